@@ -1,0 +1,178 @@
+"""Kernels that run on all cores.
+
+Warp executes a CPU launch on the calling thread, but it releases the interpreter lock while the kernel runs. Every
+kernel here is therefore a worker: it takes the next block of items from a shared atomic counter until none is left,
+and calling it starts one worker per thread. Blocks are handed out dynamically, so a busy core or an expensive tile
+delays nobody, and since no two blocks write to one location the result does not depend on the number of threads.
+
+The bodies are C++ with vector types (see `simd.py`), compiled by Warp's own Clang on first use (one to three seconds
+each) and cached on disk; no compiler has to be installed.
+"""
+
+import functools
+import inspect
+import linecache
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .simd import PRELUDE
+
+# One counter per cache line, so that nothing else is slowed down by it.
+_COUNTER_SLOTS = 16
+
+_lock = threading.RLock()
+_num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+_pool: ThreadPoolExecutor | None = None
+
+
+def get_num_threads() -> int:
+    """Number of threads that the CPU rasterizer runs on; all cores of this process unless set."""
+    return _num_threads
+
+
+def set_num_threads(n: int) -> None:
+    """Sets the number of threads of the CPU rasterizer. Images and gradients are bit-equal for any number.
+
+    Args:
+        n: At least 1.
+
+    Raises:
+        ValueError: `n` is not a whole number of at least 1.
+    """
+    global _num_threads, _pool
+    if not isinstance(n, int) or n < 1:
+        raise ValueError(f"set_num_threads expects a whole number of at least 1, got {n!r}.")
+    with _lock:
+        _num_threads = n
+        if _pool is not None:
+            _pool.shutdown()
+            _pool = None
+
+
+class FloatArray:
+    """Marks a worker's parameter as a contiguous float32 tensor, passed flat."""
+
+
+class IntArray:
+    """Marks a worker's parameter as a contiguous int32 tensor, passed flat."""
+
+
+_WARP_TYPE = {
+    FloatArray: "wp.array(dtype=wp.float32)",
+    IntArray: "wp.array(dtype=wp.int32)",
+    int: "wp.int32",
+    float: "wp.float32",
+}
+_POINTER = {FloatArray: "float", IntArray: "int"}
+
+
+class Worker:
+    """A kernel made of C++; call it with its parameters to run it on every thread. See `worker`."""
+
+    def __init__(self, name: str, kinds: dict[str, type], code: str):
+        self._name = name
+        self._kinds = kinds
+        self._code = code
+        self._command: Any = None
+
+    def __call__(self, *arguments: Tensor | int | float) -> None:
+        with _lock:
+            if self._command is None:
+                self._command = self._record(arguments)
+            self._command.set_params_from_ctypes(
+                [_parameter(_new_counter())] + [_parameter(a) for a in arguments]
+            )
+            _on_all_threads(self._command.launch)
+
+    def _record(self, arguments: tuple[Tensor | int | float, ...]) -> Any:
+        wp = _warp()
+        declared = {"counter_array": _WARP_TYPE[IntArray]}
+        pointers = "int* counter = (int*)counter_array.data;\n"
+        for name, kind in self._kinds.items():
+            if kind in _POINTER:
+                declared[f"{name}_array"] = _WARP_TYPE[kind]
+                pointers += f"{_POINTER[kind]}* __restrict {name} = ({_POINTER[kind]}*){name}_array.data;\n"
+            else:
+                declared[name] = _WARP_TYPE[kind]
+        signature = ", ".join(f"{name}: {kind}" for name, kind in declared.items())
+        source = f"def {self._name}_body({signature}): ...\n"
+        source += f"def {self._name}({signature}):\n    {self._name}_body({', '.join(declared)})\n"
+        # Warp reads a kernel's source back through `inspect`, which finds generated code in `linecache`.
+        filename = f"<skipgs_plug {self._name}>"
+        linecache.cache[filename] = (len(source), None, source.splitlines(keepends=True), filename)
+        namespace: dict[str, Any] = {"wp": wp, "__name__": f"{__name__}.{self._name}"}
+        exec(compile(source, filename, "exec"), namespace)
+        namespace[f"{self._name}_body"] = wp.func_native(pointers + PRELUDE + self._code)(
+            namespace[f"{self._name}_body"]
+        )
+        kernel = wp.kernel(enable_backward=False)(namespace[self._name])
+        inputs = [_parameter(_new_counter())] + [_parameter(a) for a in arguments]
+        return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
+
+
+def worker(code: str, *, items: str, grain: int) -> Callable[[Callable[..., None]], Worker]:
+    """Turns a stub function into a `Worker`.
+
+    Args:
+        code: C++ that handles items `[first, last)`. Array parameters of the stub are pointers of the same name.
+        items: C++ expression for the number of items, in terms of the stub's parameters.
+        grain: Items taken from the counter at a time.
+    """
+    loop = f"""
+for (;;) {{
+    const int first = __atomic_fetch_add(counter, {grain}, __ATOMIC_RELAXED);
+    if (first >= ({items})) break;
+    const int last = first + {grain} < ({items}) ? first + {grain} : ({items});
+    {code}
+}}
+"""
+
+    def build(stub: Callable[..., None]) -> Worker:
+        kinds = {name: parameter.annotation for name, parameter in inspect.signature(stub).parameters.items()}
+        return Worker(stub.__name__, kinds, loop)
+
+    return build
+
+
+@functools.cache
+def _warp() -> Any:
+    try:
+        import warp as wp
+    except ImportError as error:
+        raise ImportError('The CPU rasterizer needs NVIDIA Warp: pip install "skipgs_plug[full]".') from error
+    # A rasterizer that never touches CUDA should not print a banner and a warning about a missing driver.
+    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_ERROR
+    wp.init()
+    return wp
+
+
+def _new_counter() -> Tensor:
+    return torch.zeros(_COUNTER_SLOTS, dtype=torch.int32)
+
+
+def _parameter(value: Tensor | int | float) -> Any:
+    if isinstance(value, Tensor):
+        return _warp().from_torch(value.detach().reshape(-1), return_ctype=True)
+    return value
+
+
+def _on_all_threads(work: Callable[[], None]) -> None:
+    global _pool
+    if _num_threads == 1:
+        work()
+        return
+    if _pool is None:
+        _pool = ThreadPoolExecutor(_num_threads - 1, thread_name_prefix="skipgs-raster")
+    others = [_pool.submit(work) for _ in range(_num_threads - 1)]
+    work()
+    for other in others:
+        # A worker that has not started by now would find no item left.
+        if not other.cancel():
+            other.result()

@@ -1,0 +1,51 @@
+"""Vector code for Warp's CPU back end.
+
+Warp compiles kernels with its own Clang, also on machines without a compiler, and `wp.func_native` accepts C++ that
+may use Clang's vector extension. A value of `v16` holds 16 neighbouring pixels (or 16 Gaussians); arithmetic on it
+reads like scalar code and becomes one AVX-512 instruction, two of AVX2 or four of SSE / NEON. Scalar Warp code does
+not vectorise across pixels: it ran 12 times slower on the blend.
+"""
+
+PRELUDE = """
+typedef float v16 __attribute__((ext_vector_type(16), aligned(4)));
+typedef int i16 __attribute__((ext_vector_type(16), aligned(4)));
+
+const v16 lane = {0.f, 1.f, 2.f, 3.f, 4.f, 5.f, 6.f, 7.f, 8.f, 9.f, 10.f, 11.f, 12.f, 13.f, 14.f, 15.f};
+auto any = [](i16 mask) -> bool { return __builtin_reduce_or(mask) != 0; };
+auto all = [](i16 mask) -> bool { return __builtin_reduce_and(mask) != 0; };
+auto vmin = [](v16 a, v16 b) -> v16 { return __builtin_elementwise_min(a, b); };
+auto vmax = [](v16 a, v16 b) -> v16 { return __builtin_elementwise_max(a, b); };
+auto vsqrt = [](v16 a) -> v16 { return __builtin_elementwise_sqrt(a); };
+// Pairwise, so that the order of additions (and the result to the bit) is fixed.
+auto sum = [](v16 a) -> float {
+    auto b = a.lo + a.hi;
+    auto c = b.lo + b.hi;
+    auto d = c.lo + c.hi;
+    return d.x + d.y;
+};
+auto load = [](const float* p) -> v16 { return *(const v16*)p; };
+auto store = [](float* p, v16 a) { *(v16*)p = a; };
+// 16 rows of an array of structures, column `c`; `row` names the row of each lane.
+auto gather = [](const float* p, const int* row, int width, int c) -> v16 {
+    v16 a;
+    for (int l = 0; l < 16; ++l) a[l] = p[row[l] * width + c];
+    return a;
+};
+auto scatter = [](float* p, const int* row, int width, int c, v16 a, int lanes) {
+    for (int l = 0; l < lanes; ++l) p[row[l] * width + c] = a[l];
+};
+// 2^t for t in [-126, 126]: integer part into the exponent, degree-6 minimax polynomial for the rest in [-0.5, 0.5]
+// (relative error 1e-7). Adding 1.5 * 2^23 leaves the rounded integer in the low bits of the mantissa.
+auto exp2 = [](v16 t) -> v16 {
+    const v16 magic = (v16)12582912.0f;
+    v16 r = t + magic;
+    v16 f = t - (r - magic);
+    v16 p = 1.5403530e-4f * f + 1.3333558e-3f;
+    p = p * f + 9.6181291e-3f;
+    p = p * f + 5.5504109e-2f;
+    p = p * f + 2.4022651e-1f;
+    p = p * f + 6.9314718e-1f;
+    p = p * f + 1.0f;
+    return (v16)((i16)p + ((i16)r << 23));
+};
+"""
