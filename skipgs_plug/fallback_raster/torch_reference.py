@@ -76,11 +76,21 @@ def rasterization_reference(
     n_cameras, n_gaussians = len(viewmats), len(means)
 
     def project_rows(camera_ids: Tensor, gaussian_ids: Tensor) -> Projected:
-        rows = [t[gaussian_ids] for t in (means, quats, scales, opacities)]
-        cameras = viewmats[camera_ids], Ks.detach()[camera_ids]
-        antialiased = rasterize_mode == "antialiased"
-        limits = near_plane, far_plane, radius_clip
-        return project(*rows, *cameras, width, height, eps2d, antialiased, *limits)
+        return project(
+            means[gaussian_ids],
+            quats[gaussian_ids],
+            scales[gaussian_ids],
+            opacities[gaussian_ids],
+            viewmats[camera_ids],
+            Ks.detach()[camera_ids],
+            width,
+            height,
+            eps2d,
+            rasterize_mode == "antialiased",
+            near_plane,
+            far_plane,
+            radius_clip,
+        )
 
     # The culled leave before anything is differentiated: their depth may be 0, their gradient is 0.
     every_row = torch.cartesian_prod(torch.arange(n_cameras), torch.arange(n_gaussians)).to(means.device)

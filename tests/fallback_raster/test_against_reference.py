@@ -1,0 +1,137 @@
+"""The float32 rasterizer against the float64 reference: image and every gradient, in every mode."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from raster_scenes import errors_against_reference, leaves, random_scene
+
+from skipgs_plug.fallback_raster import rasterization
+from skipgs_plug.fallback_raster.torch_reference import rasterization_reference
+
+IMAGE_ERROR = 1e-5
+GRADIENT_ERROR = 1e-4
+
+CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    **{f"SH {degree}": ({"sh_degree": degree}, {}) for degree in range(4)},
+    **{f"{channels} features": ({"channels": channels}, {}) for channels in (1, 2, 3, 4, 5, 8)},
+    **{mode: ({}, {"render_mode": mode}) for mode in ("D", "ED", "RGB+D", "RGB+ED")},
+    "antialiased": ({}, {"rasterize_mode": "antialiased"}),
+    "antialiased, SH 3": ({"sh_degree": 3}, {"rasterize_mode": "antialiased"}),
+    "background": ({"backgrounds": True}, {}),
+    "background, depth": ({"backgrounds": True, "sh_degree": 2}, {"render_mode": "RGB+ED"}),
+    "three cameras": ({"cameras": 3, "sh_degree": 1, "backgrounds": True}, {}),
+    "packed": ({"cameras": 3, "sh_degree": 1}, {"packed": True}),
+    "packed, plain colors": ({"cameras": 2}, {"packed": True, "render_mode": "RGB+D"}),
+    "absgrad": ({}, {"absgrad": True}),
+    "absgrad, packed": ({"cameras": 3}, {"absgrad": True, "packed": True}),
+    "near and far": ({}, {"near_plane": 3.5, "far_plane": 5.0}),
+    "radius clip": ({}, {"radius_clip": 3.0}),
+    "no blur": ({}, {"eps2d": 1e-3}),
+    "much blur": ({}, {"eps2d": 4.0, "rasterize_mode": "antialiased"}),
+    "tiles of 8": ({}, {"tile_size": 8}),
+    "large tiles": ({}, {"tile_size": 32}),
+    "odd size": ({"width": 17, "height": 53}, {}),
+    "one pixel": ({"width": 1, "height": 1, "n": 60}, {}),
+    "many Gaussians": ({"n": 2000, "width": 64, "height": 48, "sh_degree": 3}, {}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_image_and_gradients(case: str) -> None:
+    scene, options = CASES[case]
+    errors = errors_against_reference(rasterization, random_scene(**scene), **{"packed": False, **options})
+    wrong = {
+        name: error
+        for name, error in errors.items()
+        if not error < (IMAGE_ERROR if name in ("image", "alpha") else GRADIENT_ERROR)
+    }
+    assert not wrong, errors
+
+
+def test_colors_and_harmonics_of_each_camera_on_their_own() -> None:
+    for sh_degree in (None, 2):
+        scene = random_scene(cameras=3, sh_degree=sh_degree)
+        shades = torch.tensor([1.0, 0.5, 0.8]).reshape(3, *[1] * scene["colors"].dim())
+        scene["colors"] = scene["colors"] * shades
+        errors = errors_against_reference(rasterization, scene, packed=False)
+        assert errors["image"] < IMAGE_ERROR
+        assert errors["colors"] < GRADIENT_ERROR
+
+
+def test_harmonics_above_the_used_degree_get_zero_gradient() -> None:
+    scene = random_scene(sh_degree=3)
+    scene["sh_degree"] = 1
+    errors = errors_against_reference(rasterization, scene, packed=False)
+    assert errors["image"] < IMAGE_ERROR
+    assert errors["colors"] < GRADIENT_ERROR
+    inputs = leaves(scene, torch.float32)
+    rasterization(**inputs)[0].sum().backward()
+    assert inputs["colors"].grad[:, :4].any()
+    assert not inputs["colors"].grad[:, 4:].any()
+
+
+def test_negative_harmonic_colors_are_clamped() -> None:
+    scene = random_scene(sh_degree=1)
+    scene["colors"] = scene["colors"] - 1.0
+    errors = errors_against_reference(rasterization, scene, packed=False)
+    assert max(errors.values()) < GRADIENT_ERROR
+
+
+def test_opaque_pile_stops_where_the_reference_stops() -> None:
+    scene = random_scene(n=400, seed=3)
+    scene["means"] = scene["means"] * torch.tensor([0.3, 0.3, 1.0])
+    scene["opacities"] = scene["opacities"].clamp(min=0.6)
+    errors = errors_against_reference(rasterization, scene, packed=False)
+    assert errors["image"] < IMAGE_ERROR
+    assert max(errors.values()) < GRADIENT_ERROR
+
+
+def test_saturated_alpha_passes_no_gradient() -> None:
+    """alpha = min(0.999, opacity * falloff): at the clamp only the color learns."""
+    gradients = []
+    for function, dtype in ((rasterization, torch.float32), (rasterization_reference, torch.float64)):
+        scene = random_scene(n=1, width=9, height=9)
+        scene["means"] = torch.zeros(1, 3)
+        scene["scales"] = torch.full((1, 3), 10.0)
+        scene["opacities"] = torch.ones(1)
+        inputs = leaves(scene, dtype)
+        image, _, _ = function(**inputs)
+        image[:, 4, 4].sum().backward()
+        assert not inputs["opacities"].grad.any()
+        assert not inputs["means"].grad.any()
+        gradients.append(inputs["colors"].grad.double())
+    torch.testing.assert_close(*gradients, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
+def test_info_agrees(packed: bool, rasterize_mode: Any) -> None:
+    scene = random_scene(cameras=3, sh_degree=1)
+    options = {"packed": packed, "rasterize_mode": rasterize_mode}
+    _, _, info = rasterization(**leaves(scene, torch.float32), **options)
+    _, _, truth = rasterization_reference(**leaves(scene, torch.float64), **options)
+    for name in ("width", "height", "tile_size", "tile_width", "tile_height", "n_cameras", "n_batches"):
+        assert info[name] == truth[name], name
+    assert torch.equal(info["radii"], truth["radii"])
+    assert info["radii"].dtype == torch.int32
+    for name in ("camera_ids", "gaussian_ids", "batch_ids"):
+        assert torch.equal(info[name], truth[name]) if packed else info[name] is None, name
+    seen = (truth["radii"] > 0).all(dim=-1)
+    for name in ("means2d", "depths", "conics", "opacities"):
+        assert info[name].shape == truth[name].shape, name
+        torch.testing.assert_close(info[name][seen].double(), truth[name][seen], rtol=1e-4, atol=1e-4)
+
+
+def test_coincident_depths_keep_the_order_of_the_input() -> None:
+    scene = random_scene(n=60)
+    scene["means"] = scene["means"] * torch.tensor([1.0, 1.0, 0.0])
+    scene["viewmats"] = torch.eye(4)[None]
+    scene["viewmats"][0, 2, 3] = 4.0
+    image, _, _ = rasterization(**leaves(scene, torch.float32))
+    truth, _, _ = rasterization_reference(**leaves(scene, torch.float64))
+    assert (image - truth).abs().max() < 1e-4
+    reverse = {k: v.flip(0) if torch.is_tensor(v) and len(v) == 60 else v for k, v in scene.items()}
+    assert (rasterization(**leaves(reverse, torch.float32))[0] - truth).abs().max() > 1e-2
