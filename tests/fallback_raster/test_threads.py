@@ -10,11 +10,12 @@ import torch
 from raster_scenes import leaves, random_scene
 
 from skipgs_plug.fallback_raster import rasterization, set_num_threads
+from skipgs_plug.fallback_raster.launch import get_num_threads
 
 
 @pytest.fixture
 def threads() -> Iterator[Any]:
-    previous = set_num_threads(1)
+    previous = get_num_threads()
     yield set_num_threads
     set_num_threads(previous)
 

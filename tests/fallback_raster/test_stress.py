@@ -1,0 +1,281 @@
+"""Finite in, finite out: extreme but finite inputs give finite images and gradients, and nothing crashes.
+
+The default run is a sample; `pytest tests/fallback_raster/test_stress.py --stress-examples 10000` is the long one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from raster_scenes import DIFFERENTIABLE, random_scene, relative_error
+from torch import Tensor
+
+from skipgs_plug.fallback_raster import rasterization
+from skipgs_plug.fallback_raster.torch_reference import rasterization_reference
+
+SCALES = ("usual", "1e-12", "1e6", "zero", "any magnitude", "needles", "disks")
+QUATS = ("usual", "zero", "1e18", "1e-18", "one axis")
+OPACITIES = ("usual", "0", "1", "at the threshold", "1e-30")
+PLACES = (
+    "usual",
+    "one point",
+    "one depth",
+    "camera plane",
+    "camera",
+    "behind",
+    "near plane",
+    "off screen",
+    "1e6",
+)
+COLORS = ("usual", "negative", "1e4", "zero")
+FOCALS = (1e-4, 0.5, 20.0, 1e4, 1e8)
+CENTERS = (0.5, 0.0, 1.3, -40.0, 1e5)
+SIZES = ((1, 1), (1, 9), (17, 1), (16, 16), (33, 15), (5, 50))
+
+
+def magnitudes(generator: torch.Generator, low: float, high: float, *shape: int) -> Tensor:
+    return 10.0 ** (low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64))
+
+
+def extreme_scene(draw: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of `rasterization` for one drawn combination of extremes."""
+    n, cameras, (width, height) = draw["n"], draw["cameras"], draw["size"]
+    generator = torch.Generator().manual_seed(draw["seed"])
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    means = normal(n, 3) + torch.tensor([0.0, 0.0, 4.0])
+    column = torch.zeros(n, 1, dtype=torch.float64)
+    means = {
+        "usual": means,
+        "one point": torch.tensor([[0.1, -0.2, 3.0]]).expand(n, 3),
+        "one depth": torch.cat([means[:, :2], column + 3.0], dim=1),
+        "camera plane": torch.cat([means[:, :2], column], dim=1),
+        "camera": means * 0,
+        "behind": -means,
+        "near plane": torch.cat([means[:, :2] * 1e-2, column + 0.01], dim=1),
+        "off screen": torch.cat([means[:, :2] * 1e4, column + 2.0], dim=1),
+        "1e6": means * 1e6,
+    }[draw["place"]]
+    scales = {
+        "usual": magnitudes(generator, -2, 0, n, 3),
+        "1e-12": torch.full((n, 3), 1e-12),
+        "1e6": torch.full((n, 3), 1e6),
+        "zero": torch.zeros(n, 3),
+        "any magnitude": magnitudes(generator, -12, 6, n, 3),
+        "needles": torch.tensor([[1e-9, 1e-7, 1e3]]).expand(n, 3),
+        "disks": torch.tensor([[1e-9, 2.0, 2.0]]).expand(n, 3),
+    }[draw["scale"]]
+    quats = {
+        "usual": normal(n, 4),
+        "zero": torch.zeros(n, 4),
+        "1e18": normal(n, 4) * 1e18,
+        "1e-18": normal(n, 4) * 1e-18,
+        "one axis": torch.tensor([[0.0, 0.0, -2.0, 0.0]]).expand(n, 4),
+    }[draw["quat"]]
+    opacities = {
+        "usual": uniform(n),
+        "0": torch.zeros(n),
+        "1": torch.ones(n),
+        "at the threshold": torch.full((n,), 1 / 255) * (1 + 1e-6 * normal(n)),
+        "1e-30": torch.full((n,), 1e-30),
+    }[draw["opacity"]]
+    colors = uniform(n, 3) if draw["sh_degree"] is None else normal(n, (draw["sh_degree"] + 1) ** 2, 3)
+    colors = colors * {"usual": 1.0, "negative": -1.0, "1e4": 1e4, "zero": 0.0}[draw["color"]]
+    viewmats = torch.eye(4).repeat(cameras, 1, 1)
+    viewmats[:, 0, 3] += 0.3 * torch.arange(cameras)
+    Ks = torch.eye(3).repeat(cameras, 1, 1)
+    Ks[:, 0, 0], Ks[:, 1, 1] = draw["focal"] * width, draw["focal"] * height * draw["aspect"]
+    Ks[:, 0, 2], Ks[:, 1, 2] = draw["center"] * width, (1.0 - draw["center"]) * height
+    scene: dict[str, Any] = {
+        "means": means,
+        "quats": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "colors": colors,
+        "viewmats": viewmats,
+        "Ks": Ks,
+        "backgrounds": uniform(cameras, 3) if draw["background"] else None,
+    }
+    for name, value in scene.items():
+        if value is not None:
+            value = strided(value.to(draw["dtype"])) if draw["strided"] else value.to(draw["dtype"]).clone()
+            scene[name] = value.detach().requires_grad_(name in DIFFERENTIABLE)
+    scene.update(width=width, height=height, sh_degree=draw["sh_degree"], **draw["options"])
+    return scene
+
+
+def strided(value: Tensor) -> Tensor:
+    """The same values with gaps in memory and the last two dimensions' strides swapped."""
+    wide = value.new_full((*value.shape, 2), float("nan"))
+    gaps = (
+        wide.transpose(0, -2) if value.dim() == 1 else wide.transpose(-2, -3).contiguous().transpose(-2, -3)
+    )
+    gaps[..., 0] = value
+    return gaps[..., 0]
+
+
+def check_finite(scene: dict[str, Any]) -> None:
+    """Render, go back, and look at every number that comes out."""
+    image, alpha, info = rasterization(**scene)
+    cameras = scene["viewmats"].shape[0]
+    assert image.shape[:3] == (cameras, scene["height"], scene["width"])
+    assert alpha.shape == (cameras, scene["height"], scene["width"], 1)
+    assert image.isfinite().all(), "image"
+    assert ((alpha >= 0) & (alpha <= 1)).all(), "alpha"
+    assert (info["radii"] >= 0).all()
+    info["means2d"].retain_grad()
+    (image.sum() + alpha.sum()).backward()
+    assert info["means2d"].isfinite().all(), "means2d"
+    assert info["means2d"].grad.isfinite().all(), "gradient of means2d"
+    for name in DIFFERENTIABLE:
+        if scene[name] is not None:
+            gradient = scene[name].grad
+            assert gradient is not None, f"no gradient for {name}"
+            assert gradient.shape == scene[name].shape and gradient.dtype == scene[name].dtype, name
+            assert gradient.isfinite().all(), f"gradient of {name}"
+
+
+DRAWS = st.fixed_dictionaries(
+    {
+        "n": st.sampled_from([0, 1, 2, 3, 17, 70]),
+        "cameras": st.sampled_from([1, 2]),
+        "size": st.sampled_from(SIZES),
+        "seed": st.integers(0, 2**31),
+        "place": st.sampled_from(PLACES),
+        "scale": st.sampled_from(SCALES),
+        "quat": st.sampled_from(QUATS),
+        "opacity": st.sampled_from(OPACITIES),
+        "color": st.sampled_from(COLORS),
+        "focal": st.sampled_from(FOCALS),
+        "aspect": st.sampled_from([1.0, 1e-3, 30.0]),
+        "center": st.sampled_from(CENTERS),
+        "sh_degree": st.sampled_from([None, 0, 1, 2, 3]),
+        "background": st.booleans(),
+        "strided": st.booleans(),
+        "dtype": st.sampled_from([torch.float32, torch.float64]),
+        "options": st.fixed_dictionaries(
+            {
+                "render_mode": st.sampled_from(["RGB", "D", "ED", "RGB+D", "RGB+ED"]),
+                "rasterize_mode": st.sampled_from(["classic", "antialiased"]),
+                "packed": st.booleans(),
+                "absgrad": st.booleans(),
+                "eps2d": st.sampled_from([0.3, 0.0, 1e-6]),
+                "radius_clip": st.sampled_from([0.0, 2.0]),
+                "near_plane": st.sampled_from([0.01, 1e-5]),
+            }
+        ),
+    }
+)
+
+
+def test_generated_extremes(stress_examples: int) -> None:
+    @settings(
+        max_examples=stress_examples,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(draw=DRAWS)
+    def check(draw: dict[str, Any]) -> None:
+        check_finite(extreme_scene(draw))
+
+    check()
+
+
+USUAL: dict[str, Any] = {
+    "n": 20,
+    "cameras": 1,
+    "size": (33, 15),
+    "seed": 1,
+    "place": "usual",
+    "scale": "usual",
+    "quat": "usual",
+    "opacity": "usual",
+    "color": "usual",
+    "focal": 0.5,
+    "aspect": 1.0,
+    "center": 0.5,
+    "sh_degree": 3,
+    "background": True,
+    "strided": False,
+    "dtype": torch.float32,
+    "options": {"render_mode": "RGB+ED", "rasterize_mode": "antialiased"},
+}
+FIXED: list[dict[str, Any]] = [
+    {},
+    {"n": 0},
+    {"n": 1},
+    *({"scale": scale} for scale in SCALES),
+    *({"quat": quat} for quat in QUATS),
+    *({"opacity": opacity} for opacity in OPACITIES),
+    *({"place": place} for place in PLACES),
+    *({"place": place, "scale": "1e6"} for place in PLACES),
+    *({"color": color} for color in COLORS),
+    *({"size": size} for size in SIZES),
+    *({"focal": focal, "scale": "any magnitude"} for focal in FOCALS),
+    *({"center": center} for center in CENTERS),
+    {"dtype": torch.float64},
+    {"strided": True},
+    {"scale": "needles", "options": {"eps2d": 0.0}},
+    {"scale": "zero", "options": {"eps2d": 0.0, "rasterize_mode": "antialiased"}},
+    {"place": "camera plane", "options": {"near_plane": 0.0}},
+    {"place": "camera plane", "options": {"near_plane": -1.0}},
+    {"place": "one point", "opacity": "1", "n": 70},
+]
+
+
+@pytest.mark.parametrize("case", FIXED, ids=str)
+def test_fixed_extremes(case: dict[str, Any]) -> None:
+    check_finite(extreme_scene({**USUAL, **case}))
+
+
+@pytest.mark.parametrize("how", ["strided", "float64", "expanded"])
+def test_layout_and_dtype_change_nothing(how: str) -> None:
+    plain = {**USUAL, "n": 40, "strided": False}
+    scenes = [extreme_scene(plain), extreme_scene(plain)]
+    for name in ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds"):
+        value = scenes[1][name].detach()
+        if how == "strided":
+            value = strided(value)
+        elif how == "float64":
+            value = value.double()
+        elif name == "quats":
+            value = value[:1].expand(40, 4)
+            scenes[0][name] = value.clone().requires_grad_()
+        scenes[1][name] = value.requires_grad_(name in DIFFERENTIABLE)
+    results = []
+    for scene in scenes:
+        image, alpha, _ = rasterization(**scene)
+        (image.sum() + alpha.sum()).backward()
+        results.append([image, alpha, *(scene[name].grad for name in DIFFERENTIABLE)])
+    for first, second in zip(*results, strict=True):
+        assert relative_error(second, first) < 1e-6
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors"])
+def test_a_poisoned_gaussian_is_refused_or_stays_where_it_is(name: str, value: float) -> None:
+    scene = random_scene(n=50)
+    without = {k: v[1:] if torch.is_tensor(v) and len(v) == 50 else v for k, v in scene.items()}
+    clean, _, _ = rasterization_reference(**scene)
+    others, _, _ = rasterization_reference(**without)
+    untouched = (clean == others).all(dim=-1)
+    assert untouched.any() and not untouched.all()
+    poisoned = {**scene, name: scene[name].clone()}
+    poisoned[name][(0, 1)[: poisoned[name].dim()]] = value
+    try:
+        image, _, _ = rasterization(**poisoned)
+    except ValueError as error:
+        assert name in str(error)
+    else:
+        torch.testing.assert_close(image[untouched], others[untouched], rtol=0, atol=1e-5)
