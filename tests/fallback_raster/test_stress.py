@@ -1,6 +1,7 @@
 """Finite in, finite out: extreme but finite inputs give finite images and gradients, and nothing crashes.
 
-The default run is a sample; `pytest tests/fallback_raster/test_stress.py --stress-examples 10000` is the long one.
+The default run is a sample. The long one:
+`pytest tests/fallback_raster/test_stress.py --stress-examples 10000`.
 """
 
 from __future__ import annotations
@@ -114,13 +115,11 @@ def extreme_scene(draw: dict[str, Any]) -> dict[str, Any]:
 
 
 def strided(value: Tensor) -> Tensor:
-    """The same values with gaps in memory and the last two dimensions' strides swapped."""
-    wide = value.new_full((*value.shape, 2), float("nan"))
-    gaps = (
-        wide.transpose(0, -2) if value.dim() == 1 else wide.transpose(-2, -3).contiguous().transpose(-2, -3)
-    )
-    gaps[..., 0] = value
-    return gaps[..., 0]
+    """The same values with gaps between them in memory and all dimensions in reverse order."""
+    backwards = tuple(reversed(range(value.dim())))
+    gaps = value.new_full((*value.shape[::-1], 2), float("nan"))
+    gaps[..., 0] = value.permute(backwards)
+    return gaps[..., 0].permute(backwards)
 
 
 def check_finite(scene: dict[str, Any]) -> None:
@@ -139,6 +138,9 @@ def check_finite(scene: dict[str, Any]) -> None:
     for name in DIFFERENTIABLE:
         if scene[name] is not None:
             gradient = scene[name].grad
+            if name in ("colors", "backgrounds") and "RGB" not in scene["render_mode"]:
+                assert gradient is None or not gradient.any(), name
+                continue
             assert gradient is not None, f"no gradient for {name}"
             assert gradient.shape == scene[name].shape and gradient.dtype == scene[name].dtype, name
             assert gradient.isfinite().all(), f"gradient of {name}"
@@ -262,10 +264,17 @@ def test_layout_and_dtype_change_nothing(how: str) -> None:
         assert relative_error(second, first) < 1e-6
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors"])
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [(name, NAN) for name in ("means", "quats", "scales", "opacities", "colors")]
+    + [(name, value) for name in ("means", "quats", "colors") for value in (INF, -INF)],
+)
 def test_a_poisoned_gaussian_is_refused_or_stays_where_it_is(name: str, value: float) -> None:
     scene = random_scene(n=50)
+    scene["means"][0], scene["scales"][0], scene["opacities"][0] = 0.0, 0.1, 0.9  # in the middle of the image
     without = {k: v[1:] if torch.is_tensor(v) and len(v) == 50 else v for k, v in scene.items()}
     clean, _, _ = rasterization_reference(**scene)
     others, _, _ = rasterization_reference(**without)
@@ -279,3 +288,17 @@ def test_a_poisoned_gaussian_is_refused_or_stays_where_it_is(name: str, value: f
         assert name in str(error)
     else:
         torch.testing.assert_close(image[untouched], others[untouched], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["scales", "opacities", "viewmats", "Ks", "backgrounds"])
+@pytest.mark.parametrize("value", [INF, NAN])
+def test_a_poison_that_reaches_every_pixel_does_not_crash(name: str, value: float) -> None:
+    scene = random_scene(n=50, backgrounds=True)
+    scene[name] = scene[name].clone()
+    scene[name].view(-1)[0] = value
+    try:
+        image, _, _ = rasterization(**scene)
+    except ValueError as error:
+        assert name in str(error)
+    else:
+        assert image.shape == (1, scene["height"], scene["width"], 3)

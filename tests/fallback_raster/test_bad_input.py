@@ -1,0 +1,100 @@
+"""Wrong or unsupported arguments raise one sentence that names them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from raster_scenes import random_scene
+
+from skipgs_plug.fallback_raster import rasterization
+
+# A type of its own per case is not worth having; NotImplementedError marks what gsplat can and we cannot.
+REFUSALS = (ValueError, TypeError, NotImplementedError)
+
+
+def refuse(match: str, **changes: Any) -> None:
+    with pytest.raises(REFUSALS, match=match) as caught:
+        rasterization(**{**random_scene(n=7, cameras=2, sh_degree=1, backgrounds=True), **changes})
+    assert "\n" not in str(caught.value)
+
+
+WRONG_SHAPES = {
+    "means": [(7, 4), (7,), (2, 7, 3)],
+    "quats": [(7, 3), (6, 4)],
+    "scales": [(7, 1), (8, 3)],
+    "opacities": [(7, 1), (6,)],
+    "colors": [(6, 4, 3), (7, 4, 4), (7, 3), (3, 7, 4, 3), (7, 3, 3)],
+    "viewmats": [(4, 4), (2, 3, 4)],
+    "Ks": [(3, 3), (1, 3, 3), (2, 4, 4)],
+    "backgrounds": [(3,), (1, 3), (2, 4)],
+}
+
+
+@pytest.mark.parametrize(("name", "shape"), [(n, s) for n, shapes in WRONG_SHAPES.items() for s in shapes])
+def test_shapes(name: str, shape: tuple[int, ...]) -> None:
+    refuse(name, **{name: torch.ones(shape)})
+
+
+@pytest.mark.parametrize("name", WRONG_SHAPES)
+def test_integer_tensors(name: str) -> None:
+    scene = random_scene(n=7, cameras=2, sh_degree=1, backgrounds=True)
+    refuse(name, **{name: scene[name].to(torch.int64)})
+
+
+@pytest.mark.parametrize("name", WRONG_SHAPES)
+def test_tensors_of_another_device(name: str) -> None:
+    scene = random_scene(n=7, cameras=2, sh_degree=1, backgrounds=True)
+    refuse(name, **{name: scene[name].to("meta")})
+
+
+@pytest.mark.parametrize("name", ["means", "viewmats"])
+def test_arrays_that_are_no_tensors(name: str) -> None:
+    scene = random_scene(n=7, cameras=2, sh_degree=1, backgrounds=True)
+    refuse(name, **{name: scene[name].numpy()})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("width", 0),
+        ("height", -3),
+        ("sh_degree", 2),  # the colors hold degree 1
+        ("sh_degree", -1),
+        ("render_mode", "depth"),
+        ("rasterize_mode", "sharp"),
+        ("tile_size", 0),
+    ],
+)
+def test_values(name: str, value: Any) -> None:
+    refuse(name, **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("sparse_grad", True),
+        ("distributed", True),
+        ("camera_model", "fisheye"),
+        ("camera_model", "ortho"),
+        ("camera_model", "ftheta"),
+        ("with_ut", True),
+        ("with_eval3d", True),
+        ("covars", torch.eye(3).repeat(7, 1, 1)),
+        ("radial_coeffs", torch.zeros(2, 4)),
+        ("tangential_coeffs", torch.zeros(2, 2)),
+        ("thin_prism_coeffs", torch.zeros(2, 4)),
+        ("ftheta_coeffs", object()),
+        ("viewmats_rs", torch.eye(4).repeat(2, 1, 1)),
+    ],
+)
+def test_what_gsplat_can_and_this_cannot(name: str, value: Any) -> None:
+    refuse(name, **{name: value})
+
+
+def test_rolling_shutter() -> None:
+    gsplat: Any = pytest.importorskip("gsplat")
+    refuse("rolling_shutter", rolling_shutter=gsplat.RollingShutterType.ROLLING_TOP_TO_BOTTOM)
+    scene = random_scene(n=7, cameras=2)
+    rasterization(**scene, rolling_shutter=gsplat.RollingShutterType.GLOBAL)  # its default
