@@ -1,0 +1,110 @@
+"""TrainConfig: every knob of the reference trainer, named as in gsplat's simple_trainer."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from skipgs_plug.trainer.errors import InputError
+
+REFERENCE_STEPS = 30_000  # the schedule that all milestone defaults describe
+
+
+@dataclass
+class TrainConfig:
+    """Settings of one training run; defaults are the 3DGS recipe for 30,000 iterations.
+
+    Milestones (`refine_*`, `reset_every`, `sh_degree_interval`) are given for 30,000 iterations and scaled
+    together by `max_steps / 30_000`, so a short run keeps the shape of the full one: see `scaled`.
+    """
+
+    data_dir: str = ""
+    """Scene: COLMAP folder, Blender folder or packed .npz."""
+    result_dir: str = ""
+    """Run folder to write."""
+    data_factor: int = 1
+    """Use images_{factor}; resized in memory when that folder is missing."""
+    test_every: int = 8
+    """Hold out every n-th view by name (index % n == 0); 0 holds out none."""
+    init_num_pts: int = 100_000
+    """Random initial points for scenes that bring no point cloud (Blender)."""
+    backend: Literal["auto", "gsplat", "warp"] = "auto"
+    """Rasterizer: gsplat on CUDA, warp on CPU; auto takes gsplat where CUDA works."""
+    seed: int = 42
+    """Seed of view order, split noise and random backgrounds."""
+    max_steps: int = 30_000
+    """Training iterations."""
+    ssim_lambda: float = 0.2
+    """Loss = (1 - ssim_lambda) * L1 + ssim_lambda * (1 - SSIM)."""
+
+    sh_degree: int = 3
+    """Highest spherical-harmonics degree."""
+    sh_degree_interval: int = 1000
+    """Iterations between two raises of the SH degree."""
+    init_opa: float = 0.1
+    """Initial opacity."""
+    init_scale: float = 1.0
+    """Initial scale, in units of the mean distance to the three nearest points."""
+
+    means_lr: float = 1.6e-4
+    """Learning rate of positions, times scene scale; decays to 1 % over max_steps."""
+    scales_lr: float = 5e-3
+    """Learning rate of log scales."""
+    opacities_lr: float = 5e-2
+    """Learning rate of opacity logits."""
+    quats_lr: float = 1e-3
+    """Learning rate of quaternions."""
+    sh0_lr: float = 2.5e-3
+    """Learning rate of the constant SH band."""
+    shN_lr: float = 2.5e-3 / 20
+    """Learning rate of the higher SH bands."""
+    visible_adam: bool = False
+    """Update only Gaussians that the view shows, without bias correction (gsplat's SelectiveAdam)."""
+
+    antialiased: bool = False
+    """Compensate opacities for the 2D low-pass filter (Mip-Splatting)."""
+    random_bkgd: bool = False
+    """Train on random background colours."""
+    near_plane: float = 0.01
+    """Near clipping plane, world units."""
+    far_plane: float = 1e10
+    """Far clipping plane, world units."""
+
+    refine_start_iter: int = 500
+    """First densification."""
+    refine_stop_iter: int = 15_000
+    """End of densification; the gate becomes active here."""
+    refine_every: int = 100
+    """Iterations between densifications."""
+    reset_every: int = 3000
+    """Iterations between opacity resets."""
+    grow_grad2d: float = 0.0002
+    """Mean screen-space gradient above which a Gaussian is duplicated or split."""
+    grow_scale3d: float = 0.01
+    """Gaussians larger than this, times scene scale, are split instead of duplicated."""
+    prune_opa: float = 0.005
+    """Gaussians below this opacity are pruned."""
+    prune_scale3d: float = 0.1
+    """Gaussians larger than this, times scene scale, are pruned after the first opacity reset."""
+    absgrad: bool = False
+    """Densify by absolute gradients (AbsGS); wants grow_grad2d of about 0.0008."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("max_steps", 1), ("data_factor", 1), ("test_every", 0), ("refine_every", 1)):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < least:
+                raise InputError(f"{name}={value!r} is not an integer of at least {least}.")
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(f"sh_degree={self.sh_degree} is outside 0..3.")
+        if not 0.0 <= self.ssim_lambda <= 1.0:
+            raise InputError(f"ssim_lambda={self.ssim_lambda} is outside 0..1.")
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, float) and not math.isfinite(value):
+                raise InputError(f"{field.name}={value} is not a finite number.")
+
+    def scaled(self, milestone: int) -> int:
+        """Return a milestone of the 30,000-iteration schedule in iterations of this run, at least 1."""
+        return max(1, round(milestone * self.max_steps / REFERENCE_STEPS))

@@ -1,0 +1,275 @@
+"""The training loop: the 3DGS recipe, one method per thing that happens."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from skipgs_plug.trainer import metrics, state
+from skipgs_plug.trainer.backend import Backend, resolve_backend
+from skipgs_plug.trainer.clock import TrainClock
+from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.model import create_optimizers, create_splats
+from skipgs_plug.trainer.order import ViewOrder, derive_seed
+from skipgs_plug.trainer.ply import write_ply
+from skipgs_plug.trainer.scene import Scene, View
+from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
+
+MEANS_LR_END = 0.01  # share of the positions' learning rate that is left at max_steps
+
+
+class Stateful(Protocol):
+    """Anything whose state should travel in snapshots and checkpoints."""
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+
+
+class Trainer:
+    """Trains one scene by the 3DGS recipe.
+
+    Attributes:
+        step: next iteration, 0-based.
+        splats: raw parameters `means scales quats opacities sh0 shN`.
+        optimizers: one per parameter, by the same names.
+        refine_stop_iter: end of densification in iterations of this run.
+        on_step: called after every iteration, outside the clock, with (step, view name, loss).
+        stop_requested: set it (from a signal handler, say) to end `train` after the current iteration.
+    """
+
+    def __init__(self, config: TrainConfig, scene: Scene, backend: Backend | None = None) -> None:
+        self.config = config
+        self.scene = scene
+        self.backend = backend or resolve_backend(config.backend)
+        self.max_steps = config.max_steps
+        self.step = 0
+        self.splats = create_splats(scene, config, self.backend.device)
+        self.optimizers = create_optimizers(self.splats, config, scene.scene_scale)
+        self.strategy = create_strategy(config)
+        self.strategy.check_sanity(self.splats, self.optimizers)
+        self.strategy_state: dict[str, Any] = self.strategy.initialize_state(scene_scale=scene.scene_scale)
+        self.refine_stop_iter: int = self.strategy.refine_stop_iter
+        self.view_names = [view.name for view in scene.train]
+        self.clock = TrainClock(self.backend.device)
+        self.registered: dict[str, Stateful] = {}
+        self.on_step: Callable[[int, str, float], None] | None = None
+        self.stop_requested = False
+        self._order = ViewOrder(len(scene.train), config.seed)
+        self._sh_interval = config.scaled(config.sh_degree_interval)
+        self._warm = False
+
+    @property
+    def phase_seconds(self) -> dict[str, float]:
+        """Seconds of training by phase: forward, loss, backward, optimizer, strategy."""
+        return self.clock.phase_seconds
+
+    @property
+    def t_total(self) -> float:
+        """Seconds of training; evaluation, saving and kernel compilation excluded."""
+        return self.clock.t_total
+
+    @property
+    def t_post(self) -> float:
+        """The part of `t_total` after densification ended."""
+        return self.clock.t_post
+
+    def train(self, until: int | None = None, progress: bool = True) -> None:
+        """Run iterations up to `until` (exclusive; default max_steps)."""
+        from tqdm import tqdm
+
+        until = self.max_steps if until is None else min(until, self.max_steps)
+        self.stop_requested = False
+        with tqdm(
+            total=until, initial=self.step, desc="Training", disable=not progress, mininterval=0.5
+        ) as bar:
+            while self.step < until and not self.stop_requested:
+                loss = self.train_step()
+                bar.update()
+                if self.step % 10 == 0:
+                    bar.set_postfix_str(f"loss={loss:.3f} | GS={len(self.splats['means'])}", refresh=False)
+
+    def train_step(self) -> float:
+        """Run one iteration and return its loss."""
+        step = self.step
+        view = self.scene.train[self._order.at(step)]
+        if not self._warm:
+            self._warm_up(view)
+        densifying = step < self.refine_stop_iter
+        self._set_learning_rate(step)
+
+        self.clock.start()
+        image, target, info = self._forward(view, self.active_sh_degree(step), step)
+        self.clock.mark("forward")
+        if densifying:
+            self.strategy.step_pre_backward(self.splats, self.optimizers, self.strategy_state, step, info)
+        loss = self.backend.loss(image, target, self.config.ssim_lambda)
+        value = float(loss.detach())
+        self.clock.mark("loss")
+        self.backward(loss, view.name, step)
+        self.clock.mark("backward")
+        self._optimizer_step(info)
+        self.clock.mark("optimizer")
+        # A gate may have left this iteration without gradients, which densification averages.
+        if densifying and info["means2d"].grad is not None:
+            self._densify(step, info)
+        self.clock.mark("strategy")
+        self.clock.stop(after_densification=not densifying)
+
+        self.step += 1
+        if self.on_step is not None:
+            self.on_step(step, view.name, value)
+        return value
+
+    def backward(self, loss: Tensor, view: str, step: int) -> None:
+        """Compute gradients: the seam that a gate replaces on the instance, called once per iteration.
+
+        Raises:
+            InputError: the loss is not finite; names view and step.
+        """
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise InputError(
+                f"Loss is {value} at iteration {step} on view {view!r}; "
+                "check that image and camera, or lower the "
+                "learning rates."
+            )
+        loss.backward()
+
+    def active_sh_degree(self, step: int) -> int:
+        """Return the SH degree that iteration `step` renders with."""
+        return min(step // self._sh_interval, self.config.sh_degree)
+
+    @torch.no_grad()
+    def render(self, view: View) -> Tensor:
+        """Return the image [H, W, 3] of a view, in [0, 1] up to overshoot."""
+        degree = self.active_sh_degree(max(self.step - 1, 0))
+        colors, _, _ = self._rasterize(view, degree, self._background())
+        return colors[0]
+
+    def evaluate(self, split: str = "test", lpips_net: str | None = None) -> dict[str, Any]:
+        """Return mean `psnr` and `ssim` over the views of "test" or "train", `num_GS`, and the flavours."""
+        views = {"test": self.scene.test, "train": self.scene.train}[split]
+        if not views:
+            raise InputError(
+                f"Scene {self.scene.name} has no {split} views; lower test_every to hold some out."
+            )
+        rows = []
+        for view in views:
+            image, target = self.render(view), self._target(view)
+            row = {"psnr": metrics.psnr(image, target), "ssim": metrics.ssim(image, target)}
+            if lpips_net is not None:
+                row[f"lpips_{lpips_net}"] = metrics.lpips(image, target, lpips_net)
+            rows.append(row)
+        means = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
+        return {
+            **means,
+            "num_GS": len(self.splats["means"]),
+            "step": self.step,
+            "split": split,
+            "views": len(views),
+            "psnr_flavour": "mean of per-image PSNR, float render clamped to [0, 1]",
+            "ssim_flavour": metrics.SSIM_FLAVOUR,
+        }
+
+    def export_ply(self, path: str | Path) -> None:
+        """Write the 62-property INRIA PLY, in the coordinates of the dataset."""
+        write_ply(self.splats, path)
+
+    def register_state(self, name: str, owner: Stateful) -> None:
+        """Let the state of `owner` travel in snapshots and checkpoints under `name`."""
+        self.registered[name] = owner
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return an exact copy of the training state, in memory."""
+        return state.capture(self)
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Go back to a snapshot; it stays valid for another restore."""
+        state.apply(self, snapshot)
+
+    def save_checkpoint(self, path: str | Path) -> None:
+        """Write a checkpoint from which `load_checkpoint` continues exactly."""
+        state.save_checkpoint(self, path)
+
+    def load_checkpoint(self, path: str | Path) -> None:
+        """Continue from a checkpoint of the same scene and settings."""
+        state.load_checkpoint(self, path)
+
+    def _forward(self, view: View, degree: int, step: int) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        background = self._background()
+        if self.config.random_bkgd:
+            generator = torch.Generator().manual_seed(derive_seed(self.config.seed, step))
+            background = torch.rand(1, 3, generator=generator).to(self.backend.device)
+        colors, _, info = self._rasterize(view, degree, background)
+        return colors[0], self._target(view), info
+
+    def _rasterize(
+        self, view: View, degree: int, background: Tensor | None
+    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        device = self.backend.device
+        splats = self.splats
+        return self.backend.rasterization(
+            means=splats["means"],
+            quats=splats["quats"],
+            scales=torch.exp(splats["scales"]),
+            opacities=torch.sigmoid(splats["opacities"]),
+            colors=torch.cat([splats["sh0"], splats["shN"]], dim=1),
+            viewmats=view.viewmat[None].to(device),
+            Ks=view.K[None].to(device),
+            width=view.width,
+            height=view.height,
+            near_plane=self.config.near_plane,
+            far_plane=self.config.far_plane,
+            sh_degree=degree,
+            packed=False,
+            absgrad=self.config.absgrad,
+            rasterize_mode="antialiased" if self.config.antialiased else "classic",
+            backgrounds=background,
+        )
+
+    def _background(self) -> Tensor | None:
+        """Return the scene's background [1, 3]; None for black, which needs no compositing."""
+        if not any(self.scene.background):
+            return None
+        return torch.tensor([self.scene.background], dtype=torch.float32, device=self.backend.device)
+
+    def _target(self, view: View) -> Tensor:
+        return view.image.to(self.backend.device).float() / 255.0
+
+    def _set_learning_rate(self, step: int) -> None:
+        decay = MEANS_LR_END ** (step / self.max_steps)
+        rate = self.config.means_lr * self.scene.scene_scale * decay
+        self.optimizers["means"].param_groups[0]["lr"] = rate
+
+    def _optimizer_step(self, info: dict[str, Any]) -> None:
+        for optimizer in self.optimizers.values():
+            if self.config.visible_adam:
+                optimizer.step((info["radii"] > 0).all(dim=-1).any(dim=0))  # type: ignore[arg-type]
+            else:
+                optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+
+    def _densify(self, step: int, info: dict[str, Any]) -> None:
+        # gsplat draws split noise from the global generator; seeding it by step makes resuming exact and
+        # leaves the caller's random state alone.
+        with torch.random.fork_rng(enabled=step % self.strategy.refine_every == 0):
+            if step % self.strategy.refine_every == 0:
+                torch.manual_seed(derive_seed(self.config.seed, step))
+            args = (self.splats, self.optimizers, self.strategy_state, step)
+            self.strategy.step_post_backward(*args, info, packed=False)
+            reset_opacity_if_missed(self.strategy, *args)
+
+    def _warm_up(self, view: View) -> None:
+        """Compile kernels before the clock runs: one forward and backward whose gradients are dropped."""
+        image, target, _ = self._forward(view, self.config.sh_degree, 0)
+        self.backend.loss(image, target, self.config.ssim_lambda).backward()
+        for optimizer in self.optimizers.values():
+            optimizer.zero_grad(set_to_none=True)
+        self._warm = True

@@ -1,0 +1,42 @@
+"""Training loss in plain torch, for devices without a fused one: (1 - w) L1 + w (1 - SSIM)."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+WINDOW = 11
+SIGMA = 1.5
+C1 = 0.01**2
+C2 = 0.03**2
+
+
+def l1_ssim_loss(image: Tensor, target: Tensor, ssim_lambda: float = 0.2) -> Tensor:
+    """Return the 3DGS loss of images [..., H, W, C] in [0, 1]; SSIM windows are zero-padded ("same")."""
+    l1 = (image - target).abs().mean()
+    return (1.0 - ssim_lambda) * l1 + ssim_lambda * (1.0 - ssim(image, target))
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Return mean SSIM (Wang et al. 2004) with an 11x11 Gaussian window of sigma 1.5, zero padding."""
+    height, width, channels = image.shape[-3:]
+    x = image.reshape(-1, height, width, channels).permute(0, 3, 1, 2).reshape(-1, 1, height, width)
+    y = target.reshape(-1, height, width, channels).permute(0, 3, 1, 2).reshape(-1, 1, height, width)
+    mean_x, mean_y, mean_xx, mean_yy, mean_xy = blur(torch.stack((x, y, x * x, y * y, x * y)))
+    var_x, var_y = mean_xx - mean_x * mean_x, mean_yy - mean_y * mean_y
+    covariance = mean_xy - mean_x * mean_y
+    numerator = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
+    denominator = (mean_x * mean_x + mean_y * mean_y + C1) * (var_x + var_y + C2)
+    return (numerator / denominator).mean()
+
+
+def blur(maps: Tensor) -> Tensor:
+    """Convolve the last two axes with the separable Gaussian window."""
+    offsets = torch.arange(WINDOW, device=maps.device, dtype=maps.dtype) - WINDOW // 2
+    window = torch.exp(-(offsets**2) / (2 * SIGMA**2))
+    window = window / window.sum()
+    flat = maps.reshape(-1, 1, *maps.shape[-2:])
+    flat = F.conv2d(flat, window.view(1, 1, WINDOW, 1), padding=(WINDOW // 2, 0))
+    flat = F.conv2d(flat, window.view(1, 1, 1, WINDOW), padding=(0, WINDOW // 2))
+    return flat.reshape(maps.shape)

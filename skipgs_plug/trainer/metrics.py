@@ -1,0 +1,48 @@
+"""PSNR, SSIM and LPIPS of rendered images; each names its flavour."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from skipgs_plug.trainer.errors import InputError
+
+SSIM_FLAVOUR = "torchmetrics: 11x11 Gaussian window, reflect padding, border cropped"
+LPIPS_WEIGHTS = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
+
+
+def psnr(render: Tensor, target: Tensor) -> float:
+    """Return PSNR in dB of images [H, W, 3] clamped to [0, 1]; infinite for equal images."""
+    error = float(((render.clamp(0, 1) - target) ** 2).mean())
+    return -10.0 * math.log10(error) if error > 0.0 else math.inf
+
+
+def ssim(render: Tensor, target: Tensor) -> float:
+    """Return SSIM of images [H, W, 3] in [0, 1], as torchmetrics pads (see SSIM_FLAVOUR)."""
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    batch = (image.permute(2, 0, 1)[None] for image in (render.clamp(0, 1), target))
+    return float(structural_similarity_index_measure(*batch, data_range=1.0))
+
+
+def lpips(render: Tensor, target: Tensor, net: str) -> float:
+    """Return LPIPS (`net` alex or vgg, inputs normalised to [-1, 1]) of images [H, W, 3] in [0, 1].
+
+    Raises:
+        InputError: torchvision or the backbone weights are not on this machine; nothing is downloaded.
+    """
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / LPIPS_WEIGHTS[net]
+    if importlib.util.find_spec("torchvision") is None:
+        raise InputError("LPIPS needs torchvision; run: pip install torchvision, or leave out --lpips-net.")
+    if not weights.is_file():
+        raise InputError(
+            f"LPIPS needs the backbone weights {weights}; put them there, or leave out --lpips-net."
+        )
+    from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
+
+    batch = (image.permute(2, 0, 1)[None] for image in (render.clamp(0, 1), target))
+    return float(learned_perceptual_image_patch_similarity(*batch, net_type=net, normalize=True))  # type: ignore[arg-type]

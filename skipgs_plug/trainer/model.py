@@ -1,0 +1,61 @@
+"""The Gaussians: raw parameters from a point cloud, and one optimizer for each."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.trainer.scene import Scene
+from skipgs_plug.trainer.selective_adam import SelectiveAdam
+
+SH_C0 = 0.28209479177387814  # constant spherical-harmonics basis function
+ADAM_EPS = 1e-15
+
+
+def create_splats(scene: Scene, config: TrainConfig, device: torch.device) -> nn.ParameterDict:
+    """Return `means [N, 3]`, `scales [N, 3]` (log), `quats [N, 4]` (wxyz), `opacities [N]` (logit),
+    `sh0 [N, 1, 3]` and `shN [N, K - 1, 3]` for one isotropic Gaussian per point."""
+    n = len(scene.points)
+    rgb = scene.points_rgb.float() / 255.0
+    tensors = {
+        "means": scene.points.clone(),
+        "scales": torch.log(neighbour_distance(scene.points) * config.init_scale)[:, None].repeat(1, 3),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        "opacities": torch.logit(torch.full((n,), config.init_opa)),
+        "sh0": ((rgb - 0.5) / SH_C0)[:, None, :],
+        "shN": torch.zeros(n, (config.sh_degree + 1) ** 2 - 1, 3),
+    }
+    return nn.ParameterDict({name: nn.Parameter(t.to(device)) for name, t in tensors.items()})
+
+
+def neighbour_distance(points: Tensor) -> Tensor:
+    """Return the root mean square distance to the three nearest other points [M]."""
+    from scipy.spatial import cKDTree
+
+    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=4)  # column 0 is the point itself
+    mean_square = np.mean(distances[:, 1:] ** 2, axis=1)
+    return torch.from_numpy(np.sqrt(np.maximum(mean_square, 1e-7))).float()  # duplicates have distance 0
+
+
+def create_optimizers(
+    splats: nn.ParameterDict, config: TrainConfig, scene_scale: float
+) -> dict[str, torch.optim.Optimizer]:
+    """Return one Adam per parameter, learning rates as in gsplat's simple_trainer."""
+    rates = {
+        "means": config.means_lr * scene_scale,
+        "scales": config.scales_lr,
+        "quats": config.quats_lr,
+        "opacities": config.opacities_lr,
+        "sh0": config.sh0_lr,
+        "shN": config.shN_lr,
+    }
+    optimizers: dict[str, torch.optim.Optimizer] = {}
+    for name, rate in rates.items():
+        group = [{"params": [splats[name]], "lr": rate, "name": name}]
+        if config.visible_adam:
+            optimizers[name] = SelectiveAdam(group, eps=ADAM_EPS)
+        else:
+            optimizers[name] = torch.optim.Adam(group, eps=ADAM_EPS, fused=True)
+    return optimizers

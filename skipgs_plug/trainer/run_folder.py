@@ -1,0 +1,63 @@
+"""The run folder, in gsplat's layout."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.trainer.errors import MissingFileError
+from skipgs_plug.trainer.files import write_aside, write_json
+from skipgs_plug.trainer.loop import Trainer
+
+
+class RunFolder:
+    """Names and writes what a run leaves behind; file names carry the last finished iteration, from 0."""
+
+    def __init__(self, root: str | Path) -> None:
+        self.root = Path(root)
+
+    def write_config(self, config: TrainConfig, **extra: Any) -> None:
+        """Write cfg.yml."""
+        import yaml
+
+        with write_aside(self.root / "cfg.yml") as temporary:
+            temporary.write_text(yaml.safe_dump({**dataclasses.asdict(config), **extra}, sort_keys=False))
+
+    def write_checkpoint(self, trainer: Trainer) -> Path:
+        path = self.root / "ckpts" / f"ckpt_{trainer.step - 1}_rank0.pt"
+        trainer.save_checkpoint(path)
+        return path
+
+    def latest_checkpoint(self) -> Path:
+        """Return the checkpoint of the highest iteration."""
+        found = list((self.root / "ckpts").glob("ckpt_*_rank0.pt"))
+        if not found:
+            raise MissingFileError(f"{self.root / 'ckpts'} holds no ckpt_*_rank0.pt; start without --resume.")
+        return max(found, key=lambda path: int(path.stem.split("_")[1]))
+
+    def write_ply(self, trainer: Trainer) -> Path:
+        path = self.root / "ply" / f"point_cloud_{trainer.step - 1}.ply"
+        trainer.export_ply(path)
+        return path
+
+    def write_stats(self, trainer: Trainer, stats: dict[str, Any], split: str = "val") -> Path:
+        path = self.root / "stats" / f"{split}_step{trainer.step - 1}.json"
+        write_json(path, stats)
+        return path
+
+    def write_renders(self, trainer: Trainer, split: str = "val") -> None:
+        """Write truth beside render for every held-out (or, for "train", training) view."""
+        from PIL import Image
+
+        views = trainer.scene.test if split == "val" else trainer.scene.train
+        for i, view in enumerate(views):
+            render = (trainer.render(view).clamp(0, 1) * 255).round().byte().cpu().numpy()
+            both = np.concatenate([view.image.numpy(), render], axis=1)
+            with write_aside(
+                self.root / "renders" / f"{split}_step{trainer.step - 1}_{i:04d}.png"
+            ) as temporary:
+                Image.fromarray(both).save(temporary, format="PNG")

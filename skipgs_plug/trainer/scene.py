@@ -1,0 +1,155 @@
+"""Scene and View: posed images plus a point cloud, whatever format they came in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skipgs_plug.trainer.errors import InputError, MissingFileError
+
+BLACK = (0.0, 0.0, 0.0)
+WHITE = (1.0, 1.0, 1.0)
+
+
+@dataclass
+class View:
+    """One posed photograph.
+
+    `name` is the image path relative to the scene, unique in it: the key under which a gate remembers the
+    view. The camera looks along +z, x right, y down; pixel centres lie at +0.5.
+    """
+
+    name: str
+    image: Tensor  # [H, W, 3] uint8
+    K: Tensor  # [3, 3] float32, pixels of `image`
+    viewmat: Tensor  # [4, 4] float32, world to camera
+
+    @property
+    def width(self) -> int:
+        return self.image.shape[1]
+
+    @property
+    def height(self) -> int:
+        return self.image.shape[0]
+
+
+@dataclass
+class Scene:
+    """Training views, held-out views and the points that training starts from.
+
+    Positions stay in the coordinates of the dataset, so an exported PLY lies where its cameras do:
+    `transform` (dataset frame to training frame) is the identity for all loaders of this package.
+    Everything in the recipe that has a length is multiplied by `scene_scale` instead.
+    """
+
+    name: str
+    train: list[View]
+    test: list[View]
+    points: Tensor  # [M, 3] float32
+    points_rgb: Tensor  # [M, 3] uint8
+    scene_scale: float  # 1.1 x largest distance of a training camera from their centre
+    transform: Tensor = field(default_factory=lambda: torch.eye(4))  # [4, 4]
+    background: tuple[float, float, float] = BLACK  # colour in [0, 1] behind the scene
+
+
+def load_scene(
+    path: str | Path, data_factor: int = 1, test_every: int = 8, init_num_pts: int = 100_000
+) -> Scene:
+    """Load a COLMAP folder, a Blender folder or a packed .npz. Writes nothing.
+
+    Args:
+        path: folder with `sparse/0` or `sparse`, folder with `transforms_train.json`, or .npz file.
+        data_factor: use `images_{data_factor}`; resized in memory when that folder is missing.
+        test_every: views sorted by name, index % test_every == 0 held out; 0 holds out none. Blender scenes
+            with `transforms_test.json` and packed files bring their own split.
+        init_num_pts: random points for a Blender scene, which has no point cloud.
+
+    Raises:
+        MissingFileError: a folder or image is not there.
+        InputError: the content cannot be used (camera model, empty or non-finite points, damaged image...).
+    """
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise MissingFileError(
+            f"Scene {path} does not exist; give a COLMAP folder, Blender folder or packed .npz."
+        )
+    if path.is_file():
+        from skipgs_plug.trainer.packed import load_packed
+
+        if path.suffix != ".npz":
+            raise InputError(f"Scene {path} is a file but not a packed .npz; give the folder that holds it.")
+        return load_packed(path)
+    if (path / "sparse").is_dir():
+        from skipgs_plug.trainer.colmap import load_colmap
+
+        return load_colmap(path, data_factor, test_every)
+    if (path / "transforms_train.json").is_file():
+        from skipgs_plug.trainer.blender import load_blender
+
+        return load_blender(path, data_factor, test_every, init_num_pts)
+    raise MissingFileError(
+        f"Scene {path} holds neither {path / 'sparse' / '0'} (COLMAP) nor "
+        f"{path / 'transforms_train.json'} (Blender); run COLMAP on it or give another folder."
+    )
+
+
+def split_views(views: list[View], test_every: int) -> tuple[list[View], list[View]]:
+    """Sort by name and hold out index % test_every == 0; returns (train, test)."""
+    views = sorted(views, key=lambda view: view.name)
+    if test_every == 0:
+        return views, []
+    test = views[::test_every]
+    return [view for i, view in enumerate(views) if i % test_every], test
+
+
+def assemble_scene(
+    source: Path,
+    name: str,
+    train: list[View],
+    test: list[View],
+    points: np.ndarray,
+    points_rgb: np.ndarray,
+    background: tuple[float, float, float] = BLACK,
+) -> Scene:
+    """Check what every format must fulfil and build the Scene; `source` is named in errors."""
+    if not train:
+        raise InputError(
+            f"{source} leaves no training view; it holds {len(test)} views, raise test_every or add some."
+        )
+    seen: set[str] = set()
+    for view in train + test:
+        if view.name in seen:
+            raise InputError(f"{source} names two views {view.name!r}; image paths must be unique.")
+        seen.add(view.name)
+        if not (torch.isfinite(view.viewmat).all() and torch.isfinite(view.K).all()):
+            raise InputError(
+                f"{source}: camera of {view.name!r} holds NaN or infinity; reconstruct it again."
+            )
+    if len(points) < 4:
+        raise InputError(
+            f"{source} has {len(points)} points, at least 4 are needed; run the reconstruction again."
+        )
+    bad = int((~np.isfinite(points).all(axis=1)).sum())
+    if bad:
+        raise InputError(f"{source} has {bad} points with NaN or infinite coordinates; remove them.")
+    return Scene(
+        name=name,
+        train=train,
+        test=test,
+        points=torch.from_numpy(np.ascontiguousarray(points, dtype=np.float32)),
+        points_rgb=torch.from_numpy(np.ascontiguousarray(points_rgb, dtype=np.uint8)),
+        scene_scale=camera_extent(train),
+        background=background,
+    )
+
+
+def camera_extent(views: list[View]) -> float:
+    """Return 1.1 x the largest distance of a camera from the mean camera position, as 3DGS does."""
+    poses = torch.stack([view.viewmat for view in views]).double()  # [C, 4, 4]
+    centres = -(poses[:, :3, :3].transpose(1, 2) @ poses[:, :3, 3:])[..., 0]  # [C, 3]
+    extent = 1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max())
+    return extent if extent > 0.0 else 1.0  # a single camera has no extent

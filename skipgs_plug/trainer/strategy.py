@@ -1,0 +1,57 @@
+"""Densification by gsplat's DefaultStrategy, milestones scaled, opacity reset as documented."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import nn
+
+from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.trainer.errors import InputError
+
+
+def create_strategy(config: TrainConfig) -> Any:
+    """Return a gsplat DefaultStrategy for this config (pure torch, runs without CUDA)."""
+    try:
+        from gsplat import DefaultStrategy
+    except ImportError as error:
+        raise InputError(
+            f"Densification needs gsplat and it cannot be imported ({error}); "
+            "run: pip install 'skipgs_plug[full]'."
+        ) from error
+    return DefaultStrategy(
+        prune_opa=config.prune_opa,
+        grow_grad2d=config.grow_grad2d,
+        grow_scale3d=config.grow_scale3d,
+        prune_scale3d=config.prune_scale3d,
+        refine_start_iter=config.scaled(config.refine_start_iter),
+        refine_stop_iter=config.scaled(config.refine_stop_iter),
+        refine_every=config.scaled(config.refine_every),
+        reset_every=config.scaled(config.reset_every),
+        absgrad=config.absgrad,
+    )
+
+
+def reset_opacity_if_missed(
+    strategy: Any,
+    splats: nn.ParameterDict,
+    optimizers: dict[str, torch.optim.Optimizer],
+    state: dict[str, Any],
+    step: int,
+) -> bool:
+    """Reset opacities when this step is due and the strategy did not; returns whether it acted.
+
+    gsplat 1.5.3 writes `step % reset_every == 0 & step > 0`, which Python reads as
+    `step % reset_every == 0 and 0 > 0`: its reset never fires. A strategy that did reset leaves no opacity
+    above the reset value, so a repaired gsplat makes this a no-op.
+    """
+    if step == 0 or step % strategy.reset_every or step >= strategy.refine_stop_iter:
+        return False
+    value = 2.0 * strategy.prune_opa
+    if not bool((torch.sigmoid(splats["opacities"]) > 1.001 * value).any()):
+        return False
+    from gsplat.strategy.ops import reset_opa
+
+    reset_opa(params=splats, optimizers=optimizers, state=state, value=value)
+    return True
