@@ -9,6 +9,7 @@ import torch
 from raster_scenes import leaves, random_scene
 
 from skipgs_plug.fallback_raster import torch_reference
+from skipgs_plug.fallback_raster import torch_reference_projection as projection
 
 gsplat_torch: Any = pytest.importorskip("gsplat.cuda._torch_impl")
 
@@ -16,7 +17,7 @@ gsplat_torch: Any = pytest.importorskip("gsplat.cuda._torch_impl")
 def test_rotation_and_covariance() -> None:
     scene = leaves(random_scene(), torch.float64)
     covariances, _ = gsplat_torch._quat_scale_to_covar_preci(scene["quats"], scene["scales"], True, False)
-    axes = torch_reference.rotation_matrices(scene["quats"]) * scene["scales"][:, None, :]
+    axes = projection.rotation_matrices(scene["quats"]) * scene["scales"][:, None, :]
     torch.testing.assert_close(axes @ axes.transpose(-1, -2), covariances, rtol=1e-12, atol=1e-14)
 
 
@@ -25,7 +26,7 @@ def test_spherical_harmonics(degree: int) -> None:
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(50, 3, generator=generator, dtype=torch.float64)
     coeffs = torch.randn(50, 16, 3, generator=generator, dtype=torch.float64)
-    ours = torch_reference.spherical_harmonics(degree, directions, coeffs)
+    ours = projection.spherical_harmonics(degree, directions, coeffs)
     theirs = gsplat_torch._spherical_harmonics(degree, directions, coeffs)
     torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-13)
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from raster_scenes import leaves, random_scene
 
+from skipgs_plug.fallback_raster import torch_reference
 from skipgs_plug.fallback_raster.torch_reference import near_cutoff, rasterization_reference
 
 STEP = 1e-6
@@ -39,6 +40,19 @@ def test_finite_differences(case: str) -> None:
         return torch.cat([image, alpha], dim=-1) * kept
 
     assert torch.autograd.gradcheck(render, [inputs[n] for n in names], eps=STEP, atol=1e-6, rtol=1e-5)
+
+
+def test_boxes_hold_every_pixel_above_the_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reference leaves Gaussians out where their boxes do not reach; blending all of them is the same."""
+    monkeypatch.setattr(torch_reference, "PAIRS_PER_CHUNK", 3000)  # small chunks, many boxes left out
+    scene = leaves(random_scene(cameras=2, sh_degree=1), torch.float64)
+    image, alpha, _ = rasterization_reference(**scene)
+    monkeypatch.setattr(
+        torch_reference, "_reaches", lambda projected, _: torch.ones_like(projected.depths, dtype=torch.bool)
+    )
+    everywhere, alpha_everywhere, _ = rasterization_reference(**scene)
+    torch.testing.assert_close(everywhere, image, rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(alpha_everywhere, alpha, rtol=1e-12, atol=1e-13)
 
 
 def test_absgrad_is_the_sum_of_the_absolute_gradients_of_single_pixels() -> None:

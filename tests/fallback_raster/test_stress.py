@@ -138,7 +138,7 @@ def check_finite(scene: dict[str, Any]) -> None:
     for name in DIFFERENTIABLE:
         if scene[name] is not None:
             gradient = scene[name].grad
-            if name in ("colors", "backgrounds") and "RGB" not in scene["render_mode"]:
+            if name in ("colors", "backgrounds") and "RGB" not in scene.get("render_mode", "RGB"):
                 assert gradient is None or not gradient.any(), name
                 continue
             assert gradient is not None, f"no gradient for {name}"
