@@ -1,0 +1,9 @@
+"""A CPU rasterizer for 3D Gaussians with gsplat's signature, written with NVIDIA Warp.
+
+Warp is imported, and kernels are compiled (seconds, cached on disk), when something is first rendered.
+"""
+
+from .install import install_as_gsplat as install_as_gsplat
+from .launch import get_num_threads as get_num_threads
+from .launch import set_num_threads as set_num_threads
+from .rasterization import rasterization as rasterization

@@ -1,12 +1,13 @@
 """Kernels that run on all cores.
 
-Warp executes a CPU launch on the calling thread, but it releases the interpreter lock while the kernel runs. Every
-kernel here is therefore a worker: it takes the next block of items from a shared atomic counter until none is left,
-and calling it starts one worker per thread. Blocks are handed out dynamically, so a busy core or an expensive tile
-delays nobody, and since no two blocks write to one location the result does not depend on the number of threads.
+Warp executes a CPU launch on the calling thread, but it releases the interpreter lock while the kernel runs.
+Every kernel here is therefore a worker: it takes the next block of items from a shared atomic counter until
+none is left, and calling it starts one worker per thread. Blocks are handed out dynamically, so a busy core or
+an expensive tile delays nobody, and since no two blocks write to one location the result does not depend on
+the number of threads.
 
-The bodies are C++ with vector types (see `simd.py`), compiled by Warp's own Clang on first use (one to three seconds
-each) and cached on disk; no compiler has to be installed.
+The bodies are C++ with vector types (see `simd.py`), compiled by Warp's own Clang on first use (up to a few
+seconds each) and cached on disk; no compiler has to be installed.
 """
 
 import functools
@@ -85,9 +86,7 @@ class Worker:
         with _lock:
             if self._command is None:
                 self._command = self._record(arguments)
-            self._command.set_params_from_ctypes(
-                [_parameter(_new_counter())] + [_parameter(a) for a in arguments]
-            )
+            self._command.set_params_from_ctypes([_parameter(a) for a in (_new_counter(), *arguments)])
             _on_all_threads(self._command.launch)
 
     def _record(self, arguments: tuple[Tensor | int | float, ...]) -> Any:
@@ -108,21 +107,23 @@ class Worker:
         linecache.cache[filename] = (len(source), None, source.splitlines(keepends=True), filename)
         namespace: dict[str, Any] = {"wp": wp, "__name__": f"{__name__}.{self._name}"}
         exec(compile(source, filename, "exec"), namespace)
-        namespace[f"{self._name}_body"] = wp.func_native(pointers + PRELUDE + self._code)(
-            namespace[f"{self._name}_body"]
-        )
+        body = namespace[f"{self._name}_body"]
+        namespace[f"{self._name}_body"] = wp.func_native(pointers + PRELUDE + self._code)(body)
         kernel = wp.kernel(enable_backward=False)(namespace[self._name])
-        inputs = [_parameter(_new_counter())] + [_parameter(a) for a in arguments]
+        inputs = [_parameter(a) for a in (_new_counter(), *arguments)]
         return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
 
 
-def worker(code: str, *, items: str, grain: int) -> Callable[[Callable[..., None]], Worker]:
+def worker(
+    code: str, *, items: str, grain: int, name: str | None = None
+) -> Callable[[Callable[..., None]], Worker]:
     """Turns a stub function into a `Worker`.
 
     Args:
-        code: C++ that handles items `[first, last)`. Array parameters of the stub are pointers of the same name.
+        code: C++ that handles items `[first, last)`; array parameters of the stub are pointers of their name.
         items: C++ expression for the number of items, in terms of the stub's parameters.
         grain: Items taken from the counter at a time.
+        name: Name of the kernel where the stub's own is not unique.
     """
     loop = f"""
 for (;;) {{
@@ -135,7 +136,7 @@ for (;;) {{
 
     def build(stub: Callable[..., None]) -> Worker:
         kinds = {name: parameter.annotation for name, parameter in inspect.signature(stub).parameters.items()}
-        return Worker(stub.__name__, kinds, loop)
+        return Worker(name or stub.__name__, kinds, loop)
 
     return build
 

@@ -1,0 +1,212 @@
+"""The three differentiable steps of the rasterizer as torch.autograd.Functions.
+
+Ownership of buffers: every step allocates its outputs and gradients itself and never writes into a tensor that
+came from outside. Inputs are saved with `save_for_backward`, so that changing one in place between forward and
+backward is noticed by torch.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from .binning import TILE, Bins, bin_gaussians, pack
+from .blend import MAX_CHANNELS, PAIR, backward_worker, forward_worker, reduce_pairs
+from .project import project_backward, project_forward
+from .sh import sh_backward, sh_forward
+
+# Items that one partial sum of the camera gradients covers (the grain of the workers that write them).
+_PARTIAL = 512
+
+
+def _partials(n: int) -> int:
+    return (n + _PARTIAL - 1) // _PARTIAL
+
+
+def visible_rows(radii: Tensor) -> Tensor:
+    """Rows of `radii` [N, 2] that are on screen, as int32."""
+    return radii[:, 0].nonzero().squeeze(1).to(torch.int32)
+
+
+class Project(torch.autograd.Function):
+    """Gaussians of one camera: (means2d [N, 2], depths [N], conics [N, 3], compensations [N], radii, sigmas)."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        means: Tensor,  # [N, 3]
+        quats: Tensor,  # [N, 4]
+        scales: Tensor,  # [N, 3]
+        opacities: Tensor,  # [N], only decides what is visible
+        viewmat: Tensor,  # [4, 4]
+        K: Tensor,  # [3, 3]
+        width: int,
+        height: int,
+        near_plane: float,
+        far_plane: float,
+        eps2d: float,
+        radius_clip: float,
+        antialiased: bool,
+    ) -> tuple[Tensor, ...]:
+        n = len(means)
+        means2d, sigmas = torch.empty(n, 2), torch.empty(n, 2)
+        depths, conics = torch.empty(n), torch.empty(n, 3)
+        compensations = torch.empty(n if antialiased else 0)
+        radii = torch.empty(n, 2, dtype=torch.int32)
+        project_forward(
+            means, quats, scales, opacities, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
+            n, float(width), float(height), near_plane, far_plane, eps2d, radius_clip, int(antialiased),
+        )  # fmt: skip
+        ctx.save_for_backward(means, quats, scales, viewmat, K, radii)
+        ctx.size = (width, height, eps2d, antialiased)
+        ctx.mark_non_differentiable(radii, sigmas)
+        return means2d, depths, conics, compensations, radii, sigmas
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor, v_comp: Tensor, *_: Any
+    ) -> Any:  # type: ignore[override]
+        means, quats, scales, viewmat, K, radii = ctx.saved_tensors
+        width, height, eps2d, antialiased = ctx.size
+        with_pose = ctx.needs_input_grad[4]
+        visible = visible_rows(radii)
+        v_means, v_quats, v_scales = (
+            torch.zeros_like(means),
+            torch.zeros_like(quats),
+            torch.zeros_like(scales),
+        )
+        v_poses = torch.zeros(_partials(len(visible)) if with_pose else 0, 3, 4)
+        project_backward(
+            means, quats, scales, viewmat, K, visible, v_means2d.contiguous(), v_depths.contiguous(),
+            v_conics.contiguous(), v_comp.contiguous(), v_means, v_quats, v_scales, v_poses,
+            len(visible), float(width), float(height), eps2d, int(antialiased), int(with_pose),
+        )  # fmt: skip
+        v_viewmat = None
+        if with_pose:
+            v_viewmat = torch.zeros(4, 4)
+            v_viewmat[:3] = v_poses.sum(0)
+        return v_means, v_quats, v_scales, None, v_viewmat, *[None] * 8
+
+
+class SphericalHarmonics(torch.autograd.Function):
+    """View-dependent colours [N, 3] of one camera."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        means: Tensor,  # [N, 3]
+        camera: Tensor,  # [3]
+        coefficients: Tensor,  # [N, K, 3]
+        radii: Tensor,  # [N, 2]
+        degree: int,
+    ) -> Tensor:
+        visible = visible_rows(radii)
+        colors = torch.zeros(len(means), 3)
+        width = coefficients.shape[1]
+        sh_forward(means, camera, coefficients, visible, colors, len(visible), width, degree)
+        ctx.save_for_backward(means, camera, coefficients, colors, visible)
+        ctx.degree = degree
+        return colors
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_colors: Tensor) -> Any:  # type: ignore[override]
+        means, camera, coefficients, colors, visible = ctx.saved_tensors
+        v_means, v_coefficients = torch.zeros_like(means), torch.zeros_like(coefficients)
+        v_cameras = torch.zeros(_partials(len(visible)), 3)
+        sh_backward(
+            means, camera, coefficients, visible, colors, v_colors.contiguous(), v_means, v_coefficients,
+            v_cameras, len(visible), coefficients.shape[1], ctx.degree,
+        )  # fmt: skip
+        return v_means, v_cameras.sum(0) if ctx.needs_input_grad[1] else None, v_coefficients, None, None
+
+
+class Blend(torch.autograd.Function):
+    """Image [H, W, D] and transmittance [H, W] behind it, of one camera.
+
+    `absolute` [R, 2] receives the sum over pixels of |v_means2d| (AbsGS) when it is not None.
+    """
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        means2d: Tensor,  # [R, 2]
+        conics: Tensor,  # [R, 3]
+        opacities: Tensor,  # [R]
+        colors: Tensor,  # [R, D]
+        depths: Tensor,  # [R]
+        sigmas: Tensor,  # [R, 2]
+        radii: Tensor,  # [R, 2]
+        width: int,
+        height: int,
+        absolute: Tensor | None,
+        info: dict[str, Tensor],
+    ) -> tuple[Tensor, Tensor]:
+        visible = visible_rows(radii)
+        bins = bin_gaussians(visible, means2d, depths, conics, opacities, sigmas, width, height)
+        channels = colors.shape[1]
+        tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+        image = torch.empty(height, width, channels)
+        transmittance = torch.empty(height, width)
+        last_pair = torch.empty(height, width, dtype=torch.int32)
+        tile_last = torch.empty(tiles_x * tiles_y, dtype=torch.int32)
+        for channel in range(0, channels, MAX_CHANNELS):
+            some = min(MAX_CHANNELS, channels - channel)
+            _pack_colors(bins, means2d, conics, opacities, sigmas, colors, channel, some)
+            forward_worker(some)(
+                bins.records, bins.tile_start, bins.tile_list, image, transmittance, last_pair, tile_last,
+                width, height, tiles_x, tiles_y, channels, channel, some,
+            )  # fmt: skip
+        ctx.save_for_backward(means2d, conics, opacities, colors, sigmas, transmittance, last_pair, tile_last)
+        ctx.bins, ctx.absolute = bins, absolute
+        info["tile_start"], info["pair_start"], info["order"] = bins.tile_start, bins.pair_start, bins.order
+        return image, transmittance
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor) -> Any:  # type: ignore[override]
+        means2d, conics, opacities, colors, sigmas, transmittance, last_pair, tile_last = ctx.saved_tensors
+        bins: Bins = ctx.bins
+        height, width, channels = v_image.shape
+        tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+        v_image, v_transmittance = v_image.contiguous(), v_transmittance.contiguous()
+        v_means2d, v_conics = torch.zeros_like(means2d), torch.zeros_like(conics)
+        v_opacities, v_colors = torch.zeros_like(opacities), torch.zeros_like(colors)
+        with_absolute = ctx.absolute is not None
+        absolute = ctx.absolute if with_absolute else torch.empty(0)
+        v_pairs = torch.empty(len(bins.tile_list), PAIR)
+        for channel in range(0, channels, MAX_CHANNELS):
+            some = min(MAX_CHANNELS, channels - channel)
+            if channels > MAX_CHANNELS:
+                _pack_colors(bins, means2d, conics, opacities, sigmas, colors, channel, some)
+            backward_worker(some, with_absolute)(
+                bins.records, bins.tile_start, bins.tile_list, tile_last, transmittance, last_pair, v_image,
+                v_transmittance, v_pairs, width, height, tiles_x, tiles_y, channels, channel, some,
+            )  # fmt: skip
+            reduce_pairs(
+                bins.order, bins.pair_start, bins.pair_slot, v_pairs, opacities, v_means2d, v_conics, v_opacities,
+                absolute, v_colors, len(bins.order), channels, channel, some, int(with_absolute),
+            )  # fmt: skip
+            # The gradient of the transmittance belongs to the first pass alone.
+            v_transmittance = (
+                torch.zeros_like(v_transmittance) if channels > MAX_CHANNELS else v_transmittance
+            )
+        return v_means2d, v_conics, v_opacities, v_colors, *[None] * 7
+
+
+def _pack_colors(
+    bins: Bins,
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    sigmas: Tensor,
+    colors: Tensor,
+    channel: int,
+    channels: int,
+) -> None:
+    pack(
+        bins.order, means2d, conics, opacities, sigmas, colors, bins.records,
+        len(bins.order), colors.shape[1], channel, channels,
+    )  # fmt: skip

@@ -1,0 +1,303 @@
+"""Which Gaussians touch which tile, front to back.
+
+Gaussians are sorted by depth once (N keys instead of one key per tile pair) and then counted into tiles in that
+order, so every tile's list comes out sorted and equal depths keep the order of the input. A tile is listed only
+where the ellipse at alpha = 1/255 really crosses it (exact bounds per row of tiles).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .launch import FloatArray, IntArray, get_num_threads, worker
+
+TILE = 16
+
+# Floats of a Gaussian as the blend reads it: centre x, y; half the conic's diagonal, its off-diagonal and log2 of
+# the opacity in units of log2(e), so that alpha = exp2(log2_opacity - (a dx^2 + b dx dy + c dy^2)); half height and
+# half width in pixels of the ellipse at alpha = 1/255; up to four channels of colour.
+RECORD = 12
+
+# Tiles [left, right] of row `ty` that Gaussian record `r` crosses. `one_column` is the common case of small ones.
+_TILE_ROWS = """
+    const float* r = records + 12 * i;
+    const float mx = r[0], my = r[1], half_h = r[6], half_w = r[7];
+    // Rows and columns of pixels whose centres the bounding box holds.
+    const int top = (int)ceilf(fmaxf(my - half_h - 0.5f, 0.0f)), bottom = (int)floorf(fminf(my + half_h - 0.5f, height - 1.0f));
+    const int box_left = (int)ceilf(fmaxf(mx - half_w - 0.5f, 0.0f)), box_right = (int)floorf(fminf(mx + half_w - 0.5f, width - 1.0f));
+    const bool empty = top > bottom || box_left > box_right;
+    const int first_row = top / 16, last_row = empty ? first_row - 1 : bottom / 16;
+    const bool whole = box_left / 16 == box_right / 16 || first_row == last_row;
+    // x(dy) = mx - dy b / 2a +- half_w sqrt((1 - rho^2)) ... of the ellipse a dx^2 + b dx dy + c dy^2 = bound.
+    const float slope = -0.5f * r[3] / r[2], extreme = -0.5f * r[3] / r[4] * half_w, inverse_h = 1.0f / half_h;
+    const float chord = sqrtf(fmaxf((r[5] + 7.99435344f) / r[2], 0.0f));
+    auto columns = [&](int ty, int& left, int& right) {
+        left = box_left / 16;
+        right = box_right / 16;
+        if (whole) return;
+        const float low = fmaxf(16.0f * ty + 0.5f - my, -half_h), high = fminf(16.0f * ty + 15.5f - my, half_h);
+        auto edge = [&](float dy, float side) {
+            const float t = dy * inverse_h;
+            return mx + dy * slope + side * chord * sqrtf(fmaxf(1.0f - t * t, 0.0f));
+        };
+        const float x0 = edge(fminf(fmaxf(-extreme, low), high), -1.0f) - 0.51f;
+        const float x1 = edge(fminf(fmaxf(extreme, low), high), 1.0f) - 0.49f;
+        left = larger(left, (int)floorf(fmaxf(ceilf(x0), 0.0f)) / 16);
+        right = smaller(right, x1 < 0.0f ? -1 : (int)floorf(fminf(x1, width - 1.0f)) / 16);
+    };
+"""
+
+
+@worker(
+    """
+// Least significant digit first, 11 bits at a time; depths are positive, so their bits sort like integers.
+for (int i = 0; i < n; ++i) {
+    keys[i] = ((const int*)depths)[visible[i]];
+    values[i] = visible[i];
+}
+int histogram[2048];
+for (int shift = 0; shift < 33; shift += 11) {
+    const int* from_keys = shift == 11 ? keys + n : keys;
+    const int* from_values = shift == 11 ? values + n : values;
+    int* to_keys = shift == 11 ? keys : keys + n;
+    int* to_values = shift == 11 ? values : values + n;
+    for (int b = 0; b < 2048; ++b) histogram[b] = 0;
+    for (int i = 0; i < n; ++i) ++histogram[((unsigned)from_keys[i] >> shift) & 2047];
+    int start = 0;
+    for (int b = 0; b < 2048; ++b) {
+        const int count = histogram[b];
+        histogram[b] = start;
+        start += count;
+    }
+    for (int i = 0; i < n; ++i) {
+        const int slot = histogram[((unsigned)from_keys[i] >> shift) & 2047]++;
+        to_keys[slot] = from_keys[i];
+        to_values[slot] = from_values[i];
+    }
+}
+""",
+    items="1",
+    grain=1,
+)
+def depth_sort(
+    depths: FloatArray,  # [N]
+    visible: IntArray,  # [M]
+    keys: IntArray,  # scratch [2M]
+    values: IntArray,  # scratch [2M]; the sorted rows end up in the second half
+    n: int,
+) -> None: ...
+
+
+@worker(
+    """
+for (int i = first; i < last; i += 16) {
+    const int lanes = last - i < 16 ? last - i : 16;
+    int row[16], place[16];
+    for (int l = 0; l < 16; ++l) {
+        place[l] = i + (l < lanes ? l : lanes - 1);
+        row[l] = order[place[l]];
+    }
+    const float log2e = 1.44269504f;
+    v16 a = gather(conics, row, 3, 0), b = gather(conics, row, 3, 1), c = gather(conics, row, 3, 2);
+    v16 log2_opacity = log2(vmax(gather(opacities, row, 1, 0), (v16)1e-20f));
+    // Half axes of the box around alpha >= 1/255, a hair wider than exact: the blend tests every pixel itself.
+    v16 reach = vsqrt(vmax(2.0f * (log2_opacity + 7.99435344f) / log2e, (v16)0.0f)) * 1.0001f + 1e-3f;
+    scatter(records, place, 12, 0, gather(means2d, row, 2, 0), lanes);
+    scatter(records, place, 12, 1, gather(means2d, row, 2, 1), lanes);
+    scatter(records, place, 12, 2, 0.5f * log2e * a, lanes);
+    scatter(records, place, 12, 3, log2e * b, lanes);
+    scatter(records, place, 12, 4, 0.5f * log2e * c, lanes);
+    scatter(records, place, 12, 5, log2_opacity, lanes);
+    scatter(records, place, 12, 6, reach * gather(sigmas, row, 2, 1), lanes);
+    scatter(records, place, 12, 7, reach * gather(sigmas, row, 2, 0), lanes);
+    for (int l = 0; l < lanes; ++l)
+        for (int k = 0; k < 4; ++k)
+            records[12 * place[l] + 8 + k] = k < channels ? colors[row[l] * stride + channel + k] : 0.0f;
+}
+""",
+    items="n",
+    grain=512,
+)
+def pack(
+    order: IntArray,  # [M], rows front to back
+    means2d: FloatArray,  # [R, 2]
+    conics: FloatArray,  # [R, 3]
+    opacities: FloatArray,  # [R]
+    sigmas: FloatArray,  # [R, 2]
+    colors: FloatArray,  # [R, D]
+    records: FloatArray,  # out [M, RECORD]
+    n: int,
+    stride: int,  # D
+    channel: int,
+    channels: int,
+) -> None: ...
+
+
+@worker(
+    """
+for (int s = first; s < last; ++s) {
+    int* count = counts + s * (tiles_x * tiles_y);
+    for (int t = 0; t < tiles_x * tiles_y; ++t) count[t] = 0;
+    for (int i = (long long)s * n / slices; i < (long long)(s + 1) * n / slices; ++i) {
+"""
+    + _TILE_ROWS
+    + """
+        int pairs = 0;
+        for (int ty = first_row; ty <= last_row; ++ty) {
+            int left, right;
+            columns(ty, left, right);
+            for (int tx = left; tx <= right; ++tx) ++count[ty * tiles_x + tx];
+            if (right >= left) pairs += right - left + 1;
+        }
+        pair_start[i + 1] = pairs;
+    }
+}
+""",
+    items="slices",
+    grain=1,
+)
+def count_pairs(
+    records: FloatArray,  # [M, RECORD]
+    counts: IntArray,  # out [slices, tiles]
+    pair_start: IntArray,  # out [M + 1], tiles of Gaussian i at i + 1
+    n: int,
+    slices: int,
+    width: float,
+    height: float,
+    tiles_x: int,
+    tiles_y: int,
+) -> None: ...
+
+
+@worker(
+    """
+int total = 0;
+for (int t = 0; t < tiles; ++t) {
+    tile_start[t] = total;
+    for (int s = 0; s < slices; ++s) {
+        const int count = counts[s * tiles + t];
+        counts[s * tiles + t] = total;
+        total += count;
+    }
+}
+tile_start[tiles] = total;
+pair_start[0] = 0;
+for (int i = 0; i < n; ++i) pair_start[i + 1] += pair_start[i];
+""",
+    items="1",
+    grain=1,
+)
+def scan_pairs(
+    counts: IntArray,  # [slices, tiles], in: counts; out: where each slice starts in each tile's list
+    tile_start: IntArray,  # out [tiles + 1]
+    pair_start: IntArray,  # [M + 1], running sum in place
+    n: int,
+    slices: int,
+    tiles: int,
+) -> None: ...
+
+
+@worker(
+    """
+for (int s = first; s < last; ++s) {
+    int* next = counts + s * (tiles_x * tiles_y);
+    for (int i = (long long)s * n / slices; i < (long long)(s + 1) * n / slices; ++i) {
+"""
+    + _TILE_ROWS
+    + """
+        int pair = pair_start[i];
+        for (int ty = first_row; ty <= last_row; ++ty) {
+            int left, right;
+            columns(ty, left, right);
+            for (int tx = left; tx <= right; ++tx) {
+                const int slot = next[ty * tiles_x + tx]++;
+                tile_list[slot] = i;
+                pair_slot[pair++] = slot;
+            }
+        }
+    }
+}
+""",
+    items="slices",
+    grain=1,
+)
+def fill_pairs(
+    records: FloatArray,  # [M, RECORD]
+    counts: IntArray,  # [slices, tiles], next free place
+    pair_start: IntArray,  # [M + 1]
+    tile_list: IntArray,  # out [P], place in depth order
+    pair_slot: IntArray,  # out [P], for each Gaussian its places in tile_list
+    n: int,
+    slices: int,
+    width: float,
+    height: float,
+    tiles_x: int,
+    tiles_y: int,
+) -> None: ...
+
+
+@dataclass
+class Bins:
+    """Tile lists of one image.
+
+    Attributes:
+        order: [M] int32, rows of the visible Gaussians, front to back.
+        records: [M, RECORD] float32, what the blend reads of each, in that order.
+        tile_start: [tiles + 1] int32, begin of each tile's part of `tile_list`, row-major.
+        tile_list: [P] int32, places in `order`.
+        pair_start: [M + 1] int32, begin of each Gaussian's part of `pair_slot`.
+        pair_slot: [P] int32, places in `tile_list`.
+    """
+
+    order: Tensor
+    records: Tensor
+    tile_start: Tensor
+    tile_list: Tensor
+    pair_start: Tensor
+    pair_slot: Tensor
+
+
+def bin_gaussians(
+    visible: Tensor,  # [M] int32
+    means2d: Tensor,  # [R, 2]
+    depths: Tensor,  # [R]
+    conics: Tensor,  # [R, 3]
+    opacities: Tensor,  # [R]
+    sigmas: Tensor,  # [R, 2]
+    width: int,
+    height: int,
+) -> Bins:
+    """Sorts the visible Gaussians of one image by depth and lists them per tile; colours are packed later."""
+    n = visible.numel()
+    tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    tiles = tiles_x * tiles_y
+    scratch = torch.empty(2, 2 * n, dtype=torch.int32)
+    depth_sort(depths, visible, scratch[0], scratch[1], n)
+    order = scratch[1, n:]
+    records = torch.empty(n, RECORD)
+    pack(order, means2d, conics, opacities, sigmas, opacities, records, n, 1, 0, 0)
+
+    slices = 1 if n < 1024 else get_num_threads()
+    counts = torch.empty(slices, tiles, dtype=torch.int32)
+    tile_start = torch.empty(tiles + 1, dtype=torch.int32)
+    pair_start = torch.empty(n + 1, dtype=torch.int32)
+    count_pairs(records, counts, pair_start, n, slices, float(width), float(height), tiles_x, tiles_y)
+    scan_pairs(counts, tile_start, pair_start, n, slices, tiles)
+    pairs = int(tile_start[-1])
+    tile_list = torch.empty(pairs, dtype=torch.int32)
+    pair_slot = torch.empty(pairs, dtype=torch.int32)
+    fill_pairs(
+        records,
+        counts,
+        pair_start,
+        tile_list,
+        pair_slot,
+        n,
+        slices,
+        float(width),
+        float(height),
+        tiles_x,
+        tiles_y,
+    )
+    return Bins(order, records, tile_start, tile_list, pair_start, pair_slot)
