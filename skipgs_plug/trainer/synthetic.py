@@ -1,0 +1,113 @@
+"""The demo scene: ray traced in numpy, so its ground truth owes nothing to a splat rasterizer.
+
+A textured floor, two textured boxes, a matte and a mirroring sphere, seen from cameras on a dome. Points on
+the surfaces stand in for those of structure from motion.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from skipgs_plug.trainer.raytrace import (
+    BOXES,
+    EPS,
+    FIRST_BOX,
+    FLOOR,
+    FLOOR_HALF,
+    SKY,
+    SPHERES,
+    Array,
+    lit_albedo,
+    trace_view,
+)
+from skipgs_plug.trainer.scene import Scene, View, assemble_scene
+
+RADIUS = 3.6  # of the camera dome
+FOV_X = np.deg2rad(52.0)
+
+
+def make_scene(
+    n_views: int = 48,
+    width: int = 160,
+    height: int = 120,
+    n_points: int = 4000,
+    test_every: int = 8,
+    seed: int = 0,
+) -> Scene:
+    """Trace the scene with 2x2 samples per pixel; the same arguments give the same scene.
+
+    Args:
+        n_views: cameras, spread evenly over the dome (golden angle).
+        width, height: image size in pixels.
+        n_points: surface points, coloured by their texture under the light.
+        test_every: every n-th view by name is held out.
+    """
+    focal = 0.5 * width / np.tan(0.5 * FOV_X)
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    train, test = [], []
+    for i in range(n_views):
+        viewmat = look_at(dome_position(i, n_views), np.array([0.0, 0.0, 0.35]))
+        image = trace_view(viewmat, K, width, height)
+        view = View(
+            f"view_{i:03d}.png",
+            torch.from_numpy(np.rint(image * 255).astype(np.uint8)),
+            torch.from_numpy(K).float(),
+            torch.from_numpy(viewmat).float(),
+        )
+        (test if test_every and i % test_every == 0 else train).append(view)
+    points, colours = sample_surfaces(n_points, np.random.default_rng(seed))
+    rgb = np.rint(colours * 255).astype(np.uint8)
+    return assemble_scene(Path("demo"), "demo", train, test, points, rgb, background=SKY)
+
+
+def dome_position(i: int, n: int) -> Array:
+    """Return camera i of n on the dome, 18 to 62 degrees above the floor."""
+    low, high = np.sin(np.deg2rad(18)), np.sin(np.deg2rad(62))
+    z = low + (high - low) * (i + 0.5) / n
+    azimuth = i * np.pi * (3.0 - np.sqrt(5.0))
+    ring = np.sqrt(1.0 - z * z)
+    return RADIUS * np.array([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
+
+
+def look_at(position: Array, target: Array) -> Array:
+    """Return world to camera [4, 4]: x right, y down, z forward, world z up."""
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+    return viewmat
+
+
+def sample_surfaces(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return points [n, 3] and colours [n, 3]: half on the floor, the rest shared by the objects."""
+    shares = [n // 8] * (len(SPHERES) + len(BOXES))
+    points, items, normals = [], [], []
+    for k, (sphere, count) in enumerate(zip(SPHERES, shares, strict=False)):
+        direction = rng.normal(size=(count, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        points.append(np.array(sphere.centre) + sphere.radius * direction)
+        normals.append(direction)
+        items.append(np.full(count, k))
+    for k, (box, count) in enumerate(zip(BOXES, shares[FIRST_BOX:], strict=False)):
+        low, high = np.array(box.low), np.array(box.high)
+        face = rng.integers(0, 5, count)  # four sides and the top
+        axis, side = np.array([0, 0, 1, 1, 2])[face], np.array([0, 1, 0, 1, 1])[face]
+        p = rng.uniform(low, high, (count, 3))
+        rows = np.arange(count)
+        p[rows, axis] = np.where(side, high[axis], low[axis])
+        points.append(p)
+        normals.append(np.eye(3)[axis] * (2 * side - 1)[:, None])
+        items.append(np.full(count, FIRST_BOX + k))
+    rest = n - sum(shares)
+    floor = rng.uniform(-FLOOR_HALF, FLOOR_HALF, (rest, 3)) * (1, 1, 0)
+    points.append(floor)
+    normals.append(np.tile((0.0, 0.0, 1.0), (rest, 1)))
+    items.append(np.full(rest, FLOOR))
+    xyz, item, normal = np.concatenate(points), np.concatenate(items), np.concatenate(normals)
+    colour, _ = lit_albedo(xyz, xyz + EPS * normal, item, normal)
+    return xyz, colour.clip(0, 1)
