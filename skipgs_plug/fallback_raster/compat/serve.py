@@ -1,0 +1,75 @@
+"""Put the stand-ins where a trainer's `import` finds them, for as long as it runs."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+
+_CLASSES = ("GaussianRasterizationSettings", "GaussianRasterizer")
+_ACCELERATED = (*_CLASSES, "SparseGaussianAdam")
+_KNN = {"simple_knn": (".knn", ()), "simple_knn._C": (".knn", ("distCUDA2",))}
+_SSIM = {"fused_ssim": (".ssim", ("fused_ssim",))}
+_RASTERIZER = "diff_gaussian_rasterization"
+_PIP = "gaussian_splatting."  # the pip package keeps its extensions inside itself
+
+# family -> module name -> (our file, the names it offers)
+FAMILIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
+    "inria": {_RASTERIZER: (".inria", _CLASSES), **_KNN, **_SSIM},
+    # Its train.py takes the presence of SparseGaussianAdam for the branch `3dgs_accel` of the rasterizer.
+    "inria_accelerated": {_RASTERIZER: (".inria_accelerated", _ACCELERATED), **_KNN, **_SSIM},
+    "fastgs": {f"{_RASTERIZER}_fastgs": (".fastgs", _ACCELERATED), **_KNN, **_SSIM},
+    "taming": {_RASTERIZER: (".taming", _ACCELERATED), **_KNN, **_SSIM},
+    "speedy_splat": {_RASTERIZER: (".speedy_splat", _CLASSES), **_KNN},
+    "lightgaussian": {_RASTERIZER: (".lightgaussian", _CLASSES), **_KNN},
+    "gaussianspa": {
+        f"{_RASTERIZER}_ms": (".gaussianspa", _CLASSES),
+        _RASTERIZER: (".inria", _CLASSES),
+        **_KNN,
+    },
+    "pip_gaussian_splatting": {
+        f"{_PIP}{_RASTERIZER}": (".inria", _CLASSES),
+        f"{_PIP}simple_knn": (".knn", ()),
+        f"{_PIP}simple_knn._C": (".knn", ("distCUDA2",)),
+        **_SSIM,
+    },
+    "gsplat": _SSIM,
+}
+
+
+@contextmanager
+def serve(family: str) -> Iterator[None]:
+    """Serve the extension modules of one family of trainers from the CPU rasterizer.
+
+    Where torchvision is not installed, the few functions of it that these trainers call come along.
+    Modules of the same names that were imported before are set aside and come back at the end.
+
+    Raises:
+        ValueError: The family is unknown.
+    """
+    if family not in FAMILIES:
+        raise ValueError(f"No stand-ins for {family!r}; there are some for: {', '.join(sorted(FAMILIES))}.")
+    served = {name: _module(name, *source) for name, source in FAMILIES[family].items()}
+    if importlib.util.find_spec("torchvision") is None:
+        served |= importlib.import_module(".vision", __package__).modules()
+    before = {name: sys.modules.get(name) for name in served}
+    sys.modules.update(served)
+    try:
+        yield
+    finally:
+        for name, module in before.items():
+            if module is None:
+                sys.modules.pop(name, None)
+            else:
+                sys.modules[name] = module
+
+
+def _module(name: str, source: str, offered: tuple[str, ...]) -> ModuleType:
+    module = ModuleType(name, f"CPU stand-in for {name}, served by skipgs_plug.")
+    ours = importlib.import_module(source, __package__)
+    for attribute in offered:
+        setattr(module, attribute, getattr(ours, attribute))
+    return module

@@ -1,0 +1,38 @@
+"""Adam that leaves invisible Gaussians alone, as the accelerated rasterizers ship it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+class SparseGaussianAdam(torch.optim.Adam):
+    """One parameter per group, first dimension N; no bias correction, as in the CUDA kernel."""
+
+    def __init__(self, params: Any, lr: float, eps: float) -> None:
+        super().__init__(params=params, lr=lr, eps=eps)
+
+    @torch.no_grad()
+    def step(self, visibility: Tensor, N: int) -> None:  # type: ignore[override]
+        """Update the rows that `visibility` marks, of every parameter with a gradient.
+
+        Args:
+            visibility: [N] bool
+            N: Number of Gaussians.
+        """
+        for group in self.param_groups:
+            (param,) = group["params"]
+            if param.grad is None:
+                continue
+            state = self.state[param]
+            if not state:
+                state["step"] = torch.tensor(0.0)
+                state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(param), torch.zeros_like(param)
+            rows = visibility.reshape(N)
+            grad = param.grad[rows]
+            mean = 0.9 * state["exp_avg"][rows] + 0.1 * grad
+            square = 0.999 * state["exp_avg_sq"][rows] + 0.001 * grad * grad
+            param[rows] -= group["lr"] * mean / (square.sqrt() + group["eps"])
+            state["exp_avg"][rows], state["exp_avg_sq"][rows] = mean, square

@@ -1,0 +1,67 @@
+"""Stand-in for the rasterizer of Taming 3DGS: thirteen results, four of them sums over weighted pixels."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .inria import RasterizerModule
+from .rendering import render, splats
+from .sparse_adam import SparseGaussianAdam
+from .statistics import Footprint, count_per_gaussian, pairs_by_strip, sum_per_gaussian
+
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam"]
+
+
+class GaussianRasterizationSettings(NamedTuple):
+    """Fields as in the CUDA module."""
+
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool
+    debug: bool
+    pixel_weights: Tensor | None  # [H, W]; None leaves the sums empty
+
+
+class GaussianRasterizer(RasterizerModule):
+    """Returns the CUDA module's 13-tuple.
+
+    (color, radii, counts [H, W], three lists, centers [N, 2], depths [N], radii [N], accum_weights [N],
+    accum_count [N], accum_blend [N], accum_dist [N]). The lists are empty, as the CUDA code leaves them;
+    counts and sums are empty without `pixel_weights`.
+    """
+
+    def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
+        result = render(self.raster_settings, splats(means3D, means2D, opacities, **gaussians))
+        f, weights = result.footprint, self.raster_settings.pixel_weights
+        whole, fraction = torch.empty(0, dtype=torch.int32), torch.empty(0)
+        counts, sums = whole, (fraction, whole, fraction, fraction)
+        if weights is not None and len(weights):
+            weights = weights.detach().reshape(-1)
+            counts = _contributions_per_pixel(f)
+            sums = (
+                sum_per_gaussian(f, lambda pairs: weights[pairs.pixel]),
+                count_per_gaussian(f),
+                sum_per_gaussian(f, lambda pairs: pairs.weight),
+                sum_per_gaussian(f, lambda pairs: pairs.offset.norm(dim=1)),
+            )
+        centers = f.means2d - 0.5  # the CUDA code has the first pixel centre at 0
+        lists = (whole, fraction, fraction)
+        return result.color, result.radii, counts, *lists, centers, f.depths, result.radii, *sums
+
+
+def _contributions_per_pixel(f: Footprint) -> Tensor:
+    total = torch.zeros(f.height * f.width, dtype=torch.int64)
+    for pairs in pairs_by_strip(f):
+        total += torch.bincount(pairs.pixel, minlength=len(total))
+    return total.reshape(f.height, f.width).to(torch.int32)

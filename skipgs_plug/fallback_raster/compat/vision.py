@@ -1,0 +1,69 @@
+"""The few functions of torchvision that the trainers of the Inria family call.
+
+Served only where torchvision is not installed. Its pretrained models cannot be replaced: they are needed
+for LPIPS alone, and asking for one says so.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+
+def to_tensor(picture: Image.Image) -> Tensor:
+    """Pixels in [0, 1], channels first. [C, H, W] float32"""
+    pixels = torch.from_numpy(np.array(picture))
+    pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
+    return pixels.permute(2, 0, 1).contiguous().float() / 255.0
+
+
+def to_pil_image(picture: Tensor) -> Image.Image:
+    """An 8-bit picture of a tensor in [0, 1], truncating as torchvision does. [C, H, W] or [H, W]"""
+    pixels = picture.detach().mul(255).to(torch.uint8)
+    pixels = pixels if pixels.ndim == 2 else pixels.permute(1, 2, 0).squeeze(-1)
+    return Image.fromarray(pixels.numpy())
+
+
+def save_image(tensor: Tensor, fp: str | Path) -> None:
+    """Write one picture, rounding as torchvision does. [3, H, W]"""
+    pixels = tensor.detach().mul(255).add(0.5).clamp(0, 255).permute(1, 2, 0).to(torch.uint8)
+    Image.fromarray(pixels.numpy()).save(fp)
+
+
+class ToTensor:
+    """Callable form of `to_tensor`."""
+
+    def __call__(self, picture: Image.Image) -> Tensor:
+        return to_tensor(picture)
+
+
+class ToPILImage:
+    """Callable form of `to_pil_image`."""
+
+    def __call__(self, picture: Tensor) -> Image.Image:
+        return to_pil_image(picture)
+
+
+class _Models(ModuleType):
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise RuntimeError(f"torchvision.models.{name} needs torchvision: install it, or leave LPIPS out.")
+
+
+def modules() -> dict[str, ModuleType]:
+    """Module objects by import name."""
+    top = ModuleType("torchvision", "The part of torchvision that skipgs_plug serves where it is missing.")
+    utils, transforms = ModuleType("torchvision.utils"), ModuleType("torchvision.transforms")
+    functional, models = ModuleType("torchvision.transforms.functional"), _Models("torchvision.models")
+    vars(utils).update(save_image=save_image)
+    vars(functional).update(to_tensor=to_tensor, to_pil_image=to_pil_image)
+    vars(transforms).update(ToTensor=ToTensor, ToPILImage=ToPILImage, functional=functional)
+    vars(top).update(utils=utils, transforms=transforms, models=models)
+    return {module.__name__: module for module in (top, utils, transforms, functional, models)}
