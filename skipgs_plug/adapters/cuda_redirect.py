@@ -1,0 +1,120 @@
+"""Run code written for CUDA on the CPU: every request for a CUDA tensor gives a CPU tensor.
+
+The counterpart of `fallback_raster.compat`: together they let an unmodified training script run where
+there is no GPU. Nothing is emulated beyond placement and clocks, and whatever is not listed here (streams,
+graphs, CUDA generators) fails as it does in any PyTorch without CUDA.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch.overrides import TorchFunctionMode
+
+
+class HostEvent:
+    """`torch.cuda.Event` on the host's clock: the CPU has finished whatever was called before."""
+
+    def __init__(
+        self, enable_timing: bool = False, blocking: bool = False, interprocess: bool = False
+    ) -> None:
+        self._time: float | None = None
+
+    def record(self, stream: Any = None) -> None:
+        """Remember the present moment."""
+        self._time = time.perf_counter()
+
+    def elapsed_time(self, end_event: HostEvent) -> float:
+        """Milliseconds from this event to `end_event`.
+
+        Raises:
+            RuntimeError: One of the two was never recorded.
+        """
+        if self._time is None or end_event._time is None:
+            raise RuntimeError("Both events must be recorded before elapsed_time.")
+        return 1000.0 * (end_event._time - self._time)
+
+    def query(self) -> bool:
+        """Whether the work before the event is done: always, here."""
+        return True
+
+    def synchronize(self) -> None:
+        """Wait for the event: there is nothing to wait for."""
+
+
+def _nothing(*args: Any, **kwargs: Any) -> None:
+    """Stands for a call that only matters where a device runs beside the host."""
+
+
+# Every name of torch.cuda that is replaced; all come back on exit.
+REPLACED: dict[str, Any] = {
+    "Event": HostEvent,
+    "synchronize": _nothing,
+    "set_device": _nothing,
+    "reset_peak_memory_stats": _nothing,
+    "current_device": lambda: 0,
+    "FloatTensor": torch.FloatTensor,
+    "IntTensor": torch.IntTensor,
+    "LongTensor": torch.LongTensor,
+    "BoolTensor": torch.BoolTensor,
+}
+
+
+@contextmanager
+def cuda_on_cpu() -> Iterator[None]:
+    """Redirect CUDA to the CPU inside the block, in this thread."""
+    # Optimizers load dynamo, which lists the functions of torch.cuda once and trips over replaced ones.
+    importlib.import_module("torch._dynamo")
+    missing = object()
+    before = {name: getattr(torch.cuda, name, missing) for name in REPLACED}
+    load = torch.load
+    for name, stand_in in REPLACED.items():
+        setattr(torch.cuda, name, stand_in)
+    torch.load = _load_on_cpu(load)
+    try:
+        with _CpuPlacement():
+            yield
+    finally:
+        torch.load = load
+        for name, original in before.items():
+            if original is missing:
+                delattr(torch.cuda, name)
+            else:
+                setattr(torch.cuda, name, original)
+
+
+class _CpuPlacement(TorchFunctionMode):
+    def __torch_function__(
+        self, func: Callable, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        kwargs = dict(kwargs or {})
+        if func in (torch.Tensor.cuda, torch.Tensor.pin_memory):
+            return args[0]
+        if func is torch.Tensor.to and len(args) > 1 and type(args[1]) is int:
+            args = (args[0], "cpu", *args[2:])
+        args = tuple("cpu" if _is_cuda(value) else value for value in args)
+        if _is_cuda(kwargs.get("device")) or type(kwargs.get("device")) is int:
+            kwargs["device"] = "cpu"
+        if kwargs.get("pin_memory"):
+            kwargs["pin_memory"] = False
+        return func(*args, **kwargs)
+
+
+def _is_cuda(value: Any) -> bool:
+    if isinstance(value, str):
+        return value == "cuda" or value.startswith("cuda:")
+    return isinstance(value, torch.device) and value.type == "cuda"
+
+
+def _load_on_cpu(load: Callable) -> Callable:
+    def load_on_cpu(f: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
+        if map_location is None or _is_cuda(map_location):
+            map_location = "cpu"
+        return load(f, map_location, *args, **kwargs)
+
+    return load_on_cpu

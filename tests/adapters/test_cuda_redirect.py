@@ -1,0 +1,99 @@
+"""CUDA requests land on the CPU inside the block, and nothing is left of it outside."""
+
+import pytest
+import torch
+
+from skipgs_plug.adapters.cuda_redirect import REPLACED, HostEvent, cuda_on_cpu
+
+CALLS = {
+    "tensor": lambda: torch.tensor([1.0], device="cuda"),
+    "zeros with index": lambda: torch.zeros(2, device="cuda:0"),
+    "zeros on a device object": lambda: torch.zeros(2, device=torch.device("cuda")),
+    "zeros_like": lambda: torch.zeros_like(torch.ones(2), device="cuda"),
+    "arange": lambda: torch.arange(3, device="cuda"),
+    "as_tensor": lambda: torch.as_tensor([1.0], device="cuda"),
+    "Tensor.cuda": lambda: torch.ones(2).cuda(),
+    "Tensor.cuda with index": lambda: torch.ones(2).cuda(0),
+    "legacy constructor": lambda: torch.Tensor([1.0, 2.0]).cuda(),
+    "Tensor.to": lambda: torch.ones(2).to("cuda"),
+    "Tensor.to by keyword": lambda: torch.ones(2).to(device="cuda", non_blocking=True),
+    "Tensor.to with index": lambda: torch.ones(2).to(0),
+    "Tensor.to with a dtype": lambda: torch.ones(2).to("cuda", torch.float64),
+    "Module.cuda": lambda: torch.nn.Linear(2, 2).cuda().weight,
+    "Module.to": lambda: torch.nn.Linear(2, 2).to("cuda").weight,
+    "FloatTensor": lambda: torch.cuda.FloatTensor([1.0]),
+    "pin_memory": lambda: torch.ones(2).pin_memory(),
+    "pinned factory": lambda: torch.ones(2, pin_memory=True),
+}
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+def test_every_way_to_ask_for_cuda_gives_a_cpu_tensor(call):
+    with cuda_on_cpu():
+        value = call()
+    assert value.device.type == "cpu"
+
+
+def test_values_dtypes_and_gradients_pass_through():
+    with cuda_on_cpu():
+        leaf = torch.tensor([1.0, 2.0], device="cuda", requires_grad=True)
+        moved = leaf.to("cuda", torch.float64)
+        moved.square().sum().backward()
+    assert moved.dtype == torch.float64
+    assert leaf.grad.tolist() == [2.0, 4.0]
+
+
+def test_device_calls_that_only_order_work_do_nothing():
+    with cuda_on_cpu():
+        torch.cuda.synchronize()
+        torch.cuda.set_device(torch.device("cuda:0"))
+        torch.cuda.reset_peak_memory_stats()
+        torch.cuda.empty_cache()
+        assert torch.cuda.current_device() == 0
+
+
+def test_events_measure_the_host():
+    with cuda_on_cpu():
+        start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        start.record()
+        end.record()
+        end.synchronize()
+        assert end.query()
+        assert start.elapsed_time(end) >= 0
+        with pytest.raises(RuntimeError, match="recorded"):
+            start.elapsed_time(torch.cuda.Event())
+
+
+def test_a_checkpoint_saved_on_cuda_loads(tmp_path):
+    torch.save({"a": torch.ones(2)}, tmp_path / "a.pt")
+    with cuda_on_cpu():
+        for place in ({}, {"map_location": "cuda"}, {"map_location": torch.device("cuda:0")}):
+            assert torch.load(tmp_path / "a.pt", **place)["a"].device.type == "cpu"
+
+
+def test_optimizers_run_inside():
+    with cuda_on_cpu():
+        parameter = torch.nn.Parameter(torch.ones(2, device="cuda"))
+        optimizer = torch.optim.Adam([parameter], lr=0.1)
+        parameter.sum().backward()
+        optimizer.step()
+    assert (parameter < 1).all()
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_everything_is_back_afterwards(fails):
+    missing = object()
+    before = {name: getattr(torch.cuda, name, missing) for name in REPLACED}
+    load = torch.load
+    try:
+        with cuda_on_cpu():
+            assert torch.cuda.Event is HostEvent
+            if fails:
+                raise KeyError("stop")
+    except KeyError:
+        pass
+    assert {name: getattr(torch.cuda, name, missing) for name in REPLACED} == before
+    assert torch.load is load
+    if not torch.cuda.is_available():
+        with pytest.raises((AssertionError, RuntimeError)):
+            torch.ones(1).cuda()
