@@ -1,8 +1,8 @@
 """The three differentiable steps of the rasterizer as torch.autograd.Functions.
 
 Ownership of buffers: every step allocates its outputs and gradients itself and never writes into a tensor that
-came from outside. Inputs are saved with `save_for_backward`, so that changing one in place between forward and
-backward is noticed by torch.
+came from outside, except the caller's `absolute`. Inputs are saved with `save_for_backward`, so that torch
+notices when one is changed in place between forward and backward.
 """
 
 from typing import Any
@@ -24,13 +24,12 @@ def _partials(n: int) -> int:
     return (n + _PARTIAL - 1) // _PARTIAL
 
 
-def visible_rows(radii: Tensor) -> Tensor:
-    """Rows of `radii` [N, 2] that are on screen, as int32."""
-    return radii[:, 0].nonzero().squeeze(1).to(torch.int32)
-
-
 class Project(torch.autograd.Function):
-    """Gaussians of one camera: (means2d [N, 2], depths [N], conics [N, 3], compensations [N], radii, sigmas)."""
+    """Gaussians of one camera on its image plane.
+
+    Gives means2d [N, 2], depths [N], conics [N, 3], compensations [N] (empty unless antialiased), and without a
+    gradient radii [N, 2], sigmas [N, 2] (standard deviations in pixels) and the visible rows [M].
+    """
 
     @staticmethod
     def forward(  # type: ignore[override]
@@ -58,20 +57,20 @@ class Project(torch.autograd.Function):
             means, quats, scales, opacities, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
             n, float(width), float(height), near_plane, far_plane, eps2d, radius_clip, int(antialiased),
         )  # fmt: skip
-        ctx.save_for_backward(means, quats, scales, viewmat, K, radii)
+        visible = radii[:, 0].nonzero().squeeze(1).to(torch.int32)
+        ctx.save_for_backward(means, quats, scales, viewmat, K, visible)
         ctx.size = (width, height, eps2d, antialiased)
-        ctx.mark_non_differentiable(radii, sigmas)
-        return means2d, depths, conics, compensations, radii, sigmas
+        ctx.mark_non_differentiable(radii, sigmas, visible)
+        return means2d, depths, conics, compensations, radii, sigmas, visible
 
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor, v_comp: Tensor, *_: Any
+        ctx: Any, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor, *_: Any
     ) -> Any:  # type: ignore[override]
-        means, quats, scales, viewmat, K, radii = ctx.saved_tensors
+        means, quats, scales, viewmat, K, visible = ctx.saved_tensors
         width, height, eps2d, antialiased = ctx.size
         with_pose = ctx.needs_input_grad[4]
-        visible = visible_rows(radii)
         v_means, v_quats, v_scales = (
             torch.zeros_like(means),
             torch.zeros_like(quats),
@@ -80,7 +79,7 @@ class Project(torch.autograd.Function):
         v_poses = torch.zeros(_partials(len(visible)) if with_pose else 0, 3, 4)
         project_backward(
             means, quats, scales, viewmat, K, visible, v_means2d.contiguous(), v_depths.contiguous(),
-            v_conics.contiguous(), v_comp.contiguous(), v_means, v_quats, v_scales, v_poses,
+            v_conics.contiguous(), v_compensations.contiguous(), v_means, v_quats, v_scales, v_poses,
             len(visible), float(width), float(height), eps2d, int(antialiased), int(with_pose),
         )  # fmt: skip
         v_viewmat = None
@@ -99,10 +98,9 @@ class SphericalHarmonics(torch.autograd.Function):
         means: Tensor,  # [N, 3]
         camera: Tensor,  # [3]
         coefficients: Tensor,  # [N, K, 3]
-        radii: Tensor,  # [N, 2]
+        visible: Tensor,  # [M]
         degree: int,
     ) -> Tensor:
-        visible = visible_rows(radii)
         colors = torch.zeros(len(means), 3)
         width = coefficients.shape[1]
         sh_forward(means, camera, coefficients, visible, colors, len(visible), width, degree)
@@ -124,7 +122,7 @@ class SphericalHarmonics(torch.autograd.Function):
 
 
 class Blend(torch.autograd.Function):
-    """Image [H, W, D] and transmittance [H, W] behind it, of one camera.
+    """Image [H, W, D] of one camera, the transmittance [H, W] behind it, and tiles_per_gauss [R].
 
     `absolute` [R, 2] receives the sum over pixels of |v_means2d| (AbsGS) when it is not None.
     """
@@ -138,36 +136,34 @@ class Blend(torch.autograd.Function):
         colors: Tensor,  # [R, D]
         depths: Tensor,  # [R]
         sigmas: Tensor,  # [R, 2]
-        radii: Tensor,  # [R, 2]
+        visible: Tensor,  # [M]
         width: int,
         height: int,
         absolute: Tensor | None,
-        info: dict[str, Tensor],
-    ) -> tuple[Tensor, Tensor]:
-        visible = visible_rows(radii)
+    ) -> tuple[Tensor, Tensor, Tensor]:
         bins = bin_gaussians(visible, means2d, depths, conics, opacities, sigmas, width, height)
         channels = colors.shape[1]
         tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
         image = torch.empty(height, width, channels)
         transmittance = torch.empty(height, width)
-        last_pair = torch.empty(height, width, dtype=torch.int32)
-        tile_last = torch.empty(tiles_x * tiles_y, dtype=torch.int32)
+        pixel_stop = torch.empty(height, width, dtype=torch.int32)
+        tile_stop = torch.empty(tiles_x * tiles_y, dtype=torch.int32)
         for channel in range(0, channels, MAX_CHANNELS):
             some = min(MAX_CHANNELS, channels - channel)
             _pack_colors(bins, means2d, conics, opacities, sigmas, colors, channel, some)
             forward_worker(some)(
-                bins.records, bins.tile_start, bins.tile_list, image, transmittance, last_pair, tile_last,
+                bins.records, bins.tile_start, bins.tile_list, image, transmittance, pixel_stop, tile_stop,
                 width, height, tiles_x, tiles_y, channels, channel, some,
             )  # fmt: skip
-        ctx.save_for_backward(means2d, conics, opacities, colors, sigmas, transmittance, last_pair, tile_last)
+        ctx.save_for_backward(means2d, conics, opacities, colors, sigmas, transmittance, pixel_stop, tile_stop)
         ctx.bins, ctx.absolute = bins, absolute
-        info["tile_start"], info["pair_start"], info["order"] = bins.tile_start, bins.pair_start, bins.order
-        return image, transmittance
+        ctx.mark_non_differentiable(bins.tiles_per_gauss)
+        return image, transmittance, bins.tiles_per_gauss
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor) -> Any:  # type: ignore[override]
-        means2d, conics, opacities, colors, sigmas, transmittance, last_pair, tile_last = ctx.saved_tensors
+    def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor, _: Any) -> Any:  # type: ignore[override]
+        means2d, conics, opacities, colors, sigmas, transmittance, pixel_stop, tile_stop = ctx.saved_tensors
         bins: Bins = ctx.bins
         height, width, channels = v_image.shape
         tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
@@ -182,7 +178,7 @@ class Blend(torch.autograd.Function):
             if channels > MAX_CHANNELS:
                 _pack_colors(bins, means2d, conics, opacities, sigmas, colors, channel, some)
             backward_worker(some, with_absolute)(
-                bins.records, bins.tile_start, bins.tile_list, tile_last, transmittance, last_pair, v_image,
+                bins.records, bins.tile_start, bins.tile_list, tile_stop, transmittance, pixel_stop, v_image,
                 v_transmittance, v_pairs, width, height, tiles_x, tiles_y, channels, channel, some,
             )  # fmt: skip
             reduce_pairs(
@@ -190,10 +186,8 @@ class Blend(torch.autograd.Function):
                 absolute, v_colors, len(bins.order), channels, channel, some, int(with_absolute),
             )  # fmt: skip
             # The gradient of the transmittance belongs to the first pass alone.
-            v_transmittance = (
-                torch.zeros_like(v_transmittance) if channels > MAX_CHANNELS else v_transmittance
-            )
-        return v_means2d, v_conics, v_opacities, v_colors, *[None] * 7
+            v_transmittance = torch.zeros_like(v_transmittance) if channels > MAX_CHANNELS else v_transmittance
+        return v_means2d, v_conics, v_opacities, v_colors, *[None] * 6
 
 
 def _pack_colors(

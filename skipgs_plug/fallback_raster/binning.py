@@ -19,17 +19,20 @@ TILE = 16
 # half width in pixels of the ellipse at alpha = 1/255; up to four channels of colour.
 RECORD = 12
 
-# Tiles [left, right] of row `ty` that Gaussian record `r` crosses. `one_column` is the common case of small ones.
+# Tiles [left, right] of tile row `ty` that the Gaussian of record `i` crosses.
 _TILE_ROWS = """
     const float* r = records + 12 * i;
     const float mx = r[0], my = r[1], half_h = r[6], half_w = r[7];
     // Rows and columns of pixels whose centres the bounding box holds.
-    const int top = (int)ceilf(fmaxf(my - half_h - 0.5f, 0.0f)), bottom = (int)floorf(fminf(my + half_h - 0.5f, height - 1.0f));
-    const int box_left = (int)ceilf(fmaxf(mx - half_w - 0.5f, 0.0f)), box_right = (int)floorf(fminf(mx + half_w - 0.5f, width - 1.0f));
+    const int top = (int)ceilf(fmaxf(my - half_h - 0.5f, 0.0f));
+    const int bottom = (int)floorf(fminf(my + half_h - 0.5f, height - 1.0f));
+    const int box_left = (int)ceilf(fmaxf(mx - half_w - 0.5f, 0.0f));
+    const int box_right = (int)floorf(fminf(mx + half_w - 0.5f, width - 1.0f));
     const bool empty = top > bottom || box_left > box_right;
     const int first_row = top / 16, last_row = empty ? first_row - 1 : bottom / 16;
+    // Small ones need no more than their bounding box.
     const bool whole = box_left / 16 == box_right / 16 || first_row == last_row;
-    // x(dy) = mx - dy b / 2a +- half_w sqrt((1 - rho^2)) ... of the ellipse a dx^2 + b dx dy + c dy^2 = bound.
+    // The ellipse's edges: x(dy) = mx - dy b / 2a +- chord sqrt(1 - (dy / half_h)^2), farthest out at dy = -+extreme.
     const float slope = -0.5f * r[3] / r[2], extreme = -0.5f * r[3] / r[4] * half_w, inverse_h = 1.0f / half_h;
     const float chord = sqrtf(fmaxf((r[5] + 7.99435344f) / r[2], 0.0f));
     auto columns = [&](int ty, int& left, int& right) {
@@ -150,7 +153,7 @@ for (int s = first; s < last; ++s) {
             for (int tx = left; tx <= right; ++tx) ++count[ty * tiles_x + tx];
             if (right >= left) pairs += right - left + 1;
         }
-        pair_start[i + 1] = pairs;
+        pair_start[i + 1] = tiles_per_gauss[order[i]] = pairs;
     }
 }
 """,
@@ -158,9 +161,11 @@ for (int s = first; s < last; ++s) {
     grain=1,
 )
 def count_pairs(
+    order: IntArray,  # [M]
     records: FloatArray,  # [M, RECORD]
     counts: IntArray,  # out [slices, tiles]
     pair_start: IntArray,  # out [M + 1], tiles of Gaussian i at i + 1
+    tiles_per_gauss: IntArray,  # out [R], the same by row, zeros
     n: int,
     slices: int,
     width: float,
@@ -248,6 +253,7 @@ class Bins:
         tile_list: [P] int32, places in `order`.
         pair_start: [M + 1] int32, begin of each Gaussian's part of `pair_slot`.
         pair_slot: [P] int32, places in `tile_list`.
+        tiles_per_gauss: [R] int32, number of tiles of every row.
     """
 
     order: Tensor
@@ -256,6 +262,7 @@ class Bins:
     tile_list: Tensor
     pair_start: Tensor
     pair_slot: Tensor
+    tiles_per_gauss: Tensor
 
 
 def bin_gaussians(
@@ -278,26 +285,17 @@ def bin_gaussians(
     records = torch.empty(n, RECORD)
     pack(order, means2d, conics, opacities, sigmas, opacities, records, n, 1, 0, 0)
 
+    # Any number of slices gives the same lists; one per thread keeps all busy.
     slices = 1 if n < 1024 else get_num_threads()
     counts = torch.empty(slices, tiles, dtype=torch.int32)
     tile_start = torch.empty(tiles + 1, dtype=torch.int32)
     pair_start = torch.empty(n + 1, dtype=torch.int32)
-    count_pairs(records, counts, pair_start, n, slices, float(width), float(height), tiles_x, tiles_y)
+    tiles_per_gauss = torch.zeros(len(means2d), dtype=torch.int32)
+    image = (float(width), float(height), tiles_x, tiles_y)
+    count_pairs(order, records, counts, pair_start, tiles_per_gauss, n, slices, *image)
     scan_pairs(counts, tile_start, pair_start, n, slices, tiles)
     pairs = int(tile_start[-1])
     tile_list = torch.empty(pairs, dtype=torch.int32)
     pair_slot = torch.empty(pairs, dtype=torch.int32)
-    fill_pairs(
-        records,
-        counts,
-        pair_start,
-        tile_list,
-        pair_slot,
-        n,
-        slices,
-        float(width),
-        float(height),
-        tiles_x,
-        tiles_y,
-    )
-    return Bins(order, records, tile_start, tile_list, pair_start, pair_slot)
+    fill_pairs(records, counts, pair_start, tile_list, pair_slot, n, slices, *image)
+    return Bins(order, records, tile_start, tile_list, pair_start, pair_slot, tiles_per_gauss)

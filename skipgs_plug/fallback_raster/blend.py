@@ -51,12 +51,12 @@ for (int t = first; t < last; ++t) {
         + _TILE
         + """
     v16 T[16], C[16][D];
-    i16 live[16], latest[16];
+    i16 stop[16];
     for (int y = 0; y < rows; ++y) {
-        T[y] = (v16)1.0f;
+        // The sign of T marks pixels that take no more: finished ones and those outside the image.
+        T[y] = inside ? (v16)1.0f : (v16)-1.0f;
         for (int c = 0; c < D; ++c) C[y][c] = (v16)0.0f;
-        live[y] = inside;
-        latest[y] = (i16)-1;
+        stop[y] = (i16)end;
     }
     unsigned open = (1u << rows) - 1;  // rows with an unfinished pixel
     for (int k = begin; k < end && open; ++k) {
@@ -68,33 +68,34 @@ for (int t = first; t < last; ++t) {
 """
         + _ALPHA
         + """
-            i16 hit = above & live[y];
+            i16 hit = above & (T[y] > 0.0f);
             if (!any(hit)) continue;
-            v16 alpha = vmin((v16)0.999f, exp2(log2_alpha));
-            v16 next = T[y] * (1.0f - alpha);
+            const v16 alpha = vmin((v16)0.999f, exp2(log2_alpha));
+            const v16 next = T[y] * (1.0f - alpha);
             const i16 finished = hit & (next <= 1e-4f);
             hit &= ~finished;
-            v16 weight = hit ? alpha * T[y] : (v16)0.0f;
-            for (int c = 0; c < D; ++c) C[y][c] += weight * r[8 + c];
+            // Selected, not multiplied by zero: a NaN colour stays in the pixels that it touches.
+            const v16 weight = alpha * T[y];
+            for (int c = 0; c < D; ++c) C[y][c] = hit ? C[y][c] + weight * r[8 + c] : C[y][c];
             T[y] = hit ? next : T[y];
-            latest[y] = hit ? (i16)k : latest[y];
             if (any(finished)) {
-                live[y] &= ~finished;
-                if (!any(live[y])) open &= ~(1u << y);
+                T[y] = finished ? -T[y] : T[y];
+                stop[y] = finished ? (i16)k : stop[y];
+                if (!any(T[y] > 0.0f)) open &= ~(1u << y);
             }
         }
     }
-    int tile_latest = -1;
+    int tile_end = begin;
     for (int y = 0; y < rows; ++y) {
         const long long at = (long long)(y0 + y) * width + x0;
         for (int x = 0; x < columns; ++x) {
-            transmittance[at + x] = T[y][x];
-            last_pair[at + x] = latest[y][x];
+            transmittance[at + x] = fabsf(T[y][x]);
+            pixel_stop[at + x] = stop[y][x];
             for (int c = 0; c < channels; ++c) image[(at + x) * stride + channel + c] = C[y][c][x];
         }
-        tile_latest = larger(tile_latest, __builtin_reduce_max(latest[y]));
+        tile_end = larger(tile_end, __builtin_reduce_max(stop[y]));
     }
-    tile_last[t] = tile_latest;
+    tile_stop[t] = tile_end;
 }
 """,
         items="tiles_x * tiles_y",
@@ -106,9 +107,9 @@ for (int t = first; t < last; ++t) {
         tile_start: IntArray,  # [tiles + 1]
         tile_list: IntArray,  # [P]
         image: FloatArray,  # out [H, W, D]
-        transmittance: FloatArray,  # out [H, W], of the last Gaussian blended
-        last_pair: IntArray,  # out [H, W], place in tile_list of the last Gaussian blended, -1 for none
-        tile_last: IntArray,  # out [tiles], their maximum
+        transmittance: FloatArray,  # out [H, W], behind the last Gaussian blended
+        pixel_stop: IntArray,  # out [H, W], place in tile_list at which the pixel was finished
+        tile_stop: IntArray,  # out [tiles], their maximum
         width: int,
         height: int,
         tiles_x: int,
@@ -131,17 +132,18 @@ for (int t = first; t < last; ++t) {
         + """
     // behind = (what lies behind the current Gaussian) . v_image, less what alpha and background receive.
     v16 T[16], behind[16], v[16][D];
-    i16 latest[16];
-    unsigned open = 0;
+    i16 stop[16];
+    unsigned open = 0, finished = 0;
+    const int tile_end = tile_stop[t];
     for (int y = 0; y < rows; ++y) {
         const long long at = (long long)(y0 + y) * width + x0;
         v16 v_last = (v16)0.0f;
         T[y] = (v16)1.0f;
-        latest[y] = (i16)-1;
+        stop[y] = (i16)tile_end;
         for (int c = 0; c < D; ++c) v[y][c] = (v16)0.0f;
         for (int x = 0; x < columns; ++x) {
             T[y][x] = transmittance[at + x];
-            latest[y][x] = last_pair[at + x];
+            stop[y][x] = pixel_stop[at + x];
             v_last[x] = v_transmittance[at + x];
             for (int c = 0; c < channels; ++c) v[y][c][x] = v_image[(at + x) * stride + channel + c];
         }
@@ -150,12 +152,13 @@ for (int t = first; t < last; ++t) {
         for (int c = 0; c < D; ++c) wanted |= v[y][c] != 0.0f;
         // A row without incoming gradient adds exact zeros.
         if (any(wanted)) open |= 1u << y;
+        if (any(stop[y] < tile_end)) finished |= 1u << y;
     }
-    const int stop = open ? tile_last[t] + 1 : begin;
-    for (int k = larger(begin, stop); k < end; ++k)
+    const int used = open ? tile_end : begin;
+    for (int k = used; k < end; ++k)
         for (int j = 0; j < 12; ++j) v_pairs[12ll * k + j] = 0.0f;
 
-    for (int k = stop - 1; k >= begin; --k) {
+    for (int k = used - 1; k >= begin; --k) {
 """
         + _GAUSSIAN
         + """
@@ -167,7 +170,8 @@ for (int t = first; t < last; ++t) {
 """
         + _ALPHA
         + """
-            const i16 hit = above & (latest[y] >= k);
+            i16 hit = above & inside;
+            if (finished >> y & 1) hit &= stop[y] > k;
             if (!any(hit)) continue;
             touched = true;
             const v16 full = exp2(log2_alpha);
@@ -181,7 +185,7 @@ for (int t = first; t < last; ++t) {
             // Where alpha is clamped, neither opacity nor shape moves it.
             const v16 v_sigma = (hit & (full <= 0.999f)) ? -full * v_alpha : (v16)0.0f;
             T[y] = hit ? before : T[y];
-            behind[y] += weight * shade;
+            behind[y] = hit ? behind[y] + weight * shade : behind[y];
             for (int c = 0; c < D; ++c) v_color[c] += weight * v[y][c];
             m0 += v_sigma;
             m1 += v_sigma * dy;
@@ -218,9 +222,9 @@ for (int t = first; t < last; ++t) {
         records: FloatArray,  # [M, RECORD]
         tile_start: IntArray,  # [tiles + 1]
         tile_list: IntArray,  # [P]
-        tile_last: IntArray,  # [tiles]
+        tile_stop: IntArray,  # [tiles]
         transmittance: FloatArray,  # [H, W]
-        last_pair: IntArray,  # [H, W]
+        pixel_stop: IntArray,  # [H, W]
         v_image: FloatArray,  # [H, W, D]
         v_transmittance: FloatArray,  # [H, W], gradient of the final transmittance
         v_pairs: FloatArray,  # out [P, PAIR]

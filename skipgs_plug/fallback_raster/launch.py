@@ -114,9 +114,7 @@ class Worker:
         return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
 
 
-def worker(
-    code: str, *, items: str, grain: int, name: str | None = None
-) -> Callable[[Callable[..., None]], Worker]:
+def worker(code: str, *, items: str, grain: int, name: str | None = None) -> Callable[[Callable[..., None]], Worker]:
     """Turns a stub function into a `Worker`.
 
     Args:

@@ -1,5 +1,6 @@
 """`rasterization` with gsplat's signature, on the CPU."""
 
+from itertools import pairwise
 from typing import Any, Literal
 
 import torch
@@ -110,23 +111,18 @@ def rasterization(
         "thin_prism_coeffs": thin_prism_coeffs is not None,
         "ftheta_coeffs": ftheta_coeffs is not None,
         "viewmats_rs": viewmats_rs is not None,
-        "rolling_shutter": rolling_shutter is not None
-        and getattr(rolling_shutter, "name", "GLOBAL") != "GLOBAL",
+        "rolling_shutter": rolling_shutter is not None and getattr(rolling_shutter, "name", "GLOBAL") != "GLOBAL",
     }
     for name, used in unsupported.items():
         if used:
             raise NotImplementedError(f"The CPU rasterizer does not support {name}; leave it at its default.")
     if camera_model != "pinhole":
-        raise NotImplementedError(
-            f"The CPU rasterizer only knows camera_model='pinhole', not {camera_model!r}."
-        )
+        raise NotImplementedError(f"The CPU rasterizer only knows camera_model='pinhole', not {camera_model!r}.")
     if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
         raise ValueError(f"render_mode must be RGB, D, ED, RGB+D or RGB+ED, not {render_mode!r}.")
     if rasterize_mode not in ("classic", "antialiased"):
         raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', not {rasterize_mode!r}.")
-    _check_tensors(
-        means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds, width, height
-    )
+    _check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds, width, height)
 
     dtype, n_cameras, n = means.dtype, len(viewmats), len(means)
     means, quats, scales, opacities, colors, viewmats, Ks = (
@@ -142,9 +138,8 @@ def rasterization(
         )
         for viewmat, K in zip(viewmats, Ks, strict=True)
     ]  # fmt: skip
-    means2d, depths, conics, compensations, radii, sigmas = (
-        _stack(parts) for parts in zip(*projected, strict=True)
-    )
+    *stacked, visible = zip(*projected, strict=True)
+    means2d, depths, conics, compensations, radii, sigmas = (_stack(parts) for parts in stacked)
     opacities = opacities.expand(n_cameras, n)
     if antialiased:
         opacities = opacities * compensations
@@ -155,7 +150,7 @@ def rasterization(
             of_camera = colors if shared_colors else colors[camera]
             if sh_degree is not None:
                 centre = _camera_centre(viewmats[camera])
-                of_camera = SphericalHarmonics.apply(means, centre, of_camera, radii[camera], sh_degree)
+                of_camera = SphericalHarmonics.apply(means, centre, of_camera, visible[camera], sh_degree)
             features.append(of_camera)
     with_depth = render_mode != "RGB"
 
@@ -168,7 +163,8 @@ def rasterization(
             t[camera_ids, gaussian_ids] for t in (means2d, depths, conics, opacities, radii, sigmas)
         )
         ends = torch.searchsorted(camera_ids, torch.arange(n_cameras + 1)).tolist()
-        rows = [slice(begin, end) for begin, end in zip(ends, ends[1:], strict=False)]
+        rows = [slice(begin, end) for begin, end in pairwise(ends)]
+        visible = [torch.arange(row.stop - row.start, dtype=torch.int32) for row in rows]
     absolute = None
     if absgrad:
         absolute = torch.zeros_like(means2d)
@@ -179,10 +175,10 @@ def rasterization(
         channels = [features[camera]] if features else []
         if with_depth:
             channels.append(depths[row].unsqueeze(1))
-        bins: dict[str, Tensor] = {}
-        image, transmittance = Blend.apply(
-            means2d[row], conics[row], opacities[row], torch.cat(channels, 1) if len(channels) > 1 else channels[0],
-            depths[row], sigmas[row], radii[row], width, height, None if absolute is None else absolute[row], bins,
+        image, transmittance, tiles = Blend.apply(
+            means2d[row], conics[row], opacities[row],
+            torch.cat(channels, 1) if len(channels) > 1 else channels[0],
+            depths[row], sigmas[row], visible[camera], width, height, None if absolute is None else absolute[row],
         )  # fmt: skip
         alpha = (1.0 - transmittance).unsqueeze(-1)
         if backgrounds is not None and features:
@@ -195,8 +191,6 @@ def rasterization(
             image = torch.cat([image[..., :-1], expected], -1) if features else expected
         images.append(image)
         alphas.append(alpha)
-        tiles = torch.zeros(len(radii[row]), dtype=torch.int32)
-        tiles[bins["order"].long()] = bins["pair_start"].diff()
         tiles_per_gauss.append(tiles)
 
     info = {
@@ -258,9 +252,7 @@ def _check_tensors(
             kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
             raise ValueError(f"{name} must be a floating point tensor, got {kind}.")
         if tensor.device.type != "cpu":
-            raise ValueError(
-                f"{name} is on {tensor.device}, but this rasterizer runs on the CPU: use {name}.cpu()."
-            )
+            raise ValueError(f"{name} is on {tensor.device}, but this rasterizer runs on the CPU: use {name}.cpu().")
     if means.dim() != 2 or means.shape[1] != 3:
         raise ValueError(f"means must have shape [N, 3] (no batch dimensions), got {list(means.shape)}.")
     n = len(means)
@@ -293,13 +285,9 @@ def _check_tensors(
             )
         channels = 3
     if backgrounds is not None and list(backgrounds.shape) != [n_cameras, channels]:
-        raise ValueError(
-            f"backgrounds must have shape [{n_cameras}, {channels}], got {list(backgrounds.shape)}."
-        )
+        raise ValueError(f"backgrounds must have shape [{n_cameras}, {channels}], got {list(backgrounds.shape)}.")
     if not (isinstance(width, int) and isinstance(height, int) and width > 0 and height > 0):
-        raise ValueError(
-            f"width and height must be whole numbers of at least 1, got {width!r} and {height!r}."
-        )
+        raise ValueError(f"width and height must be whole numbers of at least 1, got {width!r} and {height!r}.")
     for name in ("viewmats", "Ks"):
         if not torch.isfinite(tensors[name]).all():
             raise ValueError(f"{name} holds NaN or infinity: a camera must be finite.")
