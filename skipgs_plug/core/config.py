@@ -1,0 +1,85 @@
+"""Every knob of the gate, its default and the reason for it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+from skipgs_plug.core.errors import SkipGSError
+
+ON_NONFINITE = ("skip", "raise", "pass")
+STEP_MODES = ("off", "adaptive_norm")
+STEP_TRIGGERS = ("snr", "ref_k")
+
+
+@dataclasses.dataclass(frozen=True)
+class SkipConfig:
+    """Settings of a gate; names and defaults of the first six as in the authors' controller.
+
+    Args:
+        start_iter: First iteration that may be skipped, in the trainer's own counting: the end of
+            densification. None when the adapter knows it.
+        threshold: Skip when loss <= mean * (1 + threshold). Raise it to skip more.
+        ema_decay: Decay of each view's running mean of its loss, per visit.
+        warmup: Gated iterations without skipping, which seed the means and calibrate the floor.
+        min_bwd_ratio: Least share of gated iterations that run a real backward. "auto" sets
+            max(0.5, 1 - 0.5 * share that warm-up would have skipped); 0.0 removes the floor.
+        enabled: False leaves training bit-identical to training without a gate.
+        on_nonfinite: What a NaN or infinite loss does: "skip" its backward, "raise" at once, or "pass" it
+            through. It never enters a mean.
+        pause_iters: Real backwards after a structural change; None for max(number of views, 500).
+        step_mode: "adaptive_norm" accumulates gradients until `step_trigger` fires before an optimizer
+            step is taken; "off" steps as the trainer does.
+        step_trigger: "snr" (accumulated energy is twice the noise floor) or "ref_k" (accumulated norm
+            reaches that of 16 single gradients).
+
+    Raises:
+        SkipGSError: A value is out of its range; names the field and the range.
+    """
+
+    start_iter: int | None = None
+    threshold: float = 0.0
+    ema_decay: float = 0.95
+    warmup: int = 500
+    min_bwd_ratio: float | str = "auto"
+    enabled: bool = True
+    on_nonfinite: str = "skip"
+    pause_iters: int | None = None
+    step_mode: str = "off"
+    step_trigger: str = "snr"
+
+    def __post_init__(self) -> None:
+        if self.start_iter is not None:
+            _check_count("start_iter", self.start_iter)
+        _check_count("warmup", self.warmup)
+        if self.pause_iters is not None:
+            _check_count("pause_iters", self.pause_iters)
+        if not (_is_number(self.threshold) and self.threshold > -1.0):
+            raise SkipGSError(f"threshold must be a number above -1, not {self.threshold!r}.")
+        if not (_is_number(self.ema_decay) and 0.0 <= self.ema_decay < 1.0):
+            raise SkipGSError(f"ema_decay must be in [0, 1), not {self.ema_decay!r}.")
+        ratio = self.min_bwd_ratio
+        if ratio != "auto" and not (_is_number(ratio) and 0.0 <= float(ratio) <= 1.0):
+            raise SkipGSError(f'min_bwd_ratio must be "auto" or in [0, 1], not {ratio!r}.')
+        _check_choice("on_nonfinite", self.on_nonfinite, ON_NONFINITE)
+        _check_choice("step_mode", self.step_mode, STEP_MODES)
+        _check_choice("step_trigger", self.step_trigger, STEP_TRIGGERS)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The settings as plain values, as written to skipgs.json."""
+        return dataclasses.asdict(self)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _check_count(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise SkipGSError(f"{name} must be a whole number of iterations >= 0, not {value!r}.")
+
+
+def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise SkipGSError(f"{name} must be one of {', '.join(choices)}, not {value!r}.")

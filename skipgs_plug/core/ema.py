@@ -1,0 +1,55 @@
+"""One running mean of the loss per view."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+
+from skipgs_plug.core.errors import SkipGSError
+
+
+class ViewMeans:
+    """Exponential running means, seeded with each view's first loss (paper, per-view loss EMA).
+
+    Attributes:
+        values: mean by view key. A restored state has string keys; `update` gives each back to the key
+            that the loop uses when that view comes along.
+    """
+
+    __slots__ = ("_decay", "_gain", "values")
+
+    def __init__(self, decay: float) -> None:
+        self._decay = decay
+        self._gain = 1.0 - decay
+        self.values: dict[Hashable, float] = {}
+
+    def update(self, view: Hashable, loss: float) -> float | None:
+        """Take in a finite loss and return the mean before it, None for a view without one."""
+        values = self.values
+        mean = values.get(view)
+        if mean is None and (type(view) is str or (mean := values.pop(str(view), None)) is None):
+            values[view] = loss
+            return None
+        values[view] = self._decay * mean + self._gain * loss
+        return mean
+
+    def get(self, view: Hashable) -> float | None:
+        """The mean of a view, None when it has none yet."""
+        mean = self.values.get(view)
+        return self.values.get(str(view)) if mean is None else mean
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def state_dict(self) -> dict[str, float]:
+        """Means by view key as text.
+
+        Raises:
+            SkipGSError: Two keys have the same text (6 and "6").
+        """
+        state = {str(view): mean for view, mean in self.values.items()}
+        if len(state) != len(self.values):
+            raise SkipGSError("Two view keys have the same text; use image names as view keys.")
+        return state
+
+    def load_state_dict(self, state: Mapping[Hashable, float]) -> None:
+        self.values = {str(view): float(mean) for view, mean in state.items()}

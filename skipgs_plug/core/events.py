@@ -1,0 +1,35 @@
+"""Structural changes (prune, opacity reset, optimizer rebuild) and the pause that follows them."""
+
+from __future__ import annotations
+
+MIN_PAUSE_ITERS = 500
+
+
+class Pause:
+    """The iterations after a structural change that all run a real backward and are not recorded.
+
+    A change makes every loss jump. Means keep their values from before the jump, so that a view counts as
+    recovered only when it really is; and views without a mean get none, so that none is seeded at the peak.
+
+    Attributes:
+        until: first iteration that is not paused any more.
+        events: number of changes that caused or extended a pause.
+    """
+
+    __slots__ = ("_iters", "events", "until")
+
+    def __init__(self, pause_iters: int | None = None) -> None:
+        self._iters = pause_iters
+        self.until = 0
+        self.events = 0
+
+    def extend(self, step: int, n_views: int) -> int:
+        """Pause the iterations after `step`; return how many that adds to those already paused."""
+        iters = max(n_views, MIN_PAUSE_ITERS) if self._iters is None else self._iters
+        begin = max(self.until, step + 1)
+        end = step + 1 + iters
+        if end <= begin:
+            return 0
+        self.until = end
+        self.events += 1
+        return end - begin

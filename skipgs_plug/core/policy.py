@@ -1,0 +1,169 @@
+"""The rule of the paper (SkipGS, arXiv 2603.08997), in one place. Standard library only."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from typing import Any, Protocol
+
+from skipgs_plug.core import decision
+from skipgs_plug.core.budget import BackwardBudget
+from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.decision import Decision
+from skipgs_plug.core.ema import ViewMeans
+from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.events import Pause
+from skipgs_plug.core.state import POLICY_VERSION, policy_state
+
+EPS = 1e-8  # keeps the deviation score defined for a mean of zero
+
+
+class Policy(Protocol):
+    """What a gate asks of a policy; anything with these methods will do, a control for a benchmark too."""
+
+    def decide(self, view: Hashable, loss: float, step: int) -> Decision:
+        """Decide on one view in one iteration, and record the answer."""
+        ...
+
+    def notify_event(self, step: int, n_views: int) -> None:
+        """A structural change happened in iteration `step`."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain values from which `load_state_dict` continues exactly."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a saved state."""
+        ...
+
+
+class SkipPolicy:
+    """Skip a view's backward when its loss is at or below the view's own running mean.
+
+    From `start_iter` on, the deviation score of a view is loss / (mean + 1e-8), and its backward is skipped
+    when the score is at most 1 + threshold, under a floor on the share of real backwards. Arguments are
+    those of `SkipConfig`. With no events and finite losses the decisions are those of the authors' released
+    controller, one for one, except that warm-up counts from the first gated iteration seen, so that a run
+    resumed late still calibrates.
+    """
+
+    __slots__ = (
+        "_ceiling",
+        "_warmup",
+        "_warmup_end",
+        "budget",
+        "enabled",
+        "means",
+        "pause",
+        "start_iter",
+    )
+
+    def __init__(
+        self,
+        start_iter: int,
+        threshold: float = 0.0,
+        ema_decay: float = 0.95,
+        warmup: int = 500,
+        min_bwd_ratio: float | str = "auto",
+        enabled: bool = True,
+        pause_iters: int | None = None,
+    ) -> None:
+        if start_iter is None:
+            raise SkipGSError("SkipPolicy needs start_iter, the iteration at which densification has ended.")
+        SkipConfig(start_iter, threshold, ema_decay, warmup, min_bwd_ratio, enabled, pause_iters=pause_iters)
+        self.start_iter = start_iter
+        self.enabled = enabled
+        self.means = ViewMeans(ema_decay)
+        self.budget = BackwardBudget(min_bwd_ratio)
+        self.pause = Pause(pause_iters)
+        self._ceiling = 1.0 + threshold
+        self._warmup = warmup
+        self._warmup_end: int | None = None
+
+    def decide(self, view: Hashable, loss: float, step: int) -> Decision:
+        """Decide whether to skip the backward of `view`, whose loss is `loss`, in iteration `step`.
+
+        Call it once per view and iteration, after the forward; the answer is recorded as followed.
+        """
+        if step < self.start_iter or not self.enabled:
+            return decision.INACTIVE
+        if loss - loss != 0.0:  # NaN or infinite
+            return decision.NON_FINITE
+        if step < self.pause.until:
+            return decision.PAUSE
+        if self._warmup_end is None:
+            self._warmup_end = step + self._warmup
+        mean = self.means.update(view, loss)
+        at_or_below = mean is not None and loss / (mean + EPS) <= self._ceiling
+        budget = self.budget
+        if step < self._warmup_end:
+            if mean is not None and budget.calibrating:
+                budget.observe_warmup(at_or_below)
+            budget.backwards += 1
+            return decision.WARM_UP
+        if mean is None:
+            answer = decision.NEW_VIEW
+        elif not at_or_below:
+            answer = decision.ABOVE_MEAN
+        else:
+            answer = decision.AT_OR_BELOW_MEAN if budget.allows_skip() else decision.BUDGET
+        if answer.skip:
+            budget.skips += 1
+        else:
+            budget.backwards += 1
+        # The first decision after warm-up is still taken under the uncalibrated floor, as in the release.
+        if budget.calibrating:
+            budget.calibrate()
+        return answer
+
+    def overrule_skip(self) -> None:
+        """Record that the skip just decided became a backward after all (another process needed it)."""
+        self.budget.skips -= 1
+        self.budget.backwards += 1
+
+    def notify_event(self, step: int, n_views: int) -> None:
+        """Pause after a structural change in iteration `step`.
+
+        Changes before the iteration that precedes `start_iter` belong to densification and are ignored. A
+        pause inside warm-up postpones the rest of warm-up.
+        """
+        if not self.enabled or step < self.start_iter - 1:
+            return
+        added = self.pause.extend(step, n_views)
+        if self._warmup_end is not None and step < self._warmup_end:
+            self._warmup_end += added
+
+    @property
+    def floor(self) -> float:
+        """Least share of real backwards in force."""
+        return self.budget.floor
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that changes, as plain values with string keys.
+
+        Returns:
+            `version` (2); `means` (mean by view key); `budget` (`floor`, `backwards`, `skips`,
+            `calibrating`, `would_skip`, `would_total`); `warmup_end` (iteration, None before the first
+            gated one); `pause_until` (iteration); `events` (count).
+        """
+        return {
+            "version": POLICY_VERSION,
+            "means": self.means.state_dict(),
+            "budget": self.budget.state_dict(),
+            "warmup_end": self._warmup_end,
+            "pause_until": self.pause.until,
+            "events": self.pause.events,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict()`, or from a state of the authors' controller (`state_version` 1).
+
+        Raises:
+            SkipGSError: The state is of another version, or something is missing from it.
+        """
+        state = policy_state(state, self.start_iter + self._warmup)
+        self.means.load_state_dict(state["means"])
+        self.budget.load_state_dict(state["budget"])
+        self._warmup_end = state["warmup_end"]
+        self.pause.until = state["pause_until"]
+        self.pause.events = state["events"]

@@ -1,0 +1,68 @@
+"""Saved states: versions, and the one of the authors' controller."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skipgs_plug.core.errors import SkipGSError
+
+POLICY_VERSION = 2
+POLICY_KEYS = ("means", "budget", "warmup_end", "pause_until", "events")
+BUDGET_KEYS = ("floor", "backwards", "skips", "calibrating", "would_skip", "would_total")
+
+
+def is_release_state(state: Mapping[str, Any]) -> bool:
+    """Whether the authors' controller wrote this state."""
+    return "state_version" in state
+
+
+def policy_state(state: Mapping[str, Any], release_warmup_end: int) -> dict[str, Any]:
+    """Check a policy state and bring it to the present version.
+
+    Args:
+        state: As saved by `SkipPolicy.state_dict`, or by the authors' controller (`state_version` 1).
+        release_warmup_end: Iteration at which the authors' warm-up ends; their state does not hold it.
+
+    Raises:
+        SkipGSError: Another version, or something is missing.
+    """
+    if is_release_state(state):
+        state = _from_release(state, release_warmup_end)
+    version = state.get("version")
+    if version != POLICY_VERSION:
+        raise SkipGSError(f"Gate state has version {version!r}, expected {POLICY_VERSION}; start the gate afresh.")
+    require(state, POLICY_KEYS, "Gate state")
+    require(state["budget"], BUDGET_KEYS, "Gate state's budget")
+    return dict(state)
+
+
+def require(state: Mapping[str, Any], keys: tuple[str, ...], what: str) -> None:
+    """Raise SkipGSError that names what is missing from a state."""
+    missing = [key for key in keys if key not in state]
+    if missing:
+        raise SkipGSError(f"{what} lacks {', '.join(missing)}: it is damaged; start the gate afresh.")
+
+
+def _from_release(state: Mapping[str, Any], warmup_end: int) -> dict[str, Any]:
+    version = state["state_version"]
+    if version != 1:
+        raise SkipGSError(f"State of the authors' controller has version {version!r}; only 1 can be loaded.")
+    keys = ("view_loss_ema", "stats", "min_bwd_ratio_effective", "calibrated")
+    require(state, (*keys, "warmup_would_skip", "warmup_would_total"), "State of the authors' controller")
+    return {
+        "version": POLICY_VERSION,
+        "means": state["view_loss_ema"],
+        "budget": {
+            "floor": state["min_bwd_ratio_effective"],
+            "backwards": state["stats"]["bwd"],
+            "skips": state["stats"]["skip"],
+            "calibrating": not state["calibrated"],
+            "would_skip": state["warmup_would_skip"],
+            "would_total": state["warmup_would_total"],
+        },
+        # Before the first recorded iteration warm-up has not begun.
+        "warmup_end": warmup_end if state["stats"]["bwd"] else None,
+        "pause_until": 0,
+        "events": 0,
+    }
