@@ -8,7 +8,8 @@ In float64 its error is far below what a float32 rasterizer can reach.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -19,7 +20,7 @@ from .torch_reference_projection import ALPHA_THRESHOLD, Projected, project, sph
 
 ALPHA_MAX = 0.999
 TRANSMITTANCE_STOP = 1e-4  # the Gaussian that would go below ends the pixel, uncounted
-PAIRS_PER_CHUNK = 2_000_000  # pixel-Gaussian pairs held in memory at once
+BLOCK = 32  # pixels are blended in squares of this side, which bounds the memory
 
 
 def rasterization_reference(
@@ -98,9 +99,7 @@ def rasterization_reference(
     if not packed:  # [M, ...] -> [C, N, ...], zero where culled
         places = camera_ids * n_gaussians + gaussian_ids
         shape = n_cameras, n_gaussians
-        rows = Projected(
-            *(t.new_zeros(*shape, *t.shape[1:]).index_put((camera_ids, gaussian_ids), t) for t in rows)
-        )
+        rows = Projected(*(t.new_zeros(*shape, *t.shape[1:]).index_put((camera_ids, gaussian_ids), t) for t in rows))
     flat = rows if packed else Projected(*(t.flatten(0, 1) for t in rows))
     absolute = None
     if absgrad:
@@ -121,9 +120,7 @@ def rasterization_reference(
         if backgrounds is not None:
             colored = len(background) - n_depth  # depth is rendered onto 0
             background = torch.cat([backgrounds[camera, :colored], background[colored:]])
-        image, alpha = composite(
-            projected, torch.cat(values, -1), background, width, height, places[here], absolute
-        )
+        image, alpha = composite(projected, torch.cat(values, -1), background, width, height, places[here], absolute)
         if render_mode.endswith("ED"):
             expected = image[..., -1:] / alpha.clamp(min=1e-10)
             image = torch.cat([image[..., :-1], expected], dim=-1)
@@ -172,6 +169,8 @@ def composite(
 ) -> tuple[Tensor, Tensor]:
     """Blend all rows into all pixels front to back. Returns image [H, W, D] and alpha [H, W, 1]."""
 
+    by_depth = torch.sort(projected.depths.detach(), stable=True).indices
+
     def blend(pixels: Tensor, order: Tensor, *rows: Tensor) -> Tensor:
         means2d, conics, opacities, features = rows
         copies = _OneCopyPerPixel.apply(means2d, len(pixels), places[order], absolute)
@@ -184,13 +183,12 @@ def composite(
         color = (alpha * after[:, :-1]) @ features + after[:, -1:] * background
         return torch.cat([color, 1 - after[:, -1:]], dim=1)
 
-    parts = []
-    by_depth = torch.sort(projected.depths.detach(), stable=True).indices
-    for pixels in _pixel_chunks(width, height, len(by_depth), background):
+    def block(pixels: Tensor) -> Tensor:
         order = by_depth[_reaches(projected, pixels)[by_depth]]
         rows = (projected.means2d, projected.conics, projected.opacities, features)
-        parts.append(checkpoint(blend, pixels, order, *(t[order] for t in rows), use_reentrant=False))
-    image = torch.cat(parts).reshape(height, width, -1)
+        return checkpoint(blend, pixels, order, *(t[order] for t in rows), use_reentrant=False)
+
+    image = _image_of_blocks(block, width, height, background)
     return image[..., :-1], image[..., -1:]
 
 
@@ -213,26 +211,31 @@ def near_cutoff(info: dict[str, Any], relative: float = 1e-3, depth_relative: fl
         else:
             index = info["camera_ids"] == camera
         projected = Projected(*(info[name][index].detach() for name in Projected._fields))
-        by_depth = torch.sort(projected.depths, stable=True).indices
-        parts = []
-        for pixels in _pixel_chunks(info["width"], info["height"], len(by_depth), projected.depths):
-            order = by_depth[_reaches(projected, pixels)[by_depth]]
-            means2d, depths, conics, opacities, _ = (t[order] for t in projected)
-            if len(order) == 0:
-                parts.append(torch.zeros(len(pixels), dtype=torch.bool))
-                continue
-            alpha = _alphas(pixels, means2d, conics, opacities)
-            near = (alpha / ALPHA_THRESHOLD - 1).abs() < relative
-            near |= (alpha / ALPHA_MAX - 1).abs() < relative
-            alpha = torch.where(alpha >= ALPHA_THRESHOLD, alpha.clamp_max(ALPHA_MAX), 0.0)
-            near |= (torch.cumprod(1 - alpha, dim=1) / TRANSMITTANCE_STOP - 1).abs() < relative
-            # The depth of the nearest contributing Gaussian in front, carried along the sorted row.
-            contributing = torch.where(alpha > 0, depths, -torch.inf)
-            in_front = torch.cummax(contributing, dim=1).values[:, :-1]
-            tie = (alpha > 0)[:, 1:] & (depths[1:] - in_front <= depth_relative * depths[1:].abs())
-            parts.append(near.any(dim=1) | tie.any(dim=1))
-        masks.append(torch.cat(parts).reshape(info["height"], info["width"]))
+        block = partial(_near_cutoff_in_block, projected, relative, depth_relative)
+        masks.append(_image_of_blocks(block, info["width"], info["height"], projected.depths)[..., 0])
     return torch.stack(masks)
+
+
+def _near_cutoff_in_block(projected: Projected, relative: float, depth_relative: float, pixels: Tensor) -> Tensor:
+    order = torch.sort(projected.depths, stable=True).indices
+    order = order[_reaches(projected, pixels)[order]]
+    if len(order) == 0:
+        return torch.zeros(len(pixels), 1, dtype=torch.bool)
+    means2d, depths, conics, opacities, _ = (t[order] for t in projected)
+    alpha = _alphas(pixels, means2d, conics, opacities)
+    near = (alpha / ALPHA_THRESHOLD - 1).abs() < relative
+    near |= (alpha / ALPHA_MAX - 1).abs() < relative
+    alpha = torch.where(alpha >= ALPHA_THRESHOLD, alpha.clamp_max(ALPHA_MAX), 0.0)
+    transmittance = torch.cumprod(1 - alpha, dim=1)
+    near |= (transmittance / TRANSMITTANCE_STOP - 1).abs() < relative
+    # The depth of the nearest contributing Gaussian in front, carried along the sorted row.
+    contributing = torch.where(alpha > 0, depths, -torch.inf)
+    in_front = torch.cummax(contributing, dim=1).values[:, :-1]
+    tie = (alpha > 0)[:, 1:] & (depths[1:] - in_front <= depth_relative * depths[1:].abs())
+    # What lies behind the stop is never seen.
+    near[:, 1:] |= tie
+    seen = transmittance > 0.5 * TRANSMITTANCE_STOP
+    return (near & seen).any(dim=1, keepdim=True)
 
 
 def _reaches(projected: Projected, pixels: Tensor) -> Tensor:
@@ -249,7 +252,15 @@ def _alphas(pixels: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor) 
     return torch.where(sigma >= 0, opacities * torch.exp(-sigma), 0.0)
 
 
-def _pixel_chunks(width: int, height: int, n_gaussians: int, like: Tensor) -> Iterator[Tensor]:
-    rows, columns = torch.arange(height), torch.arange(width)
-    grid = torch.cartesian_prod(rows, columns).flip(-1).to(like)
-    yield from (grid + 0.5).split(max(1, PAIRS_PER_CHUNK // max(1, n_gaussians)))
+def _image_of_blocks(block: Callable[[Tensor], Tensor], width: int, height: int, like: Tensor) -> Tensor:
+    """Put together [H, W, X] from what `block` makes, [P, X], of the centres of a square of pixels [P, 2]."""
+    rows = []
+    for top in range(0, height, BLOCK):
+        y = torch.arange(top, min(top + BLOCK, height)).to(like) + 0.5
+        squares = []
+        for left in range(0, width, BLOCK):
+            x = torch.arange(left, min(left + BLOCK, width)).to(like) + 0.5
+            pixels = torch.cartesian_prod(y, x).flip(-1)
+            squares.append(block(pixels).reshape(len(y), len(x), -1))
+        rows.append(torch.cat(squares, dim=1))
+    return torch.cat(rows)

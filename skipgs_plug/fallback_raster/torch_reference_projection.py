@@ -137,7 +137,5 @@ def tiles(
         "tiles_per_gauss": count.to(torch.int32).reshape(rows.depths.shape),
         "isect_ids": isect_ids,
         "flatten_ids": flatten_ids[order].to(torch.int32),
-        "isect_offsets": (per_tile.cumsum(0) - per_tile)
-        .reshape(n_images, tile_height, tile_width)
-        .to(torch.int32),
+        "isect_offsets": (per_tile.cumsum(0) - per_tile).reshape(n_images, tile_height, tile_width).to(torch.int32),
     }

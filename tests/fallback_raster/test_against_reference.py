@@ -51,6 +51,15 @@ def test_image_and_gradients(case: str) -> None:
     assert not wrong, errors
 
 
+@pytest.mark.parametrize("case", ["SH 3", "antialiased", "RGB+ED", "three cameras", "packed", "near and far"])
+def test_camera_gradients(case: str) -> None:
+    scene, options = CASES[case]
+    errors = errors_against_reference(
+        rasterization, random_scene(**scene), extra=("viewmats",), **{"packed": False, **options}
+    )
+    assert errors["viewmats"] < GRADIENT_ERROR
+
+
 def test_colors_and_harmonics_of_each_camera_on_their_own() -> None:
     for sh_degree in (None, 2):
         scene = random_scene(cameras=3, sh_degree=sh_degree)

@@ -64,7 +64,6 @@ def test_arrays_that_are_no_tensors(name: str) -> None:
         ("sh_degree", -1),
         ("render_mode", "depth"),
         ("rasterize_mode", "sharp"),
-        ("tile_size", 0),
     ],
 )
 def test_values(name: str, value: Any) -> None:

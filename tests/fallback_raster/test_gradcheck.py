@@ -26,9 +26,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_finite_differences(case: str) -> None:
     scene_options, options = CASES[case]
-    inputs = leaves(
-        random_scene(n=12, width=8, height=7, seed=5, **scene_options), torch.float64, ("viewmats",)
-    )
+    inputs = leaves(random_scene(n=8, width=8, height=7, seed=5, **scene_options), torch.float64, ("viewmats",))
     names = [name for name, t in inputs.items() if torch.is_tensor(t) and t.requires_grad]
     *_, info = rasterization_reference(**inputs, **options)
     kept = ~near_cutoff(info, relative=1e-4)[..., None]
@@ -39,12 +37,12 @@ def test_finite_differences(case: str) -> None:
         image, alpha, _ = rasterization_reference(**{**inputs, **changed}, **options)
         return torch.cat([image, alpha], dim=-1) * kept
 
-    assert torch.autograd.gradcheck(render, [inputs[n] for n in names], eps=STEP, atol=1e-6, rtol=1e-5)
+    assert torch.autograd.gradcheck(render, [inputs[n] for n in names], eps=STEP, fast_mode=True)
 
 
 def test_boxes_hold_every_pixel_above_the_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reference leaves Gaussians out where their boxes do not reach; blending all of them is the same."""
-    monkeypatch.setattr(torch_reference, "PAIRS_PER_CHUNK", 3000)  # small chunks, many boxes left out
+    monkeypatch.setattr(torch_reference, "BLOCK", 4)  # small blocks, many boxes left out
     scene = leaves(random_scene(cameras=2, sh_degree=1), torch.float64)
     image, alpha, _ = rasterization_reference(**scene)
     monkeypatch.setattr(
