@@ -58,6 +58,9 @@ REPLACED: dict[str, Any] = {
     "set_device": _nothing,
     "reset_peak_memory_stats": _nothing,
     "current_device": lambda: 0,
+    # Scripts assert that there is a device, and count them to decide on one process per device.
+    "is_available": lambda: True,
+    "device_count": lambda: 1,
     "FloatTensor": torch.FloatTensor,
     "IntTensor": torch.IntTensor,
     "LongTensor": torch.LongTensor,

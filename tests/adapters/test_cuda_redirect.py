@@ -49,6 +49,7 @@ def test_device_calls_that_only_order_work_do_nothing():
         torch.cuda.set_device(torch.device("cuda:0"))
         torch.cuda.reset_peak_memory_stats()
         torch.cuda.empty_cache()
+        assert torch.cuda.is_available() and torch.cuda.device_count() == 1
         assert torch.cuda.current_device() == 0
 
 

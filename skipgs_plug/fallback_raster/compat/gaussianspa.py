@@ -32,9 +32,7 @@ class GaussianRasterizer(RasterizerModule):
         return result.color, result.radii, weights, count.to(torch.int32), largest
 
     @torch.no_grad()
-    def render_depth(
-        self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any
-    ) -> dict[str, Tensor]:
+    def render_depth(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> dict[str, Tensor]:
         """Where the view rays meet the strongest Gaussian of their pixel; not differentiable.
 
         Returns:

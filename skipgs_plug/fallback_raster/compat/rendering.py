@@ -59,15 +59,11 @@ def splats(
         NotImplementedError: 3D covariances are precomputed; the rasterizer wants scales and rotations.
     """
     optional = (dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
-    dc, shs, colors, scales, rotations, covariances = (
-        None if t is None or not len(t) else t for t in optional
-    )
+    dc, shs, colors, scales, rotations, covariances = (None if t is None or not len(t) else t for t in optional)
     if (shs is None) == (colors is None):
         raise ValueError("Give the rasterizer either shs or colors_precomp.")
     if covariances is not None or scales is None or rotations is None:
-        raise NotImplementedError(
-            "The CPU stand-in needs scales and rotations: run without --compute_cov3D_python."
-        )
+        raise NotImplementedError("The CPU stand-in needs scales and rotations: run without --compute_cov3D_python.")
     return Splats(means3D, means2D, opacities, scales, rotations, dc, shs, colors, scores)
 
 
@@ -102,9 +98,7 @@ class Rendering(NamedTuple):
     inverse_depth: Tensor | None  # [1, H, W]
 
 
-def render(
-    settings: Any, gaussians: Splats, antialiased: bool = False, inverse_depth: bool = False
-) -> Rendering:
+def render(settings: Any, gaussians: Splats, antialiased: bool = False, inverse_depth: bool = False) -> Rendering:
     """Render `gaussians`, differentiable in every member of `Splats`.
 
     Args:
@@ -188,9 +182,7 @@ class _Render(torch.autograd.Function):
     def forward(ctx: Any, call: _Call, *tensors: Tensor | None) -> tuple[Tensor, Tensor | None]:
         ctx.set_materialize_grads(False)
         needed = ctx.needs_input_grad[1:]
-        leaves = [
-            t if t is None else t.detach().requires_grad_(n) for t, n in zip(tensors, needed, strict=True)
-        ]
+        leaves = [t if t is None else t.detach().requires_grad_(n) for t, n in zip(tensors, needed, strict=True)]
         with torch.enable_grad():
             color, inverse = call.run(Splats(*leaves))
         ctx.call, ctx.leaves, ctx.outputs = call, leaves, (color, inverse)

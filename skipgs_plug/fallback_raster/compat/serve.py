@@ -6,7 +6,7 @@ import importlib
 import importlib.util
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import ModuleType
 
 _CLASSES = ("GaussianRasterizationSettings", "GaussianRasterizer")
@@ -53,18 +53,29 @@ def serve(family: str) -> Iterator[None]:
     if family not in FAMILIES:
         raise ValueError(f"No stand-ins for {family!r}; there are some for: {', '.join(sorted(FAMILIES))}.")
     served = {name: _module(name, *source) for name, source in FAMILIES[family].items()}
-    if importlib.util.find_spec("torchvision") is None:
+    # gsplat's script has no use for torchvision, and torchmetrics must not find a part of it.
+    if family != "gsplat" and importlib.util.find_spec("torchvision") is None:
         served |= importlib.import_module(".vision", __package__).modules()
     before = {name: sys.modules.get(name) for name in served}
     sys.modules.update(served)
     try:
-        yield
+        with _extras(family):
+            yield
     finally:
         for name, module in before.items():
             if module is None:
                 sys.modules.pop(name, None)
             else:
                 sys.modules[name] = module
+
+
+def _extras(family: str) -> AbstractContextManager[None]:
+    """gsplat's functions are replaced inside gsplat, which is a real package here."""
+    if family != "gsplat":
+        return nullcontext()
+    from .gsplat_script import gsplat_on_cpu
+
+    return gsplat_on_cpu()
 
 
 def _module(name: str, source: str, offered: tuple[str, ...]) -> ModuleType:

@@ -1,0 +1,98 @@
+"""What gsplat's own `simple_trainer.py` needs on a machine without CUDA, beyond the rasterizer."""
+
+from __future__ import annotations
+
+import importlib.util
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..install import install_as_gsplat
+from ..torch_reference_projection import rotation_matrices
+
+
+@contextmanager
+def gsplat_on_cpu() -> Iterator[None]:
+    """Replace gsplat's rasterizer and the two CUDA functions its MCMC strategy calls.
+
+    Where torchvision is missing, torchmetrics' LPIPS is replaced too: the script builds it at the start.
+
+    Raises:
+        ImportError: gsplat is not installed.
+    """
+    import gsplat.strategy.ops
+    import torchmetrics.image.lpip
+
+    replaced: list[tuple[Any, str, Any]] = [
+        (gsplat.strategy.ops, "compute_relocation", compute_relocation),
+        (gsplat.strategy.ops, "quat_scale_to_covar_preci", quat_scale_to_covar_preci),
+    ]
+    if importlib.util.find_spec("torchvision") is None:
+        replaced.append((torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", AbsentLpips))
+    before = [(owner, name, getattr(owner, name)) for owner, name, _ in replaced]
+    for owner, name, stand_in in replaced:
+        setattr(owner, name, stand_in)
+    try:
+        with install_as_gsplat():
+            yield
+    finally:
+        for owner, name, original in before:
+            setattr(owner, name, original)
+
+
+def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> tuple[Tensor, Tensor]:
+    """Opacity and scales of a Gaussian split into `ratios` equal ones (3DGS-MCMC, equation 9).
+
+    Args:
+        opacities: [N]
+        scales: [N, 3]
+        ratios: Number of copies, capped at n_max. [N]
+        binoms: Binomial coefficients. [n_max, n_max]
+
+    Returns:
+        New opacities [N] and scales [N, 3]; n copies drawn over each other look like the original.
+    """
+    n_max = len(binoms)
+    copies = ratios.clamp(min=1, max=n_max).long()
+    shared = 1 - (1 - opacities) ** (1 / copies)
+    k = torch.arange(n_max)
+    signs = torch.where(k % 2 == 0, 1.0, -1.0) / (k + 1).sqrt()
+    rows = (binoms * signs * shared[:, None, None] ** (k + 1)).tril().sum(dim=2)  # [N, n_max]
+    denominator = torch.where(k < copies[:, None], rows, 0.0).sum(dim=1)
+    return shared, (opacities / denominator)[:, None] * scales
+
+
+def quat_scale_to_covar_preci(
+    quats: Tensor,
+    scales: Tensor,
+    compute_covar: bool = True,
+    compute_preci: bool = True,
+    triu: bool = False,
+) -> tuple[Tensor | None, Tensor | None]:
+    """Covariance and its inverse, of Gaussians. [N, 4], [N, 3] -> two of [N, 3, 3] or None
+
+    Raises:
+        NotImplementedError: `triu` is set; the strategies do not.
+    """
+    if triu:
+        raise NotImplementedError("The CPU stand-in returns whole matrices: leave triu False.")
+    rotation = rotation_matrices(quats)
+    roots = (rotation * scales[:, None, :], rotation / scales[:, None, :])
+    covariance, precision = (root @ root.transpose(-1, -2) for root in roots)
+    return covariance if compute_covar else None, precision if compute_preci else None
+
+
+class AbsentLpips(torch.nn.Module):
+    """LPIPS where its network cannot be had: a warning when first asked, and nan for a value."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__()
+
+    def forward(self, image: Tensor, target: Tensor) -> Tensor:
+        """Not a number. Shapes are not checked."""
+        warnings.warn("LPIPS needs torchvision, which is not installed: reporting nan.", stacklevel=2)
+        return torch.tensor(torch.nan)

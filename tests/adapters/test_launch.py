@@ -1,0 +1,115 @@
+"""A script is run as Python would run it, and its exit code comes back."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from skipgs_plug.adapters.launch import run_script
+from skipgs_plug.core.errors import SkipGSError
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A folder with a script and the neighbour it imports; forgets the neighbour afterwards."""
+    folder = tmp_path / "checkout"
+    (folder / "neighbour_of_script").mkdir(parents=True)
+    (folder / "neighbour_of_script" / "__init__.py").write_text("VALUE = 'own'\n")
+    yield folder
+    sys.modules.pop("neighbour_of_script", None)
+
+
+def write(checkout, body):
+    script = checkout / "train.py"
+    script.write_text(body)
+    return str(script)
+
+
+def test_script_sees_its_own_folder_arguments_and_name(checkout, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    script = write(
+        checkout,
+        "import os, sys\n"
+        "from neighbour_of_script import VALUE\n"
+        "if __name__ == '__main__':\n"
+        "    print(VALUE, sys.argv[1:], os.getcwd(), os.path.basename(sys.argv[0]))\n",
+    )
+    before = (sys.argv, list(sys.path))
+    assert run_script([script, "-s", "data"]) == 0
+    assert capfd.readouterr().out == f"own ['-s', 'data'] {tmp_path} train.py\n"
+    assert (sys.argv, sys.path) == before
+
+
+@pytest.mark.parametrize(
+    ("ending", "code"),
+    [("sys.exit()", 0), ("sys.exit(3)", 3), ("sys.exit('no data')", 1), ("raise KeyboardInterrupt", 130)],
+)
+def test_exit_code_is_the_scripts(checkout, ending, code, capfd):
+    assert run_script([write(checkout, f"import sys\n{ending}\n")]) == code
+    assert ("no data" in capfd.readouterr().err) == ("no data" in ending)
+
+
+def test_traceback_starts_in_the_script(checkout, capfd):
+    script = write(checkout, "def training():\n    raise ValueError('broken scene')\ntraining()\n")
+    assert run_script([script]) == 1
+    error = capfd.readouterr().err
+    assert "ValueError: broken scene" in error and "in training" in error
+    assert "runpy" not in error and "launch.py" not in error
+
+
+def test_our_own_errors_pass_through(checkout):
+    script = write(checkout, "from skipgs_plug.core.errors import SkipGSError\nraise SkipGSError('wrong')\n")
+    with pytest.raises(SkipGSError, match="wrong"):
+        run_script([script])
+
+
+def test_stdout_that_the_script_replaces_is_given_back(checkout):
+    before = sys.stdout
+    assert run_script([write(checkout, "import sys, io\nsys.stdout = io.StringIO()\n")]) == 0
+    assert sys.stdout is before
+
+
+def test_checkpoints_with_numpy_scalars_load(checkout, tmp_path):
+    torch.save({"scale": np.float64(2.5)}, tmp_path / "a.pth")
+    load = torch.load
+    script = write(checkout, f"import torch\nassert torch.load({str(tmp_path / 'a.pth')!r})['scale'] == 2.5\n")
+    assert run_script([script]) == 0
+    assert torch.load is load
+
+
+def test_a_module_is_run_as_python_does_with_m(checkout, monkeypatch, capfd):
+    (checkout / "neighbour_of_script" / "train.py").write_text(
+        "import sys\nfrom neighbour_of_script import VALUE\nprint(VALUE, __name__, sys.argv[1:])\n"
+    )
+    monkeypatch.syspath_prepend(checkout)
+    assert run_script(["-m", "neighbour_of_script.train", "-i", "3"]) == 0
+    assert capfd.readouterr().out == "own __main__ ['-i', '3']\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ([], "no script to run"),
+        (["-m"], "no script to run"),
+        (["-m", "absent_module.train"], "no module absent_module"),
+    ],
+)
+def test_nothing_to_run_is_said(command, message):
+    with pytest.raises(SkipGSError, match=message):
+        run_script(command)
+
+
+def test_missing_script_is_named(tmp_path):
+    with pytest.raises(SkipGSError, match=r"no script .*absent\.py"):
+        run_script([str(tmp_path / "absent.py")])
+
+
+def test_a_module_imported_from_elsewhere_is_refused(checkout, tmp_path, monkeypatch):
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "neighbour_of_script.py").write_text("VALUE = 'foreign'\n")
+    monkeypatch.syspath_prepend(other)
+    __import__("neighbour_of_script")
+    with pytest.raises(SkipGSError, match=r"'neighbour_of_script' was already imported .* one training"):
+        run_script([write(checkout, "pass\n")])
