@@ -34,10 +34,11 @@ _GAUSSIAN = """
         const int top = larger(0, (int)ceilf(fmaxf(my - r[6], -1.0f)));
         const int bottom = smaller(rows - 1, (int)floorf(fminf(my + r[6], 16.0f)));
 """
-# log2(alpha) of row `y`; log2(1/255) is the cut-off.
+# log2(alpha) of row `y`; log2(1/255) is the cut-off. The quadratic form of a needle may round to a negative value,
+# which would lift alpha above the opacity.
 _ALPHA = """
             const float dy = y - my;
-            const v16 log2_alpha = along_x - dy * (cross + r[4] * dy);
+            const v16 log2_alpha = vmin((v16)r[5], along_x - dy * (cross + r[4] * dy));
             const i16 above = (log2_alpha >= -7.99435344f);
 """
 

@@ -81,6 +81,8 @@ for (int base = first; base < last; base += 16) {
     v16 sigma_x = vsqrt(cov_xx), sigma_y = vsqrt(cov_yy);
     v16 radius_x = vmin((v16)1e9f, __builtin_elementwise_ceil(reach * sigma_x));
     v16 radius_y = vmin((v16)1e9f, __builtin_elementwise_ceil(reach * sigma_y));
+    // Thinner than a millionth of a pixel (only without eps2d): it meets no pixel centre, but overflows gradients.
+    visible &= (conic_a < 1e12f) & (conic_c < 1e12f);
     visible &= (radius_x > radius_clip) | (radius_y > radius_clip);
     visible &= (u + radius_x > 0.0f) & (u - radius_x < width) & (v + radius_y > 0.0f) & (v - radius_y < height);
 

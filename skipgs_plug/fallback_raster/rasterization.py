@@ -149,7 +149,7 @@ def rasterization(
         for camera in range(n_cameras):
             of_camera = colors if shared_colors else colors[camera]
             if sh_degree is not None:
-                centre = _camera_centre(viewmats[camera])
+                centre = torch.linalg.inv(viewmats[camera])[:3, 3]
                 of_camera = SphericalHarmonics.apply(means, centre, of_camera, visible[camera], sh_degree)
             features.append(of_camera)
     with_depth = render_mode != "RGB"
@@ -217,10 +217,6 @@ def rasterization(
 def _stack(tensors: Any) -> Tensor:
     # One camera is the rule in training, and a view spares the copy.
     return tensors[0].unsqueeze(0) if len(tensors) == 1 else torch.stack(list(tensors))
-
-
-def _camera_centre(viewmat: Tensor) -> Tensor:
-    return -(viewmat[:3, :3].T @ viewmat[:3, 3])
 
 
 def _check_tensors(
