@@ -15,6 +15,7 @@ from .binning import TILE, Bins, bin_gaussians, pack
 from .blend import MAX_CHANNELS, PAIR, backward_worker, forward_worker, reduce_pairs
 from .project import project_backward, project_forward
 from .sh import sh_backward, sh_forward
+from .shortcuts import VISIBLE_ONLY, active_shortcuts
 
 # Items that one partial sum of the camera gradients covers (the grain of the workers that write them).
 _PARTIAL = 512
@@ -80,7 +81,7 @@ class Project(torch.autograd.Function):
         project_backward(
             means, quats, scales, viewmat, K, visible, v_means2d.contiguous(), v_depths.contiguous(),
             v_conics.contiguous(), v_compensations.contiguous(), v_means, v_quats, v_scales, v_poses,
-            len(visible), float(width), float(height), eps2d, int(antialiased), int(with_pose),
+            len(visible), float(width), float(height), eps2d, int(antialiased), int(with_pose), active_shortcuts(),
         )  # fmt: skip
         v_viewmat = None
         if with_pose:
@@ -103,6 +104,8 @@ class SphericalHarmonics(torch.autograd.Function):
     ) -> Tensor:
         colors = torch.zeros(len(means), 3)
         width = coefficients.shape[1]
+        if not active_shortcuts() & VISIBLE_ONLY:
+            visible = torch.arange(len(means), dtype=torch.int32)
         sh_forward(means, camera, coefficients, visible, colors, len(visible), width, degree)
         ctx.save_for_backward(means, camera, coefficients, colors, visible)
         ctx.degree = degree
@@ -116,7 +119,7 @@ class SphericalHarmonics(torch.autograd.Function):
         v_cameras = torch.zeros(_partials(len(visible)), 3)
         sh_backward(
             means, camera, coefficients, visible, colors, v_colors.contiguous(), v_means, v_coefficients,
-            v_cameras, len(visible), coefficients.shape[1], ctx.degree,
+            v_cameras, len(visible), coefficients.shape[1], ctx.degree, active_shortcuts(),
         )  # fmt: skip
         return v_means, v_cameras.sum(0) if ctx.needs_input_grad[1] else None, v_coefficients, None, None
 
@@ -153,7 +156,7 @@ class Blend(torch.autograd.Function):
             _pack_colors(bins, means2d, conics, opacities, sigmas, colors, channel, some)
             forward_worker(some)(
                 bins.records, bins.tile_start, bins.tile_list, image, transmittance, pixel_stop, tile_stop,
-                width, height, tiles_x, tiles_y, channels, channel, some,
+                width, height, tiles_x, tiles_y, channels, channel, some, active_shortcuts(),
             )  # fmt: skip
         ctx.save_for_backward(means2d, conics, opacities, colors, sigmas, transmittance, pixel_stop, tile_stop)
         ctx.bins, ctx.absolute = bins, absolute
@@ -179,7 +182,7 @@ class Blend(torch.autograd.Function):
                 _pack_colors(bins, means2d, conics, opacities, sigmas, colors, channel, some)
             backward_worker(some, with_absolute)(
                 bins.records, bins.tile_start, bins.tile_list, tile_stop, transmittance, pixel_stop, v_image,
-                v_transmittance, v_pairs, width, height, tiles_x, tiles_y, channels, channel, some,
+                v_transmittance, v_pairs, width, height, tiles_x, tiles_y, channels, channel, some, active_shortcuts(),
             )  # fmt: skip
             reduce_pairs(
                 bins.order, bins.pair_start, bins.pair_slot, v_pairs, opacities, v_means2d, v_conics, v_opacities,

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from .launch import FloatArray, IntArray, get_num_threads, worker
+from .shortcuts import active_shortcuts
 
 TILE = 16
 
@@ -31,7 +32,7 @@ _TILE_ROWS = """
     const bool empty = top > bottom || box_left > box_right;
     const int first_row = top / 16, last_row = empty ? first_row - 1 : bottom / 16;
     // Small ones need no more than their bounding box.
-    const bool whole = box_left / 16 == box_right / 16 || first_row == last_row;
+    const bool whole = box_left / 16 == box_right / 16 || first_row == last_row || !(shortcuts & 1);
     // The ellipse's edges: x(dy) = mx - dy b / 2a +- chord sqrt(1 - (dy / half_h)^2), farthest out at dy = -+extreme.
     const float slope = -0.5f * r[3] / r[2], extreme = -0.5f * r[3] / r[4] * half_w, inverse_h = 1.0f / half_h;
     const float chord = sqrtf(fmaxf((r[5] + 7.99435344f) / r[2], 0.0f));
@@ -172,6 +173,7 @@ def count_pairs(
     height: float,
     tiles_x: int,
     tiles_y: int,
+    shortcuts: int,
 ) -> None: ...
 
 
@@ -239,6 +241,7 @@ def fill_pairs(
     height: float,
     tiles_x: int,
     tiles_y: int,
+    shortcuts: int,
 ) -> None: ...
 
 
@@ -291,7 +294,7 @@ def bin_gaussians(
     tile_start = torch.empty(tiles + 1, dtype=torch.int32)
     pair_start = torch.empty(n + 1, dtype=torch.int32)
     tiles_per_gauss = torch.zeros(len(means2d), dtype=torch.int32)
-    image = (float(width), float(height), tiles_x, tiles_y)
+    image = (float(width), float(height), tiles_x, tiles_y, active_shortcuts())
     count_pairs(order, records, counts, pair_start, tiles_per_gauss, n, slices, *image)
     scan_pairs(counts, tile_start, pair_start, n, slices, tiles)
     pairs = int(tile_start[-1])

@@ -31,8 +31,8 @@ _GAUSSIAN = """
         const float my = r[1] - (y0 + 0.5f);
         const v16 dx = px - r[0];
         const v16 along_x = r[5] - r[2] * dx * dx, cross = r[3] * dx;
-        const int top = larger(0, (int)ceilf(fmaxf(my - r[6], -1.0f)));
-        const int bottom = smaller(rows - 1, (int)floorf(fminf(my + r[6], 16.0f)));
+        const int top = shortcuts & 2 ? larger(0, (int)ceilf(fmaxf(my - r[6], -1.0f))) : 0;
+        const int bottom = shortcuts & 2 ? smaller(rows - 1, (int)floorf(fminf(my + r[6], 16.0f))) : rows - 1;
 """
 # log2(alpha) of row `y`; log2(1/255) is the cut-off. The quadratic form of a needle may round to a negative value,
 # which would lift alpha above the opacity.
@@ -82,7 +82,7 @@ for (int t = first; t < last; ++t) {
             if (any(finished)) {
                 T[y] = finished ? -T[y] : T[y];
                 stop[y] = finished ? (i16)k : stop[y];
-                if (!any(T[y] > 0.0f)) open &= ~(1u << y);
+                if ((shortcuts & 4) && !any(T[y] > 0.0f)) open &= ~(1u << y);
             }
         }
     }
@@ -118,6 +118,7 @@ for (int t = first; t < last; ++t) {
         stride: int,  # D
         channel: int,
         channels: int,
+        shortcuts: int,
     ) -> None: ...
 
     return blend_forward
@@ -152,7 +153,7 @@ for (int t = first; t < last; ++t) {
         i16 wanted = v_last != 0.0f;
         for (int c = 0; c < D; ++c) wanted |= v[y][c] != 0.0f;
         // A row without incoming gradient adds exact zeros.
-        if (any(wanted)) open |= 1u << y;
+        if (any(wanted) || !(shortcuts & 8)) open |= 1u << y;
         if (any(stop[y] < tile_end)) finished |= 1u << y;
     }
     const int used = open ? tile_end : begin;
@@ -236,6 +237,7 @@ for (int t = first; t < last; ++t) {
         stride: int,  # D
         channel: int,
         channels: int,
+        shortcuts: int,
     ) -> None: ...
 
     return blend_backward

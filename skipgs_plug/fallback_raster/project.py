@@ -142,8 +142,8 @@ for (int base = first; base < last; base += 16) {
     v16 va = gather(v_conics, row, 3, 0), vb = 0.5f * gather(v_conics, row, 3, 1), vc = gather(v_conics, row, 3, 2);
     v16 v_comp = antialiased ? gather(v_compensations, row, 1, 0) : (v16)0.0f;
     // Most blocks of a close-up hold no Gaussian that received a gradient; their zeros are in place already.
-    if (!any((v_u != 0.0f) | (v_v != 0.0f) | (v_depth != 0.0f) | (va != 0.0f) | (vb != 0.0f) | (vc != 0.0f)
-             | (v_comp != 0.0f))) continue;
+    if ((shortcuts & 32) && !any((v_u != 0.0f) | (v_v != 0.0f) | (v_depth != 0.0f) | (va != 0.0f) | (vb != 0.0f)
+                                 | (vc != 0.0f) | (v_comp != 0.0f))) continue;
 """
     + _GEOMETRY
     + """
@@ -245,4 +245,5 @@ def project_backward(
     eps2d: float,
     antialiased: int,
     with_pose: int,
+    shortcuts: int,
 ) -> None: ...

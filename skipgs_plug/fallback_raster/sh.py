@@ -86,7 +86,7 @@ for (int i = first; i < last; ++i) {
     float v0 = colors[3 * g] > 0.0f ? v_colors[3 * g] : 0.0f;
     float v1 = colors[3 * g + 1] > 0.0f ? v_colors[3 * g + 1] : 0.0f;
     float v2 = colors[3 * g + 2] > 0.0f ? v_colors[3 * g + 2] : 0.0f;
-    if (v0 == 0.0f && v1 == 0.0f && v2 == 0.0f) continue;
+    if (v0 == 0.0f && v1 == 0.0f && v2 == 0.0f && (shortcuts & 32)) continue;
 """
     + _BASIS
     + """
@@ -144,4 +144,5 @@ def sh_backward(
     n_visible: int,
     width: int,  # K
     degree: int,
+    shortcuts: int,
 ) -> None: ...
