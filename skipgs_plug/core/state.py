@@ -8,7 +8,9 @@ from typing import Any
 from skipgs_plug.core.errors import SkipGSError
 
 POLICY_VERSION = 2
+GATE_VERSION = 2
 POLICY_KEYS = ("means", "budget", "warmup_end", "pause_until", "events")
+GATE_KEYS = ("policy", "stats", "accumulator", "clock", "step")
 BUDGET_KEYS = ("floor", "backwards", "skips", "calibrating", "would_skip", "would_total")
 
 
@@ -34,6 +36,19 @@ def policy_state(state: Mapping[str, Any], release_warmup_end: int) -> dict[str,
         raise SkipGSError(f"Gate state has version {version!r}, expected {POLICY_VERSION}; start the gate afresh.")
     require(state, POLICY_KEYS, "Gate state")
     require(state["budget"], BUDGET_KEYS, "Gate state's budget")
+    return dict(state)
+
+
+def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
+    """Check the state of a whole gate, as saved by `SkipGate.state_dict`.
+
+    Raises:
+        SkipGSError: Another version, or something is missing.
+    """
+    version = state.get("version")
+    if version != GATE_VERSION:
+        raise SkipGSError(f"Gate state has version {version!r}, expected {GATE_VERSION}; start the gate afresh.")
+    require(state, GATE_KEYS, "Gate state")
     return dict(state)
 
 

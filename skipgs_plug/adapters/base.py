@@ -1,0 +1,68 @@
+"""What an adapter is: one trainer's answers, and the hooks it hangs them on."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from typing import Any, ClassVar
+
+import torch
+
+from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.hooks import Hooks
+
+
+class AbstractAdapter(ABC):
+    """Knows one trainer: what its iteration, view, backward and end of densification are called.
+
+    It holds no loop and decides nothing. It tells the gate through `Hooks`
+    - once, `ready(start_iter, view_names=...)`, at attach or at the latest before the first iteration;
+    - per iteration `iteration(step)`, `view(key)`, and the backward (`gate_tensor_backward`, or a wrapped
+      method that calls `backward(loss, run)`);
+    - per structural change `event(kind)`.
+
+    Args:
+        trainer: The object, module or function to attach to; None for a script that is about to run.
+
+    Attributes:
+        name: how users call it.
+        checked: upstream version or commit that it was checked with, and how; part of error messages.
+    """
+
+    name: ClassVar[str]
+    checked: ClassVar[str]
+
+    def __init__(self, trainer: Any = None) -> None:
+        self.trainer = trainer
+
+    @classmethod
+    @abstractmethod
+    def matches(cls, trainer: Any) -> bool:
+        """Whether this is the trainer that the adapter knows. Imports nothing of it."""
+
+    @abstractmethod
+    def attach(self, hooks: Hooks) -> None:
+        """Hold on to `self.trainer`, which exists and has not begun training.
+
+        Raises:
+            AdapterMismatchError: An expected name is missing.
+        """
+
+    def attach_script(self, hooks: Hooks) -> None:
+        """Hold on to a training script that is about to run in this process.
+
+        Its folder is first on `sys.path`, and none of its modules is imported yet.
+        """
+        raise SkipGSError(f"Adapter {self.name!r} needs a trainer object; it has no script to run.")
+
+    def must_run(self, step: int) -> bool:
+        """Whether skipping is forbidden in this iteration, whose loss is not to be recorded either."""
+        return False
+
+    def optimizers(self) -> Iterable[torch.optim.Optimizer]:
+        """Optimizers that may wait for accumulated gradients; none where the trainer has its own schedule."""
+        return ()
+
+    def timing(self) -> tuple[float, float] | None:
+        """Seconds of training in all and after densification, when the trainer keeps them itself."""
+        return None

@@ -1,0 +1,150 @@
+"""Inria 3DGS (classic and current), and the answers that its forks share.
+
+The trainer is a function `training` in `train.py`, with the loop inline. One iteration:
+`update_learning_rate(iteration)`, `render(camera, ...)`, `loss.backward()`, densification, optimizer step.
+Everything the gate needs happens through names that can be wrapped, whoever imported them.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import types
+import warnings
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import torch
+
+from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.hooks import Hooks
+
+LOOP = "training"  # name of the function that holds the loop, in the whole family
+
+
+class InriaFamily(AbstractAdapter):
+    """Shared by Inria 3DGS and its forks: only the backward is gated, optimizers keep their schedules.
+
+    Attributes:
+        renders: names of the functions that render a training view; at least one must exist.
+        structural: methods of `GaussianModel` that make losses jump.
+    """
+
+    renders: ClassVar[tuple[str, ...]] = ("render",)
+    structural: ClassVar[tuple[str, ...]] = ("prune_points", "reset_opacity", "training_setup")
+
+    def __init__(self, trainer: Any = None) -> None:
+        super().__init__(trainer)
+        self.output_folder: str | None = None  # `model_path` of the run, known when training begins
+        self._step: int | None = None
+        self._key: Callable[[Any], Any] = lambda camera: getattr(camera, "image_name", None)
+
+    @classmethod
+    def matches(cls, trainer: Any) -> bool:
+        names = namespace_of(trainer)
+        return names is not None and "GaussianModel" in names and cls.recognises(names)
+
+    @classmethod
+    @abstractmethod
+    def recognises(cls, names: dict[str, Any]) -> bool:
+        """Whether a train module with these global names is this trainer's."""
+
+    @abstractmethod
+    def start_iter(self, opt: Any) -> int:
+        """First iteration after densification, from the run's optimization options."""
+
+    def attach(self, hooks: Hooks) -> None:
+        names = namespace_of(self.trainer)
+        if names is None or LOOP not in names or "GaussianModel" not in names:
+            raise AdapterMismatchError(
+                f"Adapter {self.name!r} expects a train module with {LOOP}() and GaussianModel, or its "
+                f"{LOOP} function, as in {self.checked}."
+            )
+        self._hang(hooks, names, names["GaussianModel"])
+
+    def attach_script(self, hooks: Hooks) -> None:
+        # The script binds these names when it imports them, so they are replaced before.
+        renderer = importlib.import_module("gaussian_renderer")
+        model = importlib.import_module("scene.gaussian_model").GaussianModel
+        self._hang(hooks, vars(renderer), model)
+
+    def _hang(self, hooks: Hooks, names: dict[str, Any], model: type) -> None:
+        present = [name for name in self.renders if name in names]
+        if not present:
+            raise AdapterMismatchError(
+                f"Adapter {self.name!r} found none of {', '.join(self.renders)} in {names.get('__name__')}; "
+                f"it was checked with {self.checked}."
+            )
+
+        def heartbeat(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            # Frame 2 is the loop. Its variables are read once, before they hold an iteration's graph.
+            if self._step is None:
+                self._begin(hooks, sys._getframe(2).f_locals)
+            else:
+                self._step += 1
+            assert self._step is not None
+            hooks.iteration(self._step)
+            return original(*args, **kwargs)
+
+        def rendered(original: Callable[..., Any], camera: Any, *args: Any, **kwargs: Any) -> Any:
+            if self.is_training_render(args, kwargs):
+                hooks.view(self._key(camera))
+            return original(camera, *args, **kwargs)
+
+        hooks.wrap(model, "update_learning_rate", heartbeat)
+        for name in present:
+            hooks.wrap(names, name, rendered)
+        hooks.events(model, *(name for name in self.structural if hasattr(model, name)))
+        hooks.gate_tensor_backward(LOOP)
+
+    def is_training_render(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bool:
+        """Whether a render with these arguments after the camera can be the training one."""
+        return torch.is_grad_enabled()
+
+    def _begin(self, hooks: Hooks, loop: dict[str, Any]) -> None:
+        """Read options, views and first iteration from the loop's variables."""
+        missing = [name for name in ("opt", "iteration", "scene") if name not in loop]
+        if missing:
+            raise AdapterMismatchError(
+                f"Adapter {self.name!r} expects {', '.join(missing)} among the variables of {LOOP}(), "
+                f"as in {self.checked}."
+            )
+        opt, self._step = loop["opt"], int(loop["iteration"])
+        self.output_folder = getattr(loop["scene"], "model_path", None)
+        cameras = loop["scene"].getTrainCameras()
+        names = [camera.image_name for camera in cameras]
+        if len(set(names)) < len(names):
+            warnings.warn(
+                "Several training images have the same name; the gate tells views apart by their position, "
+                "which stays the same in a resumed run only with the same seed.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            self._key = lambda camera: getattr(camera, "uid", None)
+            names = [str(camera.uid) for camera in cameras]
+        hooks.ready(self.start_iter(opt), view_names=names, max_steps=opt.iterations)
+
+
+class Inria(InriaFamily):
+    """graphdeco-inria/gaussian-splatting: densification ends before `densify_until_iter`."""
+
+    name = "inria"
+    checked = "graphdeco-inria/gaussian-splatting 8a70a8cd and 54c035f"
+
+    @classmethod
+    def recognises(cls, names: dict[str, Any]) -> bool:
+        return "render" in names and LOOP in names
+
+    def start_iter(self, opt: Any) -> int:
+        return int(opt.densify_until_iter)
+
+
+def namespace_of(trainer: Any) -> dict[str, Any] | None:
+    """Global names of a train module, or of the module that a training function is from."""
+    if isinstance(trainer, types.ModuleType):
+        return vars(trainer)
+    if isinstance(trainer, types.FunctionType):
+        return trainer.__globals__
+    return None

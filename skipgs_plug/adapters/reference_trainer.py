@@ -1,0 +1,56 @@
+"""Our own trainer, `skipgs_plug.trainer.Trainer`: its backward is a method with view and step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+
+from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.events import MIN_PAUSE_ITERS
+from skipgs_plug.core.hooks import Hooks
+
+FULL_SCHEDULE = 30_000  # iterations that the default settings of gate and trainer are made for
+
+
+class ReferenceTrainer(AbstractAdapter):
+    """Gates the instance's `backward(loss, view, step)`; gate state travels in snapshots and checkpoints."""
+
+    name = "reference"
+    checked = "the trainer of this package"
+
+    @classmethod
+    def matches(cls, trainer: Any) -> bool:
+        return any(c.__module__.startswith("skipgs_plug.trainer") for c in type(trainer).__mro__)
+
+    def attach(self, hooks: Hooks) -> None:
+        trainer = self.trainer
+        if "skipgs" in trainer.registered:
+            raise SkipGSError("This trainer is gated already: detach() the other gate first.")
+
+        def gated(original: Callable[..., None], loss: torch.Tensor, view: str, step: int) -> None:
+            hooks.iteration(step)
+            hooks.backward(loss, lambda: original(loss, view, step), view)
+
+        hooks.wrap(trainer, "backward", gated)
+        n_views = len(trainer.view_names)
+        scale = trainer.max_steps / FULL_SCHEDULE
+        hooks.ready(
+            trainer.refine_stop_iter,
+            view_names=trainer.view_names,
+            max_steps=trainer.max_steps - 1,
+            defaults={
+                "warmup": max(2 * n_views, round(500 * scale)),
+                "pause_iters": max(n_views, round(MIN_PAUSE_ITERS * scale)),
+            },
+        )
+        trainer.register_state("skipgs", hooks.state)
+        hooks.on_detach("Trainer.registered['skipgs']", lambda: trainer.registered.pop("skipgs", None))
+
+    def optimizers(self) -> Iterable[torch.optim.Optimizer]:
+        return self.trainer.optimizers.values()
+
+    def timing(self) -> tuple[float, float] | None:
+        return self.trainer.t_total, self.trainer.t_post

@@ -1,0 +1,81 @@
+"""Which adapters there are, and which one fits a trainer."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.core.adapter import use_finder
+from skipgs_plug.core.errors import SkipGSError, UnknownTrainerError
+
+# In the order in which they are asked: forks before what they were forked from. Loaded when asked for.
+BUILTIN = {
+    "reference": "skipgs_plug.adapters.reference_trainer:ReferenceTrainer",
+    "inria": "skipgs_plug.adapters.inria:Inria",
+}
+
+_registered: dict[str, type[AbstractAdapter]] = {}
+
+
+def register_adapter(adapter: type[AbstractAdapter]) -> type[AbstractAdapter]:
+    """Add an adapter of your own; works as a class decorator. It is asked before the built-in ones.
+
+    Raises:
+        SkipGSError: It has no name, or the name is taken.
+    """
+    name = getattr(adapter, "name", None)
+    if not name or not getattr(adapter, "checked", None):
+        raise SkipGSError(f"{adapter.__name__} needs the class attributes name and checked.")
+    if name in BUILTIN or _registered.get(name, adapter) is not adapter:
+        raise SkipGSError(f"There is an adapter {name!r} already; choose another name.")
+    _registered[name] = adapter
+    return adapter
+
+
+def adapter_names() -> list[str]:
+    """Names of all adapters, those of users first."""
+    return [*_registered, *BUILTIN]
+
+
+def get_adapter(name: str) -> type[AbstractAdapter]:
+    """Return the adapter class of that name.
+
+    Raises:
+        UnknownTrainerError: There is none.
+    """
+    if name in _registered:
+        return _registered[name]
+    if name not in BUILTIN:
+        raise UnknownTrainerError(
+            f"There is no adapter {name!r}; there are {', '.join(adapter_names())}. "
+            "Any other loop can be gated by hand: SkipGate(start_iter=...) and gate.backward(loss, view, step)."
+        )
+    module, _, attribute = BUILTIN[name].partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def find_adapter(trainer: Any, name: str | None = None) -> AbstractAdapter:
+    """Return the adapter for a trainer (None: for a script), by name or by asking all in order.
+
+    Raises:
+        UnknownTrainerError: No adapter knows it.
+    """
+    if name is not None:
+        return get_adapter(name)(trainer)
+    for candidate in adapter_names():
+        adapter = get_adapter(candidate)
+        if adapter.matches(trainer):
+            return adapter(trainer)
+    raise UnknownTrainerError(
+        f"No adapter knows {_describe(trainer)}; there are {', '.join(adapter_names())} (adapter=NAME). "
+        "Any other loop can be gated by hand: SkipGate(start_iter=...) and gate.backward(loss, view, step)."
+    )
+
+
+def _describe(trainer: Any) -> str:
+    name = getattr(trainer, "__name__", None)
+    return f"{name!r}" if name else f"a {type(trainer).__module__}.{type(trainer).__qualname__}"
+
+
+use_finder(find_adapter)

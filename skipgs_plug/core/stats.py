@@ -1,0 +1,90 @@
+"""What the gate did: counts, per-view table, flat scalars for loggers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from skipgs_plug.core.decision import Decision
+
+
+class GateStats:
+    """Counts of decisions. Every gated iteration is either a backward or a skip.
+
+    Attributes:
+        iterations: training backwards seen, before `start_iter` too.
+        backwards: real backwards from `start_iter` on (warm-up and paused ones included).
+        skips: skipped backwards.
+        reasons: gated decisions by reason.
+        events: structural changes that the policy was told of, by kind.
+    """
+
+    def __init__(self) -> None:
+        self.iterations = 0
+        self.backwards = 0
+        self.skips = 0
+        self.reasons: dict[str, int] = {}
+        self.events: dict[str, int] = {}
+        self._views: dict[str, list[Any]] = {}  # visits, backwards, skips, last loss
+
+    def record(self, decision: Decision, view: str, loss: float) -> None:
+        """Count one gated decision."""
+        self.reasons[decision.reason] = self.reasons.get(decision.reason, 0) + 1
+        row = self._views.get(view)
+        if row is None:
+            row = self._views[view] = [0, 0, 0, loss]
+        row[0] += 1
+        row[3] = loss
+        if decision.skip:
+            self.skips += 1
+            row[2] += 1
+        else:
+            self.backwards += 1
+            row[1] += 1
+
+    @property
+    def gated(self) -> int:
+        """Training backwards seen from `start_iter` on, run or skipped."""
+        return self.backwards + self.skips
+
+    @property
+    def skip_ratio(self) -> float:
+        """Share of the gated iterations that were skipped, 0 without any."""
+        return self.skips / self.gated if self.gated else 0.0
+
+    @property
+    def n_views(self) -> int:
+        """Number of different views seen from `start_iter` on."""
+        return len(self._views)
+
+    def view_table(self, mean_of: Callable[[str], float | None]) -> list[dict[str, Any]]:
+        """One row per view, by name: `view visits backwards skips mean_loss last_loss`."""
+        return [
+            {
+                "view": view,
+                "visits": row[0],
+                "backwards": row[1],
+                "skips": row[2],
+                "mean_loss": mean_of(view),
+                "last_loss": row[3],
+            }
+            for view, row in sorted(self._views.items())
+        ]
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "iterations": self.iterations,
+            "backwards": self.backwards,
+            "skips": self.skips,
+            "reasons": dict(self.reasons),
+            "events": dict(self.events),
+            "views": {view: list(row) for view, row in self._views.items()},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.iterations = state["iterations"]
+        self.backwards = state["backwards"]
+        self.skips = state["skips"]
+        self.reasons = dict(state["reasons"])
+        self.events = dict(state["events"])
+        self._views = {view: list(row) for view, row in state["views"].items()}

@@ -1,0 +1,54 @@
+"""View keys: what names a training view, in state, tables and traces."""
+
+from __future__ import annotations
+
+import numbers
+import os
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import PurePath
+from typing import Any
+
+from skipgs_plug.core.errors import SkipGSError
+
+
+def view_key(view: Any) -> str:
+    """Return the text by which a view is known.
+
+    Args:
+        view: Image name or path, index (int, or a tensor or array of one whole number), or a tuple of these.
+
+    Raises:
+        SkipGSError: Something else, which might not be the same for the same view in the next run.
+    """
+    if isinstance(view, str):
+        return view
+    if isinstance(view, numbers.Integral):
+        return str(int(view))
+    if isinstance(view, os.PathLike):
+        return PurePath(view).as_posix()
+    if isinstance(view, tuple) and view:
+        return "/".join(view_key(part) for part in view)
+    item = getattr(view, "item", None)
+    if callable(item) and getattr(view, "size", None) is not None:
+        try:
+            value = item()
+        except (RuntimeError, ValueError):
+            value = None
+        if isinstance(value, numbers.Integral):
+            return str(int(value))
+    raise SkipGSError(
+        f"A view key must be an image name or an index, not {type(view).__name__}; "
+        "for a batch with one joint loss use one constant key, for per-view losses a list of keys."
+    )
+
+
+def require_unique(names: Iterable[str]) -> list[str]:
+    """Return the names as a list, or raise SkipGSError that shows one that several views share."""
+    names = list(names)
+    name, count = Counter(names).most_common(1)[0] if names else ("", 0)
+    if count > 1:
+        raise SkipGSError(
+            f"View key {name!r} names {count} training views; use keys that differ, such as relative paths."
+        )
+    return names
