@@ -249,7 +249,8 @@ def _alphas(pixels: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor) 
     dx, dy = (pixels[:, None, :] - means2d).unbind(-1)  # [P, M]
     a, b, c = conics.unbind(-1)
     sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    return torch.where(sigma >= 0, opacities * torch.exp(-sigma), 0.0)
+    # Clamped as well as selected: the exponential of what rounding left below zero may be infinite.
+    return torch.where(sigma >= 0, opacities * torch.exp(-sigma.clamp_min(0.0)), 0.0)
 
 
 def _image_of_blocks(block: Callable[[Tensor], Tensor], width: int, height: int, like: Tensor) -> Tensor:

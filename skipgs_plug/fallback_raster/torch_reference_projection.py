@@ -25,7 +25,7 @@ class Projected(NamedTuple):
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotations of quaternions w, x, y, z of any length. [M, 4] -> [M, 3, 3]; zero gives the identity."""
-    w, x, y, z = F.normalize(quats, dim=-1).unbind(-1)
+    w, x, y, z = F.normalize(quats, dim=-1, eps=torch.finfo(quats.dtype).tiny).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
@@ -65,9 +65,10 @@ def project(
     covariance = flat @ flat.transpose(-1, -2)  # [M, 2, 2]
 
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    sharp_determinant = xx * yy - xy * xy
+    # det(A A^T) as the squared area that A's rows span: no cancellation where a needle is seen.
+    sharp_determinant = torch.linalg.cross(flat[:, 0], flat[:, 1]).square().sum(dim=-1)
+    determinant = sharp_determinant + eps2d * (xx + yy) + eps2d**2
     xx, yy = xx + eps2d, yy + eps2d
-    determinant = xx * yy - xy * xy
     if antialiased:
         opacities = opacities * (sharp_determinant / determinant).clamp_min(0.0).sqrt()
 
