@@ -51,9 +51,7 @@ def _gsplat_backend() -> Backend:
     from skipgs_plug.trainer.loss import l1_ssim_loss
 
     if not torch.cuda.is_available():
-        raise InputError(
-            "Backend gsplat needs a CUDA device and torch sees none; use --backend warp on the CPU."
-        )
+        raise InputError("Backend gsplat needs a CUDA device and torch sees none; use --backend warp on the CPU.")
     try:
         from gsplat import rasterization
     except ImportError as error:

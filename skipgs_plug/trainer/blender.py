@@ -37,25 +37,19 @@ def read_transforms(path: Path, file_name: str, data_factor: int) -> tuple[list[
     try:
         content = json.loads(source.read_text())
         angle = float(content["camera_angle_x"])
-        frames = [
-            (str(f["file_path"]), np.array(f["transform_matrix"], dtype=np.float64))
-            for f in content["frames"]
-        ]
+        frames = [(str(f["file_path"]), np.array(f["transform_matrix"], dtype=np.float64)) for f in content["frames"]]
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{source} is not valid JSON ({error}); restore the file.") from error
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{source} lacks or garbles camera_angle_x, file_path or transform_matrix ({error}); "
-            "restore the file."
+            f"{source} lacks or garbles camera_angle_x, file_path or transform_matrix ({error}); restore the file."
         ) from error
     views, any_alpha = [], False
     for file_path, camera_to_world in frames:
         if camera_to_world.shape != (4, 4):
             raise InputError(f"{source}: transform_matrix of {file_path!r} is not 4x4; restore the file.")
         if not np.isfinite(camera_to_world).all() or abs(np.linalg.det(camera_to_world[:3, :3])) < 1e-6:
-            raise InputError(
-                f"{source}: transform_matrix of {file_path!r} is not a finite pose; restore the file."
-            )
+            raise InputError(f"{source}: transform_matrix of {file_path!r} is not a finite pose; restore the file.")
         image_path = find_image(path, file_path if Path(file_path).suffix else file_path + ".png")
         pixels, has_alpha = read_image(image_path, image_path, WHITE, data_factor)
         any_alpha |= has_alpha

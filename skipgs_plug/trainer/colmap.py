@@ -38,9 +38,7 @@ def load_colmap(path: Path, data_factor: int, test_every: int) -> Scene:
         viewmat[:3] = pose.matrix()
         views.append(View(image.name, pixels, torch.from_numpy(K).float(), torch.from_numpy(viewmat).float()))
     if not views:
-        raise InputError(
-            f"{model} registers no image; run COLMAP again with more overlap between photographs."
-        )
+        raise InputError(f"{model} registers no image; run COLMAP again with more overlap between photographs.")
     train, test = split_views(views, test_every)
     points = list(reconstruction.points3D.values())
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
@@ -56,8 +54,7 @@ def find_model(path: Path) -> Path:
             if all((folder / (stem + suffix)).is_file() for stem in ("cameras", "images", "points3D")):
                 return folder
     raise MissingFileError(
-        f"Neither {tried[0]} nor {tried[1]} holds cameras, images and points3D (.bin or .txt); "
-        "run COLMAP's mapper."
+        f"Neither {tried[0]} nor {tried[1]} holds cameras, images and points3D (.bin or .txt); run COLMAP's mapper."
     )
 
 
@@ -66,14 +63,10 @@ def read_model(model: Path) -> Any:
     try:
         import pycolmap
     except ImportError as error:
-        raise InputError(
-            "Reading COLMAP folders needs pycolmap; run: pip install 'skipgs_plug[full]'."
-        ) from error
+        raise InputError("Reading COLMAP folders needs pycolmap; run: pip install 'skipgs_plug[full]'.") from error
     try:
         return pycolmap.Reconstruction(str(model))
-    except (
-        Exception
-    ) as error:  # pycolmap raises bare RuntimeError, ValueError or IndexError by kind of damage
+    except Exception as error:  # pycolmap raises bare RuntimeError, ValueError or IndexError by kind of damage
         raise InputError(f"COLMAP model {model} cannot be read ({error}); export it again.") from error
 
 

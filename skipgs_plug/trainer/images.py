@@ -27,9 +27,7 @@ def read_image(
         image [H, W, 3] uint8, and whether it had an alpha channel.
     """
     if isinstance(source, Path) and not source.is_file():
-        raise MissingFileError(
-            f"Image {source} does not exist; restore it or remove it from the reconstruction."
-        )
+        raise MissingFileError(f"Image {source} does not exist; restore it or remove it from the reconstruction.")
     try:
         with Image.open(source) as opened:
             opened.load()
@@ -39,7 +37,7 @@ def read_image(
         raise InputError(f"Image {label} cannot be decoded ({error}); replace the file.") from error
     if has_alpha:
         rgba = np.asarray(picture, dtype=np.float32) / 255.0
-        composed = rgba[..., :3] * rgba[..., 3:] + np.float32(background) * (1.0 - rgba[..., 3:])
+        composed = rgba[..., :3] * rgba[..., 3:] + np.array(background, dtype=np.float32) * (1.0 - rgba[..., 3:])
         picture = Image.fromarray(np.rint(composed * 255.0).astype(np.uint8))
     if factor > 1:
         size = (max(1, round(picture.width / factor)), max(1, round(picture.height / factor)))

@@ -86,9 +86,7 @@ class Trainer:
 
         until = self.max_steps if until is None else min(until, self.max_steps)
         self.stop_requested = False
-        with tqdm(
-            total=until, initial=self.step, desc="Training", disable=not progress, mininterval=0.5
-        ) as bar:
+        with tqdm(total=until, initial=self.step, desc="Training", disable=not progress, mininterval=0.5) as bar:
             while self.step < until and not self.stop_requested:
                 loss = self.train_step()
                 bar.update()
@@ -157,9 +155,7 @@ class Trainer:
         """Return mean `psnr` and `ssim` over the views of "test" or "train", `num_GS`, and the flavours."""
         views = {"test": self.scene.test, "train": self.scene.train}[split]
         if not views:
-            raise InputError(
-                f"Scene {self.scene.name} has no {split} views; lower test_every to hold some out."
-            )
+            raise InputError(f"Scene {self.scene.name} has no {split} views; lower test_every to hold some out.")
         rows = []
         for view in views:
             image, target = self.render(view), self._target(view)
@@ -180,7 +176,7 @@ class Trainer:
 
     def export_ply(self, path: str | Path) -> None:
         """Write the 62-property INRIA PLY, in the coordinates of the dataset."""
-        write_ply(self.splats, path)
+        write_ply(dict(self.splats.items()), path)
 
     def register_state(self, name: str, owner: Stateful) -> None:
         """Let the state of `owner` travel in snapshots and checkpoints under `name`."""
@@ -210,9 +206,7 @@ class Trainer:
         colors, _, info = self._rasterize(view, degree, background)
         return colors[0], self._target(view), info
 
-    def _rasterize(
-        self, view: View, degree: int, background: Tensor | None
-    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    def _rasterize(self, view: View, degree: int, background: Tensor | None) -> tuple[Tensor, Tensor, dict[str, Any]]:
         device = self.backend.device
         splats = self.splats
         return self.backend.rasterization(

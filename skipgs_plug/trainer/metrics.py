@@ -25,24 +25,31 @@ def ssim(render: Tensor, target: Tensor) -> float:
     """Return SSIM of images [H, W, 3] in [0, 1], as torchmetrics pads (see SSIM_FLAVOUR)."""
     from torchmetrics.functional.image import structural_similarity_index_measure
 
-    batch = (image.permute(2, 0, 1)[None] for image in (render.clamp(0, 1), target))
-    return float(structural_similarity_index_measure(*batch, data_range=1.0))
+    return float(structural_similarity_index_measure(batch(render.clamp(0, 1)), batch(target), data_range=1.0))  # type: ignore[arg-type]
+
+
+def require_lpips(net: str) -> None:
+    """Check that LPIPS can run without a download.
+
+    Raises:
+        InputError: torchvision or the backbone weights are not on this machine.
+    """
+    if importlib.util.find_spec("torchvision") is None:
+        raise InputError("LPIPS needs torchvision; run: pip install torchvision, or leave out --lpips-net.")
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / LPIPS_WEIGHTS[net]
+    if not weights.is_file():
+        raise InputError(f"LPIPS needs the backbone weights {weights}; put them there, or leave out --lpips-net.")
 
 
 def lpips(render: Tensor, target: Tensor, net: str) -> float:
-    """Return LPIPS (`net` alex or vgg, inputs normalised to [-1, 1]) of images [H, W, 3] in [0, 1].
-
-    Raises:
-        InputError: torchvision or the backbone weights are not on this machine; nothing is downloaded.
-    """
-    weights = Path(torch.hub.get_dir()) / "checkpoints" / LPIPS_WEIGHTS[net]
-    if importlib.util.find_spec("torchvision") is None:
-        raise InputError("LPIPS needs torchvision; run: pip install torchvision, or leave out --lpips-net.")
-    if not weights.is_file():
-        raise InputError(
-            f"LPIPS needs the backbone weights {weights}; put them there, or leave out --lpips-net."
-        )
+    """Return LPIPS (`net` alex or vgg, inputs normalised to [-1, 1]) of images [H, W, 3] in [0, 1]."""
     from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
 
-    batch = (image.permute(2, 0, 1)[None] for image in (render.clamp(0, 1), target))
-    return float(learned_perceptual_image_patch_similarity(*batch, net_type=net, normalize=True))  # type: ignore[arg-type]
+    require_lpips(net)
+    first, second = batch(render.clamp(0, 1)), batch(target)
+    return float(learned_perceptual_image_patch_similarity(first, second, net_type=net, normalize=True))  # type: ignore[arg-type]
+
+
+def batch(image: Tensor) -> Tensor:
+    """Return [H, W, 3] as [1, 3, H, W]."""
+    return image.permute(2, 0, 1)[None]

@@ -48,9 +48,7 @@ FLOOR, FIRST_BOX = len(SPHERES) + len(BOXES), len(SPHERES)
 def trace_view(viewmat: Array, K: Array, width: int, height: int) -> Array:
     """Return the image [H, W, 3] in [0, 1], mean of 2x2 samples per pixel."""
     x, y = np.meshgrid((np.arange(2 * width) + 0.5) / 2, (np.arange(2 * height) + 0.5) / 2)
-    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1).reshape(
-        -1, 3
-    )
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1).reshape(-1, 3)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     directions = rays @ viewmat[:3, :3]
     origin = -viewmat[:3, :3].T @ viewmat[:3, 3]

@@ -13,6 +13,8 @@ from skipgs_plug.trainer.errors import MissingFileError
 from skipgs_plug.trainer.files import write_aside, write_json
 from skipgs_plug.trainer.loop import Trainer
 
+CHECKPOINTS = "ckpt_*_rank0.pt"
+
 
 class RunFolder:
     """Names and writes what a run leaves behind; file names carry the last finished iteration, from 0."""
@@ -32,11 +34,14 @@ class RunFolder:
         trainer.save_checkpoint(path)
         return path
 
+    def has_checkpoints(self) -> bool:
+        return any((self.root / "ckpts").glob(CHECKPOINTS))
+
     def latest_checkpoint(self) -> Path:
         """Return the checkpoint of the highest iteration."""
-        found = list((self.root / "ckpts").glob("ckpt_*_rank0.pt"))
+        found = list((self.root / "ckpts").glob(CHECKPOINTS))
         if not found:
-            raise MissingFileError(f"{self.root / 'ckpts'} holds no ckpt_*_rank0.pt; start without --resume.")
+            raise MissingFileError(f"{self.root / 'ckpts'} holds no {CHECKPOINTS}; start without --resume.")
         return max(found, key=lambda path: int(path.stem.split("_")[1]))
 
     def write_ply(self, trainer: Trainer) -> Path:
@@ -57,7 +62,5 @@ class RunFolder:
         for i, view in enumerate(views):
             render = (trainer.render(view).clamp(0, 1) * 255).round().byte().cpu().numpy()
             both = np.concatenate([view.image.numpy(), render], axis=1)
-            with write_aside(
-                self.root / "renders" / f"{split}_step{trainer.step - 1}_{i:04d}.png"
-            ) as temporary:
+            with write_aside(self.root / "renders" / f"{split}_step{trainer.step - 1}_{i:04d}.png") as temporary:
                 Image.fromarray(both).save(temporary, format="PNG")

@@ -56,9 +56,7 @@ class Scene:
     background: tuple[float, float, float] = BLACK  # colour in [0, 1] behind the scene
 
 
-def load_scene(
-    path: str | Path, data_factor: int = 1, test_every: int = 8, init_num_pts: int = 100_000
-) -> Scene:
+def load_scene(path: str | Path, data_factor: int = 1, test_every: int = 8, init_num_pts: int = 100_000) -> Scene:
     """Load a COLMAP folder, a Blender folder or a packed .npz. Writes nothing.
 
     Args:
@@ -74,9 +72,7 @@ def load_scene(
     """
     path = Path(path).expanduser()
     if not path.exists():
-        raise MissingFileError(
-            f"Scene {path} does not exist; give a COLMAP folder, Blender folder or packed .npz."
-        )
+        raise MissingFileError(f"Scene {path} does not exist; give a COLMAP folder, Blender folder or packed .npz.")
     if path.is_file():
         from skipgs_plug.trainer.packed import load_packed
 
@@ -117,22 +113,16 @@ def assemble_scene(
 ) -> Scene:
     """Check what every format must fulfil and build the Scene; `source` is named in errors."""
     if not train:
-        raise InputError(
-            f"{source} leaves no training view; it holds {len(test)} views, raise test_every or add some."
-        )
+        raise InputError(f"{source} leaves no training view; it holds {len(test)} views, raise test_every or add some.")
     seen: set[str] = set()
     for view in train + test:
         if view.name in seen:
             raise InputError(f"{source} names two views {view.name!r}; image paths must be unique.")
         seen.add(view.name)
         if not (torch.isfinite(view.viewmat).all() and torch.isfinite(view.K).all()):
-            raise InputError(
-                f"{source}: camera of {view.name!r} holds NaN or infinity; reconstruct it again."
-            )
+            raise InputError(f"{source}: camera of {view.name!r} holds NaN or infinity; reconstruct it again.")
     if len(points) < 4:
-        raise InputError(
-            f"{source} has {len(points)} points, at least 4 are needed; run the reconstruction again."
-        )
+        raise InputError(f"{source} has {len(points)} points, at least 4 are needed; run the reconstruction again.")
     bad = int((~np.isfinite(points).all(axis=1)).sum())
     if bad:
         raise InputError(f"{source} has {bad} points with NaN or infinite coordinates; remove them.")

@@ -89,9 +89,7 @@ def load_checkpoint(trainer: Trainer, path: str | Path) -> None:
     """
     path = Path(path)
     if not path.is_file():
-        raise MissingFileError(
-            f"Checkpoint {path} does not exist; give a ckpts/ckpt_*.pt or start without --resume."
-        )
+        raise MissingFileError(f"Checkpoint {path} does not exist; give a ckpts/ckpt_*.pt or start without --resume.")
     try:
         content = torch.load(path, map_location=trainer.backend.device, weights_only=True)
         version, splats, config = content["version"], content["splats"], content["config"]
@@ -107,26 +105,20 @@ def load_checkpoint(trainer: Trainer, path: str | Path) -> None:
     ) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
-            f"Checkpoint {path} is damaged or not one of this trainer ({reason}); "
-            "use an older one or start afresh."
+            f"Checkpoint {path} is damaged or not one of this trainer ({reason}); use an older one or start afresh."
         ) from error
     if version != VERSION:
         raise InputError(f"Checkpoint {path} has version {version}, expected {VERSION}; start afresh.")
     if views != list(trainer.view_names):
-        raise InputError(
-            f"Checkpoint {path} was made with other training views; resume with its own scene and split."
-        )
+        raise InputError(f"Checkpoint {path} was made with other training views; resume with its own scene and split.")
     for name, value in dataclasses.asdict(trainer.config).items():
         if name not in FREE_FIELDS and config.get(name) != value:
             raise InputError(
-                f"Checkpoint {path} was made with {name}={config.get(name)!r}, not {value!r}; "
-                "resume with its settings."
+                f"Checkpoint {path} was made with {name}={config.get(name)!r}, not {value!r}; resume with its settings."
             )
     for name, tensor in splats.items():
         if not torch.isfinite(tensor).all():
-            raise InputError(
-                f"Checkpoint {path} holds NaN or infinite {name}; use an older one or start afresh."
-            )
+            raise InputError(f"Checkpoint {path} holds NaN or infinite {name}; use an older one or start afresh.")
     apply(trainer, content)
     for name in trainer.registered:
         if name not in content["registered"]:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.trainer.config import MIN_REFINE_EVERY, MIN_RESET_EVERY, TrainConfig
 from skipgs_plug.trainer.errors import InputError
 
 
@@ -17,8 +17,7 @@ def create_strategy(config: TrainConfig) -> Any:
         from gsplat import DefaultStrategy
     except ImportError as error:
         raise InputError(
-            f"Densification needs gsplat and it cannot be imported ({error}); "
-            "run: pip install 'skipgs_plug[full]'."
+            f"Densification needs gsplat and it cannot be imported ({error}); run: pip install 'skipgs_plug[full]'."
         ) from error
     return DefaultStrategy(
         prune_opa=config.prune_opa,
@@ -27,8 +26,8 @@ def create_strategy(config: TrainConfig) -> Any:
         prune_scale3d=config.prune_scale3d,
         refine_start_iter=config.scaled(config.refine_start_iter),
         refine_stop_iter=config.scaled(config.refine_stop_iter),
-        refine_every=config.scaled(config.refine_every),
-        reset_every=config.scaled(config.reset_every),
+        refine_every=config.scaled_interval(config.refine_every, MIN_REFINE_EVERY),
+        reset_every=config.scaled_interval(config.reset_every, MIN_RESET_EVERY),
         absgrad=config.absgrad,
     )
 

@@ -47,7 +47,8 @@ def make_scene(
     """
     focal = 0.5 * width / np.tan(0.5 * FOV_X)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    train, test = [], []
+    train: list[View] = []
+    test: list[View] = []
     for i in range(n_views):
         viewmat = look_at(dome_position(i, n_views), np.array([0.0, 0.0, 0.35]))
         image = trace_view(viewmat, K, width, height)

@@ -29,9 +29,7 @@ def value_noise(points: Array, frequency: float) -> Array:
 def tiles(p: Array) -> Array:
     checker = (np.floor(p[:, 0] / 0.4) + np.floor(p[:, 1] / 0.4)) % 2
     base = mix((0.78, 0.74, 0.66), (0.32, 0.40, 0.46), checker)
-    return (
-        base * (0.7 + 0.4 * value_noise(p, 5.0) * value_noise(p, 11.0) + 0.15 * value_noise(p, 23.0))[:, None]
-    )
+    return base * (0.7 + 0.4 * value_noise(p, 5.0) * value_noise(p, 11.0) + 0.15 * value_noise(p, 23.0))[:, None]
 
 
 def bricks(p: Array) -> Array:

@@ -1,0 +1,87 @@
+"""`skipgs-plug doctor`: what works on this machine, tried rather than guessed."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import platform
+import sys
+
+import torch
+
+FULL = "pip install 'skipgs_plug[full]'"
+# import name, distribution, what for
+EXTRAS = (
+    ("warp", "warp-lang", "rasterizer on the CPU"),
+    ("gsplat", "gsplat", "densification, rasterizer on CUDA"),
+    ("pycolmap", "pycolmap", "COLMAP scenes"),
+    ("PIL", "pillow", "images"),
+    ("plyfile", "plyfile", "PLY"),
+    ("scipy", "scipy", "initial scales"),
+    ("tyro", "tyro", "command line"),
+    ("tqdm", "tqdm", "progress bar"),
+    ("yaml", "pyyaml", "cfg.yml"),
+    ("torchmetrics", "torchmetrics", "SSIM"),
+    ("matplotlib", "matplotlib", "plots"),
+    ("tensorboard", "tensorboard", "--tensorboard"),
+)
+
+
+def main(argv: list[str]) -> int:
+    """Print the findings; 0 when a backend renders here, else 1."""
+    if argv:
+        print("usage: skipgs-plug doctor\n\nSay which backends and extras work here, and how to get the rest.")
+        return 0 if argv[0] in ("-h", "--help") else 2
+    cuda = torch.cuda.get_device_name() if torch.cuda.is_available() else "no CUDA device"
+    print(f"Python {platform.python_version()}, torch {torch.__version__}, {cuda}, {torch.get_num_threads()} threads")
+    print("\nPackages")
+    missing = [check_package(*extra) for extra in EXTRAS].count(False)
+    print("\nBackends")
+    works = [check_backend(name) for name in ("gsplat", "warp")]
+    if missing:
+        print(f"\nGet all missing packages with: {FULL}")
+    return 0 if any(works) else 1
+
+
+def check_package(module: str, distribution: str, purpose: str) -> bool:
+    try:
+        importlib.import_module(module)
+    except Exception as error:  # a broken installation fails in its own ways; each is a finding
+        reason = "missing" if isinstance(error, ModuleNotFoundError) else f"broken ({error})"
+        report(False, distribution, f"{reason}, for: {purpose}; run: pip install {distribution}")
+        return False
+    report(True, distribution, f"{importlib.metadata.version(distribution)}, for: {purpose}")
+    return True
+
+
+def check_backend(name: str) -> bool:
+    """Render four Gaussians at 16x16 with a backend, and differentiate."""
+    from skipgs_plug.trainer.backend import resolve_backend
+
+    try:
+        backend = resolve_backend(name)
+        means = torch.tensor([[0.0, 0, 2], [0.2, 0, 2], [0, 0.2, 2], [-0.2, 0, 2]], device=backend.device)
+        means.requires_grad_()
+        image, _, _ = backend.rasterization(
+            means=means,
+            quats=torch.tensor([[1.0, 0, 0, 0]], device=backend.device).repeat(4, 1),
+            scales=torch.full((4, 3), 0.1, device=backend.device),
+            opacities=torch.full((4,), 0.8, device=backend.device),
+            colors=torch.rand(4, 3, device=backend.device),
+            viewmats=torch.eye(4, device=backend.device)[None],
+            Ks=torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]], device=backend.device),
+            width=16,
+            height=16,
+        )
+        backend.loss(image[0], torch.zeros_like(image[0]), 0.2).backward()
+        if not (float(image.detach().sum()) > 0 and means.grad is not None and bool(means.grad.any())):
+            raise RuntimeError("it rendered nothing")
+    except Exception as error:  # whatever a backend fails with is the finding
+        report(False, name, str(error).splitlines()[0] if str(error) else type(error).__name__)
+        return False
+    report(True, name, f"renders and differentiates on {backend.device}")
+    return True
+
+
+def report(works: bool, name: str, finding: str) -> None:
+    print(f"  {'ok' if works else '--'}  {name:13} {finding}", file=sys.stdout)

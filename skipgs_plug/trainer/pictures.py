@@ -1,0 +1,91 @@
+"""Pictures of a comparison: truth, two renders and their errors; loss and skips over iterations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from skipgs_plug.trainer.files import write_aside
+from skipgs_plug.trainer.scene import View
+
+ERROR_GAIN = 4.0  # absolute errors are shown this much brighter
+ZOOM = 2
+SMOOTH = 0.95
+
+
+@dataclass
+class Curve:
+    """Loss and skip flag of every refinement iteration of one run."""
+
+    name: str
+    steps: list[int] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)
+    skipped: list[bool] = field(default_factory=list)
+
+    def add(self, step: int, loss: float, skipped: bool) -> None:
+        self.steps.append(step)
+        self.losses.append(loss)
+        self.skipped.append(skipped)
+
+
+def save_comparison(path: Path, views: list[View], ungated: list[Tensor], gated: list[Tensor], rows: int = 3) -> None:
+    """Write a PNG with columns truth, ungated, gated, error of each, for up to `rows` views.
+
+    Args:
+        views: held-out views, truth [H, W, 3] uint8 in them.
+        ungated, gated: their renders, each [H, W, 3] in [0, 1].
+    """
+    from PIL import Image, ImageDraw
+
+    picked = np.linspace(0, len(views) - 1, min(rows, len(views))).round().astype(int)
+    lines = []
+    for i in picked:
+        truth = views[i].image.numpy().astype(np.float32) / 255.0
+        plain, skipping = (render[i].numpy().clip(0, 1) for render in (ungated, gated))
+        errors = [(ERROR_GAIN * np.abs(image - truth)).clip(0, 1) for image in (plain, skipping)]
+        lines.append(np.concatenate([truth, plain, skipping, *errors], axis=1))
+    pixels = np.rint(np.concatenate(lines) * 255).astype(np.uint8).repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)
+    header = 20
+    sheet = Image.new("RGB", (pixels.shape[1], pixels.shape[0] + header), "white")
+    sheet.paste(Image.fromarray(pixels), (0, header))
+    titles = ("truth", "ungated", "gated", f"ungated error x{ERROR_GAIN:g}", f"gated error x{ERROR_GAIN:g}")
+    for k, title in enumerate(titles):
+        ImageDraw.Draw(sheet).text((k * pixels.shape[1] // 5 + 6, 4), title, fill="black")
+    with write_aside(path) as temporary:
+        sheet.save(temporary, format="PNG")
+
+
+def plot_refinement(path: Path, curves: list[Curve]) -> None:
+    """Plot smoothed loss of each run, and a tick for every skipped iteration with the share skipped so far."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 4.8), layout="constrained")
+    losses, skips = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    for curve in curves:
+        losses.plot(curve.steps, smooth(curve.losses), label=curve.name, linewidth=1.2)
+        if any(curve.skipped):
+            steps, skipped = np.array(curve.steps), np.array(curve.skipped)
+            skips.vlines(steps[skipped], 0, 1, color="0.75", linewidth=0.5)
+            share = np.cumsum(skipped) / np.arange(1, len(skipped) + 1)
+            skips.plot(steps, share, color="C1", label="share skipped so far")
+            skips.legend(loc="upper left", fontsize="small")
+    losses.set_ylabel("training loss (running mean)")
+    losses.legend()
+    skips.set_ylim(0, 1)
+    skips.set_ylabel("skipped")
+    skips.set_xlabel("iteration")
+    with write_aside(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=120)
+
+
+def smooth(values: list[float]) -> list[float]:
+    """Return the bias-corrected exponential running mean."""
+    total, weight, out = 0.0, 0.0, []
+    for value in values:
+        total = SMOOTH * total + (1 - SMOOTH) * value
+        weight = SMOOTH * weight + (1 - SMOOTH)
+        out.append(total / weight)
+    return out
