@@ -11,6 +11,7 @@ import importlib
 import sys
 import types
 import warnings
+import weakref
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -38,7 +39,8 @@ class InriaFamily(AbstractAdapter):
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
         self.output_folder: str | None = None  # `model_path` of the run, known when training begins
-        self._step: int | None = None
+        self._step = 0
+        self._model: Callable[[], Any] = lambda: None  # a new model means a new run
         self._key: Callable[[Any], Any] = lambda camera: getattr(camera, "image_name", None)
 
     @classmethod
@@ -80,17 +82,18 @@ class InriaFamily(AbstractAdapter):
 
         def heartbeat(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             # Frame 2 is the loop. Its variables are read once, before they hold an iteration's graph.
-            if self._step is None:
+            if self._model() is not args[0]:
                 self._begin(hooks, sys._getframe(2).f_locals)
+                self._model = weakref.ref(args[0])
             else:
                 self._step += 1
-            assert self._step is not None
             hooks.iteration(self._step)
             return original(*args, **kwargs)
 
         def rendered(original: Callable[..., Any], camera: Any, *args: Any, **kwargs: Any) -> Any:
-            if self.is_training_render(args, kwargs):
-                hooks.view(self._key(camera))
+            # Not a training camera without a name: the viewer's, which renders before the training view.
+            if self.is_training_render(args, kwargs) and (key := self._key(camera)) is not None:
+                hooks.view(key)
             return original(camera, *args, **kwargs)
 
         hooks.wrap(model, "update_learning_rate", heartbeat)

@@ -71,24 +71,19 @@ class StepAccumulator:
         return self.visible
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything but the mask, which like the gradients themselves belongs to the window."""
-        return {
-            "norm_mean": self._norm_mean,
-            "square_mean": self._square_mean,
-            "count": self.count,
-            "last_norm": self.last_norm,
-            "steps": self.steps,
-        }
+        """What outlives a window. A checkpoint holds no gradients, so a resumed run begins a new window."""
+        return {"norm_mean": self._norm_mean, "square_mean": self._square_mean, "steps": self.steps}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._norm_mean, self._square_mean = state["norm_mean"], state["square_mean"]
-        self.count, self.last_norm, self.steps = state["count"], state["last_norm"], state["steps"]
+        self.steps = state["steps"]
+        self.reset(stepped=False)
 
     def load_release_state(self, state: dict[str, Any]) -> None:
         """Continue from a state of the authors' controller (`state_version` 1)."""
         self._norm_mean, self._square_mean = state["single_scale_ema"], state.get("single_sq_ema")
-        self.count, self.last_norm = state["accum_count"], state["last_accum_norm"]
         self.steps = state["step_count"]
+        self.reset(stepped=False)
 
 
 def parameters_of(optimizers: Iterable[torch.optim.Optimizer]) -> list[Tensor]:

@@ -67,6 +67,7 @@ class SkipGate:
 
     Attributes:
         config: settings in force, completed by the adapter.
+        adapter: the adapter that is attached, None for a loop of your own.
         policy: the policy, None until an adapter knows when densification ends.
         trace: `TraceRow` per gated decision, when recorded.
 
@@ -107,11 +108,11 @@ class SkipGate:
         self._stepped: set[int] = set()
         self._updated = False
 
-        self._adapter: adapters.Adapter | None = None
+        self.adapter: adapters.Adapter | None = None
         self._hooks: Hooks | None = None
         if trainer is not None or adapter is not None:
             self._attach(trainer, adapter)
-        elif self.config.start_iter is None and policy is None:
+        elif self.config.start_iter is None and policy is None and self.config.enabled:
             raise SkipGSError("SkipGate needs a trainer, or start_iter=, the iteration at which densification ends.")
         else:
             self._configure(getattr(policy, "start_iter", 0), None, None, None, {})
@@ -238,7 +239,7 @@ class SkipGate:
         """The content of skipgs.json: settings, counters, seconds, per-view table."""
         t_total, t_post = self._timing()
         return build_report(
-            settings={**self.config.as_dict(), "adapter": self._adapter.name if self._adapter else None},
+            settings={**self.config.as_dict(), "adapter": self.adapter.name if self.adapter else None},
             stats=self._stats,
             floor=getattr(self.policy, "floor", None),
             t_total=t_total,
@@ -288,7 +289,7 @@ class SkipGate:
 
         Returns:
             `version` (2), `policy` (see `SkipPolicy.state_dict`), `stats` (counts, per-view rows),
-            `accumulator` (gradient window), `non_finite_in_a_row`, `clock` (seconds), `step` (last
+            `accumulator` (norms of single gradients), `non_finite_in_a_row`, `clock` (seconds), `step` (last
             iteration, None before the first).
         """
         if self.policy is None or self._pending_state is not None:
@@ -317,8 +318,9 @@ class SkipGate:
             return
         self._pending_state = None
         if is_release_state(state):
+            self._refuse_other_scene(state.get("view_loss_ema", ()))
             self.policy.load_state_dict(state)
-            self._stats.backwards, self._stats.skips = state["stats"]["bwd"], state["stats"]["skip"]
+            self._stats.load_release_state(state)
             self._steps.accumulator.load_release_state(state)
             self._step = None
         else:
@@ -356,7 +358,7 @@ class SkipGate:
     def _attach(self, trainer: Any, adapter: str | adapters.Adapter | None) -> None:
         if adapter is None or isinstance(adapter, str):
             adapter = adapters.find(trainer, adapter)
-        self._adapter = adapter
+        self.adapter = adapter
         self._hooks = Hooks(self, adapter.name, adapter.checked)
         try:
             if trainer is None:
@@ -384,15 +386,19 @@ class SkipGate:
             suggested["start_iter"] = start_iter
         self.config = config = dataclasses.replace(self.config, **suggested)
         if config.start_iter is None:
-            raise SkipGSError("This trainer does not densify, so the gate cannot know when to begin; give start_iter=.")
-        self._start = config.start_iter
+            if config.enabled:
+                raise SkipGSError(
+                    "This trainer does not densify, so the gate cannot know when to begin; give start_iter=."
+                )
+            self.config = config = dataclasses.replace(config, start_iter=0)
+        self._start = int(config.start_iter or 0)
         if view_names is not None:
             self._view_names = require_unique(view_names)
         if config.enabled and max_steps is not None and self._start > max_steps:
             log.warning("The gate starts at %d, after the last iteration %d.", self._start, max_steps)
         if self.policy is None:
             self.policy = SkipPolicy(
-                start_iter=config.start_iter,
+                start_iter=self._start,
                 threshold=config.threshold,
                 ema_decay=config.ema_decay,
                 warmup=config.warmup,
@@ -414,8 +420,8 @@ class SkipGate:
         self._step = step
         self._begin_iteration()
         self._clock.open(post=step >= self._start)
-        if self._steps.accumulating and self._hooks is not None and self._adapter is not None:
-            self._steps.attach(self._hooks, self._adapter.optimizers, lambda: (self._ran, self._step_at_once))
+        if self._steps.accumulating and self._hooks is not None and self.adapter is not None:
+            self._steps.attach(self._hooks, self.adapter.optimizers, lambda: (self._ran, self._step_at_once))
 
     def _begin_iteration(self) -> None:
         self._steps.begin_iteration()
@@ -488,7 +494,7 @@ class SkipGate:
         if loss - loss != 0.0:  # NaN or infinite
             return self._guard.answer(view, loss, step, self._mean(view), self._n_views)
         self._guard.in_a_row = 0
-        if self._adapter is not None and self._adapter.must_run(step):
+        if self.adapter is not None and self.adapter.must_run(step):
             return decision.FORCED
         return self.policy.decide(view, loss, step)
 
@@ -511,13 +517,13 @@ class SkipGate:
         return self.policy.means.get(view) if isinstance(self.policy, SkipPolicy) else None
 
     def _timing(self) -> tuple[float, float]:
-        own = None if self._adapter is None else self._adapter.timing()
+        own = None if self.adapter is None else self.adapter.timing()
         return (self._clock.t_total, self._clock.t_post) if own is None else own
 
     def _refuse_other_scene(self, views: Iterable[str]) -> None:
         if self._view_names is None:
             return
-        unknown = sorted(set(views) - set(self._view_names))
+        unknown = sorted({str(view) for view in views} - set(self._view_names))
         if unknown:
             raise SkipGSError(
                 f"The gate state belongs to another scene: it knows view {unknown[0]!r}, which is not among "
@@ -525,9 +531,9 @@ class SkipGate:
             )
 
     def _require_manual(self, verb: str) -> None:
-        if self._hooks is not None and self._adapter is not None:
+        if self._hooks is not None and self.adapter is not None:
             raise GateOrderError(
-                f"{verb}() is for loops of your own; this gate is attached by adapter {self._adapter.name!r}, "
+                f"{verb}() is for loops of your own; this gate is attached by adapter {self.adapter.name!r}, "
                 "and the trainer calls its own."
             )
 

@@ -35,7 +35,7 @@ class NonFiniteGuard:
         self.in_a_row += 1
         if self._mode == "raise":
             raise SkipGSError(f"{what}: it came out of the trainer so; check that image and camera.")
-        if self._mode == "skip" and self.in_a_row >= max(MIN_IN_A_ROW, n_views):
+        if self.in_a_row >= max(MIN_IN_A_ROW, n_views):
             raise SkipGSError(
                 f"{what}, like {self.in_a_row - 1} losses before it: the model is lost; "
                 "go back to a checkpoint and lower the learning rates."

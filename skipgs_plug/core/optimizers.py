@@ -36,9 +36,7 @@ class OptimizerSteps:
         self._attached: dict[int, torch.optim.Optimizer] = {}
 
     def begin_iteration(self) -> None:
-        """Forget the previous iteration's answer; a window that was stepped is over."""
-        if self._answer:
-            self.accumulator.reset()
+        """Forget the previous iteration's answer."""
         self._answer = None
 
     def step(self, optimizers: list[torch.optim.Optimizer], args: tuple[Any, ...], ran: bool, at_once: bool) -> bool:
@@ -83,10 +81,13 @@ class OptimizerSteps:
 
         def around_step(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             ran, at_once = state()
-            if args and isinstance(args[0], torch.Tensor) and args[0].dtype == torch.bool and ran:
-                args = (self.accumulator.see(args[0]), *args[1:])
+            masked = bool(args) and isinstance(args[0], torch.Tensor) and args[0].dtype == torch.bool
+            if masked and ran and self._answer is None:
+                self.accumulator.see(args[0])
             if not self._due(list(optimizers()), ran, at_once):
                 return None
+            if masked:
+                args = (self.accumulator.visible, *args[1:])
             return original(*args, **kwargs)
 
         def around_zero(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -105,6 +106,8 @@ class OptimizerSteps:
                 self.accumulator.observe(gradient_norm(parameters_of(optimizers)))
             self._answer = ran and (at_once or self.accumulator.due())
             self._may_zero = self._answer
+            if self._answer:
+                self.accumulator.reset()
         return self._answer
 
 

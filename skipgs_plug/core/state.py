@@ -10,7 +10,8 @@ from skipgs_plug.core.errors import SkipGSError
 POLICY_VERSION = 2
 GATE_VERSION = 2
 POLICY_KEYS = ("means", "budget", "warmup_end", "pause_until", "events")
-GATE_KEYS = ("policy", "stats", "accumulator", "clock", "step")
+GATE_KEYS = ("policy", "stats", "accumulator", "non_finite_in_a_row", "clock", "step")
+STATS_KEYS = ("iterations", "backwards", "skips", "reasons", "events", "views")
 BUDGET_KEYS = ("floor", "backwards", "skips", "calibrating", "would_skip", "would_total")
 
 
@@ -49,6 +50,7 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
     if version != GATE_VERSION:
         raise SkipGSError(f"Gate state has version {version!r}, expected {GATE_VERSION}; start the gate afresh.")
     require(state, GATE_KEYS, "Gate state")
+    require(state["stats"], STATS_KEYS, "Gate state's stats")
     return dict(state)
 
 

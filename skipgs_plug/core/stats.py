@@ -71,6 +71,11 @@ class GateStats:
             for view, row in sorted(self._views.items())
         ]
 
+    def load_release_state(self, state: dict[str, Any]) -> None:
+        """Take the counts from a state of the authors' controller, which has none per view."""
+        self.backwards, self.skips = state["stats"]["bwd"], state["stats"]["skip"]
+        self.iterations = self.gated
+
     def state_dict(self) -> dict[str, Any]:
         return {
             "iterations": self.iterations,
