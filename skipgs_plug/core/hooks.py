@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.intercept import Around, Patches, intercept_tensor_backward
+from skipgs_plug.core.views import view_key
 
 if TYPE_CHECKING:
-    from skipgs_plug.core.gate import SkipGate
+    from skipgs_plug.core.adapter import Adapter
+    from skipgs_plug.core.engine import Engine
 
 CHECKED_ITERATIONS = 10  # after these, exactly one training backward each must have been seen
 
@@ -23,9 +26,12 @@ class Hooks:
     through and counts as a mismatch.
     """
 
-    def __init__(self, gate: SkipGate, adapter_name: str, checked: str) -> None:
-        self._gate = gate
-        self._expectation = f"Adapter {adapter_name!r} was checked with {checked}."
+    def __init__(self, engine: Engine, adapter: Adapter, given: frozenset[str]) -> None:
+        """Make hooks for an adapter; `given` names the settings that the user gave."""
+        self._engine = engine
+        self._adapter = adapter
+        self._given = given
+        self._expectation = f"Adapter {adapter.name!r} was checked with {adapter.checked}."
         self._patches = Patches(self._expectation)
         self._ready = False
         self._view: Any = None
@@ -61,7 +67,8 @@ class Hooks:
             world_size: Number of processes, when the trainer knows better than WORLD_SIZE.
             defaults: Settings that suit this trainer, used where the user gave none.
         """
-        self._gate._configure(start_iter, view_names, max_steps, world_size, defaults or {})
+        suggested = {name: value for name, value in (defaults or {}).items() if name not in self._given}
+        self._engine.configure(start_iter, view_names, max_steps, world_size, suggested)
         self._ready = True
 
     # What the trainer does.
@@ -75,7 +82,9 @@ class Hooks:
             self._iterations += 1
             self._backwards_now = 0
             self._view = self._signal = None
-            self._gate._open_iteration(step)
+            self._engine.open_iteration(step)
+            if self._engine.steps.accumulating:
+                self._engine.steps.attach(self, self._adapter.optimizers, self._engine)
 
     def view(self, key: Any) -> None:
         """The present iteration renders this view for training; the last one before the backward counts."""
@@ -86,8 +95,9 @@ class Hooks:
         self._signal = value
 
     def event(self, kind: str) -> None:
-        """A structural change (prune, opacity reset, optimizer rebuild) happens now."""
-        self._gate._notify_event_now(kind)
+        """A structural change (prune, opacity reset, optimizer rebuild) happens now; before training none counts."""
+        if self._engine.policy is not None and self._engine.step is not None:
+            self._engine.notify_event(kind, self._engine.step)
 
     def backward(self, loss: torch.Tensor, run: Callable[[], Any], view: Any = None) -> Any:
         """Gate a training backward: `run()` is the real one, and is called unless it is skipped."""
@@ -103,7 +113,8 @@ class Hooks:
             view = self._view if view is None else view
             if view is None:
                 raise self._mismatch("no training view was rendered before the backward")
-            return self._gate._gate_backward(loss, view, run, self._signal)
+            self._engine.gate(view_key(view), loss if self._signal is None else self._signal, run)
+            return None
 
     # How to hold on to the trainer.
 
@@ -132,7 +143,7 @@ class Hooks:
         """
 
         def around(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            return None if self._gate.skipped else original(*args, **kwargs)
+            return None if self._engine.skipped else original(*args, **kwargs)
 
         for name in names:
             self.wrap(owner, name, around)
@@ -146,9 +157,9 @@ class Hooks:
         self._patches.add_undo(label, undo)
 
     @property
-    def state(self) -> SkipGate:
+    def state(self) -> Engine:
         """What has `state_dict` and `load_state_dict`, for trainers that carry others' state along."""
-        return self._gate
+        return self._engine
 
     # What the gate asks.
 
@@ -184,19 +195,11 @@ class Hooks:
             "Name another adapter, or gate the loop by hand with SkipGate(start_iter=...)."
         )
 
-    def _detaching_on_error(self) -> _DetachOnError:
-        return _DetachOnError(self._gate)
-
-
-class _DetachOnError:
-    """Leaves nothing patched behind when the gate itself gives up."""
-
-    def __init__(self, gate: SkipGate) -> None:
-        self._gate = gate
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, SkipGSError):
-            self._gate.detach()
+    @contextmanager
+    def _detaching_on_error(self) -> Iterator[None]:
+        """Leave nothing patched behind when the gate itself gives up."""
+        try:
+            yield
+        except SkipGSError:
+            self.restore()
+            raise

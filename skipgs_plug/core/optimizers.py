@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
@@ -18,6 +18,15 @@ from skipgs_plug.core.errors import SkipGSError
 
 if TYPE_CHECKING:
     from skipgs_plug.core.hooks import Hooks
+
+
+class Iteration(Protocol):
+    """What is known of the present iteration, as in `OptimizerSteps.step`."""
+
+    ran: bool
+
+    @property
+    def step_at_once(self) -> bool: ...
 
 
 class OptimizerSteps:
@@ -61,7 +70,7 @@ class OptimizerSteps:
         self,
         hooks: Hooks,
         optimizers: Callable[[], Iterable[torch.optim.Optimizer]],
-        state: Callable[[], tuple[bool, bool]],
+        iteration: Iteration,
     ) -> None:
         """Make the trainer's own `step` and `zero_grad` calls wait for the window.
 
@@ -70,7 +79,7 @@ class OptimizerSteps:
         Args:
             hooks: Where replaced methods are listed.
             optimizers: Gives all optimizers of the trainer.
-            state: Gives `ran` and `at_once` of the present iteration, as in `step`.
+            iteration: What happened in the present iteration.
 
         Raises:
             SkipGSError: The adapter names no optimizers.
@@ -80,7 +89,7 @@ class OptimizerSteps:
             raise SkipGSError("This trainer keeps its own schedule of optimizer steps; leave step_mode at 'off'.")
 
         def around_step(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            ran, at_once = state()
+            ran, at_once = iteration.ran, iteration.step_at_once
             masked = bool(args) and isinstance(args[0], torch.Tensor) and args[0].dtype == torch.bool
             if masked and ran and self._answer is None:
                 self.accumulator.see(args[0])

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.stats import GateStats
 
 if TYPE_CHECKING:
@@ -15,27 +16,17 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = 1
 
 
-def build_report(
-    settings: dict[str, Any],
-    stats: GateStats,
-    floor: float | None,
-    t_total: float,
-    t_post: float,
-    views: list[dict[str, Any]],
-) -> dict[str, Any]:
-    """Return the content of skipgs.json.
+def counters(stats: GateStats, floor: float | None, t_total: float, t_post: float) -> dict[str, Any]:
+    """Return what was counted and timed.
 
     Returns:
-        `schema_version` (1); `settings`; `iterations` (training backwards seen, run or skipped);
-        `gated_iterations` (those from start_iter on, `backwards_run` + `backwards_skipped`);
-        `min_bwd_ratio_effective` (floor in force, None for a policy without); `paused`, `non_finite`,
-        `warm_up` (gated iterations by reason); `reasons` (all of them); `events` (structural changes by
-        kind); `t_total`, `t_post` (seconds of training, and of its part from start_iter on); `views` (one row
-        per view).
+        `iterations` (training backwards seen, run or skipped); `gated_iterations` (those from start_iter on,
+        `backwards_run` + `backwards_skipped`); `min_bwd_ratio_effective` (floor in force, None for a policy
+        without); `paused`, `non_finite` (gated iterations with that reason); `reasons` (all of them);
+        `events` (structural changes by kind); `t_total`, `t_post` (seconds of training, and of its part from
+        start_iter on).
     """
     return {
-        "schema_version": SCHEMA_VERSION,
-        "settings": settings,
         "iterations": stats.iterations,
         "gated_iterations": stats.gated,
         "backwards_run": stats.backwards,
@@ -43,13 +34,32 @@ def build_report(
         "min_bwd_ratio_effective": floor,
         "paused": stats.reasons.get("pause", 0),
         "non_finite": stats.reasons.get("non-finite", 0),
-        "warm_up": stats.reasons.get("warm-up", 0),
         "reasons": dict(stats.reasons),
         "events": dict(stats.events),
         "t_total": t_total,
         "t_post": t_post,
-        "views": views,
     }
+
+
+def build_report(settings: dict[str, Any], counted: dict[str, Any], views: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the content of skipgs.json: `schema_version` (1), `settings`, all counters, `views` (one row each)."""
+    return {"schema_version": SCHEMA_VERSION, "settings": settings, **counted, "views": views}
+
+
+def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
+    """Return the counters as a few lines for people."""
+    if not config.enabled:
+        return f"SkipGS: off, {counted['iterations']:,} backwards seen."
+    gated, skipped, reasons = counted["gated_iterations"], counted["backwards_skipped"], counted["reasons"]
+    floor = counted["min_bwd_ratio_effective"]
+    share = 100 * skipped / gated if gated else 0.0
+    return (
+        f"SkipGS: {skipped:,} of {gated:,} backwards skipped ({share:.1f} %) since iteration "
+        f"{config.start_iter or 0:,}, {counted['iterations']:,} iterations in all.\n"
+        f"  floor {'none' if floor is None else format(floor, '.3f')}, warm-up {reasons.get('warm-up', 0):,}, "
+        f"held back by the floor {reasons.get('budget', 0):,}, paused {counted['paused']:,} "
+        f"(events {sum(counted['events'].values()):,}), non-finite {counted['non_finite']:,}"
+    )
 
 
 def write_report(gate: SkipGate, path: str | Path) -> None:

@@ -71,6 +71,16 @@ class GateStats:
             for view, row in sorted(self._views.items())
         ]
 
+    def scalars(self) -> dict[str, float]:
+        """Counts as a flat dict for loggers."""
+        return {
+            "skipgs/skip_ratio": self.skip_ratio,
+            "skipgs/backwards": float(self.backwards),
+            "skipgs/skips": float(self.skips),
+            "skipgs/paused": float(self.reasons.get("pause", 0)),
+            "skipgs/non_finite": float(self.reasons.get("non-finite", 0)),
+        }
+
     def load_release_state(self, state: dict[str, Any]) -> None:
         """Take the counts from a state of the authors' controller, which has none per view."""
         self.backwards, self.skips = state["stats"]["bwd"], state["stats"]["skip"]
