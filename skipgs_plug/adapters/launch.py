@@ -17,7 +17,7 @@ import torch
 from skipgs_plug.core.errors import SkipGSError
 
 
-def run_script(command: Sequence[str]) -> int:
+def run_script(command: Sequence[str], attach: Callable[[], None] | None = None) -> int:
     """Execute an unmodified script in its own checkout and give its exit code.
 
     The script sees its own folder first on `sys.path`, its own `sys.argv`, and `__name__ == "__main__"`.
@@ -25,6 +25,7 @@ def run_script(command: Sequence[str]) -> int:
 
     Args:
         command: What would follow `python`: a script and its arguments, or `-m`, a module and its arguments.
+        attach: Called where the script would be: its folder is on `sys.path`, nothing of it is imported.
 
     Raises:
         SkipGSError: There is no such script or module, or a module of the script's checkout was imported
@@ -33,6 +34,8 @@ def run_script(command: Sequence[str]) -> int:
     script, arguments, run = _resolve(command)
     first_on_path = Path.cwd() if command[0] == "-m" else script.parent
     with _as_main_program(script, arguments, first_on_path), _whole_checkpoints():
+        if attach is not None:
+            attach()
         try:
             run()
         except SystemExit as stop:

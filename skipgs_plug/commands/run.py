@@ -1,3 +1,138 @@
-"""`skipgs-plug run`: an unmodified training script, gated, and on the CPU where there is no GPU."""
+"""`skipgs-plug run ADAPTER -- train.py ...`: an unmodified training script, gated."""
 
 from __future__ import annotations
+
+import contextlib
+import dataclasses
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.cuda_redirect import cuda_on_cpu
+from skipgs_plug.adapters.launch import run_script
+from skipgs_plug.adapters.registry import get_adapter
+from skipgs_plug.core.report import write_report
+from skipgs_plug.fallback_raster.compat import FAMILIES, serve
+
+# Stand-ins are named after the extension modules, which not every adapter has to itself.
+FAMILY_OF = {"step_trainer": "pip_gaussian_splatting"}
+
+
+@dataclass
+class GateOptions:
+    """Settings of the gate, named as in SkipConfig; what is left out is the adapter's choice."""
+
+    start_iter: int | None = None
+    """First iteration that may be skipped; default: end of densification."""
+    threshold: float | None = None
+    """Skip when loss <= mean * (1 + threshold); default 0."""
+    ema_decay: float | None = None
+    """Decay of each view's mean loss; default 0.95."""
+    warmup: int | None = None
+    """Gated iterations without skipping; default 500."""
+    min_bwd_ratio: float | Literal["auto"] | None = None
+    """Least share of gated iterations with a backward; default auto."""
+    on_nonfinite: Literal["skip", "raise", "pass"] | None = None
+    """What a NaN or infinite loss does; default skip."""
+    pause_iters: int | None = None
+    """Real backwards after a prune or reset; default: one round of the views, at least 500."""
+    step_mode: Literal["off", "adaptive_norm"] | None = None
+    """Accumulate gradients over several backwards before a step; default off."""
+    step_trigger: Literal["snr", "ref_k"] | None = None
+    """When an accumulated step is taken; default snr."""
+
+
+@dataclass
+class Args:
+    """Run a training script of another project, unedited and gated.
+
+    What follows `--` is what would follow `python`, for example: skipgs-plug run fastgs -- train.py -s data/garden.
+    Exit code, output and files are the script's own; skipgs.json is added to its output folder.
+    """
+
+    adapter: tyro.conf.Positional[str]
+    """Name of the trainer: inria, fastgs, taming, ..."""
+    gate: tyro.conf.OmitArgPrefixes[GateOptions] = dataclasses.field(default_factory=GateOptions)
+    no_gate: bool = False
+    """Change nothing in training; skipgs.json then holds the seconds of the ungated run."""
+    cpu: bool = False
+    """Run on the CPU: CUDA requests are redirected, and CUDA modules are served by the CPU rasterizer."""
+
+
+def main(argv: list[str]) -> int:
+    ours, command = split(argv)
+    args = tyro.cli(Args, args=ours, prog="skipgs-plug run", config=(tyro.conf.FlagCreatePairsOff,))
+    return run(args, command)
+
+
+def split(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Separate our options from the script's command line."""
+    if "--" not in argv:
+        return list(argv), []
+    at = list(argv).index("--")
+    return list(argv[:at]), list(argv[at + 1 :])
+
+
+def run(args: Args, command: list[str]) -> int:
+    """Run the script and write skipgs.json; see `Args`.
+
+    Returns:
+        The script's exit code.
+
+    Raises:
+        SkipGSError: The script cannot be run or gated, or did not train.
+    """
+    adapter = get_adapter(args.adapter)()
+    gates: list[SkipGate] = []
+
+    def attach() -> None:
+        gates.append(SkipGate(adapter=adapter, **gate_settings(args)))
+
+    with cpu_instead_of_cuda(args, command) if args.cpu else contextlib.nullcontext():
+        try:
+            code = run_script(command, attach)
+        finally:
+            for gate in gates:
+                gate.detach()
+                report(gate, adapter)
+    if code == 0:
+        gates[0].verify()
+    return code
+
+
+def gate_settings(args: Args) -> dict[str, Any]:
+    """Return the options that were given."""
+    given = {name: value for name, value in dataclasses.asdict(args.gate).items() if value is not None}
+    return given | ({"enabled": False} if args.no_gate else {})
+
+
+def report(gate: SkipGate, adapter: AbstractAdapter) -> None:
+    """Write what is known, also of a run that failed half-way, once the script has an output folder."""
+    if gate.stats()["iterations"] == 0:
+        return
+    folder = Path(getattr(adapter, "output_folder", None) or ".")
+    write_report(gate, folder / "skipgs.json")
+    print(gate.summary(), file=sys.stderr)
+
+
+@contextlib.contextmanager
+def cpu_instead_of_cuda(args: Args, command: Sequence[str]) -> Iterator[None]:
+    """Let the script believe in CUDA.
+
+    Raises:
+        SkipGSError: There are no stand-ins for what this trainer imports.
+    """
+    family = FAMILY_OF.get(args.adapter, args.adapter)
+    if family == "inria" and "sparse_adam" in command:
+        family = "inria_accelerated"
+    if family not in FAMILIES:
+        names = sorted((set(FAMILIES) | set(FAMILY_OF)) - {"inria_accelerated", *FAMILY_OF.values()})
+        raise SkipGSError(f"--cpu has no stand-ins for {args.adapter!r}; it has for {', '.join(names)}.")
+    with serve(family), cuda_on_cpu():
+        yield

@@ -41,6 +41,17 @@ def test_script_sees_its_own_folder_arguments_and_name(checkout, tmp_path, monke
     assert (sys.argv, sys.path) == before
 
 
+def test_attach_can_reach_into_what_the_script_will_import(checkout, capfd):
+    def attach():
+        import neighbour_of_script
+
+        neighbour_of_script.VALUE = "patched"
+
+    script = write(checkout, "from neighbour_of_script import VALUE\nprint(VALUE)\n")
+    assert run_script([script], attach) == 0
+    assert capfd.readouterr().out == "patched\n"
+
+
 @pytest.mark.parametrize(
     ("ending", "code"),
     [("sys.exit()", 0), ("sys.exit(3)", 3), ("sys.exit('no data')", 1), ("raise KeyboardInterrupt", 130)],

@@ -1,0 +1,163 @@
+"""`skipgs-plug run` on a look-alike of Inria's checkout that asks for CUDA and its extension modules."""
+
+import json
+import sys
+import textwrap
+
+import pytest
+import torch
+
+from skipgs_plug import cli
+
+RENDERER = """
+    import torch
+    from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
+
+    def render(camera, model):
+        points = torch.zeros_like(model.xyz, requires_grad=True, device="cuda")
+        settings = GaussianRasterizationSettings(
+            image_height=16, image_width=16, tanfovx=0.5, tanfovy=0.5, bg=torch.zeros(3, device="cuda"),
+            scale_modifier=1.0, viewmatrix=torch.eye(4).cuda(), projmatrix=camera.projection,
+            sh_degree=0, campos=torch.zeros(3), prefiltered=False, debug=False)
+        image, radii = GaussianRasterizer(settings)(
+            means3D=model.xyz, means2D=points, opacities=torch.full((len(model.xyz), 1), 0.8).cuda(),
+            colors_precomp=model.color, scales=torch.full((len(model.xyz), 3), 0.2).cuda(),
+            rotations=torch.tensor([[1.0, 0, 0, 0]]).cuda().repeat(len(model.xyz), 1))
+        return {"render": image, "radii": radii}
+"""
+
+MODEL = """
+    import torch
+    from simple_knn._C import distCUDA2
+
+    class GaussianModel:
+        def __init__(self):
+            rng = torch.Generator().manual_seed(0)
+            points = torch.rand(12, 3, generator=rng) - 0.5 + torch.tensor([0, 0, 2.0])
+            assert (distCUDA2(points.cuda()) > 0).all()
+            self.xyz = torch.nn.Parameter(points.cuda())
+            self.color = torch.nn.Parameter(torch.rand(12, 3, generator=rng).cuda())
+
+        def training_setup(self):
+            self.optimizer = torch.optim.Adam([self.xyz, self.color], lr=0.01)
+
+        def update_learning_rate(self, iteration):
+            pass
+"""
+
+TRAIN = """
+    import random, sys
+    from types import SimpleNamespace
+    import torch
+    from gaussian_renderer import render
+    from scene.gaussian_model import GaussianModel
+
+    class Camera:
+        def __init__(self, name, shade):
+            self.image_name = name
+            self.image = torch.full((3, 16, 16), shade, device="cuda")
+            self.projection = torch.diag(torch.tensor([2.0, 2.0, 1.0, 0.0]))
+            self.projection[2, 3] = 1.0
+
+    def training(opt, out):
+        gaussians = GaussianModel()
+        gaussians.training_setup()
+        cameras = [Camera(f"view{i}", 0.2 * i) for i in range(4)]
+        scene = SimpleNamespace(model_path=out, getTrainCameras=lambda: cameras)
+        start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        for iteration in range(1, opt.iterations + 1):
+            start.record()
+            gaussians.update_learning_rate(iteration)
+            viewpoint_cam = random.choice(cameras)
+            loss = (render(viewpoint_cam, gaussians)["render"] - viewpoint_cam.image).abs().mean()
+            if "--fail" in sys.argv and iteration == 5:
+                sys.exit(3)
+            loss.backward()
+            end.record()
+            torch.cuda.synchronize()
+            gaussians.optimizer.step()
+            gaussians.optimizer.zero_grad(set_to_none=True)
+        torch.save((gaussians.xyz, gaussians.color), out + "/model.pth")
+
+    if __name__ == "__main__":
+        random.seed(0)
+        if "--idle" not in sys.argv:
+            training(SimpleNamespace(iterations=60, densify_until_iter=20), sys.argv[1])
+        print("Training complete.")
+"""
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """Path of the look-alike's train.py; forgets its modules afterwards."""
+    folder = tmp_path / "checkout"
+    (folder / "gaussian_renderer").mkdir(parents=True)
+    (folder / "scene").mkdir()
+    (folder / "gaussian_renderer" / "__init__.py").write_text(textwrap.dedent(RENDERER))
+    (folder / "scene" / "__init__.py").write_text("")
+    (folder / "scene" / "gaussian_model.py").write_text(textwrap.dedent(MODEL))
+    (folder / "train.py").write_text(textwrap.dedent(TRAIN))
+    yield str(folder / "train.py")
+    forget()
+
+
+def forget():
+    for name in ("gaussian_renderer", "scene", "scene.gaussian_model"):
+        sys.modules.pop(name, None)
+
+
+def test_script_is_gated_on_the_cpu(checkout, tmp_path, capfd):
+    before = torch.Tensor.backward
+    code = cli.main(["run", "inria", "--cpu", "--warmup", "10", "--", checkout, str(tmp_path)])
+    captured = capfd.readouterr()
+    assert code == 0
+    assert captured.out.endswith("Training complete.\n")  # what we say goes to stderr
+    assert "SkipGS: " in captured.err
+    report = json.loads((tmp_path / "skipgs.json").read_text())
+    assert report["iterations"] == 60 and report["gated_iterations"] == 41
+    assert report["backwards_run"] + report["backwards_skipped"] == 41 and report["backwards_skipped"] > 0
+    assert {row["view"] for row in report["views"]} <= {f"view{i}" for i in range(4)}
+    assert report["settings"]["warmup"] == 10 and report["settings"]["start_iter"] == 20
+    assert torch.Tensor.backward is before and "diff_gaussian_rasterization" not in sys.modules
+
+
+def test_inert_and_never_skipping_train_bit_for_bit_alike(checkout, tmp_path):
+    models = []
+    for name, option in (("off", ["--no-gate"]), ("all", ["--min-bwd-ratio", "1.0"]), ("gated", ["--warmup", "5"])):
+        (tmp_path / name).mkdir()
+        assert cli.main(["run", "inria", "--cpu", *option, "--", checkout, str(tmp_path / name)]) == 0
+        models.append(torch.load(tmp_path / name / "model.pth", weights_only=False))
+        forget()
+    off, never, gated = models
+    assert all(torch.equal(a, b) for a, b in zip(off, never, strict=True))
+    assert not torch.equal(off[0], gated[0])
+    report = json.loads((tmp_path / "off" / "skipgs.json").read_text())
+    assert report["settings"]["enabled"] is False and report["iterations"] == 60
+    assert report["t_total"] > report["t_post"] > 0
+
+
+def test_failing_script_keeps_its_code_and_leaves_a_report(checkout, tmp_path):
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path), "--fail"]) == 3
+    assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 4
+
+
+def test_script_that_never_trains_is_an_error(checkout, tmp_path, capfd):
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path), "--idle"]) == cli.BAD_INPUT
+    assert "no iteration of a training loop was seen" in capfd.readouterr().err
+    assert not (tmp_path / "skipgs.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["nerfacto", "--", "train.py"], "no adapter 'nerfacto'"),
+        (["reference", "--cpu", "--", "train.py"], "no stand-ins for 'reference'"),
+        (["inria"], "no script to run"),
+        (["inria", "--", "absent.py"], "absent.py: name the training script after '--'"),
+        (["inria", "--ema-decay", "2", "--", __file__], "ema_decay must be in [0, 1)"),
+    ],
+)
+def test_bad_input_is_one_sentence(arguments, sentence, capfd):
+    assert cli.main(["run", *arguments]) == cli.BAD_INPUT
+    error = capfd.readouterr().err
+    assert sentence in error and error.count("\n") == 1
