@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from .binning import TILE, Bins, bin_gaussians, pack
 from .blend import MAX_CHANNELS, PAIR, backward_worker, forward_worker, reduce_pairs
+from .launch import scratch
 from .project import project_backward, project_forward
 from .sh import sh_backward, sh_forward
 from .shortcuts import VISIBLE_ONLY, active_shortcuts
@@ -175,7 +176,7 @@ class Blend(torch.autograd.Function):
         v_opacities, v_colors = torch.zeros_like(opacities), torch.zeros_like(colors)
         with_absolute = ctx.absolute is not None
         absolute = ctx.absolute if with_absolute else torch.empty(0)
-        v_pairs = torch.empty(len(bins.tile_list), PAIR)
+        v_pairs = scratch("v_pairs", len(bins.tile_list), PAIR)
         for channel in range(0, channels, MAX_CHANNELS):
             some = min(MAX_CHANNELS, channels - channel)
             if channels > MAX_CHANNELS:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .launch import FloatArray, IntArray, get_num_threads, worker
+from .launch import FloatArray, IntArray, get_num_threads, scratch, worker
 from .shortcuts import active_shortcuts
 
 TILE = 16
@@ -282,9 +282,9 @@ def bin_gaussians(
     n = visible.numel()
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     tiles = tiles_x * tiles_y
-    scratch = torch.empty(2, 2 * n, dtype=torch.int32)
-    depth_sort(depths, visible, scratch[0], scratch[1], n)
-    order = scratch[1, n:]
+    sorted_rows = torch.empty(2 * n, dtype=torch.int32)
+    depth_sort(depths, visible, scratch("depth_keys", 2 * n, dtype=torch.int32), sorted_rows, n)
+    order = sorted_rows[n:]
     records = torch.empty(n, RECORD)
     pack(order, means2d, conics, opacities, sigmas, opacities, records, n, 1, 0, 0)
 

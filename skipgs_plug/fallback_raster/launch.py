@@ -13,6 +13,7 @@ seconds each) and cached on disk; no compiler has to be installed.
 import functools
 import inspect
 import linecache
+import math
 import os
 import threading
 from collections.abc import Callable
@@ -28,6 +29,7 @@ from .simd import PRELUDE
 _COUNTER_SLOTS = 16
 
 _lock = threading.RLock()
+_scratch = threading.local()
 _num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _pool: ThreadPoolExecutor | None = None
 
@@ -54,6 +56,19 @@ def set_num_threads(n: int) -> None:
         if _pool is not None:
             _pool.shutdown()
             _pool = None
+
+
+def scratch(name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """A buffer with undefined content that this thread reuses whenever it asks for the same name again.
+
+    Fresh memory of many megabytes costs a page fault per 4 KiB, as much as some kernels take. The buffer must not
+    outlive the call that asked for it.
+    """
+    buffers: dict[str, Tensor] = _scratch.__dict__
+    size = math.prod(shape)
+    if name not in buffers or buffers[name].numel() < size:
+        buffers[name] = torch.empty(size, dtype=dtype)
+    return buffers[name][:size].view(shape)
 
 
 class FloatArray:
