@@ -61,8 +61,7 @@ def _gsplat_backend() -> Backend:
 
 def _warp_backend() -> Backend:
     try:
-        from skipgs_plug.fallback_raster import rasterization
-        from skipgs_plug.trainer.loss import l1_ssim_loss
+        from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
     except ImportError as error:
         raise InputError(f"Backend warp cannot be imported ({error}); run: {INSTALL}.") from error
     return Backend("warp", torch.device("cpu"), rasterization, l1_ssim_loss)
