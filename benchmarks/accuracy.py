@@ -151,7 +151,10 @@ def relative_error(value: Tensor, truth: Tensor) -> float:
 
 def measure(name: str, scene: dict[str, Any], repeats: int, **options: Any) -> dict[str, Any]:
     """One row of the table."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the reference's many small operations only wait for each other on more
     reference = run(rasterization_reference, scene, torch.float64, **options)
+    torch.set_num_threads(threads)
     passes = [run(rasterization, scene, torch.float32, reference.keep, **options) for _ in range(repeats + 1)]
     truth, value = reference.values, passes[-1].values
     greatest = max(1.0, truth["image"].abs().max().item())

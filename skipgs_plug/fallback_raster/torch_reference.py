@@ -20,7 +20,7 @@ from .torch_reference_projection import ALPHA_THRESHOLD, Projected, project, sph
 
 ALPHA_MAX = 0.999
 TRANSMITTANCE_STOP = 1e-4  # the Gaussian that would go below ends the pixel, uncounted
-BLOCK = 32  # pixels are blended in squares of this side, which bounds the memory
+BLOCK = 16  # pixels are blended in squares of this side, which bounds the memory
 
 
 def rasterization_reference(
