@@ -36,6 +36,8 @@ class TrainConfig:
     """Random initial points for scenes that bring no point cloud (Blender)."""
     backend: Literal["auto", "gsplat", "warp"] = "auto"
     """Rasterizer: gsplat on CUDA, warp on CPU; auto takes gsplat where CUDA works."""
+    torch_threads: int = 1
+    """Threads of torch itself on the CPU; more spin against those of the rasterizer, which has its own pool."""
     seed: int = 42
     """Seed of view order, split noise and random backgrounds."""
     max_steps: int = 30_000
@@ -96,7 +98,13 @@ class TrainConfig:
     """Densify by absolute gradients (AbsGS); wants grow_grad2d of about 0.0008."""
 
     def __post_init__(self) -> None:
-        for name, least in (("max_steps", 1), ("data_factor", 1), ("test_every", 0), ("refine_every", 1)):
+        for name, least in (
+            ("max_steps", 1),
+            ("data_factor", 1),
+            ("test_every", 0),
+            ("torch_threads", 1),
+            ("refine_every", 1),
+        ):
             value = getattr(self, name)
             if not isinstance(value, int) or value < least:
                 raise InputError(f"{name}={value!r} is not an integer of at least {least}.")

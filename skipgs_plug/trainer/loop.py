@@ -12,7 +12,7 @@ from torch import Tensor
 
 from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend
-from skipgs_plug.trainer.clock import TrainClock
+from skipgs_plug.trainer.clock import TrainClock, torch_threads
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.model import create_optimizers, create_splats
@@ -86,7 +86,8 @@ class Trainer:
 
         until = self.max_steps if until is None else min(until, self.max_steps)
         self.stop_requested = False
-        with tqdm(total=until, initial=self.step, desc="Training", disable=not progress, mininterval=0.5) as bar:
+        bar = tqdm(total=until, initial=self.step, desc="Training", disable=not progress, mininterval=0.5)
+        with bar, self.backend.exclusive_cores():
             while self.step < until and not self.stop_requested:
                 loss = self.train_step()
                 bar.update()
@@ -95,12 +96,16 @@ class Trainer:
 
     def train_step(self) -> float:
         """Run one iteration and return its loss."""
+        with torch_threads(self.config.torch_threads, self.backend.device):
+            return self._train_step()
+
+    def _train_step(self) -> float:
         step = self.step
         view = self.scene.train[self._order.at(step)]
         if not self._warm:
             self._warm_up(view)
         densifying = step < self.refine_stop_iter
-        self._set_learning_rate(step)
+        self.set_learning_rate(step)
 
         self.clock.start()
         image, target, info = self._forward(view, self.active_sh_degree(step), step)
@@ -156,13 +161,8 @@ class Trainer:
         views = {"test": self.scene.test, "train": self.scene.train}[split]
         if not views:
             raise InputError(f"Scene {self.scene.name} has no {split} views; lower test_every to hold some out.")
-        rows = []
-        for view in views:
-            image, target = self.render(view), self._target(view)
-            row = {"psnr": metrics.psnr(image, target), "ssim": metrics.ssim(image, target)}
-            if lpips_net is not None:
-                row[f"lpips_{lpips_net}"] = metrics.lpips(image, target, lpips_net)
-            rows.append(row)
+        with torch_threads(self.config.torch_threads, self.backend.device):
+            rows = [self._measure(view, lpips_net) for view in views]
         means = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
         return {
             **means,
@@ -173,6 +173,13 @@ class Trainer:
             "psnr_flavour": "mean of per-image PSNR, float render clamped to [0, 1]",
             "ssim_flavour": metrics.SSIM_FLAVOUR,
         }
+
+    def _measure(self, view: View, lpips_net: str | None) -> dict[str, float]:
+        image, target = self.render(view), self._target(view)
+        row = {"psnr": metrics.psnr(image, target), "ssim": metrics.ssim(image, target)}
+        if lpips_net is not None:
+            row[f"lpips_{lpips_net}"] = metrics.lpips(image, target, lpips_net)
+        return row
 
     def export_ply(self, path: str | Path) -> None:
         """Write the 62-property INRIA PLY, in the coordinates of the dataset."""
@@ -237,7 +244,8 @@ class Trainer:
     def _target(self, view: View) -> Tensor:
         return view.image.to(self.backend.device).float() / 255.0
 
-    def _set_learning_rate(self, step: int) -> None:
+    def set_learning_rate(self, step: float) -> None:
+        """Set the positions' learning rate to that of iteration `step`; the others are constant."""
         decay = MEANS_LR_END ** (step / self.max_steps)
         rate = self.config.means_lr * self.scene.scene_scale * decay
         self.optimizers["means"].param_groups[0]["lr"] = rate
