@@ -222,6 +222,7 @@ def provenance() -> dict[str, Any]:
         "commit": commit.stdout.strip(),
         "cpu": cpu,
         "cores": os.cpu_count(),
+        "load_average": os.getloadavg()[0],  # times hold only if this was near the threads in use
         "threads": get_num_threads(),
         "python": platform.python_version(),
         "versions": {name: version(name) for name in ("torch", "warp-lang", "gsplat")},
