@@ -145,6 +145,12 @@ class Trainer:
             )
         loss.backward()
 
+    def set_learning_rate(self, step: float) -> None:
+        """Set the positions' learning rate to that of iteration `step`; the others are constant."""
+        decay = MEANS_LR_END ** (step / self.max_steps)
+        rate = self.config.means_lr * self.scene.scene_scale * decay
+        self.optimizers["means"].param_groups[0]["lr"] = rate
+
     def active_sh_degree(self, step: int) -> int:
         """Return the SH degree that iteration `step` renders with."""
         return min(step // self._sh_interval, self.config.sh_degree)
@@ -243,12 +249,6 @@ class Trainer:
 
     def _target(self, view: View) -> Tensor:
         return view.image.to(self.backend.device).float() / 255.0
-
-    def set_learning_rate(self, step: float) -> None:
-        """Set the positions' learning rate to that of iteration `step`; the others are constant."""
-        decay = MEANS_LR_END ** (step / self.max_steps)
-        rate = self.config.means_lr * self.scene.scene_scale * decay
-        self.optimizers["means"].param_groups[0]["lr"] = rate
 
     def _optimizer_step(self, info: dict[str, Any]) -> None:
         for optimizer in self.optimizers.values():
