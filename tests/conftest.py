@@ -1,0 +1,24 @@
+"""Fixtures for all tests."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """Folder of reference data and real scenes, which is not part of the repository.
+
+    It lies beside the repository, or where SKIPGS_SHARED says. Tests that need it are skipped without it,
+    except in CI, where its absence is a failure.
+    """
+    folder = Path(os.environ.get("SKIPGS_SHARED") or Path(__file__).parents[2] / "shared")
+    if not folder.is_dir():
+        message = f"reference data not found at {folder}; set SKIPGS_SHARED"
+        if os.environ.get("CI") == "true":
+            pytest.fail(message)
+        pytest.skip(message)
+    return folder

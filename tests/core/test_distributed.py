@@ -1,0 +1,85 @@
+"""Two processes whose losses disagree: no hang, and the same decisions on both."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+import torch.distributed as dist
+import torch.multiprocessing as mp
+
+from skipgs_plug import SkipGate, SkipGSError
+
+STEPS = 300
+
+
+def start(rank: int, folder: str) -> None:
+    torch.set_num_threads(1)
+    dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=2)
+
+
+def train(rank: int, folder: str) -> None:
+    """Each rank draws its own losses; the gradient is reduced in every backward, as DDP would."""
+    start(rank, folder)
+    draw = random.Random(rank)
+    parameter = torch.nn.Parameter(torch.ones(1))
+    parameter.register_hook(lambda grad: (dist.all_reduce(grad := grad.clone()), grad)[1])
+    gate = SkipGate(start_iter=20, warmup=20, record_trace=True)
+    gradients = []
+    for step in range(STEPS):
+        scale = draw.uniform(0.5, 1.5)
+        if (rank, step) == (1, 150):
+            scale = math.nan
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            if gate.backward(parameter.sum() * scale, view=f"v{step % 3}", step=step):
+                gradients.append(parameter.grad.item())
+                parameter.grad = None
+    result = {
+        "skips": [row.skip for row in gate.trace],
+        "reasons": [row.reason for row in gate.trace],
+        "gradients": gradients,
+        "recorded": [gate.policy.budget.backwards, gate.policy.budget.skips],
+    }
+    Path(folder, f"{rank}.json").write_text(json.dumps(result))
+    dist.destroy_process_group()
+
+
+def fail_on_one(rank: int, folder: str) -> None:
+    start(rank, folder)
+    gate = SkipGate(start_iter=0, on_nonfinite="raise")
+    loss = torch.ones(1, requires_grad=True).sum() * (math.nan if rank else 1.0)
+    try:
+        gate.backward(loss, view="a", step=0)
+    except SkipGSError as error:
+        Path(folder, f"{rank}.txt").write_text(str(error))
+    dist.destroy_process_group()
+
+
+@pytest.mark.timeout(120)
+def test_ranks_agree(tmp_path: Path) -> None:
+    mp.spawn(train, args=(str(tmp_path),), nprocs=2)
+    one, two = (json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2))
+    assert one["skips"] == two["skips"]
+    assert any(one["skips"])
+    assert one["gradients"] == two["gradients"]
+    assert all(math.isfinite(gradient) for gradient in one["gradients"])
+    assert len(one["gradients"]) == 20 + one["skips"].count(False)
+    # Disagreement happened, and was settled in favour of the backward, on either side.
+    assert "other rank" in one["reasons"]
+    assert "other rank" in two["reasons"]
+    assert one["reasons"][130] == two["reasons"][130] == "non-finite"
+    # What a policy counts is what happened, but for the poisoned iteration.
+    assert two["recorded"] == [one["skips"].count(False), one["skips"].count(True) - 1]
+
+
+@pytest.mark.timeout(120)
+def test_an_error_on_one_rank_ends_both(tmp_path: Path) -> None:
+    mp.spawn(fail_on_one, args=(str(tmp_path),), nprocs=2)
+    assert "view 'a'" in (tmp_path / "1.txt").read_text()
+    assert "another process" in (tmp_path / "0.txt").read_text()

@@ -1,0 +1,316 @@
+"""An adapter's hooks, on a trainer of twenty lines: mis-attachment is loud, detach leaves nothing."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from skipgs_plug import AdapterMismatchError, GateOrderError, SkipGate, SkipGSError, UnknownTrainerError
+from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.core.decision import Decision
+
+
+class ToyTrainer:
+    """Ten views, densification until iteration 20, a prune at 60."""
+
+    def __init__(self, steps: int = 100, backwards: int = 1, render: bool = True) -> None:
+        self.parameter = torch.nn.Parameter(torch.ones(3))
+        self.optimizer = torch.optim.Adam([self.parameter], lr=0.05)
+        self.steps, self.backwards, self.rendering = steps, backwards, render
+        self.noise = 0
+
+    def begin(self, step: int) -> None: ...
+
+    def render(self, view: str) -> torch.Tensor:
+        return self.parameter * (1.0 + 0.1 * int(view[1:]))
+
+    def prune(self) -> None: ...
+
+    def add_noise(self) -> None:
+        self.noise += 1
+
+    def train(self) -> None:
+        for step in range(self.steps):
+            self.begin(step)
+            image = self.render(f"v{step % 10}") if self.rendering else self.parameter
+            loss = (image**2).mean()
+            for _ in range(self.backwards):
+                loss.backward(retain_graph=True)
+            self.optimizer.step()
+            self.optimizer.zero_grad(set_to_none=True)
+            self.add_noise()
+            if step == 60:
+                self.prune()
+
+
+class Toy(AbstractAdapter):
+    name = "toy"
+    checked = "ToyTrainer 1.0"
+    hurried = False
+
+    @classmethod
+    def matches(cls, trainer) -> bool:
+        return isinstance(trainer, ToyTrainer)
+
+    def attach(self, hooks) -> None:
+        trainer = self.trainer
+        hooks.before(trainer, "begin", hooks.iteration)
+        hooks.before(trainer, "render", hooks.view)
+        hooks.events(trainer, "prune")
+        hooks.suppress_on_skip(trainer, "add_noise")
+        hooks.gate_tensor_backward("train")
+        if not self.hurried:
+            hooks.ready(20, view_names=[f"v{i}" for i in range(10)], defaults={"warmup": 12, "pause_iters": 15})
+
+    def must_run(self, step: int) -> bool:
+        return step == 45
+
+    def optimizers(self):
+        return [self.trainer.optimizer]
+
+
+class Always:
+    def __init__(self) -> None:
+        self.asked: list[int] = []
+
+    def decide(self, view, loss, step) -> Decision:
+        self.asked.append(step)
+        return Decision(True, "always")
+
+    def notify_event(self, step, n_views) -> None: ...
+
+    def state_dict(self) -> dict:
+        return {}
+
+    def load_state_dict(self, state) -> None: ...
+
+
+def attach(trainer: ToyTrainer, **settings) -> SkipGate:
+    return SkipGate(trainer, adapter=Toy(trainer), **settings)
+
+
+def plain(trainer: ToyTrainer) -> bool:
+    return not {"begin", "render", "prune", "add_noise"} & set(vars(trainer)) and not hasattr(
+        torch.Tensor.backward, "__skipgs_plug__"
+    )
+
+
+def test_gates_counts_and_leaves_nothing_behind() -> None:
+    trainer = ToyTrainer()
+    with attach(trainer) as gate:
+        assert len(gate.patched) == 5
+        trainer.train()
+        gate.verify()
+    assert plain(trainer)
+    assert gate.patched == []
+    stats = gate.stats()
+    assert (stats["iterations"], stats["gated_iterations"]) == (100, 80)
+    assert stats["reasons"]["warm-up"] == 12
+    assert stats["reasons"]["forced"] == 1
+    assert stats["paused"] == 15
+    assert stats["events"] == {"prune": 1}
+    assert stats["backwards_skipped"] > 0
+    assert trainer.noise == 100 - stats["backwards_skipped"]
+    assert gate.config.start_iter == 20
+    assert 0 < stats["t_post"] < stats["t_total"]
+
+
+def test_what_the_user_gave_stands() -> None:
+    trainer = ToyTrainer()
+    with attach(trainer, start_iter=50, warmup=3) as gate:
+        assert (gate.config.start_iter, gate.config.warmup, gate.config.pause_iters) == (50, 3, 15)
+
+
+@pytest.mark.parametrize("settings", [{"enabled": False}, {"warmup": 1000}])
+def test_never_skipping_changes_no_bit(settings) -> None:
+    expected, trainer = ToyTrainer(), ToyTrainer()
+    expected.train()
+    with attach(trainer, **settings):
+        trainer.train()
+    assert torch.equal(expected.parameter, trainer.parameter)
+    assert trainer.noise == 100
+
+
+def test_always_skipping_keeps_parameters_but_for_forced_iterations() -> None:
+    policy = Always()
+    trainer = ToyTrainer(45)
+    with attach(trainer, policy=policy):
+        trainer.train()
+    expected = ToyTrainer(20)
+    expected.train()
+    assert torch.equal(expected.parameter, trainer.parameter)
+    assert policy.asked == list(range(20, 45))
+
+
+def test_two_attaches_are_refused() -> None:
+    trainer = ToyTrainer()
+    with attach(trainer):
+        with pytest.raises(SkipGSError, match="gated already"):
+            attach(trainer)
+        with pytest.raises(SkipGSError, match="gated already"):
+            attach(ToyTrainer())  # Tensor.backward belongs to one gate at a time
+    attach(trainer).detach()
+    assert plain(trainer)
+
+
+def test_detaches_on_an_exception_in_training() -> None:
+    trainer = ToyTrainer()
+    trainer.add_noise = lambda: 1 / 0  # type: ignore[method-assign]
+    with pytest.raises(ZeroDivisionError), attach(trainer):
+        trainer.train()
+    del trainer.add_noise
+    assert plain(trainer)
+
+
+@pytest.mark.parametrize("backwards", [0, 2])
+def test_any_other_number_of_backwards_is_an_error_after_ten_iterations(backwards: int) -> None:
+    trainer = ToyTrainer(backwards=backwards)
+    with pytest.raises(
+        AdapterMismatchError, match=f"{10 * backwards} training backwards were seen in 10 .*ToyTrainer 1.0"
+    ):
+        attach(trainer)
+        trainer.train()
+    assert plain(trainer)
+
+
+def test_short_runs_are_judged_by_verify() -> None:
+    trainer = ToyTrainer(steps=3, backwards=0)
+    with attach(trainer) as gate:
+        with pytest.raises(AdapterMismatchError, match="no iteration"):
+            gate.verify()
+        trainer.train()
+        with pytest.raises(AdapterMismatchError, match="0 training backwards were seen in 3 iterations"):
+            gate.verify()
+
+
+def test_backward_without_a_render_is_an_error_at_once() -> None:
+    trainer = ToyTrainer(render=False)
+    gate = attach(trainer)
+    with pytest.raises(AdapterMismatchError, match="no training view was rendered"):
+        trainer.train()
+    assert gate.patched == []
+    assert plain(trainer)
+
+
+def test_iterating_before_ready_is_an_error() -> None:
+    class Hurried(Toy):
+        hurried = True
+
+    trainer = ToyTrainer()
+    with SkipGate(trainer, adapter=Hurried(trainer)), pytest.raises(AdapterMismatchError, match="densification"):
+        trainer.train()
+
+
+def test_backwards_outside_iterations_are_an_error() -> None:
+    class Deaf(Toy):
+        def attach(self, hooks) -> None:
+            hooks.gate_tensor_backward("train")
+            hooks.ready(20)
+
+    trainer = ToyTrainer()
+    with SkipGate(trainer, adapter=Deaf(trainer)), pytest.raises(AdapterMismatchError, match="in no iteration"):
+        trainer.train()
+
+
+def test_half_an_attachment_is_taken_back() -> None:
+    trainer = ToyTrainer()
+    with pytest.raises(SkipGSError, match="start_iter"):
+        SkipGate(trainer, adapter=Endless(trainer))
+    assert plain(trainer)
+
+
+class Endless(Toy):
+    """A trainer that does not densify."""
+
+    hurried = True
+
+    def attach(self, hooks) -> None:
+        super().attach(hooks)
+        hooks.ready(None)
+
+
+def test_two_views_of_one_name_are_refused() -> None:
+    class Twins(Toy):
+        hurried = True
+
+        def attach(self, hooks) -> None:
+            super().attach(hooks)
+            hooks.ready(20, view_names=["a", "a"])
+
+    trainer = ToyTrainer()
+    with pytest.raises(SkipGSError, match="'a' names 2"):
+        SkipGate(trainer, adapter=Twins(trainer))
+    assert plain(trainer)
+
+
+def test_state_of_another_scene_is_refused() -> None:
+    other = SkipGate(start_iter=0)
+    other.backward(torch.tensor(1.0, requires_grad=True), view="elsewhere", step=0)
+    with attach(ToyTrainer()) as gate, pytest.raises(SkipGSError, match=r"another scene.*'elsewhere'"):
+        gate.load_state_dict(other.state_dict())
+
+
+def test_verbs_belong_to_loops_of_ones_own() -> None:
+    with attach(ToyTrainer()) as gate, pytest.raises(GateOrderError, match="adapter 'toy'"):
+        gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
+
+
+def test_training_anew_with_one_gate_is_refused() -> None:
+    trainer = ToyTrainer()
+    with attach(trainer):
+        trainer.train()
+        with pytest.raises(GateOrderError, match="went back from 99 to 0"):
+            trainer.train()
+
+
+def test_accumulation_holds_back_the_trainers_own_steps() -> None:
+    trainer = ToyTrainer(60)
+    steps = []
+    original = trainer.optimizer.step
+    trainer.optimizer.step = lambda *args: (steps.append(1), original(*args))  # type: ignore[method-assign]
+    with attach(trainer, step_mode="adaptive_norm", step_trigger="ref_k", min_bwd_ratio=1.0) as gate:
+        trainer.train()
+        at_once = 20 + gate.config.warmup
+        assert at_once <= len(steps) < 20 + gate.stats()["backwards_run"]
+
+
+def test_accumulation_needs_optimizers() -> None:
+    class OwnSchedule(Toy):
+        def optimizers(self):
+            return ()
+
+    trainer = ToyTrainer()
+    gate = SkipGate(trainer, adapter=OwnSchedule(trainer), step_mode="adaptive_norm")
+    with pytest.raises(SkipGSError, match="own schedule"):
+        trainer.train()
+    assert gate.patched == []
+
+
+def test_processes_without_a_group_are_refused(monkeypatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    trainer = ToyTrainer()
+    with pytest.raises(SkipGSError, match="2 processes train together"):
+        attach(trainer)
+    assert plain(trainer)
+    gate = SkipGate(start_iter=0)
+    with pytest.raises(SkipGSError, match="init_process_group"):
+        gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
+
+
+def test_a_trainer_that_knows_of_more_processes_is_believed() -> None:
+    class Crowd(Toy):
+        hurried = True
+
+        def attach(self, hooks) -> None:
+            super().attach(hooks)
+            hooks.ready(20, world_size=4)
+
+    with pytest.raises(SkipGSError, match="4 processes"):
+        SkipGate(trainer := ToyTrainer(), adapter=Crowd(trainer))
+
+
+def test_unknown_trainers_get_the_list_and_the_manual_form() -> None:
+    with pytest.raises(UnknownTrainerError, match=r"reference.*SkipGate\(start_iter="):
+        SkipGate(object())
+    with pytest.raises(UnknownTrainerError, match="no adapter 'fastestgs'"):
+        SkipGate(object(), adapter="fastestgs")

@@ -1,0 +1,73 @@
+"""Losses that are not finite: skipped, raised or passed, never averaged."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.core.nonfinite import NonFiniteGuard
+
+
+def poison(value: float = math.nan) -> torch.Tensor:
+    return torch.tensor(1.0, requires_grad=True) * value
+
+
+def test_warns_once_per_view_with_step_and_mean() -> None:
+    gate = SkipGate(start_iter=0)
+    gate.backward(torch.tensor(0.25, requires_grad=True), view="a", step=0)
+    with pytest.warns(RuntimeWarning, match=r"nan in iteration 1 on view 'a' \(mean of its finite losses 0.25\)"):
+        assert not gate.backward(poison(), view="a", step=1)
+    assert not gate.backward(poison(), view="a", step=2)  # no second warning: it would be an error here
+    assert gate.stats()["non_finite"] == 2
+    assert gate.stats()["backwards_skipped"] == 2
+    assert gate.view_table()[0]["mean_loss"] == 0.25
+
+
+def test_gives_up_when_it_goes_on() -> None:
+    gate = SkipGate(start_iter=0)
+    with pytest.warns(RuntimeWarning):
+        for step in range(9):
+            gate.backward(poison(math.inf), view=f"v{step}", step=step)
+    with pytest.raises(SkipGSError, match=r"inf in iteration 9 on view 'v9'.*9 losses before it"):
+        gate.backward(poison(math.inf), view="v9", step=9)
+
+
+def test_one_finite_loss_begins_the_count_anew() -> None:
+    gate = SkipGate(start_iter=0)
+    with pytest.warns(RuntimeWarning):
+        for step in range(40):
+            gate.backward(poison(math.nan if step % 10 else 1.0), view="a", step=step)
+    assert gate.stats()["non_finite"] == 36
+
+
+def test_an_epoch_of_many_views_is_waited_for() -> None:
+    guard = NonFiniteGuard("skip")
+    with pytest.warns(RuntimeWarning):
+        for step in range(39):
+            guard.answer(f"v{step}", math.nan, step, None, n_views=40)
+    with pytest.raises(SkipGSError, match="v39"):
+        guard.answer("v39", math.nan, 39, None, n_views=40)
+
+
+def test_can_raise_at_once() -> None:
+    gate = SkipGate(start_iter=0, on_nonfinite="raise")
+    with pytest.raises(SkipGSError, match="iteration 0 on view 'a'"):
+        gate.backward(poison(), view="a", step=0)
+
+
+def test_can_pass() -> None:
+    gate = SkipGate(start_iter=0, on_nonfinite="pass")
+    parameter = torch.nn.Parameter(torch.ones(1))
+    with pytest.warns(RuntimeWarning, match="runs all the same"):
+        assert gate.backward(parameter.sum() * math.nan, view="a", step=0)
+    assert parameter.grad is not None
+    assert gate.view_table()[0]["mean_loss"] is None
+
+
+def test_before_start_it_is_the_trainers_own_affair() -> None:
+    gate = SkipGate(start_iter=10)
+    assert gate.backward(poison(), view="a", step=0)
+    assert gate.stats()["non_finite"] == 0

@@ -1,0 +1,89 @@
+"""Saved states: the authors' version, damage, other versions."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.core.policy import SkipPolicy
+
+RELEASE = {
+    "state_version": 1,
+    "view_loss_ema": {0: 0.5, 7: 0.25},
+    "stats": {"bwd": 600, "skip": 300},
+    "min_bwd_ratio_effective": 0.65,
+    "calibrated": True,
+    "warmup_would_skip": 7,
+    "warmup_would_total": 10,
+    "accum_count": 0,
+    "last_accum_norm": 0.0,
+    "single_scale_ema": 2.0,
+    "single_sq_ema": 4.0,
+    "reference": 32.0,
+    "step_count": 40,
+}
+
+
+def test_state_of_the_authors_controller_continues() -> None:
+    policy = SkipPolicy(start_iter=100)
+    policy.load_state_dict(RELEASE)
+    assert policy.floor == 0.65
+    assert (policy.budget.backwards, policy.budget.skips) == (600, 300)
+    assert policy.decide(7, 0.2, 1000) == (True, "deviation")
+    assert policy.decide(0, 0.6, 1001) == (False, "deviation")
+
+
+def test_interrupted_release_warm_up_goes_on_where_theirs_would() -> None:
+    policy = SkipPolicy(start_iter=100)
+    policy.load_state_dict({**RELEASE, "calibrated": False, "stats": {"bwd": 50, "skip": 0}})
+    assert policy.decide(7, 0.2, 599).reason == "warm-up"
+    assert policy.decide(7, 0.2, 600).reason == "deviation"
+
+
+def test_gate_loads_it_too() -> None:
+    gate = SkipGate(start_iter=100)
+    gate.load_state_dict(RELEASE)
+    assert gate.stats()["backwards_skipped"] == 300
+    assert not gate.backward(torch.tensor(0.2, requires_grad=True), view=7, step=1000)
+
+
+def test_gate_state_is_plain_json_and_loads_weights_only(tmp_path) -> None:
+    gate = SkipGate(start_iter=0, warmup=2)
+    for step in range(10):
+        gate.backward(torch.tensor(1.0, requires_grad=True), view=step % 3, step=step)
+    state = gate.state_dict()
+    assert json.loads(json.dumps(state)) == state
+    torch.save(state, tmp_path / "gate.pt")
+    assert torch.load(tmp_path / "gate.pt", weights_only=True) == state
+    other = SkipGate(start_iter=0, warmup=2)
+    other.load_state_dict(state)
+    assert other.state_dict() == state
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda s: {}, "empty"),
+        (lambda s: {**s, "version": 99}, "version 99"),
+        (lambda s: {**s, "state_version": 2}, "version 2"),
+        (lambda s: {k: v for k, v in s.items() if k != "clock"}, "lacks clock"),
+        (lambda s: {**s, "stats": {}}, "lacks iterations"),
+        (lambda s: {**s, "policy": {"version": 2}}, "lacks means"),
+    ],
+)
+def test_damaged_states_are_named(damage, message: str) -> None:
+    gate = SkipGate(start_iter=0)
+    gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
+    with pytest.raises(SkipGSError, match=message):
+        gate.load_state_dict(damage(gate.state_dict()))
+
+
+def test_ambiguous_view_keys_are_refused() -> None:
+    policy = SkipPolicy(start_iter=0)
+    policy.decide("6", 1.0, 0)
+    policy.means.values[6] = 1.0
+    with pytest.raises(SkipGSError, match="same text"):
+        policy.state_dict()
