@@ -148,7 +148,7 @@ for (;;) {{
 """
 
     def build(stub: Callable[..., None]) -> Worker:
-        kinds = {name: parameter.annotation for name, parameter in inspect.signature(stub).parameters.items()}
+        kinds = {name: parameter.annotation for name, parameter in inspect.signature(stub, eval_str=True).parameters.items()}
         return Worker(name or stub.__name__, kinds, loop)
 
     return build
