@@ -1,0 +1,52 @@
+"""Control policies: they skip as often as the gate did, without looking at any loss. Standard library only."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Hashable, Iterable
+from typing import Any
+
+from skipgs_plug.core import decision
+from skipgs_plug.core.decision import Decision
+
+RUN = Decision(False, "planned")
+SKIP = Decision(True, "planned")
+
+
+class PlannedSkipping:
+    """Skips exactly the iterations of a plan made beforehand.
+
+    Args:
+        first: first iteration after warm-up; earlier ones are never skipped.
+        skips: iterations whose backward is left out.
+    """
+
+    def __init__(self, first: int, skips: Iterable[int]) -> None:
+        self.first = first
+        self.skips = frozenset(skips)
+
+    def decide(self, view: Hashable, loss: float, step: int) -> Decision:
+        if step < self.first:
+            return decision.WARM_UP
+        return SKIP if step in self.skips else RUN
+
+    def notify_event(self, step: int, n_views: int) -> None:
+        """A plan does not react."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"first": self.first, "skips": sorted(self.skips)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.first = state["first"]
+        self.skips = frozenset(state["skips"])
+
+
+def random_skipping(first: int, end: int, n_skips: int, seed: int) -> PlannedSkipping:
+    """Skip `n_skips` of the iterations first..end-1, every choice equally likely, from an own generator."""
+    return PlannedSkipping(first, random.Random(seed).sample(range(first, end), n_skips))
+
+
+def periodic_skipping(first: int, end: int, n_skips: int) -> PlannedSkipping:
+    """Skip `n_skips` of the iterations first..end-1, spread as evenly as whole numbers allow (Bresenham)."""
+    n = end - first
+    return PlannedSkipping(first, (first + i for i in range(n) if (i + 1) * n_skips // n > i * n_skips // n))

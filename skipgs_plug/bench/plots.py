@@ -1,0 +1,209 @@
+"""The pictures of a bench, written as PNG. Colours are told apart by colour-blind readers (Okabe-Ito)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from skipgs_plug.bench.record import RunRecord, Trace
+from skipgs_plug.bench.summary import Quantity, Row
+from skipgs_plug.trainer.files import write_aside
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+STYLE = {  # colour, marker
+    "ungated": ("#000000", "s"),
+    "gate": ("#D55E00", "o"),
+    "gate-no-floor": ("#E69F00", "^"),
+    "gate-accumulate": ("#CC79A7", "v"),
+    "random": ("#0072B2", "D"),
+    "periodic": ("#56B4E9", "P"),
+    "shortened": ("#009E73", "X"),
+}
+PHASES = {"forward": "#0072B2", "loss": "#56B4E9", "backward": "#D55E00", "optimizer": "#E69F00"}
+NOT_VISITED, RUN, SKIPPED = 0, 1, 2
+EXAMPLES = 3  # views shown one by one
+SMALL = 9
+
+
+def write_plots(folder: Path, records: Sequence[RunRecord], rows: Sequence[Row], view_names: Sequence[str]) -> None:
+    """Write every picture that the finished runs give data for."""
+    done = [record for record in records if record.status == "done"]
+    if not done:
+        return
+    save(folder / "psnr_over_time.png", psnr_over_time(done, rows))
+    save(folder / "time_against_error.png", time_against_error(rows))
+    save(folder / "phases.png", phases(rows))
+    gated = [r for r in done if r.policy == "gate"] or [r for r in done if r.policy.startswith("gate")]
+    if gated:
+        seed = gated[0].seed
+        shown = [gated[0], *(r for r in done if r.seed == seed and r.policy == "random")]
+        save(folder / "skipped_views.png", skipped_views(shown, len(view_names)))
+        save(folder / "loss_and_mean.png", loss_and_mean(gated[0], view_names))
+
+
+def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row]) -> Figure:
+    """Mean held-out PSNR over seeds against seconds of refinement, one curve per policy."""
+    figure, axes = new_figure(7.6, 4.6)
+    for row in rows:
+        runs = [r for r in records if r.policy == row.policy]
+        if not runs:
+            continue
+        seconds = np.mean([[point.seconds for point in run.points] for run in runs], axis=0)
+        psnr = np.mean([[point.psnr for point in run.points] for run in runs], axis=0)
+        colour, marker = STYLE[row.policy]
+        axes.plot(seconds, psnr, color=colour, marker=marker, markersize=5, linewidth=1.6, label=row.policy)
+    axes.set_xlabel("training time since the end of densification (s)")
+    axes.set_ylabel("held-out PSNR (dB)")
+    axes.legend(frameon=False, fontsize=SMALL, loc="lower right")
+    axes.set_title(f"Quality against time, mean of {seeds_text(rows)}", loc="left", fontsize=11)
+    return figure
+
+
+def time_against_error(rows: Sequence[Row]) -> Figure:
+    """Refinement time against final PSNR: absolute, and against the ungated run of the same seed."""
+    paired = any("psnr_gain" in row.values for row in rows)
+    figure, *axes = new_figure(9.6 if paired else 6.0, 4.4, columns=2 if paired else 1)
+    scatter(axes[0], rows, "t_post", "psnr")
+    axes[0].set_xlabel("refinement time T_post (s)")
+    axes[0].set_ylabel("held-out PSNR (dB)")
+    axes[0].set_title(f"Mean and spread of {seeds_text(rows)}", loc="left", fontsize=11)
+    axes[0].legend(frameon=False, fontsize=SMALL, loc="best")
+    if paired:
+        scatter(axes[1], rows, "t_post_saved", "psnr_gain")
+        axes[1].axhline(0, color="0.7", linewidth=0.8, zorder=0)
+        axes[1].axvline(0, color="0.7", linewidth=0.8, zorder=0)
+        axes[1].set_xlabel("refinement time saved (%)")
+        axes[1].set_ylabel("PSNR above ungated (dB)")
+        axes[1].set_title("Against the ungated run of the same seed", loc="left", fontsize=11)
+    return figure
+
+
+def scatter(axes: Axes, rows: Sequence[Row], x_name: str, y_name: str) -> None:
+    for row in rows:
+        x, y = row.values.get(x_name), row.values.get(y_name)
+        if x is None or y is None:
+            continue
+        colour, marker = STYLE[row.policy]
+        axes.errorbar(
+            x.mean, y.mean, xerr=bar(x), yerr=bar(y), color=colour, marker=marker, markersize=8, linestyle="none",
+            linewidth=1.2, capsize=3, label=row.policy,
+        )  # fmt: skip
+    axes.margins(0.12)
+
+
+def bar(quantity: Quantity) -> float:
+    return quantity.spread or 0.0
+
+
+def phases(rows: Sequence[Row]) -> Figure:
+    """Seconds of refinement by phase, one bar per policy."""
+    rows = [row for row in rows if row.seeds]
+    figure, axes = new_figure(7.6, 0.9 + 0.45 * len(rows))
+    left = np.zeros(len(rows))
+    names = [row.policy for row in rows]
+    for phase, colour in PHASES.items():
+        width = np.array([r.values[f"share_{phase}"].mean * r.values["t_post"].mean / 100 for r in rows])
+        axes.barh(names, width, left=left, color=colour, label=phase, height=0.7)
+        left += width
+    axes.invert_yaxis()
+    axes.set_xlabel("refinement time (s)")
+    axes.tick_params(left=False)
+    axes.grid(axis="y", visible=False)
+    figure.legend(frameon=False, fontsize=SMALL, ncols=4, loc="outside upper center")
+    return figure
+
+
+def skipped_views(runs: Sequence[RunRecord], n_views: int) -> Figure:
+    """Views by time: which visits of a view were skipped, one panel per policy."""
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Patch
+
+    colours = ["#FFFFFF", "#DCE6EE", "#D55E00"]
+    figure, *axes = new_figure(9.6, 4.4, columns=len(runs), sharey=True)
+    for panel, run in zip(axes, runs, strict=True):
+        assert run.trace is not None
+        panel.imshow(
+            visit_map(run.trace, n_views), aspect="auto", interpolation="nearest", cmap=ListedColormap(colours),
+            vmin=NOT_VISITED, vmax=SKIPPED, extent=(run.trace.start, run.trace.start + run.iterations, n_views, 0),
+        )  # fmt: skip
+        if run.warm_up:
+            panel.axvline(run.trace.start + run.warm_up, color="0.25", linewidth=1, linestyle=(0, (4, 3)))
+        share = 100 * run.skips / run.iterations
+        panel.set_title(f"{run.policy}, seed {run.seed}: {share:.0f} % skipped", loc="left", fontsize=11)
+        panel.set_xlabel("iteration (dashed: end of warm-up)")
+        panel.grid(visible=False)
+    axes[0].set_ylabel("training view")
+    handles = [Patch(color=colours[RUN], label="backward run"), Patch(color=colours[SKIPPED], label="backward skipped")]
+    figure.legend(handles=handles, frameon=False, fontsize=SMALL, ncols=2, loc="outside upper right")
+    return figure
+
+
+def visit_map(trace: Trace, n_views: int) -> np.ndarray:
+    """Return [n_views, epochs]: NOT_VISITED, RUN or SKIPPED; an epoch is as many iterations as views.
+
+    A view that is visited twice in a column, at the seam of two epochs, shows its later visit.
+    """
+    grid = np.full((n_views, -(-len(trace.view) // n_views)), NOT_VISITED)
+    for i, (view, skipped) in enumerate(zip(trace.view, trace.skipped, strict=True)):
+        grid[view, i // n_views] = SKIPPED if skipped else RUN
+    return grid
+
+
+def loss_and_mean(run: RunRecord, view_names: Sequence[str]) -> Figure:
+    """Loss of single views against their running mean: the most, a middling and the least skipped view."""
+    trace = run.trace
+    assert trace is not None
+    by_view: dict[int, list[int]] = {}
+    for i, view in enumerate(trace.view):
+        by_view.setdefault(view, []).append(i)
+    skipped = trace.skipped
+    ranked = sorted(by_view, key=lambda view: (-sum(skipped[i] for i in by_view[view]) / len(by_view[view]), view))
+    picked = sorted({0, len(ranked) // 2, len(ranked) - 1})[:EXAMPLES]
+    figure, *panels = new_figure(7.6, 1.2 + 1.75 * len(picked), rows=len(picked), sharex=True)
+    for panel, rank in zip(panels, picked, strict=True):
+        view, visits = ranked[rank], np.array(by_view[ranked[rank]])
+        steps = trace.start + visits
+        loss = np.array([trace.loss[i] for i in visits])
+        mean = np.array([np.nan if trace.mean[i] is None else trace.mean[i] for i in visits], dtype=float)
+        out = np.array([skipped[i] for i in visits])
+        panel.plot(steps, mean, color="0.35", linewidth=1.4, label="running mean")
+        panel.plot(steps[~out], loss[~out], linestyle="none", marker="o", markersize=3.6, color="#0072B2",
+                   label="loss, backward run")  # fmt: skip
+        panel.plot(steps[out], loss[out], linestyle="none", marker="o", markersize=3.6, color="#D55E00",
+                   markerfacecolor="white", label="loss, backward skipped")  # fmt: skip
+        share = f"{out.sum()} of {len(out)} visits skipped"
+        panel.set_title(f"{view_names[view]}: {share}", loc="left", fontsize=SMALL + 1)
+        panel.set_ylabel("loss")
+    panels[-1].set_xlabel("iteration")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, fontsize=SMALL, ncols=3, loc="outside upper center")
+    return figure
+
+
+def seeds_text(rows: Sequence[Row]) -> str:
+    seeds = {seed for row in rows for seed in row.seeds}
+    return f"{len(seeds)} seed" + ("s" if len(seeds) != 1 else "")
+
+
+def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **share: Any) -> Any:
+    """Return a figure and its axes, without frame clutter."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False, **share).ravel()
+    for axes in grid:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(color="0.92", linewidth=0.8)
+        axes.set_axisbelow(True)
+    return figure, *grid
+
+
+def save(path: Path, figure: Figure) -> None:
+    with write_aside(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=120)

@@ -1,0 +1,43 @@
+"""bench.json: settings, provenance, all runs without their traces, and the table, in one dict of plain values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from skipgs_plug.bench import provenance
+from skipgs_plug.bench.record import RunRecord
+from skipgs_plug.bench.runner import Bench
+from skipgs_plug.bench.summary import ceiling, row_as_dict, summarise
+
+SCHEMA_VERSION = 1
+KIND = "skipgs-bench"
+
+
+def build_result(bench: Bench, records: Sequence[RunRecord], command: str) -> dict[str, Any]:
+    """Return the content of bench.json.
+
+    Returns:
+        `kind`, `schema_version`; `command`, `commits`, `versions`; `settings` (training, scene, machine, lpips);
+        `seeds`, `policies`; `refinement` (first and last iteration + 1); `view_names` (traces index into
+        them); `rows` (means and spreads); `ceiling` (see summary.ceiling); `runs` (records without traces,
+        which are in runs/).
+    """
+    last = bench.config.max_steps
+    first = bench.refine_stop_iter
+    rows = summarise(records, bench.policies, last - first)
+    return {
+        "kind": KIND,
+        "schema_version": SCHEMA_VERSION,
+        "command": command,
+        "commits": sorted({record.commit or "unknown" for record in records}),
+        "versions": provenance.versions(),
+        "settings": bench.settings,
+        "seeds": bench.seeds,
+        "policies": bench.policies,
+        "refinement": [first, last],
+        "view_names": [view.name for view in bench.scene.train],
+        "rows": [row_as_dict(row) for row in rows],
+        "ceiling": ceiling(rows),
+        "runs": [record.as_dict(with_trace=False) for record in records],
+    }

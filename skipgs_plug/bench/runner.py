@@ -1,0 +1,147 @@
+"""All runs of a bench: per seed densify once, then refine under each policy."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from skipgs_plug.bench import provenance
+from skipgs_plug.bench.policies import PolicySpec, check_policies, running_order
+from skipgs_plug.bench.record import RunRecord
+from skipgs_plug.bench.refine import DivergedError, densify, refine
+from skipgs_plug.bench.store import BenchFolder
+from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
+from skipgs_plug.trainer.backend import resolve_backend
+from skipgs_plug.trainer.metrics import LPIPS_WEIGHTS, require_lpips
+
+NOT_SETTINGS = ("data_dir", "result_dir", "seed", "backend")
+
+
+class Bench:
+    """Runs what is missing in a folder and returns all runs.
+
+    Args:
+        config: settings of training; its seed is replaced by each of `seeds`.
+        say: called with one line per event.
+
+    Raises:
+        InputError: an unknown policy, no held-out views, or a folder made with other settings.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        folder: BenchFolder,
+        seeds: Sequence[int],
+        policies: Sequence[str],
+        say: Callable[[str], None] = print,
+        progress: bool = True,
+    ) -> None:
+        check_policies(policies)
+        if not seeds or len(set(seeds)) < len(seeds):
+            raise InputError("Give at least one seed, each once.")
+        if config.scaled(config.refine_stop_iter) >= config.max_steps:
+            raise InputError(
+                f"Densification ends at iteration {config.scaled(config.refine_stop_iter):,} of {config.max_steps:,}, "
+                "which leaves nothing to refine; lower --refine-stop-iter."
+            )
+        if not scene.test:
+            raise InputError(f"Scene {scene.name} has no held-out views to measure on; lower --test-every.")
+        self.scene, self.config, self.folder = scene, config, folder
+        self.seeds, self.policies = list(seeds), list(policies)
+        self.say, self.progress = say, progress
+        self.backend = resolve_backend(config.backend)
+        self.lpips_net = available_lpips()
+        self.commit = provenance.commit()
+        self.settings = {
+            "training": {k: v for k, v in dataclasses.asdict(config).items() if k not in NOT_SETTINGS},
+            "scene": provenance.scene_facts(scene, config),
+            "machine": provenance.machine(self.backend),
+            "lpips": self.lpips_net,
+        }
+        folder.require_settings(self.settings)
+
+    @property
+    def refine_stop_iter(self) -> int:
+        """First iteration of refinement."""
+        return self.config.scaled(self.config.refine_stop_iter)
+
+    def run(self) -> list[RunRecord]:
+        """Return one record per seed and policy, by seed, in the order of `policies`."""
+        records = []
+        for position, seed in enumerate(self.seeds):
+            found = self._run_seed(seed, running_order(self.policies, position))
+            records += [found[name] for name in self.policies]
+        return records
+
+    def _run_seed(self, seed: int, order: list[PolicySpec]) -> dict[str, RunRecord]:
+        found: dict[str, RunRecord] = {}
+        for spec in order:
+            stored = self.folder.load(seed, spec.name)
+            if stored is not None:
+                found[spec.name] = stored
+        missing = [spec for spec in order if spec.name not in found]
+        if not missing:
+            return found
+        trainer = Trainer(dataclasses.replace(self.config, seed=seed), self.scene, self.backend)
+        try:
+            snapshot = self._densified(trainer)
+        except DivergedError as error:
+            for spec in missing:
+                note = f"{error}, during densification"
+                found[spec.name] = self._store(RunRecord(seed, spec.name, "diverged", note))
+            return found
+        for spec in missing:
+            found[spec.name] = self._store(self._run_policy(trainer, snapshot, spec, found))
+        return found
+
+    def _densified(self, trainer: Trainer) -> dict[str, Any]:
+        seed, path = trainer.config.seed, self.folder.snapshot(trainer.config.seed)
+        if path.is_file():
+            trainer.load_checkpoint(path)
+            self.say(f"seed {seed}: continuing from its snapshot at iteration {trainer.step:,}")
+        else:
+            densify(trainer, self.progress)
+            trainer.save_checkpoint(path)
+            count = len(trainer.splats["means"])
+            self.say(f"seed {seed}: densified to {count:,} Gaussians in {trainer.t_total:.1f} s of training")
+        return trainer.snapshot()
+
+    def _run_policy(
+        self, trainer: Trainer, snapshot: dict[str, Any], spec: PolicySpec, earlier: dict[str, RunRecord]
+    ) -> RunRecord:
+        seed = trainer.config.seed
+        lost = [name for name in spec.needs if earlier[name].status != "done"]
+        if lost:
+            return RunRecord(seed, spec.name, "not run", f"{lost[0]} of this seed, which it copies, did not finish")
+        try:
+            return refine(trainer, snapshot, spec, earlier, self.lpips_net)
+        except DivergedError as error:
+            return RunRecord(seed, spec.name, "diverged", str(error))
+
+    def _store(self, record: RunRecord) -> RunRecord:
+        record.commit = self.commit
+        self.folder.store(record)
+        if record.status == "done":
+            share = 100 * record.backwards / record.iterations
+            self.say(
+                f"seed {record.seed}: {record.policy:16} T_post {record.t_post:7.1f} s, "
+                f"{record.backwards:,} of {record.iterations:,} backwards ({share:.0f} %), "
+                f"PSNR {record.metrics['psnr']:.2f} dB"
+            )
+        else:
+            self.say(f"seed {record.seed}: {record.policy:16} {record.status}: {record.note}")
+        return record
+
+
+def available_lpips() -> str | None:
+    """Return the first LPIPS backbone whose weights are on this machine."""
+    for net in LPIPS_WEIGHTS:
+        try:
+            require_lpips(net)
+        except InputError:
+            continue
+        return net
+    return None

@@ -1,0 +1,77 @@
+"""The folder of a bench: every finished run is stored at once, so that a killed bench continues."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from skipgs_plug.bench.record import RunRecord
+from skipgs_plug.trainer import InputError
+from skipgs_plug.trainer.files import write_aside, write_json
+
+
+class BenchFolder:
+    """Names and writes `settings.json`, `snapshots/`, `runs/` and `bench.json`."""
+
+    def __init__(self, root: str | Path) -> None:
+        self.root = Path(root)
+
+    def require_settings(self, settings: dict[str, Any]) -> None:
+        """Store the settings of a new folder; those of an old one must be the same.
+
+        Seeds and policies are not among them: more of either may be added to a folder.
+
+        Raises:
+            InputError: the folder holds a bench made otherwise; names the first difference.
+        """
+        path = self.root / "settings.json"
+        if not path.is_file():
+            write_json(path, settings)
+            return
+        stored = read_json(path)
+        for name, value in flat(settings).items():
+            if flat(stored).get(name) != value:
+                raise InputError(
+                    f"{self.root} holds a bench with {name}={flat(stored).get(name)!r}, not {value!r}; "
+                    "repeat its settings or give another --out."
+                )
+
+    def snapshot(self, seed: int) -> Path:
+        """Return where the checkpoint of a densified seed lies."""
+        return self.root / "snapshots" / f"seed{seed}.pt"
+
+    def load(self, seed: int, policy: str) -> RunRecord | None:
+        """Return a finished run, None when it has not finished yet."""
+        path = self._run(seed, policy)
+        if not path.is_file():
+            return None
+        try:
+            return RunRecord.from_dict(read_json(path))
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{path} is not a run of a bench ({error}); remove it to run that again.") from error
+
+    def store(self, record: RunRecord) -> None:
+        with write_aside(self._run(record.seed, record.policy)) as temporary:
+            temporary.write_text(json.dumps(record.as_dict(), separators=(",", ":"), allow_nan=False) + "\n")
+
+    def _run(self, seed: int, policy: str) -> Path:
+        return self.root / "runs" / f"seed{seed}_{policy}.json"
+
+
+def read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except (ValueError, OSError) as error:
+        raise InputError(f"{path} cannot be read as JSON ({error}); restore it or remove it.") from error
+
+
+def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings as one dict with dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            found.update(flat(value, f"{prefix}{name}."))
+        else:
+            found[prefix + name] = value
+    return found

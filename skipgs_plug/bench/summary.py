@@ -1,0 +1,113 @@
+"""Means and spreads over seeds, one row per policy."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from skipgs_plug.bench.record import RunRecord
+from skipgs_plug.trainer.clock import PHASES
+
+
+@dataclass
+class Quantity:
+    """Mean and spread (sample standard deviation over seeds; None with one seed)."""
+
+    mean: float
+    spread: float | None
+
+
+@dataclass
+class Row:
+    """One policy over all its seeds.
+
+    Attributes:
+        seeds: those that the means are over.
+        excluded: the others, with the reason.
+        values: by name: `t_post t_total` (s), `t_post_saved t_total_saved` (% less than ungated, same seed),
+            `iterations`, `backwards_share` (% of the refinement iterations of the full schedule),
+            `share_forward ...` (% of t_post), `psnr ssim lpips_*`, `psnr_gain` (dB above ungated, same seed),
+            `num_GS`, `peak_memory_gib`.
+    """
+
+    policy: str
+    seeds: list[int]
+    excluded: dict[int, str] = field(default_factory=dict)
+    values: dict[str, Quantity] = field(default_factory=dict)
+
+
+def summarise(records: Sequence[RunRecord], policies: Sequence[str], full_iterations: int) -> list[Row]:
+    """Return one row per policy; runs that did not finish are named in it and enter no mean."""
+    ungated = {r.seed: r for r in records if r.policy == "ungated" and r.status == "done"}
+    rows = []
+    for policy in policies:
+        mine = [record for record in records if record.policy == policy]
+        done = [record for record in mine if record.status == "done"]
+        row = Row(policy, [r.seed for r in done], {r.seed: f"{r.status}: {r.note}" for r in mine if r not in done})
+        samples = [measured(record, ungated.get(record.seed), full_iterations) for record in done]
+        for name in dict.fromkeys(name for sample in samples for name in sample):
+            row.values[name] = quantity([sample[name] for sample in samples if name in sample])
+        rows.append(row)
+    return rows
+
+
+def measured(record: RunRecord, ungated: RunRecord | None, full_iterations: int) -> dict[str, float]:
+    """Return the quantities of one run; those against ungated only where that seed has an ungated run."""
+    values: dict[str, float] = {"t_post": record.t_post, "t_total": record.t_total}
+    if ungated is not None:
+        values["t_post_saved"] = 100 * (1 - record.t_post / ungated.t_post)
+        values["t_total_saved"] = 100 * (1 - record.t_total / ungated.t_total)
+    values["iterations"] = record.iterations
+    values["backwards_share"] = 100 * record.backwards / full_iterations
+    for phase in PHASES:
+        if phase != "strategy":  # nothing is left of it after densification
+            values[f"share_{phase}"] = 100 * record.phases[phase] / sum(record.phases.values())
+    values.update(record.metrics)
+    if ungated is not None:
+        values["psnr_gain"] = record.metrics["psnr"] - ungated.metrics["psnr"]
+    if record.peak_memory is not None:
+        values["peak_memory_gib"] = record.peak_memory / 2**30
+    return values
+
+
+def quantity(sample: Sequence[float]) -> Quantity:
+    return Quantity(statistics.fmean(sample), statistics.stdev(sample) if len(sample) > 1 else None)
+
+
+def ceiling(rows: Sequence[Row]) -> dict[str, float] | None:
+    """Return what a perfect gate could save at the gate's skip rate, in % of refinement time.
+
+    A skipped iteration still pays forward, loss and decision, so no gate can save more than the share of
+    backward and optimizer in ungated time, times the share of iterations skipped.
+
+    Returns:
+        `share` (% of ungated t_post in backward and optimizer), `skipped` (% of iterations), `most` (their
+        product, %), `measured` (% saved); None without an ungated and a gate row.
+    """
+    by_name = {row.policy: row.values for row in rows if row.seeds}
+    if "gate" not in by_name or "ungated" not in by_name or "t_post_saved" not in by_name["gate"]:
+        return None
+    share = by_name["ungated"]["share_backward"].mean + by_name["ungated"]["share_optimizer"].mean
+    skipped = 100 - by_name["gate"]["backwards_share"].mean
+    return {
+        "share": share,
+        "skipped": skipped,
+        "most": share * skipped / 100,
+        "measured": by_name["gate"]["t_post_saved"].mean,
+    }
+
+
+def row_as_dict(row: Row) -> dict[str, Any]:
+    return {
+        "policy": row.policy,
+        "seeds": row.seeds,
+        "excluded": row.excluded,
+        "values": {name: {"mean": q.mean, "spread": q.spread} for name, q in row.values.items()},
+    }
+
+
+def row_from_dict(content: dict[str, Any]) -> Row:
+    values = {name: Quantity(**q) for name, q in content["values"].items()}
+    return Row(content["policy"], content["seeds"], {int(k): v for k, v in content["excluded"].items()}, values)

@@ -1,0 +1,82 @@
+"""`skipgs-plug bench SCENE`: what skipping saves, what it costs, and against what."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from skipgs_plug.bench.plots import write_plots
+from skipgs_plug.bench.policies import POLICIES, check_policies
+from skipgs_plug.bench.result import build_result
+from skipgs_plug.bench.runner import Bench
+from skipgs_plug.bench.store import BenchFolder
+from skipgs_plug.bench.summary import Row, row_from_dict
+from skipgs_plug.bench.table import legend, markdown, notes
+from skipgs_plug.trainer import TrainConfig, load_scene
+from skipgs_plug.trainer.files import write_aside, write_json
+
+
+@dataclass
+class Options(TrainConfig):
+    """TrainConfig with a schedule that a CPU finishes, without folders and seed."""
+
+    data_dir: tyro.conf.Suppress[str] = ""
+    result_dir: tyro.conf.Suppress[str] = ""
+    seed: tyro.conf.Suppress[int] = 0
+    max_steps: int = 3000
+    """Training iterations."""
+
+
+@dataclass
+class Args:
+    """Densify once per seed, refine that snapshot under each policy, compare time and quality.
+
+    Evaluation, loading and compilation are outside the clock. A killed bench continues where it stopped when
+    the same command is given again.
+    """
+
+    scene: tyro.conf.Positional[str]
+    """Folder with sparse/0 or transforms_train.json, or packed .npz."""
+    out: str = "skipgs_bench"
+    """Folder for table, plots and runs."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of training; each densifies once."""
+    policies: tuple[str, ...] = tuple(POLICIES)
+    """What to compare; controls copy rate or time of gate."""
+    train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
+    no_progress: bool = False
+    """No progress bars."""
+
+
+def main(argv: list[str]) -> int:
+    args = tyro.cli(Args, args=argv, prog="skipgs-plug bench", config=(tyro.conf.FlagCreatePairsOff,))
+    run(args, "skipgs-plug bench " + shlex.join(argv))
+    return 0
+
+
+def run(args: Args, command: str) -> list[Row]:
+    """Run what is missing, print the table, write bench.json, table.md and plots; returns the rows."""
+    check_policies(args.policies)
+    config = dataclasses.replace(args.train, data_dir=args.scene, result_dir=args.out)
+    scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts)
+    folder = BenchFolder(args.out)
+    bench = Bench(scene, config, folder, args.seeds, args.policies, progress=not args.no_progress)
+    print(
+        f"{scene.name}: {len(args.seeds)} seeds x {len(args.policies)} policies, iterations to {config.max_steps:,}, "
+        f"densification to {bench.refine_stop_iter:,}, backend {bench.backend.name}"
+    )
+    records = bench.run()
+    result = build_result(bench, records, command)
+    rows = [row_from_dict(row) for row in result["rows"]]
+    text = markdown(rows) + "\n\n" + "\n".join(notes(rows, result)) + "\n"
+    text += "\n" + "\n".join(f"{name}: {meaning}." for name, meaning in legend(rows)) + "\n"
+    write_json(folder.root / "bench.json", result)
+    with write_aside(folder.root / "table.md") as temporary:
+        temporary.write_text(text)
+    write_plots(folder.root, records, rows, result["view_names"])
+    print(f"\n{text}\nTable, plots and bench.json: {folder.root}; skipgs-plug report {folder.root} makes one page.")
+    return rows
