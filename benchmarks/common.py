@@ -1,0 +1,212 @@
+"""What the speed benchmarks share: scenes, clocks, provenance, result files."""
+
+import functools
+import json
+import os
+import platform
+import shlex
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
+from skipgs_plug.fallback_raster.launch import FloatArray, Worker, worker
+
+RESULTS = Path(__file__).parent / "results"
+SCENES = Path(os.environ.get("SKIPGS_SHARED", Path(__file__).parents[2] / "shared")) / "data"
+
+
+def frustum_scene(n: int, width: int, height: int, seed: int = 0, sh_degree: int | None = None) -> dict[str, Any]:
+    """N Gaussians spread over the view frustum between depth 2 and 6, 40 to 70 of them blended per pixel.
+
+    Their size shrinks with the cube root of N, so the number of blended pairs hardly depends on N.
+    """
+    rng = np.random.default_rng(seed)
+    focal = 0.9 * width
+    half_x, half_y = 0.55 * width / focal, 0.55 * height / focal  # tangents, 10 % beyond the image's border
+    depth = rng.uniform(2, 6, n)
+    room = 4 * half_x * half_y * (6**3 - 2**3) / 3
+    means = np.stack([rng.uniform(-half_x, half_x, n) * depth, rng.uniform(-half_y, half_y, n) * depth, depth], 1)
+    scales = 0.5 * np.cbrt(room / n) * rng.uniform(0.3, 1, (n, 3))
+    quats = rng.normal(size=(n, 4))
+    opacities = 1 / (1 + np.exp(-rng.normal(0, 1.5, n)))
+    colors = rng.uniform(0, 1, (n, 3)) if sh_degree is None else _sh(rng, n, sh_degree)
+    K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+    return _scene(means, quats, scales, opacities, colors, np.eye(4), np.array(K), width, height, sh_degree)
+
+
+def garden_scene(downscale: int, seed: int = 0, sh_degree: int | None = None) -> dict[str, Any]:
+    """The 138,766 SfM points of Mip-NeRF 360 "garden" as round Gaussians, seen by its first camera.
+
+    The seed moves every point by about a hundredth of the distance to its neighbours.
+    """
+    rng = np.random.default_rng(seed)
+    data, spacing = _garden()
+    n = len(spacing)
+    means = data["means3d"] + 0.01 * spacing * rng.normal(size=(n, 3))
+    width, height = int(data["width"]) // downscale, int(data["height"]) // downscale
+    K = data["Ks"][0] * np.array([[width / data["width"]], [height / data["height"]], [1.0]])
+    quats = np.tile([1.0, 0, 0, 0], (n, 1))
+    colors = data["colors"] / 255 if sh_degree is None else _sh(rng, n, sh_degree)
+    scales, opacities = np.repeat(spacing, 3, 1), np.full(n, 0.5)
+    return _scene(means, quats, scales, opacities, colors, data["viewmats"][0], K, width, height, sh_degree)
+
+
+@functools.cache
+def _garden() -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The file's arrays, and the mean distance of every point to its three nearest neighbours [N, 1]."""
+    from scipy.spatial import cKDTree
+
+    with np.load(SCENES / "garden_points.npz") as file:
+        data = dict(file)
+    points = data["means3d"].astype(np.float64)
+    return data, np.maximum(cKDTree(points).query(points, k=4)[0][:, 1:].mean(1, keepdims=True), 1e-7)
+
+
+def _sh(rng: np.random.Generator, n: int, degree: int) -> np.ndarray:
+    return 0.3 * rng.normal(size=(n, (degree + 1) ** 2, 3))
+
+
+def _scene(
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    colors: np.ndarray,
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    width: int,
+    height: int,
+    sh_degree: int | None,
+) -> dict[str, Any]:
+    arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
+    arrays |= {"viewmats": viewmat[None], "Ks": K[None]}
+    tensors = {name: torch.tensor(array, dtype=torch.float32) for name, array in arrays.items()}
+    return {**tensors, "width": width, "height": height, "sh_degree": sh_degree}
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Runs the rasterizer and torch on `count` threads inside a `with` block."""
+    before = get_num_threads(), torch.get_num_threads()
+    set_num_threads(count)
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        set_num_threads(before[0])
+        torch.set_num_threads(before[1])
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def kernel_seconds() -> Iterator[dict[str, float]]:
+    """Collects the wall time of the rasterizer's kernels by name inside a `with` block."""
+    seconds: dict[str, float] = {}
+    original = Worker.__call__
+
+    def timed(self: Worker, *arguments: Any) -> None:
+        start = time.perf_counter()
+        original(self, *arguments)
+        seconds[self._name] = seconds.get(self._name, 0.0) + time.perf_counter() - start
+
+    Worker.__call__ = timed  # type: ignore[method-assign]
+    try:
+        yield seconds
+    finally:
+        Worker.__call__ = original  # type: ignore[method-assign]
+
+
+# Ten independent chains hide the latency of a multiply-add.
+@worker(
+    """
+for (int item = first; item < last; ++item) {
+    v16 a[10];
+    for (int j = 0; j < 10; ++j) a[j] = lane + (float)j;
+    for (int i = 0; i < rounds; ++i)
+        for (int j = 0; j < 10; ++j) a[j] = a[j] * factor + 1.0f;
+    for (int j = 1; j < 10; ++j) a[0] += a[j];
+    out[item] = sum(a[0]);
+}
+""",
+    items="items",
+    grain=1,
+)
+def multiply_add(out: FloatArray, factor: float, rounds: int, items: int) -> None: ...
+
+
+def multiply_adds_per_second() -> float:
+    """Measured peak of the threads in use, float32 multiply-adds, the best of 7 runs."""
+    items, rounds = 64, 100_000
+    out = torch.empty(items)
+    best = min(clock(lambda: multiply_add(out, 0.999, rounds, items)) for _ in range(7))
+    return items * rounds * 10 * 16 / best
+
+
+def clock(work: Callable[[], Any]) -> float:
+    """Seconds that `work` takes."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def median_ms(seconds: Sequence[float]) -> float:
+    return 1000 * statistics.median(seconds)
+
+
+def exponents(sizes: Sequence[float], values: Sequence[float]) -> dict[str, float]:
+    """How `values` grow with `sizes`: least-squares exponent, and the steepest between two neighbours."""
+    x, y = np.log(np.asarray(sizes, float)), np.log(np.asarray(values, float))
+    return {"fitted": float(np.polyfit(x, y, 1)[0]), "steepest": float((np.diff(y) / np.diff(x)).max())}
+
+
+def provenance() -> dict[str, Any]:
+    """What a reader needs to repeat or to doubt the figures."""
+    describe = ["git", "describe", "--always", "--dirty"]
+    commit = subprocess.run(describe, capture_output=True, text=True, cwd=Path(__file__).parent)
+    cpu = platform.processor() or platform.machine()
+    if Path("/proc/cpuinfo").exists():
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), cpu)
+    return {
+        "command": shlex.join(["python", *sys.argv]),
+        "commit": commit.stdout.strip(),
+        "cpu": cpu,
+        "cores": cores(),
+        "load_before": os.getloadavg()[0],  # above 0.5 something else was running: do not trust the times
+        "python": platform.python_version(),
+        "versions": {name: version(name) for name in ("torch", "warp-lang")},
+    }
+
+
+def write_part(path: Path, part: str, rows: Any, about: dict[str, Any]) -> dict[str, Any]:
+    """Replaces one part of a result file and returns the whole; the other parts keep their own provenance."""
+    whole = json.loads(path.read_text()) if path.exists() else {}
+    whole[part] = {"about": about, "rows": rows}
+    path.parent.mkdir(exist_ok=True)
+    aside = path.with_suffix(".tmp")
+    aside.write_text(json.dumps(whole, indent=1) + "\n")
+    os.replace(aside, path)
+    return whole
+
+
+def leaves(scene: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """A copy of the scene in which the named tensors want gradients."""
+    copy = {k: v.clone() if isinstance(v, Tensor) else v for k, v in scene.items()}
+    for name in names:
+        copy[name].requires_grad_()
+    return copy

@@ -1,0 +1,330 @@
+"""Speed of the CPU rasterizer: forward and backward pass, scaling, growth, memory, and what each shortcut saves.
+
+    python benchmarks/raster.py                        # everything, about ten minutes on two cores
+    python benchmarks/raster.py --parts scenes --quick
+
+A pass is `rasterization`, a mean-L1 loss and the backward to means, scales, quats, opacities and colours; times are
+medians over repeats with fresh inputs after two warm-up passes. Every part prints a table and replaces its entry in
+`benchmarks/results/raster.json`; the plot `raster.png` shows all parts measured so far. Run it on an idle machine.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+from common import (
+    RESULTS,
+    cores,
+    exponents,
+    frustum_scene,
+    garden_scene,
+    kernel_seconds,
+    leaves,
+    median_ms,
+    multiply_adds_per_second,
+    provenance,
+    threads,
+    write_part,
+)
+from pairs import blended_pairs
+from torch import Tensor
+
+from skipgs_plug.fallback_raster import rasterization
+from skipgs_plug.fallback_raster.shortcuts import SHORTCUTS, without_shortcuts
+
+PARAMETERS = ("means", "scales", "quats", "opacities", "colors")
+FILE = RESULTS / "raster.json"
+Part = Literal["scenes", "threads", "growth", "shortcuts"]
+
+# Milliseconds of other CPU implementations on two cores of an AVX-512 server, idle: OpenSplat 15b7e80 (C++, one
+# thread; its sort and conic gradient are wrong) and 3dgs-warp-scratch 5069396 (scale gradient wrong).
+PEERS = {
+    ("random", 1_000, "128x128"): (28, 54),
+    ("random", 1_000, "256x256"): (102, 150),
+    ("random", 1_000, "504x378"): (348, 398),
+    ("random", 10_000, "128x128"): (64, 163),
+    ("random", 10_000, "256x256"): (215, 417),
+    ("random", 10_000, "504x378"): (701, 922),
+    ("random", 50_000, "128x128"): (112, 264),
+    ("random", 50_000, "256x256"): (298, 577),
+    ("random", 50_000, "504x378"): (815, 1196),
+    ("garden", 138_766, "162x105"): (182, 830),
+    ("garden", 138_766, "324x210"): (377, 1074),
+    ("garden", 138_766, "648x420"): (1226, 1796),
+}
+GARDEN_DOWNSCALE = {"162x105": 4, "324x210": 2, "648x420": 1}
+
+# Multiply-adds that a blended pair cannot do without. Forward: quadratic form 2, exp 5, transmittance 2, weight 1,
+# colour 3. Backward: the first seven again, transmittance 3, colour behind and v_alpha 6, weight, v_sigma and
+# behind 3, colour gradient 3, moments 3.
+MULTIPLY_ADDS_PER_PAIR = 13 + 25
+
+PHASES = {
+    "project": ("project_forward", "sh_forward"),
+    "bin and sort": ("depth_sort", "pack", "count_pairs", "scan_pairs", "fill_pairs"),
+    "blend": ("blend_forward_3",),
+    "blend backward": ("blend_backward_3", "reduce_pairs"),
+    "project backward": ("project_backward", "sh_backward"),
+}
+
+
+def one_pass(scene: dict[str, Any], seed: int, loss_columns: slice = slice(None)) -> tuple[float, float, Any]:
+    """Seconds of the forward pass with the loss, seconds of the backward pass, and the inputs with gradients."""
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.rand(1, scene["height"], scene["width"], 3, generator=generator)
+    inputs = leaves(scene, PARAMETERS)
+    start = time.perf_counter()
+    image, _, _ = rasterization(**inputs, packed=False)
+    loss = (image - target)[:, :, loss_columns].abs().mean()
+    middle = time.perf_counter()
+    loss.backward()
+    return middle - start, time.perf_counter() - middle, {**inputs, "image": image.detach()}
+
+
+def measure(make: Callable[[int], dict[str, Any]], repeats: int) -> dict[str, Any]:
+    """Medians over passes with fresh inputs, the first two left out."""
+    forward, backward, whole = [], [], []
+    phases: dict[str, list[float]] = {name: [] for name in (*PHASES, "other")}
+    for seed in range(repeats + 2):
+        scene = make(seed)
+        with kernel_seconds() as kernels:
+            there, back, _ = one_pass(scene, seed)
+        forward.append(there)
+        backward.append(back)
+        whole.append(there + back)
+        for name, members in PHASES.items():
+            phases[name].append(sum(kernels.get(member, 0.0) for member in members))
+        phases["other"].append(there + back - sum(kernels.values()))
+    return {
+        "ms": median_ms(whole[2:]),
+        "ms_min": 1000 * min(whole[2:]),
+        "forward_ms": median_ms(forward[2:]),
+        "backward_ms": median_ms(backward[2:]),
+        "phases_ms": {name: median_ms(values[2:]) for name, values in phases.items()},
+    }
+
+
+def scene_maker(kind: str, n: int, size: str, sh_degree: int | None = None) -> Callable[[int], dict[str, Any]]:
+    """The function that gives scene number `seed` of a kind ("random" or "garden") and image size."""
+    if kind == "garden":
+        return lambda seed: garden_scene(GARDEN_DOWNSCALE[size], seed, sh_degree)
+    width, height = map(int, size.split("x"))
+    return lambda seed: frustum_scene(n, width, height, seed, sh_degree)
+
+
+def part_scenes(quick: bool, repeats: int) -> list[dict[str, Any]]:
+    """The scenes that other implementations were timed on, on all cores and on one."""
+    counts = sorted({1, cores()}, reverse=True)
+    peaks = {}
+    for count in counts:
+        with threads(count):
+            peaks[count] = multiply_adds_per_second()
+    print("measured peak, 10^9 multiply-adds/s: ", {count: round(peak / 1e9, 1) for count, peak in peaks.items()})
+    print(
+        f"{'scene':>22} {'pairs':>8} {'threads':>7} {'ms':>7} {'fwd':>6} {'bwd':>6} {'M pairs/s':>9} {'peak':>5}",
+        end="",
+    )
+    print(f" {'peer':>6} {'faster':>6}  phases (ms)")
+    rows = []
+    for (kind, n, size), peer in PEERS.items():
+        if quick and size not in ("504x378", "324x210"):
+            continue
+        make = scene_maker(kind, n, size)
+        pairs = blended_pairs(make(0))
+        for count in counts:
+            with threads(count):
+                row: dict[str, Any] = {"kind": kind, "gaussians": n, "size": size, "pairs": pairs, "threads": count}
+                row |= measure(make, repeats)
+            seconds = row["ms"] / 1000
+            row["pairs_per_second"] = pairs / seconds
+            row["share_of_peak"] = pairs * MULTIPLY_ADDS_PER_PAIR / seconds / peaks[count]
+            row["peak_multiply_adds_per_second"] = peaks[count]
+            row["best_peer_ms"] = min(peer)
+            rows.append(row)
+            print(
+                f"{kind:>7} {n:>7,} {size:>7} {pairs / 1e6:7.2f}M {count:7} {row['ms']:7.1f} {row['forward_ms']:6.1f} "
+                f"{row['backward_ms']:6.1f} {row['pairs_per_second'] / 1e6:9.0f} {row['share_of_peak']:5.0%} "
+                f"{min(peer):6} {min(peer) / row['ms']:5.1f}x  "
+                + ", ".join(f"{name} {ms:.1f}" for name, ms in row["phases_ms"].items()),
+                flush=True,
+            )
+    return rows
+
+
+def part_threads(quick: bool, repeats: int) -> list[dict[str, Any]]:
+    """How one scene speeds up with the number of threads."""
+    make = scene_maker("random", 10_000 if quick else 50_000, "504x378")
+    rows: list[dict[str, Any]] = []
+    for count in sorted({1, cores(), *(2**k for k in range(cores().bit_length()))}):
+        with threads(count):
+            rows.append({"threads": count, **measure(make, repeats)})
+        speedup = rows[0]["ms"] / rows[-1]["ms"]
+        rows[-1]["speedup"] = speedup
+        print(f"{count:3} threads {rows[-1]['ms']:8.1f} ms  {speedup:.2f}x", flush=True)
+    return rows
+
+
+def part_growth(quick: bool, repeats: int) -> list[dict[str, Any]]:
+    """Time and peak memory against Gaussians, pixels and SH degree; each point in a process of its own."""
+    gaussians = (1_000, 10_000, 100_000) if quick else (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
+    sizes = ("128x128", "256x256", "504x378", "1008x756", "1920x1080")[: 3 if quick else 5]
+    series = {
+        "gaussians": [(n, (n, "504x378", None)) for n in gaussians],
+        "pixels": [(int(s.split("x")[0]) * int(s.split("x")[1]), (10_000, s, None)) for s in sizes],
+        "SH terms": [((d + 1) ** 2, (100_000, "504x378", d)) for d in range(4)],
+    }
+    rows = []
+    for name, points in series.items():
+        row: dict[str, Any] = {"series": name, "points": []}
+        for x, point in points:
+            command = [sys.executable, __file__, "--point", json.dumps(point), "--repeats", str(repeats)]
+            out = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+            row["points"].append({"x": x, **json.loads(out.splitlines()[-1])})
+            last = row["points"][-1]
+            print(f"{name:>10} {x:>9,} {last['ms']:8.1f} ms {last['peak_mib']:7.0f} MiB above start", flush=True)
+        xs = [p["x"] for p in row["points"]]
+        row["time_exponent"] = exponents(xs, [p["ms"] for p in row["points"]])
+        row["memory_exponent"] = exponents(xs, [max(p["peak_mib"], 1.0) for p in row["points"]])
+        row["sort_exponent"] = exponents(xs, [p["phases_ms"]["bin and sort"] for p in row["points"]])
+        for kind in ("time", "memory", "sort"):
+            found = row[f"{kind}_exponent"]
+            print(f"{name:>10} {kind} grows with exponent {found['fitted']:.2f}, at most {found['steepest']:.2f}")
+        rows.append(row)
+    return rows
+
+
+def measure_point(point: str, repeats: int) -> None:
+    """One point of `part_growth`: prints time and memory as JSON."""
+    n, size, sh_degree = json.loads(point)
+    one_pass(frustum_scene(10, 32, 32, 0, sh_degree), 0)  # loads and, on first use, compiles every kernel
+    if Path("/proc/self/clear_refs").exists():
+        Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew: compiling took more than rendering may
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    result = measure(scene_maker("random", n, size, sh_degree), repeats)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    per_mib = 1 << 20 if sys.platform == "darwin" else 1 << 10  # bytes there, KiB on Linux
+    print(json.dumps({**result, "peak_mib": (peak - before) / per_mib}))
+
+
+def part_shortcuts(quick: bool, repeats: int) -> list[dict[str, Any]]:
+    """Time with and without each shortcut, in turns, and by how much it changes the result."""
+    scene = garden_scene(GARDEN_DOWNSCALE["324x210" if quick else "648x420"], 0, sh_degree=3)
+    left = slice(0, scene["width"] // 2)  # half of the image has no gradient
+    names: list[tuple[str, ...]] = [(name,) for name in SHORTCUTS] + [tuple(SHORTCUTS)]
+    rows = []
+    print(f"{'left out':>18} {'ms':>7} {'ms with':>7} {'saves':>6} {'image':>8} {'gradient':>8}")
+    for left_out in names:
+        with_it, without = [], []
+        for seed in range(repeats + 1):
+            there, back, fast = one_pass(scene, seed, left)
+            with_it.append(there + back)
+            with without_shortcuts(*left_out):
+                there, back, slow = one_pass(scene, seed, left)
+            without.append(there + back)
+        row = {
+            "shortcut": left_out[0] if len(left_out) == 1 else "all",
+            "ms": median_ms(with_it[1:]),
+            "ms_without": median_ms(without[1:]),
+            "image_difference": (fast["image"] - slow["image"]).abs().max().item(),
+            "gradient_difference": max(relative_difference(fast[p].grad, slow[p].grad) for p in PARAMETERS),
+        }
+        rows.append(row)
+        print(
+            f"{row['shortcut']:>18} {row['ms_without']:7.1f} {row['ms']:7.1f} {1 - row['ms'] / row['ms_without']:6.1%} "
+            f"{row['image_difference']:8.1e} {row['gradient_difference']:8.1e}",
+            flush=True,
+        )
+    return rows
+
+
+def relative_difference(value: Tensor, truth: Tensor) -> float:
+    return ((value - truth).double().norm() / truth.double().norm().clamp(min=1e-300)).item()
+
+
+PARTS: dict[str, Callable[[bool, int], list[dict[str, Any]]]] = {
+    "scenes": part_scenes,
+    "threads": part_threads,
+    "growth": part_growth,
+    "shortcuts": part_shortcuts,
+}
+
+
+def plot(results: dict[str, Any]) -> None:
+    """Draws every part that was measured into raster.png."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, 2, figsize=(12, 9), layout="constrained")
+    scenes, growth, scaling, shortcuts = axes.flat
+    for axis in axes.flat:
+        axis.grid(alpha=0.3)
+    if "scenes" in results:
+        rows = results["scenes"]["rows"]
+        counts = sorted({row["threads"] for row in rows})
+        labels = [f"{r['kind']} {r['gaussians']:,} {r['size']}" for r in rows if r["threads"] == counts[0]]
+        peers = [row["best_peer_ms"] for row in rows if row["threads"] == counts[0]]
+        bars = {"best peer": peers} | {f"{c} threads": [r["ms"] for r in rows if r["threads"] == c] for c in counts}
+        for shift, (label, values) in enumerate(bars.items()):
+            scenes.barh([i + 0.27 * (shift - 1) for i in range(len(labels))], values, 0.25, label=label)
+        scenes.set(xscale="log", xlabel="forward + backward (ms)", yticks=range(len(labels)), yticklabels=labels)
+        scenes.invert_yaxis()
+        scenes.legend()
+    for row in results.get("growth", {"rows": []})["rows"]:
+        x = [point["x"] for point in row["points"]]
+        label = f"{row['series']}, exponent {row['time_exponent']['fitted']:.2f}"
+        growth.plot(x, [point["ms"] for point in row["points"]], "o-", label=label)
+    if "growth" in results:
+        growth.set(xscale="log", yscale="log", xlabel="Gaussians, pixels or SH terms", ylabel="ms")
+        growth.legend()
+    if "threads" in results:
+        rows = results["threads"]["rows"]
+        counts = [row["threads"] for row in rows]
+        scaling.plot(counts, [row["speedup"] for row in rows], "o-", label="measured")
+        scaling.plot(counts, counts, "--", color="gray", label="ideal")
+        scaling.set(xlabel="threads", ylabel="times faster than one thread", xticks=counts)
+        scaling.legend()
+    if "shortcuts" in results:
+        rows = results["shortcuts"]["rows"]
+        shortcuts.barh([row["shortcut"] for row in rows], [row["ms_without"] for row in rows])
+        shortcuts.axvline(rows[0]["ms"], color="black", label="all shortcuts in use")
+        shortcuts.set(xlabel="ms without the shortcut")
+        shortcuts.legend()
+    figure.savefig(FILE.with_suffix(".png"), dpi=120)
+
+
+def main(
+    parts: tuple[Part, ...] = ("scenes", "threads", "growth", "shortcuts"),
+    quick: bool = False,
+    repeats: int = 7,
+    point: str | None = None,
+) -> None:
+    """Measure the rasterizer.
+
+    Args:
+        parts: Which tables to measure.
+        quick: Fewer and smaller scenes.
+        repeats: Timed passes per row.
+        point: For the benchmark's own use: one point of a growth series, as JSON.
+    """
+    if point is not None:
+        measure_point(point, repeats)
+        return
+    for part in parts:
+        about = provenance() | {"repeats": repeats, "quick": quick}
+        print(f"\n{part}: {about['cpu']}, {about['cores']} cores, commit {about['commit']}")
+        plot(write_part(FILE, part, PARTS[part](quick, repeats), about))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
