@@ -24,6 +24,8 @@ class ToyTrainer:
     def render(self, view: str) -> torch.Tensor:
         return self.parameter * (1.0 + 0.1 * int(view[1:]))
 
+    def measure(self, step: int) -> None: ...
+
     def prune(self) -> None: ...
 
     def add_noise(self) -> None:
@@ -34,6 +36,7 @@ class ToyTrainer:
             self.begin(step)
             image = self.render(f"v{step % 10}") if self.rendering else self.parameter
             loss = (image**2).mean()
+            self.measure(step)
             for _ in range(self.backwards):
                 loss.backward(retain_graph=True)
             self.optimizer.step()
@@ -140,6 +143,34 @@ def test_always_skipping_keeps_parameters_but_for_forced_iterations() -> None:
     expected.train()
     assert torch.equal(expected.parameter, trainer.parameter)
     assert policy.asked == list(range(20, 45))
+
+
+def test_a_signal_is_decided_on_in_its_own_iteration_only() -> None:
+    class Signalling(Toy):
+        def attach(self, hooks) -> None:
+            super().attach(hooks)
+            hooks.before(self.trainer, "measure", lambda step: hooks.signal(123.0) if step == 30 else None)
+
+    trainer = ToyTrainer()
+    with SkipGate(trainer, adapter=Signalling(trainer), record_trace=True) as gate:
+        trainer.train()
+    assert [row.step for row in gate.trace if row.loss == 123.0] == [30]
+
+
+def test_other_things_are_taken_back_too() -> None:
+    undone = []
+
+    class Listing(Toy):
+        def attach(self, hooks) -> None:
+            super().attach(hooks)
+            hooks.on_detach("trainer.registry", lambda: undone.append(1))
+
+    trainer = ToyTrainer()
+    gate = SkipGate(trainer, adapter=Listing(trainer))
+    assert "trainer.registry" in gate.patched
+    gate.detach()
+    gate.detach()
+    assert undone == [1]
 
 
 def test_two_attaches_are_refused() -> None:
