@@ -66,3 +66,15 @@ class AbstractAdapter(ABC):
     def timing(self) -> tuple[float, float] | None:
         """Seconds of training in all and after densification, when the trainer keeps them itself."""
         return None
+
+
+def refuse_other_processes(hooks: Hooks) -> None:
+    """Let a script fail that is about to spread training over several processes, where no gate is attached."""
+
+    def spawned(fn: Any, args: Any = (), nprocs: int = 1, *more: Any, **options: Any) -> None:
+        raise SkipGSError(
+            f"The script starts {nprocs} processes, which the gate cannot reach; train in one, for example with "
+            "CUDA_VISIBLE_DEVICES=0."
+        )
+
+    hooks.before(torch.multiprocessing, "spawn", spawned)

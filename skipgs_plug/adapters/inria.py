@@ -13,7 +13,8 @@ import types
 import warnings
 import weakref
 from abc import abstractmethod
-from collections.abc import Callable
+from collections import ChainMap
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -21,8 +22,17 @@ import torch
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.views import view_key
 
 LOOP = "training"  # name of the function that holds the loop, in the whole family
+# By adapter: a global name that only this fork's training scripts have.
+FORK_MARKS = {
+    "fastgs": "render_fastgs",
+    "taming": "get_count_array",
+    "speedy_splat": "score_func",
+    "lightgaussian": "calculate_v_imp_score",
+    "gaussianspa": "OptimizingSpa",
+}
 
 
 class InriaFamily(AbstractAdapter):
@@ -31,31 +41,42 @@ class InriaFamily(AbstractAdapter):
     Attributes:
         renders: names of the functions that render a training view; at least one must exist.
         structural: methods of `GaussianModel` that make losses jump.
+        scenes: names that the loop's variable for its Scene can have.
     """
 
     renders: ClassVar[tuple[str, ...]] = ("render",)
     structural: ClassVar[tuple[str, ...]] = ("prune_points", "reset_opacity", "training_setup")
+    scenes: ClassVar[tuple[str, ...]] = ("scene",)
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
         self.output_folder: str | None = None  # `model_path` of the run, known when training begins
         self._step = 0
         self._model: Callable[[], Any] = lambda: None  # a new model means a new run
-        self._key: Callable[[Any], Any] = lambda camera: getattr(camera, "image_name", None)
+        self._label = "image_name"  # attribute of a camera that names its view
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:
         names = namespace_of(trainer)
-        return names is not None and "GaussianModel" in names and cls.recognises(names)
+        return names is not None and LOOP in names and "GaussianModel" in names and cls.recognises(names)
 
     @classmethod
-    @abstractmethod
-    def recognises(cls, names: dict[str, Any]) -> bool:
+    def recognises(cls, names: Mapping[str, Any]) -> bool:
         """Whether a train module with these global names is this trainer's."""
+        return fork_of(names) == cls.name
 
     @abstractmethod
-    def start_iter(self, opt: Any) -> int:
-        """First iteration after densification, from the run's optimization options."""
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        """First iteration that may be skipped.
+
+        Args:
+            opt: The run's optimization options.
+            loop: Everything that `training` has a name for, when its first iteration begins. Not to be kept.
+        """
+
+    def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        """First iteration whose gradients only the optimizers read; arguments as for `start_iter`."""
+        return int(opt.densify_until_iter)
 
     def attach(self, hooks: Hooks) -> None:
         names = namespace_of(self.trainer)
@@ -64,6 +85,7 @@ class InriaFamily(AbstractAdapter):
                 f"Adapter {self.name!r} expects a train module with {LOOP}() and GaussianModel, or its "
                 f"{LOOP} function, as in {self.checked}."
             )
+        self._refuse_fork(names)
         self._hang(hooks, names, names["GaussianModel"])
 
     def attach_script(self, hooks: Hooks) -> None:
@@ -83,7 +105,9 @@ class InriaFamily(AbstractAdapter):
         def heartbeat(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             # Frame 2 is the loop. Its variables are read once, before they hold an iteration's graph.
             if self._model() is not args[0]:
-                self._begin(hooks, sys._getframe(2).f_locals)
+                frame = sys._getframe(2)
+                self._refuse_fork(frame.f_globals)
+                self._begin(hooks, ChainMap(frame.f_locals, frame.f_globals))
                 self._model = weakref.ref(args[0])
             else:
                 self._step += 1
@@ -92,7 +116,7 @@ class InriaFamily(AbstractAdapter):
 
         def rendered(original: Callable[..., Any], camera: Any, *args: Any, **kwargs: Any) -> Any:
             # Not a training camera without a name: the viewer's, which renders before the training view.
-            if self.is_training_render(args, kwargs) and (key := self._key(camera)) is not None:
+            if self.is_training_render(args, kwargs) and (key := self.view_key(camera)) is not None:
                 hooks.view(key)
             return original(camera, *args, **kwargs)
 
@@ -106,17 +130,33 @@ class InriaFamily(AbstractAdapter):
         """Whether a render with these arguments after the camera can be the training one."""
         return torch.is_grad_enabled()
 
-    def _begin(self, hooks: Hooks, loop: dict[str, Any]) -> None:
-        """Read options, views and first iteration from the loop's variables."""
-        missing = [name for name in ("opt", "iteration", "scene") if name not in loop]
-        if missing:
+    def view_key(self, camera: Any) -> Any:
+        """What names this camera's view; None for a camera that is not of the training set."""
+        return getattr(camera, self._label, None)
+
+    def view_keys(self, cameras: Sequence[Any]) -> list[Any]:
+        """Every key that `view_key` can give."""
+        return [getattr(camera, self._label) for camera in cameras]
+
+    def _refuse_fork(self, names: Mapping[str, Any]) -> None:
+        if not self.recognises(names):
             raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects {', '.join(missing)} among the variables of {LOOP}(), "
-                f"as in {self.checked}."
+                f"Adapter {self.name!r} is for {self.checked}, but {names.get('__file__') or names.get('__name__')} "
+                f"looks like the training script of {fork_of(names)!r}."
+            )
+
+    def _begin(self, hooks: Hooks, loop: Mapping[str, Any]) -> None:
+        """Read options, views and first iteration from the loop's variables."""
+        scene = next((loop[name] for name in self.scenes if name in loop), None)
+        missing = [name for name in ("opt", "iteration") if name not in loop]
+        if scene is None or missing:
+            wanted = ", ".join(missing or self.scenes)
+            raise AdapterMismatchError(
+                f"Adapter {self.name!r} expects {wanted} among the variables of {LOOP}(), as in {self.checked}."
             )
         opt, self._step = loop["opt"], int(loop["iteration"])
-        self.output_folder = getattr(loop["scene"], "model_path", None)
-        cameras = loop["scene"].getTrainCameras()
+        self.output_folder = getattr(scene, "model_path", None)
+        cameras = scene.getTrainCameras()
         names = [camera.image_name for camera in cameras]
         if len(set(names)) < len(names):
             warnings.warn(
@@ -125,9 +165,13 @@ class InriaFamily(AbstractAdapter):
                 RuntimeWarning,
                 stacklevel=2,
             )
-            self._key = lambda camera: getattr(camera, "uid", None)
-            names = [str(camera.uid) for camera in cameras]
-        hooks.ready(self.start_iter(opt), view_names=names, max_steps=opt.iterations)
+            self._label = "uid"
+        hooks.ready(
+            self.start_iter(opt, loop),
+            view_names=[view_key(key) for key in self.view_keys(cameras)],
+            max_steps=opt.iterations,
+            gradients_read_until=self.gradients_read_until(opt, loop),
+        )
 
 
 class Inria(InriaFamily):
@@ -136,12 +180,13 @@ class Inria(InriaFamily):
     name = "inria"
     checked = "graphdeco-inria/gaussian-splatting 8a70a8cd and 54c035f"
 
-    @classmethod
-    def recognises(cls, names: dict[str, Any]) -> bool:
-        return "render" in names and LOOP in names
-
-    def start_iter(self, opt: Any) -> int:
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter)
+
+
+def fork_of(names: Mapping[str, Any]) -> str:
+    """Name of the adapter for a train module with these global names."""
+    return next((fork for fork, mark in FORK_MARKS.items() if mark in names), Inria.name)
 
 
 def namespace_of(trainer: Any) -> dict[str, Any] | None:

@@ -9,9 +9,17 @@ from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.core.adapter import use_finder
 from skipgs_plug.core.errors import SkipGSError, UnknownTrainerError
 
-# In the order in which they are asked: forks before what they were forked from. Loaded when asked for.
+# In the order in which they are asked. Loaded when asked for.
 BUILTIN = {
     "reference": "skipgs_plug.adapters.reference_trainer:ReferenceTrainer",
+    "gsplat": "skipgs_plug.adapters.gsplat_runner:GsplatRunner",
+    "step_trainer": "skipgs_plug.adapters.step_trainer:StepTrainer",
+    "nerfstudio": "skipgs_plug.adapters.nerfstudio:Nerfstudio",
+    "fastgs": "skipgs_plug.adapters.fastgs:FastGS",
+    "taming": "skipgs_plug.adapters.taming:Taming",
+    "speedy_splat": "skipgs_plug.adapters.speedy_splat:SpeedySplat",
+    "lightgaussian": "skipgs_plug.adapters.lightgaussian:LightGaussian",
+    "gaussianspa": "skipgs_plug.adapters.gaussianspa:GaussianSpa",
     "inria": "skipgs_plug.adapters.inria:Inria",
 }
 

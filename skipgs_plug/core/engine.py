@@ -66,6 +66,7 @@ class Engine:
         view_names: Iterable[str] | None = None,
         max_steps: int | None = None,
         world_size: int | None = None,
+        gradients_read_until: int | None = None,
         defaults: dict[str, Any] | None = None,
     ) -> None:
         """Complete the settings with what is known of the trainer, and make the policy.
@@ -75,10 +76,12 @@ class Engine:
             view_names: Keys of all training views.
             max_steps: Last iteration.
             world_size: Number of processes.
+            gradients_read_until: No skip may happen before this iteration.
             defaults: Further settings to replace.
 
         Raises:
-            SkipGSError: Nothing says when to begin, view names repeat, or other processes are out of reach.
+            SkipGSError: Nothing says when to begin, the settings begin too early, view names repeat, or other
+                processes are out of reach.
         """
         if world_size is not None:
             distributed.refuse_unreachable_ranks(world_size)
@@ -89,6 +92,11 @@ class Engine:
         if config.start_iter is None:
             raise SkipGSError("This trainer does not densify, so the gate cannot know when to begin; give start_iter=.")
         self.start = config.start_iter
+        if config.enabled and gradients_read_until is not None and self.start < gradients_read_until:
+            raise SkipGSError(
+                f"start_iter={self.start} is too early: up to iteration {gradients_read_until} this trainer's "
+                "densification reads the gradients; start there or later, or leave start_iter out."
+            )
         if view_names is not None:
             self._view_names = require_unique(view_names)
         if config.enabled and max_steps is not None and self.start > max_steps:
@@ -105,6 +113,11 @@ class Engine:
             )
         if self._pending_state is not None:
             self.load_state_dict(self._pending_state)
+
+    @property
+    def active(self) -> bool:
+        """Whether the present iteration is gated."""
+        return self.config.enabled and self.step is not None and self.step >= self.start
 
     @property
     def skipped(self) -> bool:
@@ -156,7 +169,7 @@ class Engine:
         """
         assert self.step is not None
         self.stats.iterations += 1
-        if not self.config.enabled or self.step < self.start:
+        if not self.active:
             self._decision = decision.INACTIVE
             return self._decision
         loss = float(signal.detach() if isinstance(signal, Tensor) else signal)

@@ -55,6 +55,7 @@ class Hooks:
         view_names: Iterable[str] | None = None,
         max_steps: int | None = None,
         world_size: int | None = None,
+        gradients_read_until: int | None = None,
         defaults: dict[str, Any] | None = None,
     ) -> None:
         """Give what must be known before the first iteration.
@@ -65,10 +66,12 @@ class Hooks:
             view_names: Keys of all training views, checked for uniqueness.
             max_steps: Last iteration; a gate that starts after it is worth a warning.
             world_size: Number of processes, when the trainer knows better than WORLD_SIZE.
+            gradients_read_until: Before this iteration more than the optimizers reads gradients, densification
+                say, so that a gate which the user starts earlier is refused.
             defaults: Settings that suit this trainer, used where the user gave none.
         """
         suggested = {name: value for name, value in (defaults or {}).items() if name not in self._given}
-        self._engine.configure(start_iter, view_names, max_steps, world_size, suggested)
+        self._engine.configure(start_iter, view_names, max_steps, world_size, gradients_read_until, suggested)
         self._ready = True
 
     # What the trainer does.
@@ -87,7 +90,12 @@ class Hooks:
                 self._engine.steps.attach(self, self._adapter.optimizers, self._engine)
 
     def view(self, key: Any) -> None:
-        """The present iteration renders this view for training; the last one before the backward counts."""
+        """The present iteration renders this view for training; the last one before the backward counts.
+
+        Args:
+            key: As for `SkipGate.backward`; or a function that gives it, called in gated iterations only, for
+                a key that has to be read from the device.
+        """
         self._view = key
 
     def signal(self, value: float | torch.Tensor) -> None:
@@ -113,6 +121,8 @@ class Hooks:
             view = self._view if view is None else view
             if view is None:
                 raise self._mismatch("no training view was rendered before the backward")
+            if callable(view):
+                view = view() if self._engine.active else "not read"
             self._engine.gate(view_key(view), loss if self._signal is None else self._signal, run)
             return None
 

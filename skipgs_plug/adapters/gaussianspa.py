@@ -1,0 +1,36 @@
+"""GaussianSpa: train_imp_score.py, train_opacity.py and train_op.py, with an ADMM phase after densification."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+
+
+class GaussianSpa(InriaFamily):
+    """Gated after the sparsifying phase, whose alternation of steps has to stay as it is.
+
+    That phase ends with a prune, in the last iteration before the gate begins. A gate that is started
+    earlier by hand runs every iteration whose loss holds the ADMM term, and keeps it out of the means.
+    Iterations are counted, since `update_learning_rate` is called with shifted numbers.
+    """
+
+    name = "gaussianspa"
+    checked = "noodle-lab/GaussianSpa abdfaf64"
+    renders = ("render_imp", "render")
+    structural = (*InriaFamily.structural, "reinitial_pts")
+
+    def __init__(self, trainer: Any = None) -> None:
+        super().__init__(trainer)
+        self._admm = range(0)
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        first, last = int(opt.optimizing_spa_start_iter) + 1, int(opt.optimizing_spa_stop_iter)
+        interval = int(opt.optimizing_spa_interval)
+        # The scripts disagree on whether the last of these carries the term; it is run either way.
+        self._admm = range(first + -first % interval, last + 1, interval)
+        return max(last + 1, int(opt.densify_until_iter))
+
+    def must_run(self, step: int) -> bool:
+        return step in self._admm

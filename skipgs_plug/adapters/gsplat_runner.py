@@ -1,0 +1,100 @@
+"""gsplat's examples/simple_trainer.py: the `Runner` of PyPI 1.5.3 and of HEAD, DefaultStrategy and MCMCStrategy."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
+from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
+from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.hooks import Hooks
+
+EXPECTED = ("cfg", "parser", "trainset", "rasterize_splats", "world_size")
+BATCH = "batch"  # one key for the joint loss of random batches, which never recur
+
+
+class GsplatRunner(AbstractAdapter):
+    """One iteration: render, `strategy.step_pre_backward`, backward, optimizers, `strategy.step_post_backward`.
+
+    Optimizers are left alone: they zero gradients to None. MCMC's noise is left out where the gradient step
+    is. The strategy's methods are replaced on its class, since `train` writes the instance to a YAML file.
+    """
+
+    name = "gsplat"
+    checked = "nerfstudio-project/gsplat v1.5.3 and 90d7b4b3 (v1.6.0)"
+
+    def __init__(self, trainer: Any = None) -> None:
+        super().__init__(trainer)
+        self.output_folder: str | None = None
+        self._relocations = range(0)
+
+    @classmethod
+    def matches(cls, trainer: Any) -> bool:
+        strategy = getattr(getattr(trainer, "cfg", None), "strategy", None)
+        return hasattr(strategy, "step_pre_backward") and hasattr(trainer, "rasterize_splats")
+
+    def attach_script(self, hooks: Hooks) -> None:
+        def launched(original: Callable[..., Any], main: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            hooks.wrap(main.__globals__["Runner"], "train", begins)
+            return original(main, *args, **kwargs)
+
+        def begins(original: Callable[..., Any], runner: Any, *args: Any, **kwargs: Any) -> Any:
+            self.trainer = runner
+            self.attach(hooks)
+            return original(runner, *args, **kwargs)
+
+        refuse_other_processes(hooks)
+        hooks.wrap(importlib.import_module("gsplat.distributed"), "cli", launched)
+
+    def attach(self, hooks: Hooks) -> None:
+        runner = self.trainer
+        missing = [name for name in EXPECTED if not hasattr(runner, name)]
+        if missing:
+            raise AdapterMismatchError(
+                f"Adapter {self.name!r} expects a Runner with {', '.join(missing)}, as in {self.checked}."
+            )
+        strategy = runner.cfg.strategy
+        batched = runner.cfg.batch_size > 1
+        names = [BATCH] if batched else view_names(runner)
+        rendered: list[torch.Tensor] = []  # ids of the views rendered last, on the device
+
+        def remember(*args: Any, image_ids: torch.Tensor | None = None, **kwargs: Any) -> None:
+            if image_ids is not None and torch.is_grad_enabled():  # else the viewer's or an evaluation
+                rendered[:] = [image_ids]
+
+        def forwarded(own: Any, *args: Any, step: int, **kwargs: Any) -> None:
+            if own is strategy:
+                hooks.iteration(step)
+                if rendered:
+                    ids = rendered.pop()
+                    hooks.view(BATCH if batched else lambda: names[int(ids)])
+
+        # HEAD's stage took hold of rasterize_splats when the runner was built.
+        stage = getattr(runner, "stage", None)
+        hooks.before(*((runner, "rasterize_splats") if stage is None else (stage, "render")), remember)
+        hooks.before(type(strategy), "step_pre_backward", forwarded)
+        hooks.gate_tensor_backward("train")
+        self._relocations = leave_out_noise(hooks, strategy, type(strategy))
+        self.output_folder = runner.cfg.result_dir
+        hooks.ready(
+            strategy.refine_stop_iter,
+            view_names=names,
+            max_steps=runner.cfg.max_steps - 1,
+            world_size=runner.world_size,
+            gradients_read_until=gradients_read_until(strategy),
+        )
+
+    def must_run(self, step: int) -> bool:
+        return step in self._relocations
+
+
+def view_names(runner: Any) -> list[str]:
+    """Image names of the training views, in the order of their ids."""
+    names, indices = getattr(runner.parser, "image_names", None), getattr(runner.trainset, "indices", None)
+    if names is None or indices is None:
+        return [str(i) for i in range(len(runner.trainset))]
+    return [names[i] for i in indices]

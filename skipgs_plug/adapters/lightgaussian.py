@@ -1,0 +1,54 @@
+"""LightGaussian: train_densify_prune.py, prune_finetune.py and distill_train.py."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+
+
+class LightGaussian(InriaFamily):
+    """Fine-tuning and distilling are gated from the beginning, training from scratch after densification.
+
+    prune_finetune.py prunes in its first iteration, after the backward: the gate begins with the second.
+    distill_train.py jitters the camera in two of three iterations. Their losses scatter more than those of
+    the camera itself and are no measure of it, so both have means of their own.
+    """
+
+    name = "lightgaussian"
+    checked = "VITA-Group/LightGaussian 6676b983"
+    scenes = ("scene", "student_scene")
+
+    def __init__(self, trainer: Any = None) -> None:
+        super().__init__(trainer)
+        self._jitters = False
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        self._jitters = distills(loop) and loop["args"].augmented_view
+        if distills(loop):
+            return int(loop["iteration"])
+        if finetunes(loop):
+            return int(loop["iteration"]) + 1
+        return int(opt.densify_until_iter)
+
+    def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return 0 if distills(loop) or finetunes(loop) else int(opt.densify_until_iter)
+
+    def view_key(self, camera: Any) -> Any:
+        key = super().view_key(camera)
+        return (key, "jittered") if self._jitters and self._step % 3 and key is not None else key
+
+    def view_keys(self, cameras: Sequence[Any]) -> list[Any]:
+        keys = super().view_keys(cameras)
+        return keys + [(key, "jittered") for key in keys] if self._jitters else keys
+
+
+def finetunes(loop: Mapping[str, Any]) -> bool:
+    """Whether these are names of prune_finetune.py, which alone can start from a point cloud."""
+    return hasattr(loop.get("args"), "start_pointcloud")
+
+
+def distills(loop: Mapping[str, Any]) -> bool:
+    """Whether these are names of distill_train.py, which alone has two models."""
+    return "teacher_gaussians" in loop

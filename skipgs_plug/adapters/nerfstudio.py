@@ -1,0 +1,92 @@
+"""nerfstudio's `Trainer` with splatfacto or splatfacto-mcmc."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
+from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
+from skipgs_plug.adapters.loss_scaler import guard_scaler
+from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.hooks import Hooks
+
+LOOP = "train_iteration"
+
+
+class Nerfstudio(AbstractAdapter):
+    """Attach after `trainer.setup()`. Decides on `main_loss`: other terms appear in some iterations only.
+
+    nerfstudio steps an optimizer only with a pending gradient, so optimizers and schedulers are left alone.
+    """
+
+    name = "nerfstudio"
+    checked = "nerfstudio-project/nerfstudio 50e0e3c7, by its look-alike only"
+
+    def __init__(self, trainer: Any = None) -> None:
+        super().__init__(trainer)
+        self.output_folder: str | None = None
+        self._relocations = range(0)
+
+    @classmethod
+    def matches(cls, trainer: Any) -> bool:
+        return hasattr(trainer, LOOP) and hasattr(trainer, "grad_scaler")
+
+    def attach_script(self, hooks: Hooks) -> None:
+        def begins(original: Callable[..., Any], trainer: Any, *args: Any, **kwargs: Any) -> Any:
+            self.trainer = trainer
+            self.attach(hooks)
+            return original(trainer, *args, **kwargs)
+
+        refuse_other_processes(hooks)
+        hooks.wrap(importlib.import_module("nerfstudio.engine.trainer").Trainer, "train", begins)
+
+    def attach(self, hooks: Hooks) -> None:
+        trainer = self.trainer
+        pipeline = getattr(trainer, "pipeline", None)
+        if pipeline is None or not hasattr(trainer, LOOP):
+            raise AdapterMismatchError(
+                f"Adapter {self.name!r} expects a Trainer with {LOOP}() whose setup() was called, as in {self.checked}."
+            )
+        names = view_names(pipeline.datamanager.train_dataset.image_filenames)
+
+        def forwarded(original: Callable[..., Any], step: int) -> Any:
+            hooks.iteration(step)
+            outputs, losses, metrics = original(step=step)
+            if "main_loss" in losses:
+                hooks.signal(losses["main_loss"])
+            return outputs, losses, metrics
+
+        def batch_made(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            camera, batch = original(*args, **kwargs)
+            if "image_idx" in batch:
+                index = batch["image_idx"]
+                hooks.view(lambda: names[int(index)])
+            return camera, batch
+
+        hooks.wrap(pipeline, "get_train_loss_dict", forwarded)
+        hooks.wrap(pipeline.datamanager, "next_train", batch_made)
+        hooks.gate_tensor_backward(LOOP)
+        guard_scaler(hooks, trainer.grad_scaler)
+        strategy = getattr(pipeline.model, "strategy", None)
+        self._relocations = leave_out_noise(hooks, strategy, strategy)
+        self.output_folder = getattr(trainer, "base_dir", None)
+        hooks.ready(
+            getattr(strategy, "refine_stop_iter", None),
+            view_names=names,
+            max_steps=trainer.config.max_num_iterations - 1,
+            world_size=trainer.world_size,
+            gradients_read_until=gradients_read_until(strategy),
+        )
+
+    def must_run(self, step: int) -> bool:
+        return step in self._relocations
+
+
+def view_names(files: list[Path]) -> list[str]:
+    """Image paths relative to the folder that holds them all."""
+    root = os.path.commonpath([file.parent for file in files])
+    return [file.relative_to(root).as_posix() for file in files]

@@ -1,0 +1,89 @@
+"""The pip package `gaussian-splatting`: trainers with `step(camera)`, wrapped around each other."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+
+from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.hooks import Hooks
+
+# What `step` calls on the outermost trainer, and what is looked at.
+EXPECTED = ("step", "curr_step", "optimizer", "update_learning_rate", "preprocess", "before_optim_hook", "optim_step")
+# Last iteration of each kind of densification, inclusive.
+BOUNDS = ("densify_until_iter", "prune_until_iter", "opacity_reset_until_iter")
+
+
+class StepTrainer(AbstractAdapter):
+    """One `step(camera)`: learning rates, forward, loss, backward, `before_optim_hook`, `optim_step`.
+
+    All but the backward and the hook that reads gradients keep running: `loss` raises the SH degree,
+    `optim_step` resets opacities. An opacity reset shows as a parameter replaced in the optimizer; the last
+    one falls into the last iteration of densification, right before the gate begins.
+    """
+
+    name = "step_trainer"
+    checked = "gaussian-splatting 2.11.0 (PyPI)"
+
+    @classmethod
+    def matches(cls, trainer: Any) -> bool:
+        return all(hasattr(trainer, name) for name in EXPECTED)
+
+    def attach_script(self, hooks: Hooks) -> None:
+        # `python -m gaussian_splatting.train` binds this name when it is run.
+        prepare = importlib.import_module("gaussian_splatting.prepare")
+
+        def prepared(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            self.trainer = original(*args, **kwargs)
+            self.attach(hooks)
+            return self.trainer
+
+        hooks.wrap(prepare, "prepare_trainer", prepared)
+
+    def attach(self, hooks: Hooks) -> None:
+        trainer = self.trainer
+        missing = [name for name in EXPECTED if not hasattr(trainer, name)]
+        if missing:
+            raise AdapterMismatchError(
+                f"Adapter {self.name!r} expects a trainer with {', '.join(missing)}, as in {self.checked}."
+            )
+
+        bounds = [getattr(part, name) for part in layers(trainer) for name in BOUNDS if hasattr(part, name)]
+        end = max(bounds) + 1 if bounds else None
+
+        def watched(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            if end is not None and trainer.curr_step < end - 1:
+                return original(*args, **kwargs)
+            before = parameters(trainer.optimizer)
+            result = original(*args, **kwargs)
+            after = parameters(trainer.optimizer)
+            if len(before) != len(after) or any(one is not two for one, two in zip(before, after, strict=True)):
+                hooks.event("parameters replaced")
+            return result
+
+        def hooked(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            return None if hooks.state.skipped else watched(original, *args, **kwargs)
+
+        # Other wrappers may be put around this trainer later: they call all of these, but not its `step`.
+        hooks.before(trainer, "update_learning_rate", lambda: hooks.iteration(trainer.curr_step + 1))
+        hooks.before(trainer, "preprocess", lambda camera: hooks.view(camera.ground_truth_image_path))
+        hooks.wrap(trainer, "before_optim_hook", hooked)
+        hooks.wrap(trainer, "optim_step", watched)
+        hooks.gate_tensor_backward("step")
+        hooks.ready(end, gradients_read_until=end)
+
+
+def layers(part: Any) -> Iterator[Any]:
+    """A trainer, the trainers and densifiers that it wraps, and those that they wrap."""
+    yield part
+    for name in ("base_trainer", "densifier", "base_densifier"):
+        if name in vars(part):
+            yield from layers(vars(part)[name])
+
+
+def parameters(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]

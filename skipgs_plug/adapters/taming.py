@@ -1,0 +1,21 @@
+"""Taming 3DGS: two optimizers, of which one may accumulate, so only the backward is gated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+
+
+class Taming(InriaFamily):
+    """Both optimizers keep their schedules: with `--sh_lower` SH gradients wait for every 16th iteration.
+
+    At `ho_iteration` opacity becomes a plain tensor that renders the same, so no event is reported.
+    """
+
+    name = "taming"
+    checked = "humansensinglab/taming-3dgs fd0f7d9e"
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return int(opt.densify_until_iter)
