@@ -1,6 +1,6 @@
 """What one decision costs: SkipPolicy beside an empty function call, and the authors' controller if given.
 
-python benchmarks/decision.py [--authors PATH_TO_THEIR_CHECKOUT] [--out decision.json]
+python benchmarks/decision.py [--authors PATH_TO_THEIR_CHECKOUT] [--out FILE]
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def authors_controller(checkout: Path) -> Callable[[], Decide]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--authors", type=Path, help="checkout of skill-diver/SkipGS")
-    parser.add_argument("--out", type=Path, default=Path("decision.json"))
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "decision.json")
     args = parser.parse_args()
 
     candidates: dict[str, Callable[[], Decide]] = {
