@@ -12,7 +12,7 @@ COMMANDS = {
     "train": "train a COLMAP, Blender or packed scene, gated",
     "run": "run an unmodified training script of another project, gated",
     "bench": "compare the gate with its controls on a scene",
-    "report": "print or compare finished runs",
+    "report": "make one HTML page of finished runs: tables, plots, comparison",
     "doctor": "say which backends and extras work here, and how to get the rest",
 }
 BAD_INPUT = 2

@@ -73,7 +73,8 @@ def time_against_error(rows: Sequence[Row]) -> Figure:
     axes[0].set_xlabel("refinement time T_post (s)")
     axes[0].set_ylabel("held-out PSNR (dB)")
     axes[0].set_title(f"Mean and spread of {seeds_text(rows)}", loc="left", fontsize=11)
-    axes[0].legend(frameon=False, fontsize=SMALL, loc="best")
+    figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=7 if paired else 4,
+                  loc="outside lower center")  # fmt: skip
     if paired:
         scatter(axes[1], rows, "t_post_saved", "psnr_gain")
         axes[1].axhline(0, color="0.7", linewidth=0.8, zorder=0)
@@ -128,10 +129,13 @@ def skipped_views(runs: Sequence[RunRecord], n_views: int) -> Figure:
     figure, *axes = new_figure(9.6, 4.4, columns=len(runs), sharey=True)
     for panel, run in zip(axes, runs, strict=True):
         assert run.trace is not None
+        visits = visit_map(run.trace, n_views)
+        left = run.trace.start // n_views * n_views
         panel.imshow(
-            visit_map(run.trace, n_views), aspect="auto", interpolation="nearest", cmap=ListedColormap(colours),
-            vmin=NOT_VISITED, vmax=SKIPPED, extent=(run.trace.start, run.trace.start + run.iterations, n_views, 0),
+            visits, aspect="auto", interpolation="nearest", cmap=ListedColormap(colours), vmin=NOT_VISITED,
+            vmax=SKIPPED, extent=(left, left + visits.shape[1] * n_views, n_views - 0.5, -0.5),
         )  # fmt: skip
+        panel.yaxis.get_major_locator().set_params(integer=True)
         if run.warm_up:
             panel.axvline(run.trace.start + run.warm_up, color="0.25", linewidth=1, linestyle=(0, (4, 3)))
         share = 100 * run.skips / run.iterations
@@ -145,13 +149,15 @@ def skipped_views(runs: Sequence[RunRecord], n_views: int) -> Figure:
 
 
 def visit_map(trace: Trace, n_views: int) -> np.ndarray:
-    """Return [n_views, epochs]: NOT_VISITED, RUN or SKIPPED; an epoch is as many iterations as views.
+    """Return [n_views, epochs]: NOT_VISITED, RUN or SKIPPED.
 
-    A view that is visited twice in a column, at the seam of two epochs, shows its later visit.
+    Training visits every view once in an epoch; refinement begins and ends within one.
     """
-    grid = np.full((n_views, -(-len(trace.view) // n_views)), NOT_VISITED)
+    first = trace.start // n_views
+    last = (trace.start + len(trace.view) - 1) // n_views
+    grid = np.full((n_views, last - first + 1), NOT_VISITED)
     for i, (view, skipped) in enumerate(zip(trace.view, trace.skipped, strict=True)):
-        grid[view, i // n_views] = SKIPPED if skipped else RUN
+        grid[view, (trace.start + i) // n_views - first] = SKIPPED if skipped else RUN
     return grid
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from skipgs_plug.bench import provenance
 from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.bench.runner import Bench
-from skipgs_plug.bench.summary import ceiling, row_as_dict, summarise
+from skipgs_plug.bench.summary import ceiling, row_as_dict, summarise, timing_noise
 
 SCHEMA_VERSION = 1
 KIND = "skipgs-bench"
@@ -20,7 +20,7 @@ def build_result(bench: Bench, records: Sequence[RunRecord], command: str) -> di
     Returns:
         `kind`, `schema_version`; `command`, `commits`, `versions`; `settings` (training, scene, machine, lpips);
         `seeds`, `policies`; `refinement` (first and last iteration + 1); `view_names` (traces index into
-        them); `rows` (means and spreads); `ceiling` (see summary.ceiling); `runs` (records without traces,
+        them); `rows` (means and spreads); `ceiling`, `timing_noise` (see summary); `runs` (records without traces,
         which are in runs/).
     """
     last = bench.config.max_steps
@@ -39,5 +39,6 @@ def build_result(bench: Bench, records: Sequence[RunRecord], command: str) -> di
         "view_names": [view.name for view in bench.scene.train],
         "rows": [row_as_dict(row) for row in rows],
         "ceiling": ceiling(rows),
+        "timing_noise": timing_noise(records),
         "runs": [record.as_dict(with_trace=False) for record in records],
     }

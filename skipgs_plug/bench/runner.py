@@ -48,7 +48,7 @@ class Bench:
                 "which leaves nothing to refine; lower --refine-stop-iter."
             )
         if not scene.test:
-            raise InputError(f"Scene {scene.name} has no held-out views to measure on; lower --test-every.")
+            raise InputError(f"Scene {scene.name} has no held-out views to measure on; give --test-every 8.")
         self.scene, self.config, self.folder = scene, config, folder
         self.seeds, self.policies = list(seeds), list(policies)
         self.say, self.progress = say, progress

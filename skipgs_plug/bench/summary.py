@@ -99,6 +99,19 @@ def ceiling(rows: Sequence[Row]) -> dict[str, float] | None:
     }
 
 
+def timing_noise(records: Sequence[RunRecord]) -> float | None:
+    """Return by how much forward time per iteration differed within a seed, in %, at worst; None for single runs.
+
+    Every policy renders the same views of nearly the same model, so this is what the machine adds.
+    """
+    worst = None
+    for seed in {record.seed for record in records}:
+        rates = [r.phases["forward"] / r.iterations for r in records if r.seed == seed and r.status == "done"]
+        if len(rates) > 1:
+            worst = max(worst or 0.0, 100 * (max(rates) / min(rates) - 1))
+    return worst
+
+
 def row_as_dict(row: Row) -> dict[str, Any]:
     return {
         "policy": row.policy,

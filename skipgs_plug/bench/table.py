@@ -21,17 +21,13 @@ class Column:
     signed: bool = False
 
 
-COLUMNS = (
+RESULTS = (
     Column("T_post s", "t_post", 1),
     Column("saved %", "t_post_saved", 1),
     Column("T_total s", "t_total", 1),
     Column("saved %", "t_total_saved", 1),
     Column("iterations", "iterations", 0),
     Column("backwards %", "backwards_share", 1),
-    Column("forward %", "share_forward", 0),
-    Column("loss %", "share_loss", 0),
-    Column("backward %", "share_backward", 0),
-    Column("optimizer %", "share_optimizer", 0),
     Column("PSNR dB", "psnr", 2),
     Column("vs ungated dB", "psnr_gain", 2, signed=True),
     Column("SSIM", "ssim", 4),
@@ -39,11 +35,12 @@ COLUMNS = (
     Column("LPIPS vgg", "lpips_vgg", 4),
     Column("peak GiB", "peak_memory_gib", 2),
 )
-
-
-def columns_of(rows: Sequence[Row]) -> list[Column]:
-    """Return the columns that some row has a value for."""
-    return [column for column in COLUMNS if any(column.name in row.values for row in rows)]
+SHARES = (
+    Column("forward", "share_forward", 1),
+    Column("loss", "share_loss", 1),
+    Column("backward", "share_backward", 1),
+    Column("optimizer", "share_optimizer", 1),
+)
 
 
 def cell(value: Quantity | None, column: Column) -> str:
@@ -54,9 +51,12 @@ def cell(value: Quantity | None, column: Column) -> str:
     return mean if value.spread is None else f"{mean} ± {value.spread:.{column.digits}f}"
 
 
-def cells(rows: Sequence[Row]) -> list[list[str]]:
-    """Return heading and rows as text: policy, number of seeds (marked when some are left out), values."""
-    columns = columns_of(rows)
+def cells(rows: Sequence[Row], columns: Sequence[Column]) -> list[list[str]]:
+    """Return heading and rows as text: policy, number of seeds (marked when some are left out), values.
+
+    A column that no row has a value for is left out.
+    """
+    columns = [column for column in columns if any(column.name in row.values for row in rows)]
     lines = [["policy", "seeds", *(column.heading for column in columns)]]
     for row in rows:
         total = len(row.seeds) + len(row.excluded)
@@ -65,9 +65,8 @@ def cells(rows: Sequence[Row]) -> list[list[str]]:
     return lines
 
 
-def markdown(rows: Sequence[Row]) -> str:
-    """Return the table in Markdown, aligned to be read in a terminal too."""
-    lines = cells(rows)
+def markdown(lines: Sequence[Sequence[str]]) -> str:
+    """Return heading and rows as a Markdown table, aligned to be read in a terminal too."""
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     rule = [("-" * width if i == 0 else "-" * (width - 1) + ":") for i, width in enumerate(widths)]
     text = []
@@ -90,6 +89,11 @@ def notes(rows: Sequence[Row], bench: dict[str, Any]) -> list[str]:
             f"A perfect gate at this skip rate could save {most['most']:.1f} % of refinement: backward and optimizer "
             f"take {most['share']:.1f} % of ungated time, and {most['skipped']:.1f} % of them are skipped. "
             f"Measured: {most['measured']:.1f} %."
+        )
+    if bench["timing_noise"] is not None:
+        sentences.append(
+            "The forward pass is nearly the same work under every policy; within a seed its time per iteration "
+            f"differed by up to {bench['timing_noise']:.0f} %. Differences in time below that are noise of the machine."
         )
     scene, machine = bench["settings"]["scene"], bench["settings"]["machine"]
     first, last = bench["refinement"]

@@ -15,7 +15,7 @@ from skipgs_plug.bench.result import build_result
 from skipgs_plug.bench.runner import Bench
 from skipgs_plug.bench.store import BenchFolder
 from skipgs_plug.bench.summary import Row, row_from_dict
-from skipgs_plug.bench.table import legend, markdown, notes
+from skipgs_plug.bench.table import RESULTS, SHARES, cells, legend, markdown, notes
 from skipgs_plug.trainer import TrainConfig, load_scene
 from skipgs_plug.trainer.files import write_aside, write_json
 
@@ -72,8 +72,14 @@ def run(args: Args, command: str) -> list[Row]:
     records = bench.run()
     result = build_result(bench, records, command)
     rows = [row_from_dict(row) for row in result["rows"]]
-    text = markdown(rows) + "\n\n" + "\n".join(notes(rows, result)) + "\n"
-    text += "\n" + "\n".join(f"{name}: {meaning}." for name, meaning in legend(rows)) + "\n"
+    parts = [
+        markdown(cells(rows, RESULTS)),
+        "Share of refinement time, %:",
+        markdown(cells(rows, SHARES)),
+        "\n\n".join(notes(rows, result)),
+        "\n".join(f"- {name}: {meaning}" for name, meaning in legend(rows)),
+    ]
+    text = "\n\n".join(parts) + "\n"
     write_json(folder.root / "bench.json", result)
     with write_aside(folder.root / "table.md") as temporary:
         temporary.write_text(text)

@@ -1,0 +1,1 @@
+"""One HTML page from finished runs: read a folder (`source`), draw (`plots`), write (`page`)."""

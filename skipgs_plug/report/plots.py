@@ -1,0 +1,97 @@
+"""Pictures of one gated run, drawn from its skipgs.json."""
+
+from __future__ import annotations
+
+import base64
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from skipgs_plug.bench.plots import SMALL, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RUN_COLOUR = "#0072B2"
+SKIP_COLOUR = "#D55E00"
+REASON_COLOURS = {
+    "warm-up": "#999999",
+    "new view": "#56B4E9",
+    "deviation": "#0072B2",
+    "budget": "#009E73",
+    "pause": "#F0E442",
+    "non-finite": "#000000",
+}
+
+
+def view_shares(views: list[dict[str, Any]]) -> Figure:
+    """Share of skipped visits of every view, in the order of their names."""
+    figure, axes = new_figure(9.0, 3.0)
+    share = [100 * row["skips"] / row["visits"] for row in views]
+    axes.bar(range(len(views)), share, width=1.0 if len(views) > 60 else 0.8, color=SKIP_COLOUR)
+    axes.set_ylim(0, 100)
+    axes.set_xlim(-0.5, len(views) - 0.5)
+    axes.set_xlabel("view, by name")
+    axes.set_ylabel("visits skipped (%)")
+    axes.grid(axis="x", visible=False)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    return figure
+
+
+def loss_against_skips(views: list[dict[str, Any]]) -> Figure:
+    """Mean loss of every view against its share of skipped visits."""
+    figure, axes = new_figure(5.2, 3.4)
+    known = [row for row in views if row["mean_loss"] is not None]
+    loss = np.array([row["mean_loss"] for row in known])
+    share = np.array([100 * row["skips"] / row["visits"] for row in known])
+    axes.plot(share, loss, linestyle="none", marker="o", markersize=4, color=RUN_COLOUR, alpha=0.7)
+    axes.set_xlim(-3, 103)
+    axes.set_xlabel("visits skipped (%)")
+    axes.set_ylabel("running mean of loss")
+    return figure
+
+
+def reasons(data: dict[str, Any]) -> Figure:
+    """All gated iterations by what decided: one bar of backwards run, one of those skipped."""
+    figure, axes = new_figure(9.0, 1.9)
+    run = {k: v for k, v in data["reasons"].items() if k not in ("deviation", "non-finite")}
+    lost = data["non_finite"]
+    if data["settings"].get("on_nonfinite") == "pass":
+        run["non-finite"], lost = lost, 0
+    above = data["backwards_run"] - sum(run.values())
+    parts = {
+        "backward run": {**run, "deviation": above},
+        "backward skipped": {"deviation": data["backwards_skipped"] - lost, "non-finite": lost},
+    }
+    names = {
+        "deviation": {"backward run": "loss above its mean", "backward skipped": "loss at or below its mean"},
+        "budget": {"backward run": "held back by the floor"},
+    }
+    for bar, counts in parts.items():
+        left = 0
+        for reason, count in counts.items():
+            if count <= 0:
+                continue
+            colour = SKIP_COLOUR if bar == "backward skipped" else REASON_COLOURS.get(reason, "#CC79A7")
+            label = names.get(reason, {}).get(bar, reason)
+            axes.barh(bar, count, left=left, color=colour, height=0.65, label=f"{label} ({count:,})")
+            left += count
+    axes.invert_yaxis()
+    axes.set_xlabel("iterations since the gate became active")
+    axes.grid(axis="y", visible=False)
+    axes.tick_params(left=False)
+    figure.legend(frameon=False, fontsize=SMALL, ncols=4, loc="outside upper center")
+    return figure
+
+
+def inline_svg(figure: Figure) -> str:
+    """Return the figure as a data URI."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="svg", metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(stream.getvalue()).decode()
+
+
+def inline_png(path: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
