@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from .binning import TILE, Bins, bin_gaussians, pack
 from .blend import MAX_CHANNELS, PAIR, backward_worker, forward_worker, reduce_pairs
-from .launch import scratch
+from .launch import scratch, zeros
 from .project import project_backward, project_forward
 from .sh import sh_backward, sh_forward
 from .shortcuts import VISIBLE_ONLY, active_shortcuts
@@ -92,37 +92,45 @@ class Project(torch.autograd.Function):
 
 
 class SphericalHarmonics(torch.autograd.Function):
-    """View-dependent colours [N, 3] of one camera."""
+    """View-dependent colours [N, 3] of one camera.
+
+    The coefficients are `base` [N, K, 3] with `rest` None, or `base` [N, 1, 3] and `rest` [N, K - 1, 3].
+    """
 
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any,
         means: Tensor,  # [N, 3]
         camera: Tensor,  # [3]
-        coefficients: Tensor,  # [N, K, 3]
+        base: Tensor,
+        rest: Tensor | None,
         visible: Tensor,  # [M]
         degree: int,
     ) -> Tensor:
-        colors = torch.zeros(len(means), 3)
-        width = coefficients.shape[1]
+        colors = zeros(len(means), 3)
         if not active_shortcuts() & VISIBLE_ONLY:
             visible = torch.arange(len(means), dtype=torch.int32)
-        sh_forward(means, camera, coefficients, visible, colors, len(visible), width, degree)
-        ctx.save_for_backward(means, camera, coefficients, colors, visible)
+        ctx.layout = (3 * base.shape[1], 3 * base.shape[1], 3) if rest is None else (3, 3 * rest.shape[1], 0)
         ctx.degree = degree
+        ctx.joined = rest is None
+        rest = base if rest is None else rest
+        sh_forward(means, camera, base, rest, visible, colors, len(visible), *ctx.layout, degree)
+        ctx.save_for_backward(means, camera, base, rest, colors, visible)
         return colors
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> Any:  # type: ignore[override]
-        means, camera, coefficients, colors, visible = ctx.saved_tensors
-        v_means, v_coefficients = torch.zeros_like(means), torch.zeros_like(coefficients)
+        means, camera, base, rest, colors, visible = ctx.saved_tensors
+        v_means, v_base = zeros(*means.shape), zeros(*base.shape)
+        v_rest = v_base if ctx.joined else zeros(*rest.shape)
         v_cameras = torch.zeros(_partials(len(visible)), 3)
         sh_backward(
-            means, camera, coefficients, visible, colors, v_colors.contiguous(), v_means, v_coefficients,
-            v_cameras, len(visible), coefficients.shape[1], ctx.degree, active_shortcuts(),
+            means, camera, base, rest, visible, colors, v_colors.contiguous(), v_means, v_base, v_rest,
+            v_cameras, len(visible), *ctx.layout, ctx.degree, active_shortcuts(),
         )  # fmt: skip
-        return v_means, v_cameras.sum(0) if ctx.needs_input_grad[1] else None, v_coefficients, None, None
+        v_camera = v_cameras.sum(0) if ctx.needs_input_grad[1] else None
+        return v_means, v_camera, v_base, None if ctx.joined else v_rest, None, None
 
 
 class Blend(torch.autograd.Function):
@@ -172,8 +180,8 @@ class Blend(torch.autograd.Function):
         height, width, channels = v_image.shape
         tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
         v_image, v_transmittance = v_image.contiguous(), v_transmittance.contiguous()
-        v_means2d, v_conics = torch.zeros_like(means2d), torch.zeros_like(conics)
-        v_opacities, v_colors = torch.zeros_like(opacities), torch.zeros_like(colors)
+        v_means2d, v_conics = zeros(*means2d.shape), zeros(*conics.shape)
+        v_opacities, v_colors = zeros(*opacities.shape), zeros(*colors.shape)
         with_absolute = ctx.absolute is not None
         absolute = ctx.absolute if with_absolute else torch.empty(0)
         v_pairs = scratch("v_pairs", len(bins.tile_list), PAIR)

@@ -147,6 +147,12 @@ for (int base = first; base < last; base += 16) {
 """
     + _GEOMETRY
     + """
+    // Extreme cameras (a principal point 1e5 images away) leave float's range: a huge gradient is better than
+    // infinity, and infinity less infinity is NaN. No gradient of a usual scene comes near these bounds.
+    auto saturated = [](v16 v, float most) -> v16 { return v > most ? (v16)most : (v < -most ? (v16)-most : v); };
+    v_u = saturated(v_u, 1e20f); v_v = saturated(v_v, 1e20f);
+    va = saturated(va, 1e12f); vb = saturated(vb, 1e12f); vc = saturated(vc, 1e12f);
+
     // Inverse of a matrix: v_cov = -conic v_conic conic, all symmetric.
     v16 pa = conic_a * va + conic_b * vb, pb = conic_a * vb + conic_b * vc;
     v16 pc = conic_b * va + conic_c * vb, pd = conic_b * vb + conic_c * vc;
@@ -161,9 +167,11 @@ for (int base = first; base < last; base += 16) {
         v_xy += half_comp * slope * (i_blurred - i_sharp);
     }
 
+    v_xx = saturated(v_xx, 1e15f); v_xy = saturated(v_xy, 1e15f); v_yy = saturated(v_yy, 1e15f);
     v16 v_WM[3][3], v_J00 = (v16)0.0f, v_J02 = v_J00, v_J11 = v_J00, v_J12 = v_J00;
     for (int j = 0; j < 3; ++j) {
-        v16 v_T0 = 2.0f * (v_xx * T0[j] + v_xy * T1[j]), v_T1 = 2.0f * (v_xy * T0[j] + v_yy * T1[j]);
+        v16 v_T0 = saturated(2.0f * (v_xx * T0[j] + v_xy * T1[j]), 1e20f);
+        v16 v_T1 = saturated(2.0f * (v_xy * T0[j] + v_yy * T1[j]), 1e20f);
         v_J00 += v_T0 * WM[0][j];
         v_J02 += v_T0 * WM[2][j];
         v_J11 += v_T1 * WM[1][j];
@@ -173,16 +181,20 @@ for (int base = first; base < last; base += 16) {
         v_WM[2][j] = J02 * v_T0 + J12 * v_T1;
     }
 
+    v_J00 = saturated(v_J00, 1e20f); v_J02 = saturated(v_J02, 1e20f);
+    v_J11 = saturated(v_J11, 1e20f); v_J12 = saturated(v_J12, 1e20f);
     // Projection: u = fx x / z + cx; J00 = fx / z; J02 = -fx ux / z with ux = x / z where it is not clamped.
     v16 inside_x = ux == x * iz ? (v16)1.0f : (v16)0.0f, inside_y = uy == y * iz ? (v16)1.0f : (v16)0.0f;
     v16 v_tx = v_u - inside_x * v_J02 * iz, v_ty = v_v - inside_y * v_J12 * iz;
-    v16 v_x = fx * iz * v_tx, v_y = fy * iz * v_ty;
+    v16 v_x = saturated(fx * iz * v_tx, 1e20f), v_y = saturated(fy * iz * v_ty, 1e20f);
     v16 v_z = v_depth - iz * (x * v_x + y * v_y) - iz * (J00 * v_J00 + J02 * v_J02 + J11 * v_J11 + J12 * v_J12);
 
+    v_z = saturated(v_z, 1e20f);
     v16 v_mean[3], v_M[3][3];
     for (int i = 0; i < 3; ++i) {
         v_mean[i] = V[i] * v_x + V[4 + i] * v_y + V[8 + i] * v_z;
-        for (int j = 0; j < 3; ++j) v_M[i][j] = V[i] * v_WM[0][j] + V[4 + i] * v_WM[1][j] + V[8 + i] * v_WM[2][j];
+        for (int j = 0; j < 3; ++j)
+            v_M[i][j] = saturated(V[i] * v_WM[0][j] + V[4 + i] * v_WM[1][j] + V[8 + i] * v_WM[2][j], 1e30f);
     }
     if (with_pose) {
         const i16 in_use = lane < (float)lanes;
@@ -213,10 +225,10 @@ for (int base = first; base < last; base += 16) {
              - 2.0f * qz * (v_M[0][0] + v_M[1][1]);
     v16 along = qw * v_qw + qx * v_qx + qy * v_qy + qz * v_qz;
     v16 back = q_norm * q_scale;
-    scatter(v_quats, row, 4, 0, (v_qw - along * qw) * back, lanes);
-    scatter(v_quats, row, 4, 1, (v_qx - along * qx) * back, lanes);
-    scatter(v_quats, row, 4, 2, (v_qy - along * qy) * back, lanes);
-    scatter(v_quats, row, 4, 3, (v_qz - along * qz) * back, lanes);
+    scatter(v_quats, row, 4, 0, saturated((v_qw - along * qw) * back, 1e38f), lanes);
+    scatter(v_quats, row, 4, 1, saturated((v_qx - along * qx) * back, 1e38f), lanes);
+    scatter(v_quats, row, 4, 2, saturated((v_qy - along * qy) * back, 1e38f), lanes);
+    scatter(v_quats, row, 4, 3, saturated((v_qz - along * qz) * back, 1e38f), lanes);
 }
 if (with_pose)
     for (int i = 0; i < 12; ++i) v_poses[12 * (first / 512) + i] = sum(pose[i]);

@@ -18,7 +18,7 @@ def rasterization(
     quats: Tensor,  # [N, 4]
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N]
-    colors: Tensor,  # [(C,) N, D] or [(C,) N, K, 3]
+    colors: Tensor | tuple[Tensor, Tensor],  # [(C,) N, D], [(C,) N, K, 3] or ([N, 1, 3], [N, K - 1, 3])
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3]
     width: int,
@@ -60,7 +60,9 @@ def rasterization(
         quats: Rotations w, x, y, z of any length; zero stands for no rotation.
         scales: Standard deviations along the axes, world units.
         opacities: In [0, 1].
-        colors: D channels per Gaussian (per camera if C is given), or K >= (sh_degree + 1)^2 SH coefficients.
+        colors: D channels per Gaussian (per camera if C is given), or K >= (sh_degree + 1)^2 SH coefficients. Not in
+            gsplat: the constant band and the others as a pair of tensors, which spares joining them in every
+            iteration.
         viewmats: World to camera, x right, y down, z forward.
         Ks: Intrinsics in pixels; pixel centres lie at +0.5.
         width: Image width in pixels.
@@ -122,12 +124,21 @@ def rasterization(
         raise ValueError(f"render_mode must be RGB, D, ED, RGB+D or RGB+ED, not {render_mode!r}.")
     if rasterize_mode not in ("classic", "antialiased"):
         raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', not {rasterize_mode!r}.")
-    _check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, backgrounds, width, height)
+    sh_rest = None
+    if isinstance(colors, tuple):
+        if sh_degree is None or len(colors) != 2:
+            raise ValueError("colors as a tuple must be a pair (sh0 [N, 1, 3], shN [N, K - 1, 3]) with sh_degree set.")
+        colors, sh_rest = colors
+    _check_tensors(
+        means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, sh_rest, backgrounds, width, height
+    )
 
     dtype, n_cameras, n = means.dtype, len(viewmats), len(means)
     means, quats, scales, opacities, colors, viewmats, Ks = (
         t.to(torch.float32).contiguous() for t in (means, quats, scales, opacities, colors, viewmats, Ks)
     )
+    if sh_rest is not None:
+        sh_rest = sh_rest.to(torch.float32).contiguous()
     antialiased = rasterize_mode == "antialiased"
     shared_colors = colors.dim() == (2 if sh_degree is None else 3)
 
@@ -150,7 +161,7 @@ def rasterization(
             of_camera = colors if shared_colors else colors[camera]
             if sh_degree is not None:
                 centre = torch.linalg.inv(viewmats[camera])[:3, 3]
-                of_camera = SphericalHarmonics.apply(means, centre, of_camera, visible[camera], sh_degree)
+                of_camera = SphericalHarmonics.apply(means, centre, of_camera, sh_rest, visible[camera], sh_degree)
             features.append(of_camera)
     with_depth = render_mode != "RGB"
 
@@ -228,6 +239,7 @@ def _check_tensors(
     viewmats: Tensor,
     Ks: Tensor,
     sh_degree: int | None,
+    sh_rest: Tensor | None,
     backgrounds: Tensor | None,
     width: int,
     height: int,
@@ -243,6 +255,8 @@ def _check_tensors(
     }
     if backgrounds is not None:
         tensors["backgrounds"] = backgrounds
+    if sh_rest is not None:
+        tensors["colors[1]"] = sh_rest
     for name, tensor in tensors.items():
         if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
             kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
@@ -274,6 +288,13 @@ def _check_tensors(
         if sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"sh_degree must be 0 to 3 on the CPU, got {sh_degree!r}.")
         terms = (sh_degree + 1) ** 2
+        if sh_rest is not None:
+            rest = list(sh_rest.shape)
+            if shape != [n, 1, 3] or len(rest) != 3 or rest[0] != n or rest[2] != 3:
+                raise ValueError(
+                    f"colors as a pair must have shapes [{n}, 1, 3], [{n}, K - 1, 3], got {shape}, {rest}."
+                )
+            shape = [n, 1 + rest[1], 3]
         if shape[-1:] != [3] or shape[:-2] not in ([n], [n_cameras, n]) or shape[-2] < terms:
             raise ValueError(
                 f"colors must have shape [{n}, K, 3] or [{n_cameras}, {n}, K, 3] with K >= {terms} for "

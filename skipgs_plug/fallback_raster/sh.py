@@ -39,7 +39,8 @@ _BASIS = """
         basis[15] = -0.5900435899266435f * x * (xx - 3.0f * yy);
     }
     const int terms = (degree + 1) * (degree + 1);
-    const float* sh = coefficients + (long long)g * width * 3;
+    const float* constant = base + (long long)g * base_stride;
+    const float* sh = rest + (long long)g * rest_stride + rest_offset - 3;  // sh[3 k] is band k, from 1 on
 """
 
 
@@ -50,8 +51,8 @@ for (int i = first; i < last; ++i) {
 """
     + _BASIS
     + """
-    float c0 = 0.5f, c1 = 0.5f, c2 = 0.5f;
-    for (int k = 0; k < terms; ++k) {
+    float c0 = 0.5f + basis[0] * constant[0], c1 = 0.5f + basis[0] * constant[1], c2 = 0.5f + basis[0] * constant[2];
+    for (int k = 1; k < terms; ++k) {
         c0 += basis[k] * sh[3 * k];
         c1 += basis[k] * sh[3 * k + 1];
         c2 += basis[k] * sh[3 * k + 2];
@@ -68,11 +69,14 @@ for (int i = first; i < last; ++i) {
 def sh_forward(
     means: FloatArray,  # [N, 3]
     camera: FloatArray,  # [3], centre of the camera in world space
-    coefficients: FloatArray,  # [N, K, 3]
+    base: FloatArray,  # constant band of Gaussian g at base_stride * g
+    rest: FloatArray,  # the others at rest_stride * g + rest_offset; may be the same array
     visible: IntArray,  # [M]
     colors: FloatArray,  # out [N, 3], zeros
     n_visible: int,
-    width: int,  # K
+    base_stride: int,
+    rest_stride: int,
+    rest_offset: int,
     degree: int,
 ) -> None: ...
 
@@ -90,9 +94,13 @@ for (int i = first; i < last; ++i) {
 """
     + _BASIS
     + """
-    float* v_sh = v_coefficients + (long long)g * width * 3;
+    float* v_constant = v_base + (long long)g * base_stride;
+    float* v_sh = v_rest + (long long)g * rest_stride + rest_offset - 3;
+    v_constant[0] = basis[0] * v0;
+    v_constant[1] = basis[0] * v1;
+    v_constant[2] = basis[0] * v2;
     float along[16];
-    for (int k = 0; k < terms; ++k) {
+    for (int k = 1; k < terms; ++k) {
         v_sh[3 * k] = basis[k] * v0;
         v_sh[3 * k + 1] = basis[k] * v1;
         v_sh[3 * k + 2] = basis[k] * v2;
@@ -134,15 +142,19 @@ for (int c = 0; c < 3; ++c) v_cameras[3 * (first / 512) + c] = camera_sum[c];
 def sh_backward(
     means: FloatArray,  # [N, 3]
     camera: FloatArray,  # [3]
-    coefficients: FloatArray,  # [N, K, 3]
+    base: FloatArray,  # constant band of Gaussian g at base_stride * g
+    rest: FloatArray,  # the others at rest_stride * g + rest_offset; may be the same array
     visible: IntArray,  # [M]
     colors: FloatArray,  # [N, 3], result of the forward pass
     v_colors: FloatArray,  # [N, 3]
     v_means: FloatArray,  # out [N, 3], zeros
-    v_coefficients: FloatArray,  # out [N, K, 3], zeros
+    v_base: FloatArray,  # out, like base, zeros
+    v_rest: FloatArray,  # out, like rest, zeros
     v_cameras: FloatArray,  # out [ceil(M / 512), 3], partial sums
     n_visible: int,
-    width: int,  # K
+    base_stride: int,
+    rest_stride: int,
+    rest_offset: int,
     degree: int,
     shortcuts: int,
 ) -> None: ...

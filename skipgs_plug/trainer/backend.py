@@ -24,6 +24,13 @@ class Backend:
     rasterization: Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
     loss: Callable[[Tensor, Tensor, float], Tensor]  # (image, target [..., H, W, C], ssim_lambda) -> scalar
 
+    def sh_colors(self, sh0: Tensor, shN: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+        """Return SH coefficients [N, 1, 3] and [N, K - 1, 3] as `rasterization` takes them.
+
+        The CPU rasterizer reads the two as they are; joining them costs more than evaluating them.
+        """
+        return (sh0, shN) if self.name == "warp" else torch.cat([sh0, shN], dim=1)
+
     @contextmanager
     def exclusive_cores(self) -> Iterator[None]:
         """Keep torch to one thread inside the block where the rasterizer has threads of its own.

@@ -227,7 +227,7 @@ class Trainer:
             quats=splats["quats"],
             scales=torch.exp(splats["scales"]),
             opacities=torch.sigmoid(splats["opacities"]),
-            colors=torch.cat([splats["sh0"], splats["shN"]], dim=1),
+            colors=self.backend.sh_colors(splats["sh0"], splats["shN"]),
             viewmats=view.viewmat[None].to(device),
             Ks=view.K[None].to(device),
             width=view.width,
