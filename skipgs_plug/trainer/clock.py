@@ -1,10 +1,8 @@
-"""Time of training by phase, and the threads it is measured with."""
+"""The training clock: time by phase, and the part that falls after densification."""
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Iterator
 
 import torch
 
@@ -50,21 +48,3 @@ class TrainClock:
         if self._cuda:
             torch.cuda.synchronize()
         return time.perf_counter()
-
-
-@contextlib.contextmanager
-def torch_threads(count: int, device: torch.device) -> Iterator[None]:
-    """Let torch use `count` threads inside the block when training on the CPU.
-
-    The workers of torch spin between operations and take the cores from the rasterizer's own pool: on two busy
-    cores, iterations of the demo scene took ten times as long with torch's default.
-    """
-    previous = torch.get_num_threads()
-    if device.type == "cpu" and previous != count:
-        torch.set_num_threads(count)
-        try:
-            yield
-        finally:
-            torch.set_num_threads(previous)
-    else:
-        yield

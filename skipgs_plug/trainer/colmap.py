@@ -40,7 +40,7 @@ def load_colmap(path: Path, data_factor: int, test_every: int) -> Scene:
     if not views:
         raise InputError(f"{model} registers no image; run COLMAP again with more overlap between photographs.")
     train, test = split_views(views, test_every)
-    points = list(reconstruction.points3D.values())
+    points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
     return assemble_scene(model, path.resolve().name, train, test, xyz, rgb)

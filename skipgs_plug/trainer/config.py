@@ -36,8 +36,6 @@ class TrainConfig:
     """Random initial points for scenes that bring no point cloud (Blender)."""
     backend: Literal["auto", "gsplat", "warp"] = "auto"
     """Rasterizer: gsplat on CUDA, warp on CPU; auto takes gsplat where CUDA works."""
-    torch_threads: int = 1
-    """Threads of torch itself on the CPU; more spin against those of the rasterizer, which has its own pool."""
     seed: int = 42
     """Seed of view order, split noise and random backgrounds."""
     max_steps: int = 30_000
@@ -102,7 +100,6 @@ class TrainConfig:
             ("max_steps", 1),
             ("data_factor", 1),
             ("test_every", 0),
-            ("torch_threads", 1),
             ("refine_every", 1),
         ):
             value = getattr(self, name)

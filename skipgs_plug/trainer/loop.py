@@ -12,7 +12,7 @@ from torch import Tensor
 
 from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend
-from skipgs_plug.trainer.clock import TrainClock, torch_threads
+from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.model import create_optimizers, create_splats
@@ -87,7 +87,7 @@ class Trainer:
         until = self.max_steps if until is None else min(until, self.max_steps)
         self.stop_requested = False
         bar = tqdm(total=until, initial=self.step, desc="Training", disable=not progress, mininterval=0.5)
-        with bar, self.backend.exclusive_cores():
+        with bar:
             while self.step < until and not self.stop_requested:
                 loss = self.train_step()
                 bar.update()
@@ -96,7 +96,7 @@ class Trainer:
 
     def train_step(self) -> float:
         """Run one iteration and return its loss."""
-        with torch_threads(self.config.torch_threads, self.backend.device):
+        with self.backend.exclusive_cores():
             return self._train_step()
 
     def _train_step(self) -> float:
@@ -167,7 +167,7 @@ class Trainer:
         views = {"test": self.scene.test, "train": self.scene.train}[split]
         if not views:
             raise InputError(f"Scene {self.scene.name} has no {split} views; lower test_every to hold some out.")
-        with torch_threads(self.config.torch_threads, self.backend.device):
+        with self.backend.exclusive_cores():
             rows = [self._measure(view, lpips_net) for view in views]
         means = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
         return {

@@ -42,7 +42,7 @@ def save_packed(scene: Scene, path: str | Path) -> None:
 def load_packed(path: Path) -> Scene:
     """Read what `save_packed` wrote."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
             content = {key: archive[key] for key in archive.files}
         if int(content["version"]) != VERSION:
             raise InputError(

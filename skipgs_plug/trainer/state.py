@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 VERSION = 1
-FREE_FIELDS = ("data_dir", "result_dir", "backend", "torch_threads")  # may differ between a run and its continuation
+FREE_FIELDS = ("data_dir", "result_dir", "backend")  # may differ between a run and its continuation
 
 
 def capture(trainer: Trainer) -> dict[str, Any]:

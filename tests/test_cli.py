@@ -1,0 +1,137 @@
+"""The command: exit codes, one sentence per error, a run folder, Ctrl-C and resume, the demo."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+from plyfile import PlyData
+
+from skipgs_plug.cli import COMMANDS, main
+from skipgs_plug.trainer import Trainer, save_packed
+from skipgs_plug.trainer.synthetic import make_scene
+
+SHORT = ["--max-steps", "60", "--refine-every", "10", "--no-progress"]
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("scene") / "tiny.npz"
+    save_packed(make_scene(n_views=10, width=32, height=24, n_points=160), path)
+    return str(path)
+
+
+def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
+    error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("skipgs-plug: ")]
+    assert len(error) == 1
+    return error[0]
+
+
+def test_help_lists_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    assert all(f"  {name}" in shown for name in COMMANDS)
+    assert main([]) == 2
+    assert main(["tarin"]) == 2
+    assert "no command 'tarin'" in one_sentence(capsys)
+
+
+def test_bad_input_is_one_sentence(tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]) -> None:
+    out = str(tmp_path / "run")
+    assert main(["train", str(tmp_path / "nowhere"), "--out", out]) == 2
+    assert "nowhere does not exist" in one_sentence(capsys)
+    assert main(["train", packed, "--out", out, "--resume"]) == 2
+    assert "start without --resume" in one_sentence(capsys)
+    assert main(["train", packed, "--out", out, "--gate.threshold", "-2", *SHORT]) == 2
+    assert "threshold must be" in one_sentence(capsys)
+    assert main(["train", packed, "--out", out, "--max-steps", "0"]) == 2
+    assert not Path(out).exists()
+    assert main(["train", packed, "--out", out, "--resume", "--debug"]) == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_run_folder(tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    command = ["train", packed, "--out", str(out), "--tensorboard", "--gate.warmup", "4", *SHORT]
+    assert main(command) == 0
+    shown = capsys.readouterr().out
+    assert re.search(r"8 training views, 2 held out", shown) and "backwards skipped" in shown
+    names = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
+    assert {
+        "cfg.yml",
+        "skipgs.json",
+        "ckpts/ckpt_59_rank0.pt",
+        "ply/point_cloud_59.ply",
+        "stats/val_step59.json",
+        "renders/val_step59_0000.png",
+        "renders/val_step59_0001.png",
+    } <= names
+    assert any(name.startswith("tb/") for name in names)
+    stats = json.loads((out / "stats/val_step59.json").read_text())
+    assert len(PlyData.read(str(out / "ply/point_cloud_59.ply"))["vertex"]) == stats["num_GS"]
+    report = json.loads((out / "skipgs.json").read_text())
+    assert report["iterations"] == 60 and report["gated_iterations"] == 30
+    assert report["settings"]["warmup"] == 4
+    assert main(command) == 2
+    assert "already holds a run" in one_sentence(capsys)
+
+
+def test_interrupt_leaves_a_checkpoint_that_resume_continues(
+    tmp_path: Path, packed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train_step = Trainer.train_step
+
+    def interrupted(self: Trainer) -> float:
+        if self.step == 40:
+            os.kill(os.getpid(), signal.SIGINT)
+        return train_step(self)
+
+    stopped, whole = tmp_path / "stopped", tmp_path / "whole"
+    monkeypatch.setattr(Trainer, "train_step", interrupted)
+    assert main(["train", packed, "--out", str(stopped), *SHORT]) == 130
+    assert [p.name for p in (stopped / "ckpts").iterdir()] == ["ckpt_40_rank0.pt"]
+    assert not (stopped / "ply").exists()
+    monkeypatch.setattr(Trainer, "train_step", train_step)
+    assert main(["train", packed, "--out", str(stopped), "--resume", *SHORT]) == 0
+    assert main(["train", packed, "--out", str(whole), *SHORT]) == 0
+    ends = [torch.load(run / "ckpts/ckpt_59_rank0.pt", weights_only=True) for run in (stopped, whole)]
+    for name in ends[0]["splats"]:
+        assert torch.equal(ends[0]["splats"][name], ends[1]["splats"][name])
+    reports = [json.loads((run / "skipgs.json").read_text()) for run in (stopped, whole)]
+    for key in ("iterations", "gated_iterations", "backwards_run", "backwards_skipped", "views"):
+        assert reports[0][key] == reports[1][key]
+
+
+def test_ungated_run_writes_no_gate_report(tmp_path: Path, packed: str) -> None:
+    assert main(["train", packed, "--out", str(tmp_path / "run"), "--no-gate", *SHORT]) == 0
+    assert not (tmp_path / "run/skipgs.json").exists()
+
+
+def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "demo"
+    size = ["--max-steps", "120", "--views", "10", "--width", "32", "--points", "200"]
+    assert main(["demo", "--out", str(out), "--no-progress", *size]) == 0
+    shown = capsys.readouterr().out
+    rows = {
+        line.split()[0]: line.split() for line in shown.splitlines() if line.split()[:1] and "gated" in line.split()[0]
+    }
+    assert [int(cell) for cell in rows["ungated"][4:6]] == [60, 0]
+    run, skipped = (int(cell) for cell in rows["gated"][4:6])
+    assert run + skipped == 60 and skipped > 0
+    with Image.open(out / "comparison.png") as comparison:
+        assert comparison.size == (2 * 32 * 5, 2 * 24 * 2 + 20)  # 5 columns, 2 views, doubled, below a title line
+    with Image.open(out / "refinement.png") as plot:
+        assert plot.width > 500
+    for name in ("ungated", "gated"):
+        assert len(PlyData.read(str(out / name / "ply/point_cloud_119.ply"))["vertex"]) > 0
+
+
+def test_doctor_renders(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor"]) == 0
+    assert re.search(r"ok  warp +renders and differentiates on cpu", capsys.readouterr().out)

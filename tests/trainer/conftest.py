@@ -1,0 +1,24 @@
+"""A scene of ten 32x24 views, shared by the tests of the reference trainer."""
+
+from __future__ import annotations
+
+import pytest
+
+from skipgs_plug.trainer import Scene, TrainConfig, Trainer
+from skipgs_plug.trainer.synthetic import make_scene
+
+
+@pytest.fixture(scope="session")
+def tiny_scene() -> Scene:
+    return make_scene(n_views=10, width=32, height=24, n_points=160)
+
+
+@pytest.fixture
+def tiny_config() -> TrainConfig:
+    # Milestones are given for 30,000 steps: refinement ends at 30, SH rises every 10, opacities reset at 20.
+    return TrainConfig(max_steps=60, refine_every=4, reset_every=20, sh_degree_interval=5000)
+
+
+@pytest.fixture
+def trainer(tiny_scene: Scene, tiny_config: TrainConfig) -> Trainer:
+    return Trainer(tiny_config, tiny_scene)

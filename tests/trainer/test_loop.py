@@ -1,0 +1,149 @@
+"""The training loop: it learns, follows its schedule, resets opacities, and refuses what it cannot use."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
+from skipgs_plug.trainer.config import REFERENCE_STEPS
+from skipgs_plug.trainer.order import ViewOrder
+from skipgs_plug.trainer.strategy import reset_opacity_if_missed
+
+
+def test_training_improves_held_out_views(tiny_scene: Scene) -> None:
+    trainer = Trainer(TrainConfig(max_steps=120), tiny_scene)
+    before = trainer.evaluate()
+    trainer.train(progress=False)
+    after = trainer.evaluate()
+    assert after["psnr"] > before["psnr"] + 1.5
+    assert after["views"] == 2 and after["num_GS"] == len(trainer.splats["means"])
+    assert trainer.t_total >= trainer.t_post > 0.0
+    assert sum(trainer.phase_seconds.values()) == pytest.approx(trainer.t_total)
+
+
+def test_schedule_scales_together_and_intervals_have_a_floor() -> None:
+    full, tenth = TrainConfig(), TrainConfig(max_steps=REFERENCE_STEPS // 10)
+    assert full.scaled(full.refine_stop_iter) == 15_000 and tenth.scaled(tenth.refine_stop_iter) == 1500
+    assert tenth.scaled(tenth.sh_degree_interval) == 100
+    assert tenth.scaled_interval(100, least=100) == 100 and full.scaled_interval(100, least=100) == 100
+    assert tenth.scaled_interval(30, least=100) == 30
+
+
+def test_sh_degree_and_positions_rate_follow_the_step(trainer: Trainer) -> None:
+    assert [trainer.active_sh_degree(step) for step in (0, 9, 10, 20, 59)] == [0, 0, 1, 2, 3]
+    trainer.train_step()
+    first = trainer.optimizers["means"].param_groups[0]["lr"]
+    assert first == pytest.approx(1.6e-4 * trainer.scene.scene_scale)
+    trainer.train(progress=False)
+    assert trainer.optimizers["means"].param_groups[0]["lr"] == pytest.approx(first * 0.01 ** (59 / 60))
+
+
+def test_every_view_once_per_epoch() -> None:
+    order = ViewOrder(7, seed=3)
+    epochs = [[order.at(step) for step in range(7 * e, 7 * e + 7)] for e in range(3)]
+    assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
+    assert epochs[0] != epochs[1]
+    assert [ViewOrder(7, seed=3).at(step) for step in range(7, 14)] == epochs[1]
+    assert [ViewOrder(7, seed=4).at(step) for step in range(7)] != epochs[0]
+
+
+def test_densification_runs_and_ends(trainer: Trainer) -> None:
+    start = len(trainer.splats["means"])
+    trainer.train(until=trainer.refine_stop_iter, progress=False)
+    densified = len(trainer.splats["means"])
+    assert densified != start
+    trainer.train(progress=False)
+    assert len(trainer.splats["means"]) == densified
+
+
+def test_opacities_are_reset_though_gsplat_1_5_3_does_not(trainer: Trainer) -> None:
+    trainer.train(until=20, progress=False)
+    assert torch.sigmoid(trainer.splats["opacities"]).max() > 0.05
+    trainer.train_step()  # step 20, a multiple of reset_every
+    assert torch.sigmoid(trainer.splats["opacities"]).max() <= 0.01001
+    # The strategy that did reset (or a second call) leaves nothing to do.
+    args = (trainer.strategy, trainer.splats, trainer.optimizers, trainer.strategy_state)
+    assert not reset_opacity_if_missed(*args, 20)
+    with torch.no_grad():
+        trainer.splats["opacities"].fill_(0.0)
+    assert not reset_opacity_if_missed(*args, 21)
+    assert not reset_opacity_if_missed(*args, 40)  # after densification
+    assert reset_opacity_if_missed(*args, 20)
+    moments = trainer.optimizers["opacities"].state[trainer.splats["opacities"]]
+    assert not moments["exp_avg"].any()
+
+
+def test_backward_is_called_once_per_iteration_with_view_and_step(trainer: Trainer) -> None:
+    calls: list[tuple[str, int]] = []
+    original = trainer.backward
+
+    def spy(loss: torch.Tensor, view: str, step: int) -> None:
+        calls.append((view, step))
+        original(loss, view, step)
+
+    trainer.backward = spy  # type: ignore[method-assign]
+    trainer.train(until=8, progress=False)
+    assert [step for _, step in calls] == list(range(8))
+    assert sorted(view for view, _ in calls) == sorted(trainer.view_names)
+
+
+def test_iteration_without_backward_changes_nothing(trainer: Trainer) -> None:
+    trainer.train(until=31, progress=False)
+    before = trainer.snapshot()
+    trainer.backward = lambda loss, view, step: None  # type: ignore[method-assign]
+    trainer.train_step()
+    after = trainer.snapshot()
+    for name in before["splats"]:
+        assert torch.equal(before["splats"][name], after["splats"][name])
+        assert torch.equal(before["optimizers"][name]["exp_avg"], after["optimizers"][name]["exp_avg"])
+    assert after["step"] == before["step"] + 1
+
+
+def test_non_finite_loss_names_view_and_step(trainer: Trainer) -> None:
+    trainer.train(until=3, progress=False)
+    with torch.no_grad():
+        trainer.splats["sh0"].fill_(torch.nan)
+    with pytest.raises(InputError, match=r"Loss is nan at iteration 3 on view 'view_00\d\.png'"):
+        trainer.train_step()
+
+
+@pytest.mark.parametrize("field", ["visible_adam", "antialiased", "random_bkgd", "absgrad"])
+def test_options_train(tiny_scene: Scene, tiny_config: TrainConfig, field: str) -> None:
+    plain = Trainer(tiny_config, tiny_scene)
+    varied = Trainer(dataclasses.replace(tiny_config, **{field: True}), tiny_scene)
+    for trainer in (plain, varied):
+        trainer.train(until=6, progress=False)
+    assert all(torch.isfinite(p).all() for p in varied.splats.values())
+    changed = not torch.equal(plain.splats["means"], varied.splats["means"])
+    assert changed or field == "absgrad"  # which acts at the first densification only
+
+
+def test_callers_random_state_is_left_alone(trainer: Trainer) -> None:
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    trainer.train(until=12, progress=False)
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_no_held_out_views(tiny_scene: Scene, tiny_config: TrainConfig) -> None:
+    scene = dataclasses.replace(tiny_scene, test=[])
+    with pytest.raises(InputError, match="has no test views; lower test_every"):
+        Trainer(tiny_config, scene).evaluate()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("max_steps", 0), ("data_factor", 0), ("sh_degree", 4), ("ssim_lambda", 1.5), ("means_lr", float("nan"))],
+)
+def test_settings_out_of_range(field: str, value: float) -> None:
+    with pytest.raises(InputError, match=field):
+        TrainConfig(**{field: value})  # type: ignore[arg-type]
+
+
+def test_unknown_backend(tiny_scene: Scene) -> None:
+    with pytest.raises(InputError, match="Backend 'opengl' is unknown; choose"):
+        Trainer(TrainConfig(backend="opengl"), tiny_scene)  # type: ignore[arg-type]

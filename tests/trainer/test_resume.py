@@ -1,0 +1,116 @@
+"""Snapshots and checkpoints: interrupted and resumed equals uninterrupted, bit for bit."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from skipgs_plug.trainer import InputError, MissingFileError, Scene, TrainConfig, Trainer
+
+
+class Counter:
+    """A registered object with state."""
+
+    def __init__(self) -> None:
+        self.value = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"value": self.value}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.value = state["value"]
+
+
+def assert_same(one: Trainer, other: Trainer) -> None:
+    first, second = one.snapshot(), other.snapshot()
+    assert first["step"] == second["step"]
+    for name in first["splats"]:
+        assert torch.equal(first["splats"][name], second["splats"][name]), name
+        for key, moment in first["optimizers"][name].items():
+            assert torch.equal(moment, second["optimizers"][name][key]), (name, key)
+
+
+@pytest.mark.parametrize("visible_adam", [False, True])
+@pytest.mark.parametrize("stop", [6, 13, 45])
+def test_resumed_equals_uninterrupted(
+    tmp_path: Path, tiny_scene: Scene, tiny_config: TrainConfig, stop: int, visible_adam: bool
+) -> None:
+    config = dataclasses.replace(tiny_config, visible_adam=visible_adam, random_bkgd=True)
+    whole = Trainer(config, tiny_scene)
+    whole.train(progress=False)
+    first = Trainer(config, tiny_scene)
+    first.train(until=stop, progress=False)
+    first.save_checkpoint(tmp_path / "c.pt")
+    second = Trainer(config, tiny_scene)
+    second.load_checkpoint(tmp_path / "c.pt")
+    assert second.step == stop
+    second.train(progress=False)
+    assert_same(whole, second)
+
+
+def test_snapshot_can_be_restored_twice(trainer: Trainer) -> None:
+    trainer.train(until=30, progress=False)
+    optimizer = trainer.optimizers["means"]
+    snapshot = trainer.snapshot()
+    ends = []
+    for _ in range(2):
+        trainer.restore(snapshot)
+        assert trainer.step == 30 and trainer.optimizers["means"] is optimizer
+        trainer.train(progress=False)
+        ends.append(trainer.splats["means"].detach().clone())
+    assert torch.equal(ends[0], ends[1])
+
+
+def test_registered_state_travels(tmp_path: Path, trainer: Trainer) -> None:
+    counter = Counter()
+    trainer.register_state("counter", counter)
+    counter.value = 7
+    trainer.save_checkpoint(tmp_path / "c.pt")
+    snapshot = trainer.snapshot()
+    counter.value = 9
+    trainer.restore(snapshot)
+    assert counter.value == 7
+    counter.value = 9
+    trainer.load_checkpoint(tmp_path / "c.pt")
+    assert counter.value == 7
+
+
+def test_missing_registered_state_is_said(tmp_path: Path, trainer: Trainer, caplog: pytest.LogCaptureFixture) -> None:
+    trainer.save_checkpoint(tmp_path / "c.pt")
+    trainer.register_state("counter", Counter())
+    trainer.load_checkpoint(tmp_path / "c.pt")
+    assert "holds no state for counter: it starts fresh" in caplog.text
+
+
+def test_bad_checkpoints(tmp_path: Path, trainer: Trainer, tiny_scene: Scene) -> None:
+    path = tmp_path / "c.pt"
+    with pytest.raises(MissingFileError, match=r"c\.pt does not exist"):
+        trainer.load_checkpoint(path)
+    trainer.save_checkpoint(path)
+    whole = path.read_bytes()
+    for content in (whole[: len(whole) // 2], b"", b"garbage"):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"c\.pt is damaged or not one of this trainer"):
+            trainer.load_checkpoint(path)
+    torch.save({"step": 3}, path)
+    with pytest.raises(InputError, match="damaged or not one"):
+        trainer.load_checkpoint(path)
+
+    path.write_bytes(whole)
+    other = Trainer(dataclasses.replace(trainer.config, max_steps=90), tiny_scene)
+    with pytest.raises(InputError, match=r"made with max_steps=60, not 90"):
+        other.load_checkpoint(path)
+    fewer = dataclasses.replace(tiny_scene, train=tiny_scene.train[1:])
+    with pytest.raises(InputError, match="other training views"):
+        Trainer(trainer.config, fewer).load_checkpoint(path)
+
+    with torch.no_grad():
+        trainer.splats["scales"][0, 0] = torch.inf
+    trainer.save_checkpoint(path)
+    with pytest.raises(InputError, match=r"holds NaN or infinite scales"):
+        trainer.load_checkpoint(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["c.pt"]
