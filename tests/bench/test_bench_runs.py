@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+import torch
+from bench_fixtures import MAX_STEPS, SEEDS, early_floor, make_bench
+
+from skipgs_plug.bench.policies import POLICIES
+from skipgs_plug.bench.refine import compressed, densify, shortened_iterations
+from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
+from skipgs_plug.trainer.backend import resolve_backend
+
+START = MAX_STEPS // 2
+
+
+def test_every_policy_ran_from_the_same_point(finished):
+    for seed in SEEDS:
+        starts = {finished.run(policy, seed).points[0].psnr for policy in POLICIES}
+        assert len(starts) == 1
+        densified = {finished.run(policy, seed).t_total - finished.run(policy, seed).t_post for policy in POLICIES}
+        assert max(densified) - min(densified) < 1e-9
+
+
+def test_every_policy_saw_the_same_views_in_the_same_order(finished):
+    for seed in SEEDS:
+        full = finished.run("ungated", seed).trace.view
+        assert len(full) == MAX_STEPS - START
+        for policy in POLICIES:
+            record = finished.run(policy, seed)
+            assert record.trace.start == START
+            assert record.trace.view == full[: record.iterations]
+    assert finished.run("ungated", 0).trace.view != finished.run("ungated", 1).trace.view
+
+
+def test_controls_skip_exactly_as_often_as_the_gate(finished):
+    for seed in SEEDS:
+        gate = finished.run("gate", seed)
+        assert 0 < gate.skips < gate.iterations - gate.warm_up
+        assert gate.warm_up == 2 * len(finished.bench.scene.train)
+        for policy in ("random", "periodic"):
+            control = finished.run(policy, seed)
+            assert control.skips == gate.skips
+            assert sum(control.trace.skipped) == gate.skips
+            assert not any(control.trace.skipped[: gate.warm_up])
+            assert control.trace.skipped != gate.trace.skipped
+
+
+def test_ungated_runs_every_backward(finished):
+    record = finished.run("ungated")
+    assert record.backwards == record.iterations == MAX_STEPS - START
+    assert set(record.trace.codes) == {"-"}
+
+
+def test_a_gate_skips_at_or_below_the_mean_only(finished):
+    trace = finished.run("gate").trace
+    for loss, mean, code in zip(trace.loss, trace.mean, trace.codes, strict=True):
+        if code == "D":
+            assert mean is not None and loss <= mean
+        elif code == "d":
+            assert loss >= mean
+
+
+def test_time_is_split_into_phases_and_evaluated_on_the_way(finished):
+    for record in finished.records:
+        assert sum(record.phases.values()) == pytest.approx(record.t_post, rel=1e-6)
+        steps = [point.step for point in record.points]
+        assert steps[0] == START and steps[-1] == START + record.iterations
+        seconds = [point.seconds for point in record.points]
+        assert seconds == sorted(seconds) and seconds[0] == 0.0
+        assert record.points[-1].psnr == record.metrics["psnr"]
+
+
+def test_shortened_takes_the_time_of_the_gate():
+    assert shortened_iterations(1000, gate_seconds=60.0, ungated_seconds=100.0) == 600
+    assert shortened_iterations(1000, gate_seconds=110.0, ungated_seconds=100.0) == 1000
+    assert shortened_iterations(10, gate_seconds=0.1, ungated_seconds=100.0) == 1
+
+
+def test_shortened_runs_through_the_whole_schedule(scene):
+    trainer = Trainer(TrainConfig(max_steps=200, sh_degree_interval=7000), scene)
+
+    def rate(step: int) -> float:
+        trainer.set_learning_rate(step)
+        return trainer.optimizers["means"].param_groups[0]["lr"]
+
+    full = [rate(step) for step in (50, 100, 150, 200)]
+    degrees = [trainer.active_sh_degree(step) for step in (100, 150, 199)]
+    with compressed(trainer, start=100, iterations=50):
+        assert [rate(step) for step in (50, 100, 125, 150)] == pytest.approx(full)
+        assert [trainer.active_sh_degree(step) for step in (100, 125, 149)] == degrees
+    assert rate(150) == pytest.approx(full[2])
+
+
+def test_a_killed_bench_continues_where_it_stopped(scene, finished, tmp_path):
+    class Killed(BaseException):
+        pass
+
+    lines: list[str] = []
+
+    def die_after_three(line: str) -> None:
+        lines.append(line)
+        if len(lines) == 4:  # densification, then three runs
+            raise Killed
+
+    with early_floor(), pytest.raises(Killed):
+        make_bench(scene, tmp_path, say=die_after_three).run()
+    stored = {path: path.read_bytes() for path in (tmp_path / "runs").iterdir()}
+    assert len(stored) == 3
+
+    said: list[str] = []
+    with early_floor():
+        records = make_bench(scene, tmp_path, say=said.append).run()
+    assert sum("continuing from its snapshot" in line for line in said) == 1
+    assert len(records) == len(SEEDS) * len(POLICIES)
+    assert sum("T_post" in line for line in said) == len(records) - 3
+    assert all(path.read_bytes() == content for path, content in stored.items())
+    for record in records:
+        if record.policy != "shortened":  # its length depends on measured time
+            whole = finished.run(record.policy, record.seed)
+            assert record.trace == whole.trace
+            assert record.metrics == whole.metrics
+
+    said.clear()
+    assert make_bench(scene, tmp_path, say=said.append).run() == records
+    assert said == []
+
+
+def test_a_run_that_diverges_is_named_and_its_copies_are_not_run(scene, tmp_path):
+    bench = make_bench(scene, tmp_path, seeds=(5,))
+    bench.backend = failing_backend(START + 1 + (MAX_STEPS - START) + 20)  # warm-up, densification, ungated, then
+    found = {record.policy: record for record in bench.run()}
+    assert found["ungated"].status == "done"
+    assert found["gate"].status == "diverged"
+    assert f"loss nan at iteration {START + 19} on view" in found["gate"].note
+    assert found["gate-no-floor"].status == "done"
+    for policy in ("random", "periodic", "shortened"):
+        assert found[policy].status == "not run" and "gate" in found[policy].note
+    assert json.loads((tmp_path / "runs" / "seed5_gate.json").read_text())["status"] == "diverged"
+
+
+def test_a_seed_that_diverges_in_densification_is_named_under_every_policy(scene, tmp_path):
+    bench = make_bench(scene, tmp_path, seeds=(5,), policies=("ungated", "gate"))
+    bench.backend = failing_backend(10)
+    records = bench.run()
+    assert [record.status for record in records] == ["diverged", "diverged"]
+    assert all("densification" in record.note for record in records)
+
+
+def failing_backend(call: int):
+    """Return the default backend with a loss that is NaN at its `call`-th evaluation."""
+    backend = resolve_backend("auto")
+    calls = 0
+
+    def loss(image: torch.Tensor, target: torch.Tensor, ssim_lambda: float) -> torch.Tensor:
+        nonlocal calls
+        calls += 1
+        value = backend.loss(image, target, ssim_lambda)
+        return value * float("nan") if calls == call else value
+
+    return dataclasses.replace(backend, loss=loss)
+
+
+def test_other_settings_in_the_same_folder_are_refused(scene, finished):
+    with pytest.raises(InputError, match=r"training.max_steps=80, not 90"):
+        make_bench(scene, finished.folder, max_steps=90)
+
+
+def test_more_seeds_may_be_added_to_a_folder(scene, finished):
+    make_bench(scene, finished.folder, seeds=(0, 1, 2))
+
+
+def test_a_scene_without_held_out_views_is_refused(scene, tmp_path):
+    bare: Scene = dataclasses.replace(scene, test=[])
+    with pytest.raises(InputError, match="no held-out views"):
+        make_bench(bare, tmp_path)
+
+
+def test_a_schedule_without_refinement_is_refused(scene, tmp_path):
+    config = TrainConfig(max_steps=100, refine_stop_iter=30_000)
+    bench = make_bench(scene, tmp_path)
+    with pytest.raises(InputError, match="nothing to refine"):
+        type(bench)(scene, config, bench.folder, (0,), ("ungated",))
+
+
+def test_a_damaged_run_is_named(scene, finished, tmp_path):
+    bench = make_bench(scene, tmp_path)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "seed0_gate.json").write_text("{")
+    with pytest.raises(InputError, match=r"seed0_gate\.json"):
+        bench.run()
+
+
+def test_densify_stops_where_refinement_begins(scene):
+    trainer = Trainer(TrainConfig(max_steps=20), scene)
+    densify(trainer, progress=False)
+    assert trainer.step == trainer.refine_stop_iter == 10

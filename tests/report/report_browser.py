@@ -1,0 +1,28 @@
+"""How the tests look into a page with a browser."""
+
+from __future__ import annotations
+
+import re
+
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+# Runs in a copy of the page only: the page itself holds no script.
+COUNT_IMAGES = """<script>addEventListener("load", () => {
+  const images = [...document.images];
+  document.body.dataset.images = images.length;
+  document.body.dataset.decoded = images.filter(i => i.complete && i.naturalWidth > 0).length;
+});</script>"""
+
+
+def body_count(dom: str, name: str) -> int:
+    found = re.search(rf'<body[^>]* data-{name}="(\d+)"', dom)
+    assert found, f"the browser did not report {name}"
+    return int(found.group(1))

@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+from report_browser import body_count
+
+from skipgs_plug.cli import main
+
+
+def make_page(tmp_path, *folders):
+    page = tmp_path / "page.html"
+    assert main(["report", *map(str, folders), "--out", str(page)]) == 0
+    return page
+
+
+def rows_of(dom: str, caption: str) -> list[list[str]]:
+    """Return the cells of the body rows of the table with this caption."""
+    table = re.search(rf"<table[^>]*><caption>{re.escape(caption)}.*?</table>", dom, re.DOTALL)
+    assert table, f"no table {caption!r}"
+    body = table.group(0).split("<tbody>")[1]
+    return [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>.*?</tr>", body, re.DOTALL)]
+
+
+def test_browser_shows_a_training_run(train_folder, tmp_path, dump_dom):
+    dom = dump_dom(make_page(tmp_path, train_folder))
+    data = json.loads((train_folder / "skipgs.json").read_text())
+    (row,) = rows_of(dom, "What the gate did")
+    assert row[:5] == ["gated", "40", "20", str(data["backwards_run"]), str(data["backwards_skipped"])]
+    assert len(rows_of(dom, "Views")) == 6
+    assert dict(rows_of(dom, "Last evaluation"))["num_GS"].isdigit()
+    assert body_count(dom, "images") == body_count(dom, "decoded") == 5  # three plots, two held-out renders
+
+
+def test_browser_shows_a_bench(bench_folder, tmp_path, dump_dom):
+    dom = dump_dom(make_page(tmp_path, bench_folder))
+    rows = rows_of(dom, "Time and quality")
+    assert [row[0] for row in rows] == ["ungated", "gate", "random"]
+    assert all(len(row) == len(rows[0]) > 8 for row in rows)
+    assert [row[0] for row in rows_of(dom, "Share of refinement time")] == ["ungated", "gate", "random"]
+    assert "A perfect gate at this skip rate could save" in dom
+    assert body_count(dom, "images") == body_count(dom, "decoded") == 5
+
+
+def test_browser_shows_the_run_of_an_upstream_script(script_folder, tmp_path, dump_dom):
+    dom = dump_dom(make_page(tmp_path, script_folder))
+    (row,) = rows_of(dom, "What the gate did")
+    assert row[:3] == ["output &amp; &lt;model&gt;", "60", "55"]
+    assert [row[0] for row in rows_of(dom, "Views")] == [f"cam/{i}&lt;b&gt;.png" for i in range(3)]
+    assert body_count(dom, "images") == body_count(dom, "decoded") == 3
+
+
+def test_browser_compares_several_runs(train_folder, script_folder, bench_folder, tmp_path, dump_dom):
+    dom = dump_dom(make_page(tmp_path, train_folder, script_folder, bench_folder))
+    assert [row[0] for row in rows_of(dom, "All runs")] == ["gated", "output &amp; &lt;model&gt;"]
+    assert body_count(dom, "images") == body_count(dom, "decoded") == 13
+
+
+def test_page_loads_nothing_from_elsewhere(train_folder, bench_folder, tmp_path):
+    text = make_page(tmp_path, train_folder, bench_folder).read_text()
+    sources = re.findall(r'(?:src|href)="([^"]*)"', text)
+    assert sources and all(source.startswith("data:") for source in sources)
+    assert "<script" not in text and "url(" not in text and "@import" not in text
+
+
+def test_tables_and_pictures_are_accessible(train_folder, bench_folder, tmp_path):
+    text = make_page(tmp_path, train_folder, bench_folder).read_text()
+    assert text.count("<table") == text.count("<caption>") > 4
+    assert all(' alt="' in image for image in re.findall(r"<img[^>]*>", text))
+    assert '<html lang="en">' in text and 'scope="row"' in text and 'scope="col"' in text
+
+
+def test_the_json_file_itself_may_be_given(script_folder, tmp_path):
+    assert "backwards run" in make_page(tmp_path, script_folder / "skipgs.json").read_text()
+
+
+def test_a_run_whose_gate_was_never_active_is_shown(script_folder, tmp_path):
+    data = json.loads((script_folder / "skipgs.json").read_text())
+    data.update(gated_iterations=0, backwards_run=0, backwards_skipped=0, reasons={}, views=[])
+    (tmp_path / "skipgs.json").write_text(json.dumps(data))
+    text = make_page(tmp_path, tmp_path / "skipgs.json").read_text()
+    assert "never active" in text and "<img" not in text
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (None, "does not exist"),
+        ("{", "is damaged"),
+        ("[1]", "no JSON object"),
+        ('{"schema_version": 99}', "schema version 99"),
+        ('{"schema_version": 1, "settings": {}}', "no 'iterations' in it"),
+        ('{"kind": "skipgs-bench", "schema_version": 1}', "no 'command' in it"),
+    ],
+)
+def test_unusable_input_is_one_sentence(tmp_path, capsys, content, sentence):
+    if content is not None:
+        (tmp_path / "skipgs.json").write_text(content)
+    assert main(["report", str(tmp_path), "--out", str(tmp_path / "page.html")]) == 2
+    error = capsys.readouterr().err.strip()
+    assert sentence in error and "skipgs.json" in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_an_unfinished_bench_is_named_as_such(tmp_path, capsys):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "settings.json").write_text("{}")
+    assert main(["report", str(tmp_path)]) == 2
+    assert "has not finished" in capsys.readouterr().err
