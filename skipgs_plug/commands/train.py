@@ -109,6 +109,8 @@ def finish(args: Args, folder: RunFolder, trainer: Trainer, gate: SkipGate | Non
     split: Literal["val", "train"] = "val" if trainer.scene.test else "train"
     stats = trainer.evaluate("test" if split == "val" else "train", args.lpips_net)
     folder.write_stats(trainer, stats, split)
+    if args.tensorboard:
+        log_evaluation(folder, trainer, stats, split)
     folder.write_renders(trainer, split)
     ply = folder.write_ply(trainer)
     if gate is not None:
@@ -121,6 +123,16 @@ def finish(args: Args, folder: RunFolder, trainer: Trainer, gate: SkipGate | Non
         f"PSNR {stats['psnr']:.2f} dB, SSIM {stats['ssim']:.4f} (torchmetrics padding){lpips} on {where}; "
         f"{stats['num_GS']:,} Gaussians; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s\n{ply}"
     )
+
+
+def log_evaluation(folder: RunFolder, trainer: Trainer, stats: dict[str, Any], split: str) -> None:
+    """Write the numbers of an evaluation as TensorBoard scalars, tagged as gsplat does: val/psnr and so on."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    with SummaryWriter(str(folder.root / "tb")) as writer:
+        for name, value in stats.items():
+            if name in ("psnr", "ssim", "num_GS") or name.startswith("lpips"):
+                writer.add_scalar(f"{split}/{name}", value, trainer.step - 1)
 
 
 def gate_settings(options: GateOptions) -> dict[str, Any]:
