@@ -61,7 +61,7 @@ def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row]) -> Figure:
     axes.set_xlabel("training time since the end of densification (s)")
     axes.set_ylabel("held-out PSNR (dB)")
     axes.legend(frameon=False, fontsize=SMALL, loc="lower right")
-    axes.set_title(f"Quality against time, mean of {seeds_text(rows)}", loc="left", fontsize=11)
+    axes.set_title(f"Quality against time, {seeds_text(rows)}", loc="left", fontsize=11)
     return figure
 
 
@@ -72,7 +72,7 @@ def time_against_error(rows: Sequence[Row]) -> Figure:
     scatter(axes[0], rows, "t_post", "psnr")
     axes[0].set_xlabel("refinement time T_post (s)")
     axes[0].set_ylabel("held-out PSNR (dB)")
-    axes[0].set_title(f"Mean and spread of {seeds_text(rows)}", loc="left", fontsize=11)
+    axes[0].set_title(f"Time and quality, {seeds_text(rows)}", loc="left", fontsize=11)
     figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=7 if paired else 4,
                   loc="outside lower center")  # fmt: skip
     if paired:
@@ -194,7 +194,7 @@ def loss_and_mean(run: RunRecord, view_names: Sequence[str]) -> Figure:
 
 def seeds_text(rows: Sequence[Row]) -> str:
     seeds = {seed for row in rows for seed in row.seeds}
-    return f"{len(seeds)} seed" + ("s" if len(seeds) != 1 else "")
+    return "one seed" if len(seeds) == 1 else f"mean of {len(seeds)} seeds"
 
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **share: Any) -> Any:

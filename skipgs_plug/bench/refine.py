@@ -79,6 +79,7 @@ def refine(
         record.backwards = report["backwards_run"]
         record.warm_up = sum(row.reason == "warm-up" for row in gate.trace)
         record.floor = report["min_bwd_ratio_effective"]
+        record.reasons = report["reasons"]
     return record
 
 

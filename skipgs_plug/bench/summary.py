@@ -29,7 +29,8 @@ class Row:
         values: by name: `t_post t_total` (s), `t_post_saved t_total_saved` (% less than ungated, same seed),
             `iterations`, `backwards_share` (% of the refinement iterations of the full schedule),
             `share_forward ...` (% of t_post), `psnr ssim lpips_*`, `psnr_gain` (dB above ungated, same seed),
-            `num_GS`, `peak_memory_gib`.
+            `num_GS`, `peak_memory_gib`; `wanted` and `held_back`: backwards after warm-up that a gate's rule asked
+            for, and skips that its floor forbade (% of the iterations after warm-up).
     """
 
     policy: str
@@ -67,6 +68,11 @@ def measured(record: RunRecord, ungated: RunRecord | None, full_iterations: int)
     values.update(record.metrics)
     if ungated is not None:
         values["psnr_gain"] = record.metrics["psnr"] - ungated.metrics["psnr"]
+    after_warm_up = record.iterations - record.warm_up
+    if "deviation" in record.reasons and after_warm_up > 0:
+        held_back = record.reasons.get("budget", 0)
+        values["wanted"] = 100 * (record.backwards - record.warm_up - held_back) / after_warm_up
+        values["held_back"] = 100 * held_back / after_warm_up
     if record.peak_memory is not None:
         values["peak_memory_gib"] = record.peak_memory / 2**30
     return values

@@ -90,6 +90,13 @@ def notes(rows: Sequence[Row], bench: dict[str, Any]) -> list[str]:
             f"take {most['share']:.1f} % of ungated time, and {most['skipped']:.1f} % of them are skipped. "
             f"Measured: {most['measured']:.1f} %."
         )
+    for row in rows:
+        if "wanted" in row.values:
+            wanted, held_back = row.values["wanted"].mean, row.values["held_back"].mean
+            sentences.append(
+                f"After warm-up the rule of {row.policy} asked for a backward in {wanted:.1f} % of the iterations; in "
+                f"{held_back:.1f} % its floor forbade a skip."
+            )
     if bench["timing_noise"] is not None:
         sentences.append(
             "The forward pass is nearly the same work under every policy; within a seed its time per iteration "

@@ -9,6 +9,7 @@ from bench_fixtures import MAX_STEPS, SEEDS, early_floor, make_bench
 
 from skipgs_plug.bench.policies import POLICIES
 from skipgs_plug.bench.refine import compressed, densify, shortened_iterations
+from skipgs_plug.bench.summary import summarise
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.backend import resolve_backend
 
@@ -45,6 +46,15 @@ def test_controls_skip_exactly_as_often_as_the_gate(finished):
             assert sum(control.trace.skipped) == gate.skips
             assert not any(control.trace.skipped[: gate.warm_up])
             assert control.trace.skipped != gate.trace.skipped
+
+
+def test_what_the_rule_asked_for_is_told_from_what_the_floor_forbade(finished):
+    record = finished.run("gate")
+    row = next(row for row in summarise([record], ("gate",), record.iterations))
+    after = record.trace.codes[record.warm_up :]
+    assert row.values["wanted"].mean == pytest.approx(100 * after.count("d") / len(after))
+    assert row.values["held_back"].mean == pytest.approx(100 * after.count("b") / len(after))
+    assert after.count("b") > 0
 
 
 def test_ungated_runs_every_backward(finished):
