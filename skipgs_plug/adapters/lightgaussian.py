@@ -11,7 +11,8 @@ from skipgs_plug.adapters.inria import InriaFamily
 class LightGaussian(InriaFamily):
     """Fine-tuning and distilling are gated from the beginning, training from scratch after densification.
 
-    prune_finetune.py prunes in its first iteration, after the backward: the gate begins with the second.
+    prune_finetune.py usually prunes in its first iteration, after the backward: the gate then begins with
+    the second, and with a pause.
     distill_train.py jitters the camera in two of three iterations. Their losses scatter more than those of
     the camera itself and are no measure of it, so both have means of their own.
     """
@@ -26,10 +27,11 @@ class LightGaussian(InriaFamily):
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         self._jitters = distills(loop) and loop["args"].augmented_view
+        first = int(loop["iteration"])
         if distills(loop):
-            return int(loop["iteration"])
+            return first
         if finetunes(loop):
-            return int(loop["iteration"]) + 1
+            return first + (first in loop["args"].prune_iterations)
         return int(opt.densify_until_iter)
 
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:

@@ -81,8 +81,8 @@ def layers(part: Any) -> Iterator[Any]:
     """A trainer, the trainers and densifiers that it wraps, and those that they wrap."""
     yield part
     for name in ("base_trainer", "densifier", "base_densifier"):
-        if name in vars(part):
-            yield from layers(vars(part)[name])
+        if hasattr(part, name):
+            yield from layers(getattr(part, name))
 
 
 def parameters(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:

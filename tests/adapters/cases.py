@@ -1,0 +1,169 @@
+"""Every look-alike as a case: how to make its trainer, how to run it, and what is expected of it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+from lookalikes import (
+    fastgs,
+    gaussianspa,
+    gaussianspa_op,
+    gsplat_runner,
+    inria,
+    lightgaussian_densify_prune,
+    lightgaussian_distill,
+    lightgaussian_prune_finetune,
+    nerfstudio,
+    speedy_splat,
+    step_trainer,
+    taming,
+)
+from lookalikes.splats import NAMES, log, new_log
+
+from skipgs_plug import SkipGate
+from skipgs_plug.core import decision
+
+PAUSE = 4  # iterations
+
+
+@dataclass(frozen=True)
+class Case:
+    """A trainer and what it does when left alone.
+
+    Attributes:
+        name: of the test.
+        module: the look-alike; has ADAPTER, FIRST, START and LAST iteration.
+        make: gives the trainer and a function `train(last)` that runs it.
+        resume: runs a copy of what `train` returned: resume(result) gives another trainer and `train`.
+        settled: iteration from which nothing changes when everything is skipped.
+        pending: gradients are left over when skipping begins, and are to be applied right before `settled`.
+        views: keys of all training views.
+    """
+
+    name: str
+    module: ModuleType
+    make: Callable[[], tuple[Any, Callable[..., Any]]]
+    resume: Callable[[Any], tuple[Any, Callable[..., Any]]] | None = None
+    settled: int | None = None
+    pending: bool = False
+    views: tuple[str, ...] = tuple(NAMES)
+
+    @property
+    def iterations(self) -> range:
+        return range(self.module.FIRST, self.module.LAST + 1)
+
+
+def script(
+    name: str,
+    module: ModuleType,
+    settled: int | None = None,
+    pending: bool = False,
+    views: Any = NAMES,
+    **options: Any,
+) -> Case:
+    """A train module with its function `training`; resumed with the cameras in another order."""
+
+    def make() -> tuple[Any, Callable[..., Any]]:
+        return module, lambda last=module.LAST: module.train(last=last, **options)
+
+    def resume(checkpoint: Any) -> tuple[Any, Callable[..., Any]]:
+        return module, lambda last=module.LAST: module.train(checkpoint, last=last, order=7, **options)
+
+    return Case(name, module, make, resume, settled, pending, tuple(views))
+
+
+def gsplat(name: str, cls: type, strategy: type, **options: Any) -> Case:
+    def make() -> tuple[Any, Callable[..., Any]]:
+        runner = cls(strategy(), **options)
+        return runner, runner.train
+
+    return Case(name, gsplat_runner, make, views=("batch",) if options else tuple(NAMES))
+
+
+def studio(name: str, **options: Any) -> Case:
+    def make() -> tuple[Any, Callable[..., Any]]:
+        trainer = nerfstudio.Trainer(**options).setup()
+        return trainer, lambda last=nerfstudio.LAST: (trainer.train(last), trainer, last)[1:]
+
+    def resume(result: Any) -> tuple[Any, Callable[..., Any]]:
+        trainer, last = result
+        trainer.start_step = last + 1
+        return trainer, trainer.train
+
+    return Case(name, nerfstudio, make, resume)
+
+
+def pip() -> Case:
+    def make() -> tuple[Any, Callable[..., Any]]:
+        trainer, dataset = step_trainer.make(), step_trainer.dataset()
+        return trainer, lambda last=step_trainer.LAST: (step_trainer.training(trainer, dataset, last), trainer)[1]
+
+    def resume(trainer: Any) -> tuple[Any, Callable[..., Any]]:
+        trainer = copy.deepcopy(trainer)
+        dataset = step_trainer.dataset()
+        return trainer, lambda last=step_trainer.LAST: step_trainer.training(trainer, dataset, last)
+
+    return Case("step_trainer", step_trainer, make, resume)
+
+
+SCRIPTS = [
+    script("inria", inria),
+    script("fastgs", fastgs, settled=25, pending=True),
+    script("taming", taming, settled=21),
+    script("taming_sh_lower", taming, settled=25, pending=True, sh_lower=True),
+    script("speedy_splat", speedy_splat),
+    script("lightgaussian_densify_prune", lightgaussian_densify_prune),
+    script("lightgaussian_prune_finetune", lightgaussian_prune_finetune),
+    script("lightgaussian_distill", lightgaussian_distill, views=lightgaussian_distill.VIEWS),
+    script("lightgaussian_distill_plain", lightgaussian_distill, augmented_view=False),
+    script("gaussianspa", gaussianspa),
+    script("gaussianspa_op", gaussianspa_op),
+]
+CASES = [
+    *SCRIPTS,
+    gsplat("gsplat_default", gsplat_runner.Runner, gsplat_runner.DefaultStrategy),
+    gsplat("gsplat_mcmc", gsplat_runner.Runner, gsplat_runner.MCMCStrategy),
+    gsplat("gsplat_head_default", gsplat_runner.HeadRunner, gsplat_runner.DefaultStrategy),
+    gsplat("gsplat_head_mcmc", gsplat_runner.HeadRunner, gsplat_runner.MCMCStrategy),
+    gsplat("gsplat_batch", gsplat_runner.Runner, gsplat_runner.DefaultStrategy, batch_size=2),
+    pip(),
+    studio("nerfstudio"),
+    studio("nerfstudio_mcmc", strategy=gsplat_runner.MCMCStrategy()),
+    studio("nerfstudio_scaled", scaled=True, max_norm=1.0),
+]
+
+
+class SkipAlways:
+    """A policy that skips whatever it is asked about."""
+
+    def decide(self, view, loss, step):
+        return decision.AT_OR_BELOW_MEAN
+
+    def notify_event(self, step, n_views):
+        pass
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state):
+        pass
+
+
+def run(case: Case, **settings: Any) -> tuple[Any, SkipGate | None]:
+    """Train a fresh trainer to the end, gated if there are settings; give the log and the detached gate."""
+    new_log()
+    trainer, train = case.make()
+    if not settings:
+        train()
+        return copy.copy(log), None
+    with SkipGate(trainer, **settings) as gate:
+        train()
+    gate.verify()
+    return copy.copy(log), gate
+
+
+RULE = {"warmup": 3, "min_bwd_ratio": 0.0, "pause_iters": PAUSE, "record_trace": True}

@@ -1,0 +1,60 @@
+"""Look-alike of GaussianSpa's train_op.py: classic render, and a prune after the last ADMM iteration's step."""
+
+from types import SimpleNamespace
+
+import torch
+from lookalikes.gaussianspa import OptimizingSpa
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+
+ADAPTER, FIRST, START, LAST = "gaussianspa", 1, 41, 80
+
+
+class GaussianModel(SplatModel):
+    def update_learning_rate(self, iteration, training_args):
+        super().update_learning_rate(iteration)
+
+
+def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, override_color=None):
+    return draw(viewpoint_camera, pc.values)
+
+
+def training(dataset, opt, pipe, checkpoint=None):
+    first_iter = 0
+    gaussians = GaussianModel()
+    scene = Scene(dataset, gaussians)
+    gaussians.training_setup(opt)
+    optimizing_spa = None
+    if checkpoint:
+        model_params, first_iter = checkpoint
+        gaussians.restore(model_params, opt)
+    first_iter += 1
+    for iteration in range(first_iter, opt.last + 1):
+        log.begins(iteration, gaussians.values.values())
+        gaussians.update_learning_rate(iteration, opt)
+        viewpoint_cam = pick(scene.getTrainCameras(), iteration)
+        render_pkg = render(viewpoint_cam, gaussians, pipe, None)
+        loss = photo_loss(render_pkg["render"], viewpoint_cam)
+        in_phase = opt.optimizing_spa_start_iter < iteration <= opt.optimizing_spa_stop_iter
+        if in_phase and iteration % opt.optimizing_spa_interval == 0:
+            loss = optimizing_spa.append_spa_loss(loss)
+        loss.backward()
+        with torch.no_grad():
+            if iteration < opt.densify_until_iter:
+                gaussians.add_densification_stats(render_pkg["viewspace_points"])
+                if iteration % 8 == 0:
+                    gaussians.reset_opacity()
+            elif iteration == opt.optimizing_spa_start_iter:
+                optimizing_spa = OptimizingSpa(gaussians)
+            if iteration < opt.iterations:
+                note_step([gaussians.optimizer])
+                gaussians.optimizer.step()
+                gaussians.optimizer.zero_grad(set_to_none=True)
+            if iteration == opt.optimizing_spa_stop_iter:
+                gaussians.prune_gaussians(0.4, gaussians.values["opacity"].detach())
+    return gaussians.capture(), iteration
+
+
+def train(checkpoint=None, last=LAST, order=0, **options):
+    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=15, optimizing_spa_interval=5)
+    opt.__dict__.update(optimizing_spa_start_iter=20, optimizing_spa_stop_iter=40, **options)
+    return training(dataset(order), opt, None, checkpoint)

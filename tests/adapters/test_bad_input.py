@@ -1,0 +1,202 @@
+"""Whatever does not fit is one sentence that names what was expected and where, early enough."""
+
+import copy
+import types
+
+import pytest
+import torch
+from cases import RULE, SCRIPTS, run, script
+from lookalikes import fastgs, inria, speedy_splat
+from lookalikes.splats import NAMES, Scene, SplatModel, dataset, draw, make_cameras, new_log, photo_loss, pick
+
+from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError, UnknownTrainerError
+from skipgs_plug.adapters.registry import adapter_names
+
+
+def test_unknown_trainer_gets_the_list_and_the_manual_form():
+    with pytest.raises(UnknownTrainerError) as error:
+        SkipGate(object())
+    message = str(error.value)
+    assert all(name in message for name in adapter_names())
+    assert "SkipGate(start_iter=...)" in message and "gate.backward(loss, view, step)" in message
+
+
+def test_unknown_adapter_gets_the_list():
+    with pytest.raises(UnknownTrainerError, match=r"no adapter 'fastsg'; there are .*fastgs"):
+        SkipGate(inria, adapter="fastsg")
+
+
+@pytest.mark.parametrize("name", ["fastgs", "taming", "speedy_splat", "lightgaussian", "gaussianspa", "inria"])
+def test_wrong_fork_is_named_with_the_right_one(name):
+    module = speedy_splat if name in ("inria", "taming") else inria
+    with pytest.raises(AdapterMismatchError) as error:
+        SkipGate(module, adapter=name)
+    assert f"Adapter {name!r}" in str(error.value)
+    assert f"looks like the training script of {module.ADAPTER!r}" in str(error.value)
+
+
+def test_wrong_fork_of_a_script_is_noticed_in_its_first_iteration():
+    new_log()
+    module = copied(speedy_splat)
+    with SkipGate(copied(inria)) as gate:
+        adapter, hooks = gate.adapter, gate._hooks
+        gate.detach()
+        adapter._hang(hooks, vars(module), module.GaussianModel)  # as attach_script does with gaussian_renderer
+        with pytest.raises(AdapterMismatchError, match="looks like the training script of 'speedy_splat'"):
+            module.training(dataset(), types.SimpleNamespace(last=5, iterations=5), None)
+
+
+@pytest.mark.parametrize("name", ["gsplat", "step_trainer", "nerfstudio", "inria"])
+def test_named_adapter_on_something_else_says_what_it_expects(name):
+    with pytest.raises(AdapterMismatchError, match=f"Adapter '{name}' expects"):
+        SkipGate(types.SimpleNamespace(), adapter=name)
+
+
+def copied(module):
+    """The same module anew, to be spoilt."""
+    copy_of = types.ModuleType(module.__name__)
+    copy_of.__dict__.update({k: v for k, v in vars(module).items() if not k.startswith("__")})
+    for name, value in vars(module).items():
+        if isinstance(value, types.FunctionType) and value.__module__ == module.__name__:
+            setattr(copy_of, name, types.FunctionType(value.__code__, vars(copy_of), name, value.__defaults__))
+    copy_of.GaussianModel = type("GaussianModel", module.GaussianModel.__bases__, dict(vars(module.GaussianModel)))
+    return copy_of
+
+
+@pytest.mark.parametrize("case", SCRIPTS, ids=lambda case: case.name)
+def test_renamed_method_is_named(case, monkeypatch):
+    monkeypatch.delattr(SplatModel, "update_learning_rate")
+    if "update_learning_rate" in vars(case.module.GaussianModel):
+        monkeypatch.delattr(case.module.GaussianModel, "update_learning_rate")
+    with pytest.raises(AdapterMismatchError, match=r"GaussianModel\.update_learning_rate does not exist\. Adapter '"):
+        SkipGate(case.module)
+    assert torch.Tensor.backward.__module__ == "torch._tensor"
+
+
+def test_renamed_renderer_is_named():
+    module = copied(fastgs)
+    module.FORK = module.render_fastgs
+    del module.render_fastgs
+    with pytest.raises(AdapterMismatchError, match="Adapter 'fastgs'"):
+        SkipGate(module, adapter="fastgs")
+
+
+TRAIN = """
+def training(dataset, opt, pipe):
+    gaussians = GaussianModel()
+    scene = Scene(dataset, gaussians)
+    gaussians.training_setup(opt)
+    for iteration in range(1, opt.iterations + 1):
+        gaussians.update_learning_rate(iteration)
+        viewpoint_cam = pick(scene.getTrainCameras(), iteration)
+        loss = photo_loss(render(viewpoint_cam, gaussians)["render"], viewpoint_cam)
+        {backward}
+        done.append(iteration)
+"""
+
+
+def train_module(backward):
+    """A training module in Inria's shape with this line in the place of the backward."""
+    module = types.ModuleType("train")
+    module.__dict__.update(
+        GaussianModel=type("GaussianModel", (SplatModel,), {}),
+        Scene=Scene,
+        pick=pick,
+        photo_loss=photo_loss,
+        torch=torch,
+        done=[],
+        render=lambda camera, gaussians: draw(camera, gaussians.values),
+    )
+    exec(TRAIN.format(backward=backward), vars(module))
+    return module
+
+
+BACKWARDS = {
+    "none": "pass",
+    "other": "torch.autograd.backward(loss)",
+    "two": "loss.backward(); render(viewpoint_cam, gaussians)['render'].mean().backward()",
+}
+
+
+@pytest.mark.parametrize("backward", BACKWARDS.values(), ids=BACKWARDS)
+def test_not_one_backward_per_iteration_is_noticed_after_ten_at_the_latest(backward):
+    module = train_module(backward)
+    opt = types.SimpleNamespace(iterations=40, densify_until_iter=20)
+    with pytest.raises(AdapterMismatchError, match="where one per iteration was expected") as error, SkipGate(module):
+        module.training(dataset(), opt, None)
+    assert module.done == list(range(1, 11))
+    assert "8a70a8cd" in str(error.value)
+
+
+def test_script_shorter_than_ten_iterations_is_judged_at_its_end():
+    module = train_module("pass")
+    with SkipGate(module) as gate:
+        module.training(dataset(), types.SimpleNamespace(iterations=4, densify_until_iter=2), None)
+    with pytest.raises(AdapterMismatchError, match="0 training backwards were seen in 4 iterations"):
+        gate.verify()
+
+
+@pytest.mark.parametrize("name", ["opt", "scene"])
+def test_renamed_variable_of_the_loop_is_named(name):
+    module = train_module("loss.backward()")
+    exec(TRAIN.format(backward="loss.backward()").replace(name, "renamed"), vars(module))
+    opt = types.SimpleNamespace(iterations=40, densify_until_iter=20)
+    sentence = rf"expects {name} among the variables of training\(\)"
+    with pytest.raises(AdapterMismatchError, match=sentence), SkipGate(module):
+        module.training(dataset(), opt, None)
+
+
+def test_state_of_another_scene_is_refused_before_the_first_iteration():
+    _, gate = run(script("inria", inria), **RULE)
+    state = gate.state_dict()
+    state["stats"]["views"]["garden.jpg"] = state["stats"]["views"].pop(next(iter(state["stats"]["views"])))
+    new_log()
+    with SkipGate(inria, **RULE) as other:
+        other.load_state_dict(state)
+        with pytest.raises(SkipGSError, match=r"belongs to another scene: it knows view 'garden\.jpg'"):
+            inria.train()
+
+
+def test_views_of_the_same_name_are_told_apart_by_position(monkeypatch):
+    cameras = make_cameras()
+    for camera in cameras:
+        camera.image_name = camera.image_name.rsplit("/", 1)[1]
+    monkeypatch.setattr(inria, "dataset", lambda order: types.SimpleNamespace(model_path="output", cameras=cameras))
+    monkeypatch.setattr(inria, "pick", lambda cameras, iteration: cameras[iteration % len(cameras)])
+    with pytest.warns(RuntimeWarning, match="same name"):
+        _, gate = run(script("inria", inria), **RULE)
+    assert {row["view"] for row in gate.view_table()} == {str(i) for i in range(len(NAMES))}
+
+
+def test_early_start_is_refused_where_gradients_are_read():
+    with pytest.raises(SkipGSError, match="start_iter=19 is too early: up to iteration 20"):
+        run(script("inria", inria), start_iter=19)
+    run(script("inria", inria), start_iter=20)
+
+
+def test_user_adapter_of_a_fork_is_asked_first():
+    from skipgs_plug import register_adapter
+    from skipgs_plug.adapters import registry
+    from skipgs_plug.adapters.inria import InriaFamily
+
+    class Mine(InriaFamily):
+        name, checked = "mine", "my fork of Inria 3DGS"
+
+        @classmethod
+        def recognises(cls, names):
+            return "MY_FORK" in names
+
+        def start_iter(self, opt, loop):
+            return 30
+
+    module = copied(inria)
+    module.MY_FORK = True
+    try:
+        register_adapter(Mine)
+        with SkipGate(module) as gate:
+            assert gate.adapter.name == "mine"
+        with SkipGate(inria) as gate:
+            assert gate.adapter.name == "inria"
+    finally:
+        registry._registered.pop("mine", None)
+    assert copy.copy(adapter_names())[0] == "reference"

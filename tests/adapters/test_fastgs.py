@@ -1,0 +1,50 @@
+"""FastGS and Taming: gradients of earlier iterations are applied in iterations that are skipped themselves."""
+
+import torch
+from cases import run, script
+from lookalikes import fastgs, taming
+from lookalikes.splats import Log
+
+from skipgs_plug.core import decision
+
+CASES = {"fastgs": script("fastgs", fastgs), "taming": script("taming", taming, sh_lower=True)}
+
+
+class SkipWhenDue:
+    """Skips exactly the iterations in which accumulated gradients are to be applied."""
+
+    def decide(self, view, loss, step):
+        return decision.AT_OR_BELOW_MEAN if step % 8 == 0 else decision.ABOVE_MEAN
+
+    def notify_event(self, step, n_views):
+        pass
+
+
+def moved(log: Log, name: str) -> list[int]:
+    """Iterations in which a parameter changed and kept its size."""
+    index = ["xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"].index(name)
+    steps = sorted(log.values)
+    pairs = [(i, log.values[i][index], log.values[i + 1][index]) for i in steps[:-1]]
+    return [i for i, a, b in pairs if a.shape == b.shape and not torch.equal(a, b)]
+
+
+def test_fastgs_applies_the_sum_of_backwards_that_ran():
+    gated, gate = run(CASES["fastgs"], policy=SkipWhenDue())
+    assert [i for i in range(20, 65) if i not in gated.backwards] == [24, 32, 40, 48, 56, 64]
+    # 32 is a prune too: new parameters have no gradient, upstream as here, so that step is empty.
+    assert [step for step in gated.steps if step > 20] == [24, 40, 48, 56]
+    assert moved(gated, "f_rest")[-3:] == [40, 48, 56] and moved(gated, "xyz")[-3:] == [40, 48, 56]
+    assert gate.report()["backwards_skipped"] == 6
+
+
+def test_taming_applies_pending_sh_gradients():
+    gated, _ = run(CASES["taming"], policy=SkipWhenDue())
+    assert moved(gated, "f_rest") == [8, 16, 24, 32, 40, 48, 56]
+    assert not set(moved(gated, "xyz")) & {24, 32, 40, 48, 56}  # the other optimizer has nothing pending there
+
+
+def test_prunes_of_fastgs_are_events():
+    gated, gate = run(CASES["fastgs"], warmup=0, pause_iters=6, record_trace=True)
+    assert [step for step, kind, _ in gated.structure if step > 20] == list(fastgs.PRUNES)
+    assert gate.stats()["events"] == {"prune_points": 2}
+    assert [row.step for row in gate.trace if row.reason == "pause"] == [*range(33, 39), *range(45, 51)]

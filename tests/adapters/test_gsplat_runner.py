@@ -1,0 +1,114 @@
+"""gsplat's Runner: MCMC's noise, batches, processes, and the script that builds it."""
+
+import sys
+import types
+
+import pytest
+import torch
+from cases import RULE, SkipAlways, gsplat, run
+from lookalikes.gsplat_runner import DefaultStrategy, HeadRunner, MCMCStrategy, Runner
+from lookalikes.splats import NAMES, log, new_log
+
+from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError
+
+MCMC = gsplat("mcmc", Runner, MCMCStrategy)
+
+
+def test_noise_comes_with_the_gradient_step_only():
+    gated, gate = run(MCMC, **RULE)
+    skipped = {row.step for row in gate.trace if row.skip}
+    moved = {i for i in range(59) if not torch.equal(gated.values[i][0], gated.values[i + 1][0])}
+    assert skipped and moved == set(range(59)) - skipped
+
+
+def test_gate_started_while_mcmc_relocates_forces_those_iterations():
+    gated, gate = run(MCMC, start_iter=8, policy=SkipAlways(), record_trace=True)
+    assert [row.step for row in gate.trace if not row.skip] == [10, 15]
+    assert [step for step, kind, _ in gated.structure if kind == "relocate"] == [0, 5, 10, 15]
+
+
+def test_default_strategy_reads_gradients_so_that_an_early_start_is_refused():
+    with pytest.raises(SkipGSError, match="start_iter=8 is too early: up to iteration 20"):
+        SkipGate(Runner(DefaultStrategy()), start_iter=8)
+
+
+def test_batches_have_one_key():
+    _, gate = run(gsplat("batch", HeadRunner, DefaultStrategy, batch_size=2), **RULE)
+    assert {row.view for row in gate.trace} == {"batch"}
+
+
+def test_views_are_named_by_index_without_image_names():
+    runner = Runner(DefaultStrategy())
+    del runner.parser.image_names
+    with SkipGate(runner, **RULE) as gate:
+        new_log()
+        runner.train()
+    assert {row.view for row in gate.trace} == {str(i) for i in range(len(NAMES))}
+
+
+def test_other_runner_of_the_same_strategy_is_left_alone():
+    runner, other = Runner(DefaultStrategy()), Runner(DefaultStrategy())
+    with SkipGate(runner) as gate:
+        new_log()
+        other.train(last=3)
+        assert log.backwards == [0, 1, 2, 3] and gate.report()["iterations"] == 0
+
+
+def test_several_processes_without_a_group_are_refused():
+    with pytest.raises(SkipGSError, match=r"2 processes train together, but torch\.distributed is not initialised"):
+        SkipGate(Runner(DefaultStrategy(), world_size=2))
+
+
+def test_renamed_attribute_names_what_was_expected_and_where():
+    runner = Runner(DefaultStrategy())
+    del runner.trainset
+    with pytest.raises(AdapterMismatchError, match=r"Runner with trainset, as in nerfstudio-project/gsplat v1\.5\.3"):
+        SkipGate(runner, adapter="gsplat")
+
+
+@pytest.fixture
+def gsplat_module(monkeypatch):
+    """`gsplat.distributed` with upstream's `cli`: several devices mean several processes."""
+    module = types.ModuleType("gsplat.distributed")
+    module.devices = 1
+
+    def cli(fn, args, verbose=False):
+        if module.devices > 1:
+            return torch.multiprocessing.spawn(fn, args=(module.devices, args), nprocs=module.devices, join=False)
+        return fn(0, 0, 1, args)
+
+    module.cli = cli
+    monkeypatch.setitem(sys.modules, "gsplat.distributed", module)
+    return module
+
+
+def script():
+    """What simple_trainer.py does when run, in a namespace of its own."""
+    names = {"Runner": type("Runner", (Runner,), {}), "DefaultStrategy": DefaultStrategy}
+    code = """
+from gsplat.distributed import cli
+def main(local_rank, world_rank, world_size, cfg):
+    runner = Runner(DefaultStrategy(), world_size=world_size)
+    runner.train()
+cli(main, None, verbose=True)
+"""
+    exec(code, names)
+    return names
+
+
+def test_script_is_reached_through_its_launcher(gsplat_module):
+    new_log()
+    with SkipGate(adapter="gsplat", **RULE) as gate:
+        names = script()
+    gate.verify()
+    assert gate.report()["iterations"] == 60 and gate.report()["backwards_skipped"] > 0
+    assert gate.adapter.output_folder == "output"
+    assert not hasattr(names["Runner"].train, "__skipgs_plug__") and not hasattr(gsplat_module.cli, "__skipgs_plug__")
+
+
+def test_script_that_spawns_processes_is_refused(gsplat_module):
+    gsplat_module.devices = 4
+    sentence = "starts 4 processes, which the gate cannot reach"
+    with pytest.raises(SkipGSError, match=sentence), SkipGate(adapter="gsplat"):
+        script()
+    assert not hasattr(torch.multiprocessing.spawn, "__skipgs_plug__")

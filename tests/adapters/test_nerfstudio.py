@@ -1,0 +1,68 @@
+"""nerfstudio: the signal is the main loss, and a loss scaler copes without gradients."""
+
+import sys
+import types
+
+import pytest
+import torch
+from cases import RULE, SkipAlways
+from lookalikes import nerfstudio
+from lookalikes.splats import log, new_log
+
+from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError
+from skipgs_plug.core import decision
+
+
+def train(gate_settings, **options):
+    new_log()
+    trainer = nerfstudio.Trainer(**options).setup()
+    with SkipGate(trainer, **gate_settings) as gate:
+        trainer.train()
+    return trainer, gate
+
+
+def test_terms_of_some_iterations_do_not_enter_the_decision():
+    _, gate = train(RULE)
+    assert max(row.loss for row in gate.trace) < 1.0  # scale_reg, in every tenth iteration, is above that
+    _, plain = train({**RULE, "enabled": True, "threshold": -0.999})
+    assert all(row.loss < 1.0 for row in plain.trace if row.step % 10 == 0)
+
+
+@pytest.mark.parametrize("max_norm", [None, 1.0])
+def test_enabled_scaler_survives_iterations_without_gradients(max_norm):
+    trainer, gate = train({"policy": SkipAlways()}, scaled=True, max_norm=max_norm)
+    assert gate.report()["backwards_skipped"] == 40
+    assert log.backwards == list(range(20)) and log.steps == list(range(20))
+    assert not any(hasattr(value, "__skipgs_plug__") for value in vars(trainer.grad_scaler).values())
+
+
+class SkipOdd(SkipAlways):
+    def decide(self, view, loss, step):
+        return decision.AT_OR_BELOW_MEAN if step % 2 else decision.ABOVE_MEAN
+
+
+def test_accumulated_gradients_are_stepped_in_a_skipped_iteration():
+    train({"policy": SkipOdd()}, accumulate=2)  # zeroed in even iterations, stepped in odd ones
+    assert [step for step in log.steps if step >= 20] == list(range(21, 60, 2))
+
+
+def test_trainer_before_setup_is_refused():
+    with pytest.raises(AdapterMismatchError, match=r"whose setup\(\) was called, as in nerfstudio-project/nerfstudio"):
+        SkipGate(nerfstudio.Trainer())
+
+
+def test_several_processes_without_a_group_are_refused():
+    with pytest.raises(SkipGSError, match="4 processes train together"):
+        SkipGate(nerfstudio.Trainer(world_size=4).setup())
+
+
+def test_script_is_reached_through_the_trainer_class(monkeypatch):
+    module = types.ModuleType("nerfstudio.engine.trainer")
+    module.Trainer = type("Trainer", (nerfstudio.Trainer,), {})
+    monkeypatch.setitem(sys.modules, "nerfstudio.engine.trainer", module)
+    new_log()
+    with SkipGate(adapter="nerfstudio", **RULE) as gate:
+        module.Trainer().setup().train()
+    gate.verify()
+    assert gate.report()["iterations"] == 60 and gate.report()["backwards_skipped"] > 0
+    assert torch.Tensor.backward.__module__ == "torch._tensor"

@@ -1,0 +1,24 @@
+"""Speedy-Splat's own backwards, in skipped iterations too."""
+
+from cases import SkipAlways, run, script
+from lookalikes import speedy_splat
+
+CASE = script("speedy_splat", speedy_splat)
+
+
+def test_prunes_in_skipped_iterations_run_their_backwards():
+    gated, gate = run(CASE, policy=SkipAlways())
+    prunes = [step for step, _, _ in gated.structure]
+    assert prunes == [10, 20, 30, 40, 50, 60]
+    assert gated.other_backwards == len(prunes) * 5
+    assert not {30, 40, 50, 60} & set(gated.backwards)
+    assert gate.stats()["events"] == {"prune_points": 5}  # not the one of densification
+    assert gate.report()["iterations"] == 60  # score backwards are not taken for training
+
+
+def test_gate_begins_after_the_prune_that_ends_densification():
+    _, gate = run(CASE, warmup=0, pause_iters=4, record_trace=True)
+    assert [(row.step, row.reason) for row in gate.trace[:5]] == [
+        *((step, "pause") for step in range(21, 25)),
+        (25, "new view"),
+    ]

@@ -1,0 +1,68 @@
+"""The pip package: inclusive bounds, the reset right before the gate begins, wrappers added later."""
+
+import sys
+import types
+
+import pytest
+from cases import RULE
+from lookalikes import step_trainer
+from lookalikes.splats import log, new_log
+
+from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError
+
+
+def test_start_follows_the_latest_inclusive_bound_and_the_reset_in_it_pauses():
+    new_log()
+    trainer = step_trainer.make()
+    with SkipGate(trainer, **RULE) as gate:
+        step_trainer.training(trainer, step_trainer.dataset(), 60)
+    assert gate.config.start_iter == 21
+    assert log.structure[-1][:2] == (20, "reset")
+    assert [row.reason for row in gate.trace[:4]] == ["pause"] * 4 and gate.trace[4].reason != "pause"
+    assert trainer.raised == 6  # the loss, and with it the SH degree, goes on once per iteration
+
+
+def test_wrappers_put_around_a_gated_trainer_stay_gated():
+    new_log()
+    trainer = step_trainer.make()
+    with SkipGate(trainer, **RULE) as gate:
+        step_trainer.training(step_trainer.SHLifter(trainer), step_trainer.dataset(), 60)
+    gate.verify()
+    assert gate.report()["iterations"] == 60 and gate.report()["backwards_skipped"] > 0
+
+
+def test_trainer_without_densification_asks_for_a_start():
+    trainer = step_trainer.make()
+    del trainer.base_trainer.base_trainer.densifier.prune_until_iter
+    del trainer.base_trainer.base_trainer.densifier.base_densifier
+    del trainer.base_trainer.opacity_reset_until_iter
+    with pytest.raises(SkipGSError, match="does not densify, so the gate cannot know when to begin; give start_iter="):
+        SkipGate(trainer)
+    SkipGate(trainer, start_iter=5).detach()
+
+
+def test_early_start_is_refused():
+    with pytest.raises(SkipGSError, match="start_iter=20 is too early: up to iteration 21"):
+        SkipGate(step_trainer.make(), start_iter=20)
+
+
+def test_renamed_method_names_what_was_expected_and_where():
+    trainer = step_trainer.make()
+    with pytest.raises(AdapterMismatchError, match=r"with before_optim_hook, as in gaussian-splatting 2\.11\.0"):
+        SkipGate(
+            types.SimpleNamespace(**{n: getattr(trainer, n) for n in dir(trainer) if n != "before_optim_hook"}),
+            adapter="step_trainer",
+        )
+
+
+def test_script_is_reached_through_prepare_trainer(monkeypatch):
+    prepare = types.ModuleType("gaussian_splatting.prepare")
+    prepare.prepare_trainer = lambda *args, **kwargs: step_trainer.make()
+    monkeypatch.setitem(sys.modules, "gaussian_splatting", types.ModuleType("gaussian_splatting"))
+    monkeypatch.setitem(sys.modules, "gaussian_splatting.prepare", prepare)
+    new_log()
+    with SkipGate(adapter="step_trainer", **RULE) as gate:
+        step_trainer.training(prepare.prepare_trainer(), step_trainer.dataset(), 60)
+    gate.verify()
+    assert gate.report()["iterations"] == 60 and gate.report()["backwards_skipped"] > 0
+    assert not hasattr(prepare.prepare_trainer, "__skipgs_plug__")
