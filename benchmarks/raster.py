@@ -10,6 +10,8 @@ medians over repeats with fresh inputs after two warm-up passes. Every part prin
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import json
 import resource
 import subprocess
@@ -43,7 +45,7 @@ from skipgs_plug.fallback_raster.shortcuts import SHORTCUTS, without_shortcuts
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "colors")
 FILE = RESULTS / "raster.json"
-Part = Literal["scenes", "threads", "growth", "shortcuts"]
+Part = Literal["scenes", "threads", "gaussians", "pixels", "sh_terms", "shortcuts"]
 
 # Milliseconds of other CPU implementations on two cores of an AVX-512 server, idle: OpenSplat 15b7e80 (C++, one
 # thread; its sort and conic gradient are wrong) and 3dgs-warp-scratch 5069396 (scale gradient wrong).
@@ -173,41 +175,52 @@ def part_threads(quick: bool, repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
-def part_growth(quick: bool, repeats: int) -> list[dict[str, Any]]:
-    """Time and peak memory against Gaussians, pixels and SH degree; each point in a process of its own."""
-    gaussians = (1_000, 10_000, 100_000) if quick else (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
-    sizes = ("128x128", "256x256", "504x378", "1008x756", "1920x1080")[: 3 if quick else 5]
-    series = {
-        "gaussians": [(n, (n, "504x378", None)) for n in gaussians],
-        "pixels": [(int(s.split("x")[0]) * int(s.split("x")[1]), (10_000, s, None)) for s in sizes],
-        "SH terms": [((d + 1) ** 2, (100_000, "504x378", d)) for d in range(4)],
-    }
+def part_gaussians(quick: bool, repeats: int) -> dict[str, Any]:
+    """Time and memory from 1,000 to 1,000,000 Gaussians on 504x378 pixels."""
+    counts = (1_000, 10_000, 100_000) if quick else (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
+    return growth({n: (n, "504x378", None) for n in counts}, repeats)
+
+
+def part_pixels(quick: bool, repeats: int) -> dict[str, Any]:
+    """Time and memory from 128x128 to 1920x1080 pixels with 10,000 Gaussians."""
+    sizes = ((128, 128), (256, 256), (504, 378), (1008, 756), (1920, 1080))[: 3 if quick else 5]
+    return growth({w * h: (10_000, f"{w}x{h}", None) for w, h in sizes}, repeats)
+
+
+def part_sh_terms(quick: bool, repeats: int) -> dict[str, Any]:
+    """Time and memory for SH degree 0 to 3 with 100,000 Gaussians on 504x378 pixels."""
+    n = 10_000 if quick else 100_000
+    return growth({(degree + 1) ** 2: (n, "504x378", degree) for degree in range(4)}, repeats)
+
+
+def growth(points: dict[int, tuple[int, str, int | None]], repeats: int) -> dict[str, Any]:
+    """Measures each point in a process of its own, because the peak memory of a process never falls."""
     rows = []
-    for name, points in series.items():
-        row: dict[str, Any] = {"series": name, "points": []}
-        for x, point in points:
-            command = [sys.executable, __file__, "--point", json.dumps(point), "--repeats", str(repeats)]
-            out = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-            row["points"].append({"x": x, **json.loads(out.splitlines()[-1])})
-            last = row["points"][-1]
-            print(f"{name:>10} {x:>9,} {last['ms']:8.1f} ms {last['peak_mib']:7.0f} MiB above start", flush=True)
-        xs = [p["x"] for p in row["points"]]
-        row["time_exponent"] = exponents(xs, [p["ms"] for p in row["points"]])
-        row["memory_exponent"] = exponents(xs, [max(p["peak_mib"], 1.0) for p in row["points"]])
-        row["sort_exponent"] = exponents(xs, [p["phases_ms"]["bin and sort"] for p in row["points"]])
-        for kind in ("time", "memory", "sort"):
-            found = row[f"{kind}_exponent"]
-            print(f"{name:>10} {kind} grows with exponent {found['fitted']:.2f}, at most {found['steepest']:.2f}")
-        rows.append(row)
-    return rows
+    for x, point in points.items():
+        command = [sys.executable, __file__, "--point", json.dumps(point), "--repeats", str(repeats)]
+        out = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+        rows.append({"x": x, **json.loads(out.splitlines()[-1])})
+        print(f"{x:>9,} {rows[-1]['ms']:8.1f} ms {rows[-1]['peak_mib']:7.1f} MiB above start", flush=True)
+    measures = {
+        "time": [row["ms"] for row in rows],
+        "sort": [row["phases_ms"]["bin and sort"] for row in rows],
+        "memory": [max(row["peak_mib"], 1.0) for row in rows],
+    }
+    found = {name: exponents([row["x"] for row in rows], values) for name, values in measures.items()}
+    for name, exponent in found.items():
+        print(f"{name:>9} grows with exponent {exponent['fitted']:.2f}, at most {exponent['steepest']:.2f}")
+    return {"points": rows, "exponents": found}
 
 
 def measure_point(point: str, repeats: int) -> None:
-    """One point of `part_growth`: prints time and memory as JSON."""
+    """One point of `growth`: prints time and memory as JSON."""
     n, size, sh_degree = json.loads(point)
     one_pass(frustum_scene(10, 32, 32, 0, sh_degree), 0)  # loads and, on first use, compiles every kernel
-    if Path("/proc/self/clear_refs").exists():
-        Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew: compiling took more than rendering may
+    if sys.platform == "linux":
+        # Loading or compiling the kernels took more memory than rendering may: give it back, let the peak start anew.
+        with contextlib.suppress(AttributeError):  # not glibc
+            ctypes.CDLL(None).malloc_trim(0)
+        Path("/proc/self/clear_refs").write_text("5")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     result = measure(scene_maker("random", n, size, sh_degree), repeats)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -250,10 +263,12 @@ def relative_difference(value: Tensor, truth: Tensor) -> float:
     return ((value - truth).double().norm() / truth.double().norm().clamp(min=1e-300)).item()
 
 
-PARTS: dict[str, Callable[[bool, int], list[dict[str, Any]]]] = {
+PARTS: dict[str, Callable[[bool, int], Any]] = {
     "scenes": part_scenes,
     "threads": part_threads,
-    "growth": part_growth,
+    "gaussians": part_gaussians,
+    "pixels": part_pixels,
+    "sh_terms": part_sh_terms,
     "shortcuts": part_shortcuts,
 }
 
@@ -266,7 +281,7 @@ def plot(results: dict[str, Any]) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(2, 2, figsize=(12, 9), layout="constrained")
-    scenes, growth, scaling, shortcuts = axes.flat
+    scenes, against, scaling, shortcuts = axes.flat
     for axis in axes.flat:
         axis.grid(alpha=0.3)
     if "scenes" in results:
@@ -280,13 +295,14 @@ def plot(results: dict[str, Any]) -> None:
         scenes.set(xscale="log", xlabel="forward + backward (ms)", yticks=range(len(labels)), yticklabels=labels)
         scenes.invert_yaxis()
         scenes.legend()
-    for row in results.get("growth", {"rows": []})["rows"]:
-        x = [point["x"] for point in row["points"]]
-        label = f"{row['series']}, exponent {row['time_exponent']['fitted']:.2f}"
-        growth.plot(x, [point["ms"] for point in row["points"]], "o-", label=label)
-    if "growth" in results:
-        growth.set(xscale="log", yscale="log", xlabel="Gaussians, pixels or SH terms", ylabel="ms")
-        growth.legend()
+    for name in ("gaussians", "pixels", "sh_terms"):
+        if name in results:
+            rows, exponent = results[name]["rows"]["points"], results[name]["rows"]["exponents"]["time"]["fitted"]
+            label = f"{name.replace('_', ' ')}, exponent {exponent:.2f}"
+            against.plot([row["x"] for row in rows], [row["ms"] for row in rows], "o-", label=label)
+    against.set(xscale="log", yscale="log", xlabel="Gaussians, pixels or SH terms", ylabel="forward + backward (ms)")
+    if against.lines:
+        against.legend()
     if "threads" in results:
         rows = results["threads"]["rows"]
         counts = [row["threads"] for row in rows]
@@ -304,7 +320,7 @@ def plot(results: dict[str, Any]) -> None:
 
 
 def main(
-    parts: tuple[Part, ...] = ("scenes", "threads", "growth", "shortcuts"),
+    parts: tuple[Part, ...] = ("scenes", "threads", "gaussians", "pixels", "sh_terms", "shortcuts"),
     quick: bool = False,
     repeats: int = 7,
     point: str | None = None,
