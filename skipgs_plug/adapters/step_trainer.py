@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -33,11 +34,17 @@ class StepTrainer(AbstractAdapter):
     def matches(cls, trainer: Any) -> bool:
         return all(hasattr(trainer, name) for name in EXPECTED)
 
+    def __init__(self, trainer: Any = None) -> None:
+        super().__init__(trainer)
+        self.output_folder: str | None = None
+
     def attach_script(self, hooks: Hooks) -> None:
         # `python -m gaussian_splatting.train` binds this name when it is run.
         prepare = importlib.import_module("gaussian_splatting.prepare")
 
         def prepared(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            options = sys._getframe(2).f_globals.get("args")  # frame 2 is the script's
+            self.output_folder = getattr(options, "destination", None)
             self.trainer = original(*args, **kwargs)
             self.attach(hooks)
             return self.trainer

@@ -61,8 +61,11 @@ def test_script_is_reached_through_prepare_trainer(monkeypatch):
     monkeypatch.setitem(sys.modules, "gaussian_splatting", types.ModuleType("gaussian_splatting"))
     monkeypatch.setitem(sys.modules, "gaussian_splatting.prepare", prepare)
     new_log()
+    main = {"prepare": prepare, "args": types.SimpleNamespace(destination="out")}
     with SkipGate(adapter="step_trainer", **RULE) as gate:
-        step_trainer.training(prepare.prepare_trainer(), step_trainer.dataset(), 60)
+        exec("trainer = prepare.prepare_trainer()", main)
+        step_trainer.training(main["trainer"], step_trainer.dataset(), 60)
     gate.verify()
     assert gate.report()["iterations"] == 60 and gate.report()["backwards_skipped"] > 0
+    assert gate.adapter.output_folder == "out"
     assert not hasattr(prepare.prepare_trainer, "__skipgs_plug__")
