@@ -27,9 +27,25 @@ def create_strategy(config: TrainConfig) -> Any:
         refine_start_iter=config.scaled(config.refine_start_iter),
         refine_stop_iter=config.scaled(config.refine_stop_iter),
         refine_every=config.scaled_interval(config.refine_every, MIN_REFINE_EVERY),
-        reset_every=config.scaled_interval(config.reset_every, MIN_RESET_EVERY),
+        reset_every=reset_interval(config),
         absgrad=config.absgrad,
     )
+
+
+def reset_interval(config: TrainConfig) -> int:
+    """Return the iterations between opacity resets, so that the last one leaves time to recover.
+
+    In a short run the scaled interval can put a reset right before the end of densification, and refinement would
+    start from a model that is still opaque nowhere. The resets are spread so that none falls into the last
+    MIN_RESET_EVERY iterations; the schedule of 30,000 iterations stays as it is, and so does an interval that was
+    asked to be shorter.
+    """
+    stop = config.scaled(config.refine_stop_iter)
+    every = config.scaled_interval(config.reset_every, MIN_RESET_EVERY)
+    if every < MIN_RESET_EVERY:
+        return every
+    resets = max(stop - MIN_RESET_EVERY, 0) // every
+    return max(every, -(-stop // (resets + 1)))
 
 
 def reset_opacity_if_missed(

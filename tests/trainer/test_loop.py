@@ -10,7 +10,7 @@ import torch
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.config import REFERENCE_STEPS
 from skipgs_plug.trainer.order import ViewOrder
-from skipgs_plug.trainer.strategy import reset_opacity_if_missed
+from skipgs_plug.trainer.strategy import reset_interval, reset_opacity_if_missed
 
 
 def test_training_improves_held_out_views(tiny_scene: Scene) -> None:
@@ -60,6 +60,7 @@ def test_densification_runs_and_ends(trainer: Trainer) -> None:
 
 
 def test_opacities_are_reset_though_gsplat_1_5_3_does_not(trainer: Trainer) -> None:
+    trainer.strategy.reset_every = 20
     trainer.train(until=20, progress=False)
     assert torch.sigmoid(trainer.splats["opacities"]).max() > 0.05
     trainer.train_step()  # step 20, a multiple of reset_every
@@ -74,6 +75,16 @@ def test_opacities_are_reset_though_gsplat_1_5_3_does_not(trainer: Trainer) -> N
     assert reset_opacity_if_missed(*args, 20)
     moments = trainer.optimizers["opacities"].state[trainer.splats["opacities"]]
     assert not moments["exp_avg"].any()
+
+
+@pytest.mark.parametrize(
+    ("max_steps", "resets"),
+    [(30_000, [3000, 6000, 9000, 12_000]), (3000, [300, 600, 900, 1200]), (1500, [375]), (900, [])],
+)
+def test_short_runs_reset_opacities_in_time_to_recover(max_steps: int, resets: list[int]) -> None:
+    config = TrainConfig(max_steps=max_steps)
+    stop, every = config.scaled(config.refine_stop_iter), reset_interval(config)
+    assert [step for step in range(1, stop) if step % every == 0] == resets
 
 
 def test_backward_is_called_once_per_iteration_with_view_and_step(trainer: Trainer) -> None:
