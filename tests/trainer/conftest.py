@@ -15,8 +15,8 @@ def tiny_scene() -> Scene:
 
 @pytest.fixture
 def tiny_config() -> TrainConfig:
-    # Milestones are given for 30,000 steps: refinement ends at 30, SH rises every 10, opacities reset at 20.
-    return TrainConfig(max_steps=60, refine_every=4, reset_every=20, sh_degree_interval=5000)
+    # Milestones are given for 30,000 steps: refinement ends at 30, SH rises every 10.
+    return TrainConfig(max_steps=60, refine_every=4, sh_degree_interval=5000)
 
 
 @pytest.fixture
