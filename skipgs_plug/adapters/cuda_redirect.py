@@ -20,9 +20,7 @@ from torch.overrides import TorchFunctionMode
 class HostEvent:
     """`torch.cuda.Event` on the host's clock: the CPU has finished whatever was called before."""
 
-    def __init__(
-        self, enable_timing: bool = False, blocking: bool = False, interprocess: bool = False
-    ) -> None:
+    def __init__(self, enable_timing: bool = False, blocking: bool = False, interprocess: bool = False) -> None:
         self._time: float | None = None
 
     def record(self, stream: Any = None) -> None:

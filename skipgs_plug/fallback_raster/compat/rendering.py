@@ -127,6 +127,8 @@ class _Call:
         self.footprint: Footprint
 
     def run(self, g: Splats) -> tuple[Tensor, Tensor | None]:
+        colors: Tensor | None
+        degree: int | None
         if g.shs is not None:
             colors = g.shs if g.dc is None else torch.cat([g.dc, g.shs], dim=1)
             degree = int(self.settings.sh_degree)
@@ -184,7 +186,7 @@ class _Render(torch.autograd.Function):
         needed = ctx.needs_input_grad[1:]
         leaves = [t if t is None else t.detach().requires_grad_(n) for t, n in zip(tensors, needed, strict=True)]
         with torch.enable_grad():
-            color, inverse = call.run(Splats(*leaves))
+            color, inverse = call.run(Splats(*leaves))  # type: ignore[arg-type]
         ctx.call, ctx.leaves, ctx.outputs = call, leaves, (color, inverse)
         return color.detach().clone(), None if inverse is None else inverse.detach().clone()
 

@@ -11,13 +11,14 @@ from types import ModuleType
 
 _CLASSES = ("GaussianRasterizationSettings", "GaussianRasterizer")
 _ACCELERATED = (*_CLASSES, "SparseGaussianAdam")
-_KNN = {"simple_knn": (".knn", ()), "simple_knn._C": (".knn", ("distCUDA2",))}
-_SSIM = {"fused_ssim": (".ssim", ("fused_ssim",))}
+_Source = dict[str, tuple[str, tuple[str, ...]]]  # module name -> our file, the names it offers
+
+_KNN: _Source = {"simple_knn": (".knn", ()), "simple_knn._C": (".knn", ("distCUDA2",))}
+_SSIM: _Source = {"fused_ssim": (".ssim", ("fused_ssim",))}
 _RASTERIZER = "diff_gaussian_rasterization"
 _PIP = "gaussian_splatting."  # the pip package keeps its extensions inside itself
 
-# family -> module name -> (our file, the names it offers)
-FAMILIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
+FAMILIES: dict[str, _Source] = {
     "inria": {_RASTERIZER: (".inria", _CLASSES), **_KNN, **_SSIM},
     # Its train.py takes the presence of SparseGaussianAdam for the branch `3dgs_accel` of the rasterizer.
     "inria_accelerated": {_RASTERIZER: (".inria_accelerated", _ACCELERATED), **_KNN, **_SSIM},
