@@ -11,13 +11,16 @@ seconds each) and cached on disk; no compiler has to be installed.
 """
 
 import functools
+import importlib
 import inspect
 import linecache
 import math
 import os
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -159,14 +162,31 @@ for (;;) {{
 @functools.cache
 def _warp() -> Any:
     try:
-        import warp as wp
+        wp: Any = importlib.import_module("warp")
     except ImportError as error:
         raise ImportError('The CPU rasterizer needs NVIDIA Warp: pip install "skipgs_plug[full]".') from error
-    # A rasterizer that never touches CUDA should not print a banner and a warning about a missing driver.
     wp.config.quiet = True
     wp.config.log_level = wp.LOG_ERROR
-    wp.init()
+    with _quiet_stderr():
+        wp.init()
     return wp
+
+
+@contextmanager
+def _quiet_stderr() -> Iterator[None]:
+    """Drops what native code writes to stderr inside the block.
+
+    Warp's library warns there that it found no CUDA driver, which a rasterizer for machines without one expects.
+    """
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _new_counter() -> Tensor:

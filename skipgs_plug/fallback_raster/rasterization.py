@@ -149,7 +149,7 @@ def rasterization(
         )
         for viewmat, K in zip(viewmats, Ks, strict=True)
     ]  # fmt: skip
-    *stacked, visible = zip(*projected, strict=True)
+    *stacked, visible = map(list, zip(*projected, strict=True))
     means2d, depths, conics, compensations, radii, sigmas = (_stack(parts) for parts in stacked)
     opacities = opacities.expand(n_cameras, n)
     if antialiased:
