@@ -1,0 +1,14 @@
+r"""LightGaussian, its own training script, unedited and gated.
+
+    python examples/train_lightgaussian.py --repo path/to/LightGaussian -- \
+        -s data/garden --eval --start_checkpoint chkpnt30000.pth --iterations 35000
+
+Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+`--script` chooses among its three scripts; the default is prune_finetune.py.
+"""
+
+import sys
+
+from _checkout import run_in_checkout
+
+sys.exit(run_in_checkout("lightgaussian", "prune_finetune.py", "train_densify_prune.py", "distill_train.py"))

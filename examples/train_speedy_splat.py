@@ -1,0 +1,13 @@
+r"""Speedy-Splat, its own training script, unedited and gated.
+
+    python examples/train_speedy_splat.py --repo path/to/speedy-splat -- \
+        -s data/garden --eval
+
+Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+"""
+
+import sys
+
+from _checkout import run_in_checkout
+
+sys.exit(run_in_checkout("speedy_splat", "train.py"))
