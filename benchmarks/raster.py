@@ -1,4 +1,4 @@
-"""Speed of the CPU rasterizer: forward and backward pass, scaling, growth, memory, and what each shortcut saves.
+"""Speed of the CPU rasterizer: forward and backward pass, scaling, growth, memory, shortcuts, and the fused loss.
 
     python benchmarks/raster.py                        # everything, about ten minutes on two cores
     python benchmarks/raster.py --parts scenes --quick
@@ -40,12 +40,13 @@ from common import (
 from pairs import blended_pairs
 from torch import Tensor
 
-from skipgs_plug.fallback_raster import rasterization
+from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
 from skipgs_plug.fallback_raster.shortcuts import SHORTCUTS, without_shortcuts
+from skipgs_plug.trainer.loss import l1_ssim_loss as convolved_loss
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "colors")
 FILE = RESULTS / "raster.json"
-Part = Literal["scenes", "threads", "gaussians", "pixels", "sh_terms", "shortcuts"]
+Part = Literal["scenes", "threads", "gaussians", "pixels", "sh_terms", "shortcuts", "loss"]
 
 # Milliseconds of other CPU implementations on two cores of an AVX-512 server, idle: OpenSplat 15b7e80 (C++, one
 # thread; its sort and conic gradient are wrong) and 3dgs-warp-scratch 5069396 (scale gradient wrong).
@@ -259,6 +260,46 @@ def part_shortcuts(quick: bool, repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
+def part_loss(quick: bool, repeats: int) -> list[dict[str, Any]]:
+    """Value and gradient of the fused L1 + SSIM against PyTorch's convolutions: time, and error beside float64."""
+    print(f"{'image':>10} {'threads':>7} {'fused ms':>8} {'torch ms':>8} {'value error':>20} {'gradient error':>20}")
+    rows = []
+    for width, height in ((252, 189), (504, 378)) if quick else ((252, 189), (504, 378), (1008, 756), (1920, 1080)):
+        for count in sorted({1, cores()}, reverse=True):
+            seconds: dict[str, list[float]] = {"fused": [], "torch": []}
+            errors: dict[str, tuple[float, float]] = {}
+            for seed in range(repeats + 2):
+                generator = torch.Generator().manual_seed(seed)
+                target = torch.rand(height, width, 3, generator=generator)
+                image = (target + 0.1 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1)
+                exact = image.double().requires_grad_()
+                truth = convolved_loss(exact, target.double())
+                truth.backward()
+                for name, function in (("fused", l1_ssim_loss), ("torch", convolved_loss)):
+                    leaf = image.clone().requires_grad_()
+                    with threads(count):
+                        start = time.perf_counter()
+                        loss = function(leaf, target)
+                        loss.backward()
+                        seconds[name].append(time.perf_counter() - start)
+                    error = abs(loss.item() - truth.item()), relative_difference(leaf.grad, exact.grad)
+                    errors[name] = max(error, errors.get(name, error))
+            row: dict[str, Any] = {"size": f"{width}x{height}", "threads": count}
+            for name in seconds:
+                row |= {f"{name}_ms": median_ms(seconds[name][2:]), f"{name}_ms_min": 1000 * min(seconds[name][2:])}
+                row |= {f"{name}_value_error": errors[name][0], f"{name}_gradient_error": errors[name][1]}
+            rows.append(row)
+            both = [
+                f"{row[f'fused_{kind}']:.1e} / {row[f'torch_{kind}']:.1e}" for kind in ("value_error", "gradient_error")
+            ]
+            print(
+                f"{row['size']:>10} {count:7} {row['fused_ms']:8.2f} {row['torch_ms']:8.1f} "
+                f"{both[0]:>20} {both[1]:>20}",
+                flush=True,
+            )
+    return rows
+
+
 def relative_difference(value: Tensor, truth: Tensor) -> float:
     return ((value - truth).double().norm() / truth.double().norm().clamp(min=1e-300)).item()
 
@@ -270,6 +311,7 @@ PARTS: dict[str, Callable[[bool, int], Any]] = {
     "pixels": part_pixels,
     "sh_terms": part_sh_terms,
     "shortcuts": part_shortcuts,
+    "loss": part_loss,
 }
 
 
@@ -320,7 +362,7 @@ def plot(results: dict[str, Any]) -> None:
 
 
 def main(
-    parts: tuple[Part, ...] = ("scenes", "threads", "gaussians", "pixels", "sh_terms", "shortcuts"),
+    parts: tuple[Part, ...] = ("scenes", "threads", "gaussians", "pixels", "sh_terms", "shortcuts", "loss"),
     quick: bool = False,
     repeats: int = 7,
     point: str | None = None,
