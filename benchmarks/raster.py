@@ -5,7 +5,9 @@
 
 A pass is `rasterization`, a mean-L1 loss and the backward to means, scales, quats, opacities and colours; times are
 medians over repeats with fresh inputs after two warm-up passes. Every part prints a table and replaces its entry in
-`benchmarks/results/raster.json`; the plot `raster.png` shows all parts measured so far. Run it on an idle machine.
+`benchmarks/results/raster.json`; the plot `raster.png` shows all parts measured so far.
+The garden is read from `$SKIPGS_SHARED/data/garden_points.npz` (gsplat's test asset; default `../shared`).
+Run it on an idle machine.
 """
 
 from __future__ import annotations
