@@ -126,7 +126,7 @@ class Worker:
         namespace: dict[str, Any] = {"wp": wp, "__name__": f"{__name__}.{self._name}"}
         exec(compile(source, filename, "exec"), namespace)
         body = namespace[f"{self._name}_body"]
-        namespace[f"{self._name}_body"] = wp.func_native(pointers + PRELUDE + self._code)(body)
+        namespace[f"{self._name}_body"] = wp.func_native(PRELUDE + pointers + self._code)(body)
         kernel = wp.kernel(enable_backward=False)(namespace[self._name])
         inputs = [_parameter(a) for a in (_new_counter(), *arguments)]
         return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)

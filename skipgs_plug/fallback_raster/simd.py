@@ -6,7 +6,9 @@ arithmetic on it reads like scalar code and becomes one AVX-512 instruction, two
 NEON. Scalar Warp code does not vectorise across pixels.
 """
 
+# The pragma lets Clang fuse a * b + c into one instruction, which is faster and rounds once; Warp leaves it off.
 PRELUDE = """
+#pragma clang fp contract(fast)
 typedef float v16 __attribute__((ext_vector_type(16), aligned(4)));
 typedef int i16 __attribute__((ext_vector_type(16), aligned(4)));
 
