@@ -97,10 +97,13 @@ def _scene(
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Runs the rasterizer and torch on `count` threads inside a `with` block."""
+    """Runs the rasterizer on `count` threads inside a `with` block, and torch on one, as the trainer does.
+
+    Idle threads of torch would spin beside those of the rasterizer.
+    """
     before = get_num_threads(), torch.get_num_threads()
     set_num_threads(count)
-    torch.set_num_threads(count)
+    torch.set_num_threads(1)
     try:
         yield
     finally:
