@@ -1,16 +1,27 @@
 """A short run on real photographs (LLFF fern, 252x189): gated against ungated, resume, PLY."""
 
-import copy
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
 import torch
 from plyfile import PlyData
+from torch import Tensor
 
 from skipgs_plug import SkipGate
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer, load_scene
 
-STEPS = 900
+# Refinement has to be long enough for losses to level off: at 900 iterations the gate costs 0.6 dB, here 0.2. The
+# higher threshold keeps the model near 19,000 Gaussians, which suits images this small.
+CONFIG = TrainConfig(max_steps=3000, grow_grad2d=0.001)
+
+
+class Refined(NamedTuple):
+    """One refinement from the snapshot."""
+
+    metrics: dict[str, Any]
+    gate: SkipGate
+    splats: dict[str, Tensor]
 
 
 @pytest.fixture(scope="module")
@@ -19,50 +30,56 @@ def fern(shared: Path) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def densified(fern: Scene) -> tuple[Trainer, dict]:
-    trainer = Trainer(TrainConfig(max_steps=STEPS), fern)
+def densified(fern: Scene) -> tuple[Trainer, dict[str, Any]]:
+    trainer = Trainer(CONFIG, fern)
     trainer.train(until=trainer.refine_stop_iter, progress=False)
     return trainer, trainer.snapshot()
 
 
-def refine(densified: tuple[Trainer, dict], gated: bool) -> tuple[dict, SkipGate, dict]:
+@pytest.fixture(scope="module")
+def gated(densified: tuple[Trainer, dict[str, Any]]) -> Refined:
+    return refine(densified, enabled=True)
+
+
+def refine(densified: tuple[Trainer, dict[str, Any]], enabled: bool) -> Refined:
     trainer, snapshot = densified
-    trainer.restore(copy.deepcopy(snapshot))
-    with SkipGate(trainer, enabled=gated) as gate:
+    trainer.restore(snapshot)
+    with SkipGate(trainer, enabled=enabled) as gate:
         trainer.train(progress=False)
-    return trainer.evaluate(), gate, {name: p.detach().clone() for name, p in trainer.splats.items()}
+    splats = {name: parameter.detach().clone() for name, parameter in trainer.splats.items()}
+    return Refined(trainer.evaluate(), gate, splats)
 
 
-def test_gated_refinement_skips_and_keeps_quality(densified: tuple[Trainer, dict]) -> None:
-    ungated, _, _ = refine(densified, gated=False)
-    gated, gate, _ = refine(densified, gated=True)
-    stats = gate.stats()
-    assert stats["gated_iterations"] == STEPS - densified[0].refine_stop_iter
+def test_gated_refinement_skips_and_keeps_quality(densified: tuple[Trainer, dict[str, Any]], gated: Refined) -> None:
+    ungated = refine(densified, enabled=False)
+    stats = gated.gate.stats()
+    assert stats["gated_iterations"] == CONFIG.max_steps - densified[0].refine_stop_iter
     assert stats["backwards_run"] + stats["backwards_skipped"] == stats["gated_iterations"]
     assert stats["backwards_skipped"] > 0.15 * stats["gated_iterations"]
-    assert ungated["psnr"] > 17
-    assert abs(ungated["psnr"] - gated["psnr"]) < 0.3
+    assert ungated.metrics["psnr"] > 19
+    assert abs(ungated.metrics["psnr"] - gated.metrics["psnr"]) < 0.3
 
 
-def test_interrupted_and_resumed_equals_uninterrupted(densified: tuple[Trainer, dict], tmp_path: Path) -> None:
-    _, whole_gate, whole = refine(densified, gated=True)
+def test_interrupted_and_resumed_equals_uninterrupted(
+    densified: tuple[Trainer, dict[str, Any]], gated: Refined, tmp_path: Path
+) -> None:
     trainer, snapshot = densified
-    trainer.restore(copy.deepcopy(snapshot))
+    trainer.restore(snapshot)
     with SkipGate(trainer):
-        trainer.train(until=STEPS - 150, progress=False)
+        trainer.train(until=CONFIG.max_steps - 300, progress=False)
         trainer.save_checkpoint(tmp_path / "interrupted.pt")
 
-    resumed = Trainer(trainer.config, trainer.scene)
+    resumed = Trainer(CONFIG, trainer.scene)
     with SkipGate(resumed) as gate:
         resumed.load_checkpoint(tmp_path / "interrupted.pt")
         resumed.train(progress=False)
     for name, parameter in resumed.splats.items():
-        assert torch.equal(parameter, whole[name]), name
-    assert gate.stats()["backwards_skipped"] == whole_gate.stats()["backwards_skipped"]
-    assert gate.view_table() == whole_gate.view_table()
+        assert torch.equal(parameter, gated.splats[name]), name
+    assert gate.stats()["backwards_skipped"] == gated.gate.stats()["backwards_skipped"]
+    assert gate.view_table() == gated.gate.view_table()
 
 
-def test_ply_is_readable_by_another_reader(densified: tuple[Trainer, dict], tmp_path: Path) -> None:
+def test_ply_is_readable_by_another_reader(densified: tuple[Trainer, dict[str, Any]], tmp_path: Path) -> None:
     trainer, _ = densified
     trainer.export_ply(tmp_path / "fern.ply")
     vertex = PlyData.read(tmp_path / "fern.ply")["vertex"]
