@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .binning import TILE, Bins, bin_gaussians, pack
-from .blend import MAX_CHANNELS, PAIR, backward_worker, forward_worker, reduce_pairs
+from .binning import MAX_CHANNELS, TILE, Bins, bin_gaussians, pack
+from .blend import PAIR, backward_worker, forward_worker, reduce_pairs
 from .launch import scratch, zeros
 from .project import project_backward, project_forward
 from .sh import sh_backward, sh_forward
@@ -153,7 +153,7 @@ class Blend(torch.autograd.Function):
         height: int,
         absolute: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        bins = bin_gaussians(visible, means2d, depths, conics, opacities, sigmas, width, height)
+        bins = bin_gaussians(visible, means2d, depths, conics, opacities, sigmas, colors, width, height)
         channels = colors.shape[1]
         tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
         image = torch.empty(height, width, channels)
@@ -162,7 +162,8 @@ class Blend(torch.autograd.Function):
         tile_stop = torch.empty(tiles_x * tiles_y, dtype=torch.int32)
         for channel in range(0, channels, MAX_CHANNELS):
             some = min(MAX_CHANNELS, channels - channel)
-            _pack_colors(bins, means2d, conics, opacities, sigmas, colors, channel, some)
+            if channel > 0:
+                _pack_colors(bins, means2d, conics, opacities, sigmas, colors, channel, some)
             forward_worker(some)(
                 bins.records, bins.tile_start, bins.tile_list, image, transmittance, pixel_stop, tile_stop,
                 width, height, tiles_x, tiles_y, channels, channel, some, active_shortcuts(),

@@ -20,6 +20,9 @@ TILE = 16
 # half width in pixels of the ellipse at alpha = 1/255; up to four channels of colour.
 RECORD = 12
 
+# Channels that one pass blends; wider colours take several passes.
+MAX_CHANNELS = RECORD - 8
+
 # Tiles [left, right] of tile row `ty` that the Gaussian of record `i` crosses.
 _TILE_ROWS = """
     const float* r = records + 12 * i;
@@ -275,10 +278,11 @@ def bin_gaussians(
     conics: Tensor,  # [R, 3]
     opacities: Tensor,  # [R]
     sigmas: Tensor,  # [R, 2]
+    colors: Tensor,  # [R, D]
     width: int,
     height: int,
 ) -> Bins:
-    """Sorts the visible Gaussians of one image by depth and lists them per tile; colours are packed later."""
+    """Sorts the visible Gaussians of one image by depth and lists them per tile, with their first channels."""
     n = visible.numel()
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     tiles = tiles_x * tiles_y
@@ -286,7 +290,11 @@ def bin_gaussians(
     depth_sort(depths, visible, scratch("depth_keys", 2 * n, dtype=torch.int32), sorted_rows, n)
     order = sorted_rows[n:]
     records = torch.empty(n, RECORD)
-    pack(order, means2d, conics, opacities, sigmas, opacities, records, n, 1, 0, 0)
+    channels = colors.shape[1]
+    pack(
+        order, means2d, conics, opacities, sigmas, colors, records,
+        n, channels, 0, min(channels, MAX_CHANNELS),
+    )  # fmt: skip
 
     # Any number of slices gives the same lists; one per thread keeps all busy.
     slices = 1 if n < 1024 else get_num_threads()

@@ -12,9 +12,6 @@ place and `reduce_pairs` adds a Gaussian's pairs in a fixed order: no atomics, a
 from .binning import RECORD
 from .launch import FloatArray, IntArray, Worker, worker
 
-# Channels that one pass blends; wider colours take several passes.
-MAX_CHANNELS = RECORD - 8
-
 # Gradient of a pair: centre x, y; conic a, b, c; opacity; |centre x|, |centre y|; colour.
 PAIR = RECORD
 
