@@ -13,24 +13,22 @@ from torch.autograd.function import once_differentiable
 
 from .binning import MAX_CHANNELS, TILE, Bins, bin_gaussians, pack
 from .blend import PAIR, backward_worker, forward_worker, reduce_pairs
-from .launch import scratch, zeros
-from .project import project_backward, project_forward
+from .launch import scratch
+from .project import BLOCK, list_visible, project_backward, project_forward
 from .sh import sh_backward, sh_forward
 from .shortcuts import VISIBLE_ONLY, active_shortcuts
 
-# Items that one partial sum of the camera gradients covers (the grain of the workers that write them).
-_PARTIAL = 512
 
-
-def _partials(n: int) -> int:
-    return (n + _PARTIAL - 1) // _PARTIAL
+def _blocks(n: int) -> int:
+    return (n + BLOCK - 1) // BLOCK
 
 
 class Project(torch.autograd.Function):
     """Gaussians of one camera on its image plane.
 
     Gives means2d [N, 2], depths [N], conics [N, 3], compensations [N] (empty unless antialiased), and without a
-    gradient radii [N, 2], sigmas [N, 2] (standard deviations in pixels) and the visible rows [M].
+    gradient radii [N, 2], sigmas [N, 2] (standard deviations in pixels), the visible rows [M] and where
+    each block of rows begins among them [ceil(N / BLOCK) + 1].
     """
 
     @staticmethod
@@ -59,30 +57,28 @@ class Project(torch.autograd.Function):
             means, quats, scales, opacities, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
             n, float(width), float(height), near_plane, far_plane, eps2d, radius_clip, int(antialiased),
         )  # fmt: skip
-        visible = radii[:, 0].nonzero().squeeze(1).to(torch.int32)
-        ctx.save_for_backward(means, quats, scales, viewmat, K, visible)
+        visible, block_start = torch.empty(n, dtype=torch.int32), torch.empty(_blocks(n) + 1, dtype=torch.int32)
+        list_visible(radii, visible, block_start, n)
+        visible = visible[: int(block_start[-1])]
+        ctx.save_for_backward(means, quats, scales, viewmat, K, visible, block_start)
         ctx.size = (width, height, eps2d, antialiased)
-        ctx.mark_non_differentiable(radii, sigmas, visible)
-        return means2d, depths, conics, compensations, radii, sigmas, visible
+        ctx.mark_non_differentiable(radii, sigmas, visible, block_start)
+        return means2d, depths, conics, compensations, radii, sigmas, visible, block_start
 
     @staticmethod
     @once_differentiable
     def backward(
         ctx: Any, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor, *_: Any
     ) -> Any:  # type: ignore[override]
-        means, quats, scales, viewmat, K, visible = ctx.saved_tensors
+        means, quats, scales, viewmat, K, visible, block_start = ctx.saved_tensors
         width, height, eps2d, antialiased = ctx.size
         with_pose = ctx.needs_input_grad[4]
-        v_means, v_quats, v_scales = (
-            torch.zeros_like(means),
-            torch.zeros_like(quats),
-            torch.zeros_like(scales),
-        )
-        v_poses = torch.zeros(_partials(len(visible)) if with_pose else 0, 3, 4)
+        v_means, v_quats, v_scales = torch.empty(means.shape), torch.empty(quats.shape), torch.empty(scales.shape)
+        v_poses = torch.zeros(_blocks(len(means)) if with_pose else 0, 3, 4)
         project_backward(
-            means, quats, scales, viewmat, K, visible, v_means2d.contiguous(), v_depths.contiguous(),
+            means, quats, scales, viewmat, K, visible, block_start, v_means2d.contiguous(), v_depths.contiguous(),
             v_conics.contiguous(), v_compensations.contiguous(), v_means, v_quats, v_scales, v_poses,
-            len(visible), float(width), float(height), eps2d, int(antialiased), int(with_pose), active_shortcuts(),
+            len(means), float(width), float(height), eps2d, int(antialiased), int(with_pose), active_shortcuts(),
         )  # fmt: skip
         v_viewmat = None
         if with_pose:
@@ -105,32 +101,35 @@ class SphericalHarmonics(torch.autograd.Function):
         base: Tensor,
         rest: Tensor | None,
         visible: Tensor,  # [M]
+        block_start: Tensor,  # [ceil(N / BLOCK) + 1]
         degree: int,
     ) -> Tensor:
-        colors = zeros(len(means), 3)
+        n = len(means)
+        colors = torch.empty(n, 3)
         if not active_shortcuts() & VISIBLE_ONLY:
-            visible = torch.arange(len(means), dtype=torch.int32)
+            visible = torch.arange(n, dtype=torch.int32)
+            block_start = torch.arange(0, BLOCK * (_blocks(n) + 1), BLOCK, dtype=torch.int32).clamp(max=n)
         ctx.layout = (3 * base.shape[1], 3 * base.shape[1], 3) if rest is None else (3, 3 * rest.shape[1], 0)
         ctx.degree = degree
         ctx.joined = rest is None
         rest = base if rest is None else rest
-        sh_forward(means, camera, base, rest, visible, colors, len(visible), *ctx.layout, degree)
-        ctx.save_for_backward(means, camera, base, rest, colors, visible)
+        sh_forward(means, camera, base, rest, visible, block_start, colors, n, *ctx.layout, degree)
+        ctx.save_for_backward(means, camera, base, rest, colors, visible, block_start)
         return colors
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> Any:  # type: ignore[override]
-        means, camera, base, rest, colors, visible = ctx.saved_tensors
-        v_means, v_base = zeros(*means.shape), zeros(*base.shape)
-        v_rest = v_base if ctx.joined else zeros(*rest.shape)
-        v_cameras = torch.zeros(_partials(len(visible)), 3)
+        means, camera, base, rest, colors, visible, block_start = ctx.saved_tensors
+        v_means, v_base = torch.empty(means.shape), torch.empty(base.shape)
+        v_rest = v_base if ctx.joined else torch.empty(rest.shape)
+        v_cameras = torch.zeros(_blocks(len(means)), 3)
         sh_backward(
-            means, camera, base, rest, visible, colors, v_colors.contiguous(), v_means, v_base, v_rest,
-            v_cameras, len(visible), *ctx.layout, ctx.degree, active_shortcuts(),
+            means, camera, base, rest, visible, block_start, colors, v_colors.contiguous(), v_means, v_base, v_rest,
+            v_cameras, len(means), *ctx.layout, ctx.degree, active_shortcuts(),
         )  # fmt: skip
         v_camera = v_cameras.sum(0) if ctx.needs_input_grad[1] else None
-        return v_means, v_camera, v_base, None if ctx.joined else v_rest, None, None
+        return v_means, v_camera, v_base, None if ctx.joined else v_rest, None, None, None
 
 
 class Blend(torch.autograd.Function):
@@ -181,8 +180,8 @@ class Blend(torch.autograd.Function):
         height, width, channels = v_image.shape
         tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
         v_image, v_transmittance = v_image.contiguous(), v_transmittance.contiguous()
-        v_means2d, v_conics = zeros(*means2d.shape), zeros(*conics.shape)
-        v_opacities, v_colors = zeros(*opacities.shape), zeros(*colors.shape)
+        v_means2d, v_conics = torch.empty(means2d.shape), torch.empty(conics.shape)
+        v_opacities, v_colors = torch.empty(opacities.shape), torch.empty(colors.shape)
         with_absolute = ctx.absolute is not None
         absolute = ctx.absolute if with_absolute else torch.empty(0)
         v_pairs = scratch("v_pairs", len(bins.tile_list), PAIR)
@@ -195,8 +194,8 @@ class Blend(torch.autograd.Function):
                 v_transmittance, v_pairs, width, height, tiles_x, tiles_y, channels, channel, some, active_shortcuts(),
             )  # fmt: skip
             reduce_pairs(
-                bins.order, bins.pair_start, bins.pair_slot, v_pairs, opacities, v_means2d, v_conics, v_opacities,
-                absolute, v_colors, len(bins.order), channels, channel, some, int(with_absolute),
+                bins.pair_start, bins.pair_slot, v_pairs, opacities, v_means2d, v_conics, v_opacities,
+                absolute, v_colors, len(means2d), len(bins.tile_list), channels, channel, some, int(with_absolute),
             )  # fmt: skip
             # The gradient of the transmittance belongs to the first pass alone.
             v_transmittance = torch.zeros_like(v_transmittance) if channels > MAX_CHANNELS else v_transmittance

@@ -104,6 +104,13 @@ for (int i = first; i < last; i += 16) {
     for (int l = 0; l < 16; ++l) {
         place[l] = i + (l < lanes ? l : lanes - 1);
         row[l] = order[place[l]];
+        // Depth order is no order of rows: every read is far from the last.
+        const int later = order[smaller(i + l + 32, n - 1)];
+        __builtin_prefetch(means2d + 2 * later);
+        __builtin_prefetch(conics + 3 * later);
+        __builtin_prefetch(opacities + later);
+        __builtin_prefetch(sigmas + 2 * later);
+        __builtin_prefetch(colors + (long long)later * stride + channel);
     }
     const float log2e = 1.44269504f;
     v16 a = gather(conics, row, 3, 0), b = gather(conics, row, 3, 1), c = gather(conics, row, 3, 2);
@@ -157,7 +164,7 @@ for (int s = first; s < last; ++s) {
             for (int tx = left; tx <= right; ++tx) ++count[ty * tiles_x + tx];
             if (right >= left) pairs += right - left + 1;
         }
-        pair_start[i + 1] = tiles_per_gauss[order[i]] = pairs;
+        tiles_per_gauss[order[i]] = pairs;
     }
 }
 """,
@@ -168,8 +175,7 @@ def count_pairs(
     order: IntArray,  # [M]
     records: FloatArray,  # [M, RECORD]
     counts: IntArray,  # out [slices, tiles]
-    pair_start: IntArray,  # out [M + 1], tiles of Gaussian i at i + 1
-    tiles_per_gauss: IntArray,  # out [R], the same by row, zeros
+    tiles_per_gauss: IntArray,  # out [R], zeros
     n: int,
     slices: int,
     width: float,
@@ -193,7 +199,7 @@ for (int t = 0; t < tiles; ++t) {
 }
 tile_start[tiles] = total;
 pair_start[0] = 0;
-for (int i = 0; i < n; ++i) pair_start[i + 1] += pair_start[i];
+for (int g = 0; g < n; ++g) pair_start[g + 1] = pair_start[g] + tiles_per_gauss[g];
 """,
     items="1",
     grain=1,
@@ -201,7 +207,8 @@ for (int i = 0; i < n; ++i) pair_start[i + 1] += pair_start[i];
 def scan_pairs(
     counts: IntArray,  # [slices, tiles], in: counts; out: where each slice starts in each tile's list
     tile_start: IntArray,  # out [tiles + 1]
-    pair_start: IntArray,  # [M + 1], running sum in place
+    tiles_per_gauss: IntArray,  # [R]
+    pair_start: IntArray,  # out [R + 1], running sum
     n: int,
     slices: int,
     tiles: int,
@@ -216,7 +223,7 @@ for (int s = first; s < last; ++s) {
 """
     + _TILE_ROWS
     + """
-        int pair = pair_start[i];
+        int pair = pair_start[order[i]];
         for (int ty = first_row; ty <= last_row; ++ty) {
             int left, right;
             columns(ty, left, right);
@@ -233,9 +240,10 @@ for (int s = first; s < last; ++s) {
     grain=1,
 )
 def fill_pairs(
+    order: IntArray,  # [M]
     records: FloatArray,  # [M, RECORD]
     counts: IntArray,  # [slices, tiles], next free place
-    pair_start: IntArray,  # [M + 1]
+    pair_start: IntArray,  # [R + 1]
     tile_list: IntArray,  # out [P], place in depth order
     pair_slot: IntArray,  # out [P], for each Gaussian its places in tile_list
     n: int,
@@ -257,7 +265,7 @@ class Bins:
         records: [M, RECORD] float32, what the blend reads of each, in that order.
         tile_start: [tiles + 1] int32, begin of each tile's part of `tile_list`, row-major.
         tile_list: [P] int32, places in `order`.
-        pair_start: [M + 1] int32, begin of each Gaussian's part of `pair_slot`.
+        pair_start: [R + 1] int32, begin of each row's part of `pair_slot`.
         pair_slot: [P] int32, places in `tile_list`.
         tiles_per_gauss: [R] int32, number of tiles of every row.
     """
@@ -300,13 +308,14 @@ def bin_gaussians(
     slices = 1 if n < 1024 else get_num_threads()
     counts = torch.empty(slices, tiles, dtype=torch.int32)
     tile_start = torch.empty(tiles + 1, dtype=torch.int32)
-    pair_start = torch.empty(n + 1, dtype=torch.int32)
-    tiles_per_gauss = torch.zeros(len(means2d), dtype=torch.int32)
+    rows = len(means2d)
+    pair_start = torch.empty(rows + 1, dtype=torch.int32)
+    tiles_per_gauss = torch.zeros(rows, dtype=torch.int32)
     image = (float(width), float(height), tiles_x, tiles_y, active_shortcuts())
-    count_pairs(order, records, counts, pair_start, tiles_per_gauss, n, slices, *image)
-    scan_pairs(counts, tile_start, pair_start, n, slices, tiles)
+    count_pairs(order, records, counts, tiles_per_gauss, n, slices, *image)
+    scan_pairs(counts, tile_start, tiles_per_gauss, pair_start, rows, slices, tiles)
     pairs = int(tile_start[-1])
     tile_list = torch.empty(pairs, dtype=torch.int32)
     pair_slot = torch.empty(pairs, dtype=torch.int32)
-    fill_pairs(records, counts, pair_start, tile_list, pair_slot, n, slices, *image)
+    fill_pairs(order, records, counts, pair_start, tile_list, pair_slot, n, slices, *image)
     return Bins(order, records, tile_start, tile_list, pair_start, pair_slot, tiles_per_gauss)

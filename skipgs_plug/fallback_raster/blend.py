@@ -258,21 +258,26 @@ def backward_worker(channels: int, absgrad: bool) -> Worker:
 
 @worker(
     """
-for (int i = first; i < last; ++i) {
-    const int g = order[i];
+for (int g = first; g < last; ++g) {
     float total[12] = {};
-    for (int j = pair_start[i]; j < pair_start[i + 1]; ++j) {
+    for (int j = pair_start[g]; j < pair_start[g + 1]; ++j) {
+        // Pairs lie in the order of tiles: ask for the ones to come, also those of the next Gaussians.
+        __builtin_prefetch(v_pairs + 12ll * pair_slot[smaller(j + 16, pairs - 1)]);
         const float* pair = v_pairs + 12ll * pair_slot[j];
         for (int c = 0; c < 12; ++c) total[c] += pair[c];
     }
-    v_means2d[2 * g] += total[0];
-    v_means2d[2 * g + 1] += total[1];
-    for (int c = 0; c < 3; ++c) v_conics[3 * g + c] += total[2 + c];
-    v_opacities[g] += total[5] == 0.0f ? 0.0f : total[5] / opacities[g];
-    if (absgrad) {
-        v_absolute[2 * g] += total[6];
-        v_absolute[2 * g + 1] += total[7];
+    const float v_opacity = total[5] == 0.0f ? 0.0f : total[5] / opacities[g];
+    if (channel == 0) {
+        for (int c = 0; c < 2; ++c) v_means2d[2 * g + c] = total[c];
+        for (int c = 0; c < 3; ++c) v_conics[3 * g + c] = total[2 + c];
+        v_opacities[g] = v_opacity;
+    } else {
+        for (int c = 0; c < 2; ++c) v_means2d[2 * g + c] += total[c];
+        for (int c = 0; c < 3; ++c) v_conics[3 * g + c] += total[2 + c];
+        v_opacities[g] += v_opacity;
     }
+    if (absgrad)
+        for (int c = 0; c < 2; ++c) v_absolute[2 * g + c] += total[6 + c];
     for (int c = 0; c < channels; ++c) v_colors[(long long)g * stride + channel + c] = total[8 + c];
 }
 """,
@@ -280,17 +285,17 @@ for (int i = first; i < last; ++i) {
     grain=512,
 )
 def reduce_pairs(
-    order: IntArray,  # [M]
-    pair_start: IntArray,  # [M + 1]
+    pair_start: IntArray,  # [R + 1]
     pair_slot: IntArray,  # [P]
     v_pairs: FloatArray,  # [P, PAIR]
     opacities: FloatArray,  # [R]
-    v_means2d: FloatArray,  # out [R, 2], added to
-    v_conics: FloatArray,  # out [R, 3], added to
-    v_opacities: FloatArray,  # out [R], added to
+    v_means2d: FloatArray,  # out [R, 2]; added to from the second pass over the channels on, as the next two
+    v_conics: FloatArray,  # out [R, 3]
+    v_opacities: FloatArray,  # out [R]
     v_absolute: FloatArray,  # out [R, 2], added to, only with absgrad
     v_colors: FloatArray,  # out [R, D]
     n: int,
+    pairs: int,
     stride: int,  # D
     channel: int,
     channels: int,

@@ -212,29 +212,3 @@ def _on_all_threads(work: Callable[[], None]) -> None:
         # A worker that has not started by now would find no item left.
         if not other.cancel():
             other.result()
-
-
-# Floats that one block of `_zero` clears; smaller tensors are cleared by torch.
-_ZERO_BLOCK = 1 << 16
-
-
-@worker(
-    """
-for (int block = first; block < last; ++block) {
-    const long long begin = (long long)block << 16, end = begin + 65536 < n ? begin + 65536 : n;
-    for (long long i = begin; i < end; ++i) out[i] = 0.0f;
-}
-""",
-    items="(n + 65535) >> 16",
-    grain=1,
-)
-def _zero(out: FloatArray, n: int) -> None: ...
-
-
-def zeros(*shape: int) -> Tensor:
-    """Like `torch.zeros`, cleared on all threads: for large gradients the page faults are most of the work."""
-    out = torch.empty(shape)
-    if out.numel() < _ZERO_BLOCK:
-        return out.zero_()
-    _zero(out, out.numel())
-    return out

@@ -7,6 +7,9 @@ squares, |T0 x T1|^2 (Cauchy-Binet), so that needles and giants lose no digits a
 
 from .launch import FloatArray, IntArray, worker
 
+# Rows that one worker clears and fills at a time, and that one partial sum of the camera's gradients covers.
+BLOCK = 512
+
 # Loads Gaussians `row[0..15]` and computes everything the forward and the backward pass share.
 _GEOMETRY = """
     const float *V = viewmat, fx = K[0], cx = K[2], fy = K[4], cy = K[5];
@@ -133,9 +136,37 @@ def project_forward(
 
 @worker(
     """
+int m = 0;
+for (int i = 0; i < n; ++i) {
+    if (i % 512 == 0) block_start[i / 512] = m;
+    visible[m] = i;
+    m += radii[2 * i] > 0;
+}
+block_start[(n + 511) / 512] = m;
+""",
+    items="1",
+    grain=1,
+)
+def list_visible(
+    radii: IntArray,  # [N, 2]
+    visible: IntArray,  # out [N], the rows with a radius come first
+    block_start: IntArray,  # out [ceil(N / BLOCK) + 1], where each block of rows begins in `visible`
+    n: int,
+) -> None: ...
+
+
+@worker(
+    """
+for (int block = first; block < last; ++block) {
 v16 pose[12] = {};
-for (int base = first; base < last; base += 16) {
-    const int lanes = last - base < 16 ? last - base : 16;
+// Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
+const int row_begin = 512 * block, rows = n - row_begin < 512 ? n - row_begin : 512;
+clear(v_means + 3ll * row_begin, 3 * rows);
+clear(v_quats + 4ll * row_begin, 4 * rows);
+clear(v_scales + 3ll * row_begin, 3 * rows);
+const int end = block_start[block + 1];
+for (int base = block_start[block]; base < end; base += 16) {
+    const int lanes = end - base < 16 ? end - base : 16;
     int row[16];
     for (int l = 0; l < 16; ++l) row[l] = visible[base + (l < lanes ? l : lanes - 1)];
     v16 v_u = gather(v_means2d, row, 2, 0), v_v = gather(v_means2d, row, 2, 1), v_depth = gather(v_depths, row, 1, 0);
@@ -231,10 +262,11 @@ for (int base = first; base < last; base += 16) {
     scatter(v_quats, row, 4, 3, saturated((v_qz - along * qz) * back, 1e38f), lanes);
 }
 if (with_pose)
-    for (int i = 0; i < 12; ++i) v_poses[12 * (first / 512) + i] = sum(pose[i]);
+    for (int i = 0; i < 12; ++i) v_poses[12 * block + i] = sum(pose[i]);
+}
 """,
-    items="n_visible",
-    grain=512,
+    items="(n + 511) / 512",
+    grain=1,
 )
 def project_backward(
     means: FloatArray,  # [N, 3]
@@ -243,15 +275,16 @@ def project_backward(
     viewmat: FloatArray,  # [4, 4]
     K: FloatArray,  # [3, 3]
     visible: IntArray,  # [M], rows with a radius
+    block_start: IntArray,  # [ceil(N / BLOCK) + 1], where each block of rows begins in `visible`
     v_means2d: FloatArray,  # [N, 2]
     v_depths: FloatArray,  # [N]
     v_conics: FloatArray,  # [N, 3]
     v_compensations: FloatArray,  # [N], only read when antialiased
-    v_means: FloatArray,  # out [N, 3], zeros
-    v_quats: FloatArray,  # out [N, 4], zeros
-    v_scales: FloatArray,  # out [N, 3], zeros
-    v_poses: FloatArray,  # out [ceil(M / 512), 3, 4], partial sums, only written with_pose
-    n_visible: int,
+    v_means: FloatArray,  # out [N, 3]
+    v_quats: FloatArray,  # out [N, 4]
+    v_scales: FloatArray,  # out [N, 3]
+    v_poses: FloatArray,  # out [ceil(N / BLOCK), 3, 4], partial sums, only written with_pose
+    n: int,
     width: float,
     height: float,
     eps2d: float,

@@ -149,7 +149,7 @@ def rasterization(
         )
         for viewmat, K in zip(viewmats, Ks, strict=True)
     ]  # fmt: skip
-    *stacked, visible = map(list, zip(*projected, strict=True))
+    *stacked, visible, block_starts = map(list, zip(*projected, strict=True))
     means2d, depths, conics, compensations, radii, sigmas = (_stack(parts) for parts in stacked)
     opacities = opacities.expand(n_cameras, n)
     if antialiased:
@@ -161,7 +161,9 @@ def rasterization(
             of_camera = colors if shared_colors else colors[camera]
             if sh_degree is not None:
                 centre = torch.linalg.inv(viewmats[camera])[:3, 3]
-                of_camera = SphericalHarmonics.apply(means, centre, of_camera, sh_rest, visible[camera], sh_degree)
+                of_camera = SphericalHarmonics.apply(
+                    means, centre, of_camera, sh_rest, visible[camera], block_starts[camera], sh_degree
+                )
             features.append(of_camera)
     with_depth = render_mode != "RGB"
 

@@ -46,7 +46,9 @@ _BASIS = """
 
 @worker(
     """
-for (int i = first; i < last; ++i) {
+for (int block = first; block < last; ++block) {
+clear(colors + 1536ll * block, 3 * smaller(512, n - 512 * block));
+for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
     const int g = visible[i];
 """
     + _BASIS
@@ -62,9 +64,10 @@ for (int i = first; i < last; ++i) {
     colors[3 * g + 1] = c1 < 0.0f ? 0.0f : c1;
     colors[3 * g + 2] = c2 < 0.0f ? 0.0f : c2;
 }
+}
 """,
-    items="n_visible",
-    grain=512,
+    items="(n + 511) / 512",
+    grain=1,
 )
 def sh_forward(
     means: FloatArray,  # [N, 3]
@@ -72,8 +75,9 @@ def sh_forward(
     base: FloatArray,  # constant band of Gaussian g at base_stride * g
     rest: FloatArray,  # the others at rest_stride * g + rest_offset; may be the same array
     visible: IntArray,  # [M]
-    colors: FloatArray,  # out [N, 3], zeros
-    n_visible: int,
+    block_start: IntArray,  # [ceil(N / BLOCK) + 1], where each block of rows begins in `visible`
+    colors: FloatArray,  # out [N, 3], zero where not visible
+    n: int,
     base_stride: int,
     rest_stride: int,
     rest_offset: int,
@@ -83,8 +87,14 @@ def sh_forward(
 
 @worker(
     """
+for (int block = first; block < last; ++block) {
 float camera_sum[3] = {0.0f, 0.0f, 0.0f};
-for (int i = first; i < last; ++i) {
+// Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
+const long long row_begin = 512ll * block, rows = n - row_begin < 512 ? n - row_begin : 512;
+clear(v_means + 3 * row_begin, 3 * rows);
+clear(v_base + base_stride * row_begin, base_stride * rows);
+if (v_rest != v_base) clear(v_rest + rest_stride * row_begin, rest_stride * rows);
+for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
     const int g = visible[i];
     // Where the colour was clamped at zero, and where nothing blended the Gaussian, there is no gradient.
     float v0 = colors[3 * g] > 0.0f ? v_colors[3 * g] : 0.0f;
@@ -134,10 +144,11 @@ for (int i = first; i < last; ++i) {
         camera_sum[c] -= v_direction[c];
     }
 }
-for (int c = 0; c < 3; ++c) v_cameras[3 * (first / 512) + c] = camera_sum[c];
+for (int c = 0; c < 3; ++c) v_cameras[3 * block + c] = camera_sum[c];
+}
 """,
-    items="n_visible",
-    grain=512,
+    items="(n + 511) / 512",
+    grain=1,
 )
 def sh_backward(
     means: FloatArray,  # [N, 3]
@@ -145,13 +156,14 @@ def sh_backward(
     base: FloatArray,  # constant band of Gaussian g at base_stride * g
     rest: FloatArray,  # the others at rest_stride * g + rest_offset; may be the same array
     visible: IntArray,  # [M]
+    block_start: IntArray,  # [ceil(N / BLOCK) + 1], where each block of rows begins in `visible`
     colors: FloatArray,  # [N, 3], result of the forward pass
     v_colors: FloatArray,  # [N, 3]
-    v_means: FloatArray,  # out [N, 3], zeros
-    v_base: FloatArray,  # out, like base, zeros
-    v_rest: FloatArray,  # out, like rest, zeros
-    v_cameras: FloatArray,  # out [ceil(M / 512), 3], partial sums
-    n_visible: int,
+    v_means: FloatArray,  # out [N, 3]
+    v_base: FloatArray,  # out, like base
+    v_rest: FloatArray,  # out, like rest; may be the same array
+    v_cameras: FloatArray,  # out [ceil(N / BLOCK), 3], partial sums
+    n: int,
     base_stride: int,
     rest_stride: int,
     rest_offset: int,

@@ -32,6 +32,7 @@ auto sum = [](v16 a) -> float {
 };
 auto load = [](const float* p) -> v16 { return *(const v16*)p; };
 auto store = [](float* p, v16 a) { *(v16*)p = a; };
+auto clear = [](float* p, int n) { for (int i = 0; i < n; ++i) p[i] = 0.0f; };
 // 16 rows of an array of structures, column `c`; `row` names the row of each lane.
 auto gather = [](const float* p, const int* row, int width, int c) -> v16 {
     v16 a;
