@@ -28,8 +28,8 @@ from torch import Tensor
 
 from .simd import PRELUDE
 
-# One counter per cache line, so that nothing else is slowed down by it.
-_COUNTER_SLOTS = 16
+# A counter fills a cache line, so that nothing else is slowed down by it.
+_COUNTER_SIZE = 16
 
 _lock = threading.RLock()
 _scratch = threading.local()
@@ -82,12 +82,8 @@ class IntArray:
     """Marks a worker's parameter as a contiguous int32 tensor, passed flat."""
 
 
-_WARP_TYPE = {
-    FloatArray: "wp.array(dtype=wp.float32)",
-    IntArray: "wp.array(dtype=wp.int32)",
-    int: "wp.int32",
-    float: "wp.float32",
-}
+# Arrays travel as addresses: describing them to Warp takes longer than some kernels run.
+_WARP_TYPE = {FloatArray: "wp.uint64", IntArray: "wp.uint64", int: "wp.int32", float: "wp.float32"}
 _POINTER = {FloatArray: "float", IntArray: "int"}
 
 
@@ -103,18 +99,20 @@ class Worker:
     def __call__(self, *arguments: Tensor | int | float) -> None:
         with _lock:
             if self._command is None:
-                self._command = self._record(arguments)
-            self._command.set_params_from_ctypes([_parameter(a) for a in (_new_counter(), *arguments)])
+                self._command = self._record()
+            # Named, because an address does not keep a tensor alive.
+            counter = torch.zeros(_COUNTER_SIZE, dtype=torch.int32)
+            self._command.set_params_from_ctypes([_parameter(a) for a in (counter, *arguments)])
             _on_all_threads(self._command.launch)
 
-    def _record(self, arguments: tuple[Tensor | int | float, ...]) -> Any:
+    def _record(self) -> Any:
         wp = _warp()
-        declared = {"counter_array": _WARP_TYPE[IntArray]}
-        pointers = "int* counter = (int*)counter_array.data;\n"
+        declared = {"counter_address": _WARP_TYPE[IntArray]}
+        pointers = "int* counter = (int*)counter_address;\n"
         for name, kind in self._kinds.items():
             if kind in _POINTER:
-                declared[f"{name}_array"] = _WARP_TYPE[kind]
-                pointers += f"{_POINTER[kind]}* __restrict {name} = ({_POINTER[kind]}*){name}_array.data;\n"
+                declared[f"{name}_address"] = _WARP_TYPE[kind]
+                pointers += f"{_POINTER[kind]}* __restrict {name} = ({_POINTER[kind]}*){name}_address;\n"
             else:
                 declared[name] = _WARP_TYPE[kind]
         signature = ", ".join(f"{name}: {kind}" for name, kind in declared.items())
@@ -128,7 +126,7 @@ class Worker:
         body = namespace[f"{self._name}_body"]
         namespace[f"{self._name}_body"] = wp.func_native(PRELUDE + pointers + self._code)(body)
         kernel = wp.kernel(enable_backward=False)(namespace[self._name])
-        inputs = [_parameter(a) for a in (_new_counter(), *arguments)]
+        inputs = [0] * len(declared)
         return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
 
 
@@ -189,13 +187,10 @@ def _quiet_stderr() -> Iterator[None]:
         os.close(nowhere)
 
 
-def _new_counter() -> Tensor:
-    return torch.zeros(_COUNTER_SLOTS, dtype=torch.int32)
-
-
-def _parameter(value: Tensor | int | float) -> Any:
+def _parameter(value: Tensor | int | float) -> int | float:
     if isinstance(value, Tensor):
-        return _warp().from_torch(value.detach().reshape(-1), return_ctype=True)
+        assert value.is_contiguous(), "kernels read and write contiguous tensors only"
+        return value.data_ptr()
     return value
 
 

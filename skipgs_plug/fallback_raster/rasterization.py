@@ -1,6 +1,6 @@
 """`rasterization` with gsplat's signature, on the CPU."""
 
-from itertools import pairwise
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -167,31 +167,30 @@ def rasterization(
             features.append(of_camera)
     with_depth = render_mode != "RGB"
 
-    camera_ids = gaussian_ids = None
-    rows: list[Any] = list(range(n_cameras))
+    camera_ids = gaussian_ids = counts = None
     if packed:
         camera_ids, gaussian_ids = radii[..., 0].nonzero(as_tuple=True)
         features = [f[gaussian_ids[camera_ids == c]] for c, f in enumerate(features)]
         means2d, depths, conics, opacities, radii, sigmas = (
             t[camera_ids, gaussian_ids] for t in (means2d, depths, conics, opacities, radii, sigmas)
         )
-        ends = torch.searchsorted(camera_ids, torch.arange(n_cameras + 1)).tolist()
-        rows = [slice(begin, end) for begin, end in pairwise(ends)]
-        visible = [torch.arange(row.stop - row.start, dtype=torch.int32) for row in rows]
+        counts = torch.bincount(camera_ids, minlength=n_cameras).tolist()
+        visible = [torch.arange(count, dtype=torch.int32) for count in counts]
     absolute = None
     if absgrad:
         absolute = torch.zeros_like(means2d)
         means2d.absgrad = absolute  # type: ignore[attr-defined]
 
     images, alphas, tiles_per_gauss = [], [], []
-    for camera, row in enumerate(rows):
+    absolutes = [None] * n_cameras if absolute is None else _unstack(absolute, counts)
+    of_cameras = zip(*(_unstack(t, counts) for t in (means2d, conics, opacities, depths, sigmas)), strict=True)
+    for camera, (centres, shapes, strengths, distances, extents) in enumerate(of_cameras):
         channels = [features[camera]] if features else []
         if with_depth:
-            channels.append(depths[row].unsqueeze(1))
+            channels.append(distances.unsqueeze(1))
         image, transmittance, tiles = Blend.apply(
-            means2d[row], conics[row], opacities[row],
-            torch.cat(channels, 1) if len(channels) > 1 else channels[0],
-            depths[row], sigmas[row], visible[camera], width, height, None if absolute is None else absolute[row],
+            centres, shapes, strengths, torch.cat(channels, 1) if len(channels) > 1 else channels[0],
+            distances, extents, visible[camera], width, height, absolutes[camera],
         )  # fmt: skip
         alpha = (1.0 - transmittance).unsqueeze(-1)
         if backgrounds is not None and features:
@@ -227,9 +226,16 @@ def rasterization(
     return _stack(images).to(dtype), _stack(alphas).to(dtype), info
 
 
+# One camera is the rule in training: views, whose gradients are views too, spare copies of everything.
 def _stack(tensors: Any) -> Tensor:
-    # One camera is the rule in training, and a view spares the copy.
     return tensors[0].unsqueeze(0) if len(tensors) == 1 else torch.stack(list(tensors))
+
+
+def _unstack(tensor: Tensor, counts: list[int] | None) -> Sequence[Tensor]:
+    """One tensor per camera, of rows that are stacked, or packed with `counts` per camera."""
+    if counts is not None:
+        return [tensor] if len(counts) == 1 else tensor.split(counts)
+    return [tensor.squeeze(0)] if len(tensor) == 1 else tensor.unbind()
 
 
 def _check_tensors(
