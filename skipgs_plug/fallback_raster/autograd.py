@@ -159,15 +159,18 @@ class Blend(torch.autograd.Function):
         transmittance = torch.empty(height, width)
         pixel_stop = torch.empty(height, width, dtype=torch.int32)
         tile_stop = torch.empty(tiles_x * tiles_y, dtype=torch.int32)
+        pair_blocks = torch.empty(len(bins.tile_list), dtype=torch.int32)
         for channel in range(0, channels, MAX_CHANNELS):
             some = min(MAX_CHANNELS, channels - channel)
             if channel > 0:
                 _pack_colors(bins, means2d, conics, opacities, sigmas, colors, channel, some)
             forward_worker(some)(
                 bins.records, bins.tile_start, bins.tile_list, image, transmittance, pixel_stop, tile_stop,
-                width, height, tiles_x, tiles_y, channels, channel, some, active_shortcuts(),
+                pair_blocks, width, height, tiles_x, tiles_y, channels, channel, some, active_shortcuts(),
             )  # fmt: skip
-        ctx.save_for_backward(means2d, conics, opacities, colors, sigmas, transmittance, pixel_stop, tile_stop)
+        ctx.save_for_backward(
+            means2d, conics, opacities, colors, sigmas, transmittance, pixel_stop, tile_stop, pair_blocks
+        )  # fmt: skip
         ctx.bins, ctx.absolute = bins, absolute
         ctx.mark_non_differentiable(bins.tiles_per_gauss)
         return image, transmittance, bins.tiles_per_gauss
@@ -175,7 +178,9 @@ class Blend(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor, _: Any) -> Any:  # type: ignore[override]
-        means2d, conics, opacities, colors, sigmas, transmittance, pixel_stop, tile_stop = ctx.saved_tensors
+        means2d, conics, opacities, colors, sigmas, transmittance, pixel_stop, tile_stop, pair_blocks = (
+            ctx.saved_tensors
+        )
         bins: Bins = ctx.bins
         height, width, channels = v_image.shape
         tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
@@ -190,11 +195,12 @@ class Blend(torch.autograd.Function):
             if channels > MAX_CHANNELS:
                 _pack_colors(bins, means2d, conics, opacities, sigmas, colors, channel, some)
             backward_worker(some, with_absolute)(
-                bins.records, bins.tile_start, bins.tile_list, tile_stop, transmittance, pixel_stop, v_image,
-                v_transmittance, v_pairs, width, height, tiles_x, tiles_y, channels, channel, some, active_shortcuts(),
+                bins.records, bins.tile_start, bins.tile_list, tile_stop, pair_blocks, transmittance, pixel_stop,
+                v_image, v_transmittance, v_pairs, width, height, tiles_x, tiles_y, channels, channel, some,
+                active_shortcuts(),
             )  # fmt: skip
             reduce_pairs(
-                bins.pair_start, bins.pair_slot, v_pairs, opacities, v_means2d, v_conics, v_opacities,
+                bins.pair_start, bins.pair_slot, v_pairs, conics, opacities, v_means2d, v_conics, v_opacities,
                 absolute, v_colors, len(means2d), len(bins.tile_list), channels, channel, some, int(with_absolute),
             )  # fmt: skip
             # The gradient of the transmittance belongs to the first pass alone.
@@ -213,6 +219,6 @@ def _pack_colors(
     channels: int,
 ) -> None:
     pack(
-        bins.order, means2d, conics, opacities, sigmas, colors, bins.records,
-        len(bins.order), colors.shape[1], channel, channels,
+        bins.visible, means2d, conics, opacities, sigmas, colors, bins.records,
+        len(bins.visible), colors.shape[1], channel, channels,
     )  # fmt: skip

@@ -15,17 +15,21 @@ from .shortcuts import active_shortcuts
 
 TILE = 16
 
-# Floats of a Gaussian as the blend reads it: centre x, y; half the conic's diagonal, its off-diagonal and log2 of
-# the opacity in units of log2(e), so that alpha = exp2(log2_opacity - (a dx^2 + b dx dy + c dy^2)); half height and
-# half width in pixels of the ellipse at alpha = 1/255; up to four channels of colour.
-RECORD = 12
+# Floats of a Gaussian as the blend reads it: centre x, y; the conic as a sum of squares, so that with
+# p = r[2] dx + r[3] dy and w = r[4] dy, alpha = exp2(r[5] - p^2 - w^2); half height and half width in pixels of the
+# ellipse at alpha = 1/255; up to four channels of colour; where p^2 + w^2 is least, dx / dy along a row and dy / dx
+# along a column; p^2 + w^2 at alpha = 1/255; one unused, which makes it a cache line.
+RECORD = 16
 
 # Channels that one pass blends; wider colours take several passes.
-MAX_CHANNELS = RECORD - 8
+MAX_CHANNELS = 4
 
-# Tiles [left, right] of tile row `ty` that the Gaussian of record `i` crosses.
+# Tiles [left, right] of tile row `ty` that the Gaussian at place `i` crosses.
 _TILE_ROWS = """
-    const float* r = records + 12 * i;
+    const int g = order[i];
+    // Depth order is no order of rows: every record is far from the last.
+    __builtin_prefetch(records + 16ll * order[smaller(i + 16, n - 1)]);
+    const float* r = records + 16ll * g;
     const float mx = r[0], my = r[1], half_h = r[6], half_w = r[7];
     // Rows and columns of pixels whose centres the bounding box holds.
     const int top = (int)ceilf(fmaxf(my - half_h - 0.5f, 0.0f));
@@ -36,9 +40,9 @@ _TILE_ROWS = """
     const int first_row = top / 16, last_row = empty ? first_row - 1 : bottom / 16;
     // Small ones need no more than their bounding box.
     const bool whole = box_left / 16 == box_right / 16 || first_row == last_row || !(shortcuts & 1);
-    // The ellipse's edges: x(dy) = mx - dy b / 2a +- chord sqrt(1 - (dy / half_h)^2), farthest out at dy = -+extreme.
-    const float slope = -0.5f * r[3] / r[2], extreme = -0.5f * r[3] / r[4] * half_w, inverse_h = 1.0f / half_h;
-    const float chord = sqrtf(fmaxf((r[5] + 7.99435344f) / r[2], 0.0f));
+    // The ellipse's edges: x(dy) = mx + dy slope +- chord sqrt(1 - (dy / half_h)^2), farthest out at dy = -+extreme.
+    const float slope = r[12], extreme = r[13] * half_w, inverse_h = 1.0f / half_h;
+    const float chord = sqrtf(fmaxf(r[14], 0.0f)) / r[2];
     auto columns = [&](int ty, int& left, int& right) {
         left = box_left / 16;
         right = box_right / 16;
@@ -100,47 +104,35 @@ def depth_sort(
     """
 for (int i = first; i < last; i += 16) {
     const int lanes = last - i < 16 ? last - i : 16;
-    int row[16], place[16];
-    for (int l = 0; l < 16; ++l) {
-        place[l] = i + (l < lanes ? l : lanes - 1);
-        row[l] = order[place[l]];
-        // Depth order is no order of rows: every read is far from the last.
-        const int later = order[smaller(i + l + 32, n - 1)];
-        __builtin_prefetch(means2d + 2 * later);
-        __builtin_prefetch(conics + 3 * later);
-        __builtin_prefetch(opacities + later);
-        __builtin_prefetch(sigmas + 2 * later);
-        __builtin_prefetch(colors + (long long)later * stride + channel);
-    }
+    int row[16];
+    for (int l = 0; l < 16; ++l) row[l] = visible[i + (l < lanes ? l : lanes - 1)];
     const float log2e = 1.44269504f;
     v16 a = gather(conics, row, 3, 0), b = gather(conics, row, 3, 1), c = gather(conics, row, 3, 2);
     v16 log2_opacity = log2(vmax(gather(opacities, row, 1, 0), (v16)1e-20f));
     // Half axes of the box around alpha >= 1/255, a hair wider than exact: the blend tests every pixel itself.
-    v16 reach = vsqrt(vmax(2.0f * (log2_opacity + 7.99435344f) / log2e, (v16)0.0f)) * 1.0001f + 1e-3f;
-    scatter(records, place, 12, 0, gather(means2d, row, 2, 0), lanes);
-    scatter(records, place, 12, 1, gather(means2d, row, 2, 1), lanes);
-    scatter(records, place, 12, 2, 0.5f * log2e * a, lanes);
-    scatter(records, place, 12, 3, log2e * b, lanes);
-    scatter(records, place, 12, 4, 0.5f * log2e * c, lanes);
-    scatter(records, place, 12, 5, log2_opacity, lanes);
-    scatter(records, place, 12, 6, reach * gather(sigmas, row, 2, 1), lanes);
-    scatter(records, place, 12, 7, reach * gather(sigmas, row, 2, 0), lanes);
-    for (int l = 0; l < lanes; ++l)
-        for (int k = 0; k < 4; ++k)
-            records[12 * place[l] + 8 + k] = k < channels ? colors[row[l] * stride + channel + k] : 0.0f;
+    v16 reach = log2_opacity + 7.99435344f;
+    // a dx^2 + 2 b dx dy + c dy^2 = a (dx + b / a dy)^2 + dy^2 / sigma_y^2: no needle rounds to a negative value.
+    v16 along = vsqrt(0.5f * log2e * a), across = 0.849321800f / gather(sigmas, row, 2, 1);
+    v16 half = vsqrt(vmax(2.0f * reach / log2e, (v16)0.0f)) * 1.0001f + 1e-3f;
+    v16 value[16] = {
+        gather(means2d, row, 2, 0), gather(means2d, row, 2, 1), along, along * (b / a), across, log2_opacity,
+        half * gather(sigmas, row, 2, 1), half * gather(sigmas, row, 2, 0), {}, {}, {}, {}, -b / a, -b / c, reach, {}};
+    for (int k = 0; k < channels; ++k) value[8 + k] = gather(colors + channel, row, stride, k);
+    transpose(value);
+    for (int l = 0; l < lanes; ++l) store(records + 16ll * row[l], value[l]);
 }
 """,
     items="n",
     grain=512,
 )
 def pack(
-    order: IntArray,  # [M], rows front to back
+    visible: IntArray,  # [M]
     means2d: FloatArray,  # [R, 2]
     conics: FloatArray,  # [R, 3]
     opacities: FloatArray,  # [R]
     sigmas: FloatArray,  # [R, 2]
     colors: FloatArray,  # [R, D]
-    records: FloatArray,  # out [M, RECORD]
+    records: FloatArray,  # out [R, RECORD], only visible rows are written
     n: int,
     stride: int,  # D
     channel: int,
@@ -164,7 +156,7 @@ for (int s = first; s < last; ++s) {
             for (int tx = left; tx <= right; ++tx) ++count[ty * tiles_x + tx];
             if (right >= left) pairs += right - left + 1;
         }
-        tiles_per_gauss[order[i]] = pairs;
+        tiles_per_gauss[g] = pairs;
     }
 }
 """,
@@ -173,7 +165,7 @@ for (int s = first; s < last; ++s) {
 )
 def count_pairs(
     order: IntArray,  # [M]
-    records: FloatArray,  # [M, RECORD]
+    records: FloatArray,  # [R, RECORD]
     counts: IntArray,  # out [slices, tiles]
     tiles_per_gauss: IntArray,  # out [R], zeros
     n: int,
@@ -223,13 +215,13 @@ for (int s = first; s < last; ++s) {
 """
     + _TILE_ROWS
     + """
-        int pair = pair_start[order[i]];
+        int pair = pair_start[g];
         for (int ty = first_row; ty <= last_row; ++ty) {
             int left, right;
             columns(ty, left, right);
             for (int tx = left; tx <= right; ++tx) {
                 const int slot = next[ty * tiles_x + tx]++;
-                tile_list[slot] = i;
+                tile_list[slot] = g;
                 pair_slot[pair++] = slot;
             }
         }
@@ -241,10 +233,10 @@ for (int s = first; s < last; ++s) {
 )
 def fill_pairs(
     order: IntArray,  # [M]
-    records: FloatArray,  # [M, RECORD]
+    records: FloatArray,  # [R, RECORD]
     counts: IntArray,  # [slices, tiles], next free place
     pair_start: IntArray,  # [R + 1]
-    tile_list: IntArray,  # out [P], place in depth order
+    tile_list: IntArray,  # out [P], rows
     pair_slot: IntArray,  # out [P], for each Gaussian its places in tile_list
     n: int,
     slices: int,
@@ -261,16 +253,16 @@ class Bins:
     """Tile lists of one image.
 
     Attributes:
-        order: [M] int32, rows of the visible Gaussians, front to back.
-        records: [M, RECORD] float32, what the blend reads of each, in that order.
+        visible: [M] int32, rows of the visible Gaussians.
+        records: [R, RECORD] float32, what the blend reads of each of them.
         tile_start: [tiles + 1] int32, begin of each tile's part of `tile_list`, row-major.
-        tile_list: [P] int32, places in `order`.
+        tile_list: [P] int32, rows, front to back in every tile.
         pair_start: [R + 1] int32, begin of each row's part of `pair_slot`.
         pair_slot: [P] int32, places in `tile_list`.
         tiles_per_gauss: [R] int32, number of tiles of every row.
     """
 
-    order: Tensor
+    visible: Tensor
     records: Tensor
     tile_start: Tensor
     tile_list: Tensor
@@ -297,10 +289,10 @@ def bin_gaussians(
     sorted_rows = torch.empty(2 * n, dtype=torch.int32)
     depth_sort(depths, visible, scratch("depth_keys", 2 * n, dtype=torch.int32), sorted_rows, n)
     order = sorted_rows[n:]
-    records = torch.empty(n, RECORD)
-    channels = colors.shape[1]
+    rows, channels = colors.shape
+    records = torch.empty(rows, RECORD)
     pack(
-        order, means2d, conics, opacities, sigmas, colors, records,
+        visible, means2d, conics, opacities, sigmas, colors, records,
         n, channels, 0, min(channels, MAX_CHANNELS),
     )  # fmt: skip
 
@@ -308,7 +300,6 @@ def bin_gaussians(
     slices = 1 if n < 1024 else get_num_threads()
     counts = torch.empty(slices, tiles, dtype=torch.int32)
     tile_start = torch.empty(tiles + 1, dtype=torch.int32)
-    rows = len(means2d)
     pair_start = torch.empty(rows + 1, dtype=torch.int32)
     tiles_per_gauss = torch.zeros(rows, dtype=torch.int32)
     image = (float(width), float(height), tiles_x, tiles_y, active_shortcuts())
@@ -318,4 +309,4 @@ def bin_gaussians(
     tile_list = torch.empty(pairs, dtype=torch.int32)
     pair_slot = torch.empty(pairs, dtype=torch.int32)
     fill_pairs(order, records, counts, pair_start, tile_list, pair_slot, n, slices, *image)
-    return Bins(order, records, tile_start, tile_list, pair_start, pair_slot, tiles_per_gauss)
+    return Bins(visible, records, tile_start, tile_list, pair_start, pair_slot, tiles_per_gauss)

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 # Names in the order of their bits; kernels read them from an int parameter `shortcuts`.
 SHORTCUTS = {
     "exact_tiles": "list a Gaussian only in tiles that its ellipse at alpha 1/255 crosses, not in its whole box",
-    "row_bounds": "visit only the rows of a tile that the ellipse reaches",
-    "saturation": "leave rows and tiles whose pixels are all finished",
-    "zero_gradient": "leave rows and tiles whose incoming gradient is zero in the backward pass",
+    "block_bounds": "visit only the 4 x 4 blocks of a tile that the ellipse reaches",
+    "saturation": "leave blocks and tiles whose pixels are all finished",
+    "zero_gradient": "leave blocks and tiles whose incoming gradient is zero in the backward pass",
     "visible_only": "evaluate SH and its adjoint only for Gaussians on screen",
     "contributed_only": "run the adjoint of SH and projection only for Gaussians that received a gradient",
 }

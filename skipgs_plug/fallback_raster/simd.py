@@ -6,21 +6,59 @@ arithmetic on it reads like scalar code and becomes one AVX-512 instruction, two
 NEON. Scalar Warp code does not vectorise across pixels.
 """
 
+
+def _shuffle(lanes: list[int]) -> str:
+    """C++ function of two vectors that picks lanes of the first (0 to 15) and of the second (16 to 31)."""
+    return f"[](v16 a, v16 b) -> v16 {{ return __builtin_shufflevector(a, b, {', '.join(map(str, lanes))}); }}"
+
+
+def _exchange(step: int) -> str:
+    low = [16 + lane - step if lane & step else lane for lane in range(16)]
+    high = [16 + lane if lane & step else lane + step for lane in range(16)]
+    return f"exchange({step}, {_shuffle(low)}, {_shuffle(high)});\n"
+
+
+# Rows become columns in four rounds: rows `step` apart exchange the lanes that lie `step` apart.
+_TRANSPOSE = f"""
+auto transpose = [](v16* a) {{
+    auto exchange = [&](int step, auto low, auto high) {{
+        for (int i = 0; i < 16; ++i)
+            if (!(i & step)) {{
+                const v16 b = low(a[i], a[i + step]), c = high(a[i], a[i + step]);
+                a[i] = b;
+                a[i + step] = c;
+            }}
+    }};
+    {"".join(_exchange(step) for step in (8, 4, 2, 1))}
+}};
+"""
+
 # The pragma lets Clang fuse a * b + c into one instruction, which is faster and rounds once; Warp leaves it off.
-PRELUDE = """
+PRELUDE = (
+    """
 #pragma clang fp contract(fast)
 typedef float v16 __attribute__((ext_vector_type(16), aligned(4)));
 typedef int i16 __attribute__((ext_vector_type(16), aligned(4)));
+typedef bool b16 __attribute__((ext_vector_type(16)));
+typedef float v8 __attribute__((ext_vector_type(8), aligned(4)));
 
 const v16 lane = {0.f, 1.f, 2.f, 3.f, 4.f, 5.f, 6.f, 7.f, 8.f, 9.f, 10.f, 11.f, 12.f, 13.f, 14.f, 15.f};
+// Where each lane lies in a block of 4 x 4.
+const v16 lane_x = {0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f};
+const v16 lane_y = {0.f, 0.f, 0.f, 0.f, 1.f, 1.f, 1.f, 1.f, 2.f, 2.f, 2.f, 2.f, 3.f, 3.f, 3.f, 3.f};
 auto fmaxf = [](float a, float b) -> float { return a > b ? a : b; };
 auto fminf = [](float a, float b) -> float { return a < b ? a : b; };
 auto larger = [](int a, int b) -> int { return a > b ? a : b; };
 auto smaller = [](int a, int b) -> int { return a < b ? a : b; };
 auto any = [](i16 mask) -> bool { return __builtin_reduce_or(mask) != 0; };
 auto all = [](i16 mask) -> bool { return __builtin_reduce_and(mask) != 0; };
-auto vmin = [](v16 a, v16 b) -> v16 { return __builtin_elementwise_min(a, b); };
-auto vmax = [](v16 a, v16 b) -> v16 { return __builtin_elementwise_max(a, b); };
+// Bit l is set where lane l of the mask is.
+auto bits = [](i16 mask) -> unsigned {
+    return __builtin_bit_cast(unsigned short, __builtin_convertvector(mask != 0, b16));
+};
+// One instruction each; where one of the two is NaN, the second is taken.
+auto vmin = [](v16 a, v16 b) -> v16 { return a < b ? a : b; };
+auto vmax = [](v16 a, v16 b) -> v16 { return a > b ? a : b; };
 auto vabs = [](v16 a) -> v16 { return __builtin_elementwise_abs(a); };
 auto vsqrt = [](v16 a) -> v16 { return __builtin_elementwise_sqrt(a); };
 // Pairwise, so that the order of additions (and the result to the bit) is fixed.
@@ -29,6 +67,21 @@ auto sum = [](v16 a) -> float {
     auto c = b.lo + b.hi;
     auto d = c.lo + c.hi;
     return d.x + d.y;
+};
+// Eight sums at a time, folded together: a third of the instructions of eight calls of `sum`.
+auto sum8 = [](const v16* a) -> v8 {
+    v16 b[4], c[2];
+    for (int i = 0; i < 4; ++i)
+        b[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23)
+             + __builtin_shufflevector(a[2 * i], a[2 * i + 1], 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30,
+                                       31);
+    for (int i = 0; i < 2; ++i)
+        c[i] = __builtin_shufflevector(b[2 * i], b[2 * i + 1], 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27)
+             + __builtin_shufflevector(b[2 * i], b[2 * i + 1], 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30,
+                                       31);
+    v16 d = __builtin_shufflevector(c[0], c[1], 0, 1, 4, 5, 8, 9, 12, 13, 16, 17, 20, 21, 24, 25, 28, 29)
+          + __builtin_shufflevector(c[0], c[1], 2, 3, 6, 7, 10, 11, 14, 15, 18, 19, 22, 23, 26, 27, 30, 31);
+    return d.even + d.odd;
 };
 auto load = [](const float* p) -> v16 { return *(const v16*)p; };
 auto store = [](float* p, v16 a) { *(v16*)p = a; };
@@ -42,6 +95,9 @@ auto gather = [](const float* p, const int* row, int width, int c) -> v16 {
 auto scatter = [](float* p, const int* row, int width, int c, v16 a, int lanes) {
     for (int l = 0; l < lanes; ++l) p[row[l] * width + c] = a[l];
 };
+"""
+    + _TRANSPOSE
+    + """
 // 2^t for t in [-126, 126]: the integer part goes into the exponent, a degree-5 minimax polynomial gives the rest
 // in [-0.5, 0.5] (relative error 7.5e-8). Adding 1.5 * 2^23 leaves the rounded integer in the low mantissa bits.
 auto exp2 = [](v16 t) -> v16 {
@@ -66,3 +122,4 @@ auto log2 = [](v16 a) -> v16 {
     return exponent + t * p * 2.88539008f;
 };
 """
+)
