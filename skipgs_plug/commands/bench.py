@@ -48,6 +48,8 @@ class Args:
     policies: tuple[str, ...] = tuple(POLICIES)
     """What to compare; controls copy rate or time of gate."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
+    tensorboard: bool = False
+    """Log gsplat's scalars and the gate's counters of every run to OUT/tb; the clock stands meanwhile."""
     no_progress: bool = False
     """No progress bars."""
 
@@ -64,7 +66,8 @@ def run(args: Args, command: str) -> list[Row]:
     config = dataclasses.replace(args.train, data_dir=args.scene, result_dir=args.out)
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts)
     folder = BenchFolder(args.out)
-    bench = Bench(scene, config, folder, args.seeds, args.policies, progress=not args.no_progress)
+    progress, tensorboard = not args.no_progress, args.tensorboard
+    bench = Bench(scene, config, folder, args.seeds, args.policies, progress=progress, tensorboard=tensorboard)
     print(
         f"{scene.name}: {len(args.seeds)} seeds x {len(args.policies)} policies, iterations to {config.max_steps:,}, "
         f"densification to {bench.refine_stop_iter:,}, backend {bench.backend.name}"
