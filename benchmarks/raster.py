@@ -36,11 +36,11 @@ from common import (
     median_ms,
     multiply_adds_per_second,
     provenance,
+    relative_difference,
     threads,
     write_part,
 )
 from pairs import blended_pairs
-from torch import Tensor
 
 from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
 from skipgs_plug.fallback_raster.shortcuts import SHORTCUTS, without_shortcuts
@@ -300,10 +300,6 @@ def part_loss(quick: bool, repeats: int) -> list[dict[str, Any]]:
                 flush=True,
             )
     return rows
-
-
-def relative_difference(value: Tensor, truth: Tensor) -> float:
-    return ((value - truth).double().norm() / truth.double().norm().clamp(min=1e-300)).item()
 
 
 PARTS: dict[str, Callable[[bool, int], Any]] = {
