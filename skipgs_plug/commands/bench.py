@@ -9,6 +9,8 @@ from typing import Annotated
 
 import tyro
 
+from skipgs_plug.bench.decisions import FILE as DECISIONS
+from skipgs_plug.bench.decisions import write_decisions
 from skipgs_plug.bench.plots import write_plots
 from skipgs_plug.bench.policies import POLICIES, check_policies
 from skipgs_plug.bench.result import build_result
@@ -61,7 +63,7 @@ def main(argv: list[str]) -> int:
 
 
 def run(args: Args, command: str) -> list[Row]:
-    """Run what is missing, print the table, write bench.json, table.md and plots; returns the rows."""
+    """Run what is missing, print the table, write bench.json, decisions.json, table.md and plots; returns the rows."""
     check_policies(args.policies)
     config = dataclasses.replace(args.train, data_dir=args.scene, result_dir=args.out)
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts)
@@ -84,6 +86,7 @@ def run(args: Args, command: str) -> list[Row]:
     ]
     text = "\n\n".join(parts) + "\n"
     write_json(folder.root / "bench.json", result)
+    write_decisions(folder.root / DECISIONS, records)
     with write_aside(folder.root / "table.md") as temporary:
         temporary.write_text(text)
     write_plots(folder.root, records, rows, result["view_names"])
