@@ -64,10 +64,10 @@ def test_train_writes_the_tags_of_gsplat(packed, tmp_path):
 
 def test_memory_is_in_gib_and_counts_what_was_used():
     before = peak_memory(torch.device("cpu"))
-    used = torch.ones(2**28)  # 1 GiB, touched
+    used = torch.ones(2**26)  # 256 MiB, touched
     assert used[-1] == 1
     assert before is not None and 2**26 < before < 2**37
-    assert peak_memory(torch.device("cpu")) > 2**30
+    assert max(before, 2**28) <= peak_memory(torch.device("cpu")) < before + 2**29
 
 
 def test_a_continued_run_replaces_what_came_after_its_checkpoint(scene, tmp_path):
