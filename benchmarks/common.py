@@ -1,4 +1,4 @@
-"""What the speed benchmarks share: scenes, clocks, provenance, result files."""
+"""What the benchmarks share: scenes, clocks, errors, provenance, result files."""
 
 import functools
 import json
@@ -21,6 +21,7 @@ from torch import Tensor
 
 from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
 from skipgs_plug.fallback_raster.launch import FloatArray, Worker, worker
+from skipgs_plug.trainer.files import write_aside
 
 RESULTS = Path(__file__).parent / "results"
 SCENES = Path(os.environ.get("SKIPGS_SHARED", Path(__file__).parents[2] / "shared")) / "data"
@@ -178,8 +179,13 @@ def exponents(sizes: Sequence[float], values: Sequence[float]) -> dict[str, floa
     return {"fitted": float(np.polyfit(x, y, 1)[0]), "steepest": float((np.diff(y) / np.diff(x)).max())}
 
 
-def provenance() -> dict[str, Any]:
-    """What a reader needs to repeat or to doubt the figures."""
+def relative_difference(value: Tensor, truth: Tensor) -> float:
+    """L2 distance as a share of the truth's L2 norm."""
+    return ((value.double() - truth.double()).norm() / truth.double().norm().clamp(min=1e-300)).item()
+
+
+def provenance(*packages: str) -> dict[str, Any]:
+    """What a reader needs to repeat or to doubt the figures; packages are named with their versions."""
     describe = ["git", "describe", "--always", "--dirty"]
     commit = subprocess.run(describe, capture_output=True, text=True, cwd=Path(__file__).parent)
     cpu = platform.processor() or platform.machine()
@@ -193,7 +199,7 @@ def provenance() -> dict[str, Any]:
         "cores": cores(),
         "load_before": os.getloadavg()[0],  # above 0.5 something else was running: do not trust the times
         "python": platform.python_version(),
-        "versions": {name: version(name) for name in ("torch", "warp-lang")},
+        "versions": {name: version(name) for name in ("torch", "warp-lang", *packages)},
     }
 
 
@@ -201,11 +207,13 @@ def write_part(path: Path, part: str, rows: Any, about: dict[str, Any]) -> dict[
     """Replaces one part of a result file and returns the whole; the other parts keep their own provenance."""
     whole = json.loads(path.read_text()) if path.exists() else {}
     whole[part] = {"about": about, "rows": rows}
-    path.parent.mkdir(exist_ok=True)
-    aside = path.with_suffix(".tmp")
-    aside.write_text(json.dumps(whole, indent=1) + "\n")
-    os.replace(aside, path)
+    write_results(path, whole)
     return whole
+
+
+def write_results(path: Path, content: Any) -> None:
+    with write_aside(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n")
 
 
 def leaves(scene: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:

@@ -6,7 +6,6 @@ python benchmarks/decision.py [--authors PATH_TO_THEIR_CHECKOUT] [--out FILE]
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import platform
 import random
@@ -16,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from skipgs_plug.core.policy import SkipPolicy
+from skipgs_plug.trainer.files import write_json
 
 VIEWS, STEPS, REPEATS = 100, 20_000, 15
 
@@ -84,9 +84,7 @@ def main() -> None:
         "calls": STEPS,
         "repeats": REPEATS,
     }
-    aside = args.out.with_name(f".{args.out.name}.{os.getpid()}")
-    aside.write_text(json.dumps(result, indent=2) + "\n")
-    os.replace(aside, args.out)
+    write_json(args.out, result)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
 
 import torch
@@ -54,6 +54,16 @@ class AbstractAdapter(ABC):
         Its folder is first on `sys.path`, and none of its modules is imported yet.
         """
         raise SkipGSError(f"Adapter {self.name!r} needs a trainer object; it has no script to run.")
+
+    def attach_on_call(self, hooks: Hooks, owner: Any, method: str) -> None:
+        """Attach to the object that `owner.method` is called on, before it runs."""
+
+        def begins(original: Callable[..., Any], trainer: Any, *args: Any, **kwargs: Any) -> Any:
+            self.trainer = trainer
+            self.attach(hooks)
+            return original(trainer, *args, **kwargs)
+
+        hooks.wrap(owner, method, begins)
 
     def must_run(self, step: int) -> bool:
         """Whether skipping is forbidden in this iteration, whose loss is not to be recorded either."""

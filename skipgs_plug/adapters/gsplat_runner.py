@@ -39,13 +39,8 @@ class GsplatRunner(AbstractAdapter):
 
     def attach_script(self, hooks: Hooks) -> None:
         def launched(original: Callable[..., Any], main: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            hooks.wrap(main.__globals__["Runner"], "train", begins)
+            self.attach_on_call(hooks, main.__globals__["Runner"], "train")
             return original(main, *args, **kwargs)
-
-        def begins(original: Callable[..., Any], runner: Any, *args: Any, **kwargs: Any) -> Any:
-            self.trainer = runner
-            self.attach(hooks)
-            return original(runner, *args, **kwargs)
 
         refuse_other_processes(hooks)
         hooks.wrap(importlib.import_module("gsplat.distributed"), "cli", launched)

@@ -36,13 +36,8 @@ class Nerfstudio(AbstractAdapter):
         return hasattr(trainer, LOOP) and hasattr(trainer, "grad_scaler")
 
     def attach_script(self, hooks: Hooks) -> None:
-        def begins(original: Callable[..., Any], trainer: Any, *args: Any, **kwargs: Any) -> Any:
-            self.trainer = trainer
-            self.attach(hooks)
-            return original(trainer, *args, **kwargs)
-
         refuse_other_processes(hooks)
-        hooks.wrap(importlib.import_module("nerfstudio.engine.trainer").Trainer, "train", begins)
+        self.attach_on_call(hooks, importlib.import_module("nerfstudio.engine.trainer").Trainer, "train")
 
     def attach(self, hooks: Hooks) -> None:
         trainer = self.trainer

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,6 +15,8 @@ from skipgs_plug.bench.controls import PlannedSkipping, periodic_skipping, rando
 from skipgs_plug.bench.policies import PolicySpec
 from skipgs_plug.bench.record import Point, RunRecord, Trace
 from skipgs_plug.trainer import Trainer
+from skipgs_plug.trainer.loop import Iteration
+from skipgs_plug.trainer.scalars import ScalarLog
 
 EVALUATIONS = 5  # after this many equal parts of refinement, and once before
 
@@ -22,14 +25,16 @@ class DivergedError(Exception):
     """A loss or a metric is not finite any more; one sentence says where."""
 
 
-def densify(trainer: Trainer, progress: bool = True) -> None:
-    """Train up to the end of densification.
+def densify(trainer: Trainer, progress: bool = True, scalars: Path | None = None) -> None:
+    """Train up to the end of densification; `scalars` as in `refine`.
 
     Raises:
         DivergedError: a loss is not finite.
     """
-    with finite_losses(trainer):
+    with finite_losses(trainer), logged(trainer, scalars) as log:
+        trainer.on_step = None if log is None else log.iteration
         trainer.train(until=trainer.refine_stop_iter, progress=progress)
+        trainer.on_step = None
 
 
 def refine(
@@ -38,12 +43,14 @@ def refine(
     spec: PolicySpec,
     earlier: dict[str, RunRecord],
     lpips_net: str | None = None,
+    scalars: Path | None = None,
 ) -> RunRecord:
     """Refine `snapshot` to the end of the schedule under one policy.
 
     Args:
         earlier: runs of the same seed by policy, of which a control copies rate or time.
         lpips_net: also measure LPIPS with this backbone.
+        scalars: folder for TensorBoard scalars.
 
     Raises:
         DivergedError: a loss or a metric is not finite.
@@ -57,18 +64,23 @@ def refine(
     record = RunRecord(trainer.config.seed, spec.name, iterations=iterations, trace=Trace(start))
     if trainer.backend.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(trainer.backend.device)
-    with compressed(trainer, start, iterations), gated(trainer, spec, earlier) as gate, finite_losses(trainer):
-        record_losses(trainer, record, gate)
-        record.points.append(evaluate(trainer))
+    with (
+        compressed(trainer, start, iterations),
+        gated(trainer, spec, earlier) as gate,
+        finite_losses(trainer),
+        logged(trainer, scalars, gate) as log,
+    ):
+        record_losses(trainer, record, gate, log)
+        record.points.append(evaluate(trainer, log))
         for part in range(1, EVALUATIONS + 1):
             trainer.train(until=start + round(part * iterations / EVALUATIONS), progress=False)
             if part < EVALUATIONS:
-                record.points.append(evaluate(trainer))
+                record.points.append(evaluate(trainer, log))
         trainer.on_step = None
         if trainer.backend.device.type == "cuda":
             record.peak_memory = torch.cuda.max_memory_allocated(trainer.backend.device)
         stats = trainer.evaluate("test", lpips_net)
-        record.points.append(point(trainer, stats))
+        record.points.append(point(trainer, stats, log))
     names = ["psnr", "ssim", "num_GS"] + [name for name in stats if name.startswith("lpips")]
     record.metrics = {name: stats[name] for name in names}
     record.t_post, record.t_total = trainer.t_post, trainer.t_total
@@ -154,27 +166,41 @@ def finite_losses(trainer: Trainer) -> Iterator[None]:
             del trainer.backward
 
 
-def record_losses(trainer: Trainer, record: RunRecord, gate: SkipGate | None) -> None:
-    """Fill the trace of `record` after every iteration, outside the clock."""
+@contextlib.contextmanager
+def logged(trainer: Trainer, scalars: Path | None, gate: SkipGate | None = None) -> Iterator[ScalarLog | None]:
+    """Open TensorBoard scalars in a folder, if one is given."""
+    if scalars is None:
+        yield None
+        return
+    with ScalarLog(scalars, trainer, gate.scalars if gate is not None else dict) as log:
+        yield log
+
+
+def record_losses(trainer: Trainer, record: RunRecord, gate: SkipGate | None, log: ScalarLog | None) -> None:
+    """Fill the trace of `record`, and the log, after every iteration, outside the clock."""
     index = {name: i for i, name in enumerate(trainer.view_names)}
     trace = record.trace
     assert trace is not None
 
-    def on_step(step: int, view: str, loss: float) -> None:
+    def on_step(iteration: Iteration) -> None:
         if gate is None:
-            trace.add(index[view], loss, None, "ungated", False)
+            trace.add(index[iteration.view], iteration.loss, None, "ungated", False)
         else:
             row = gate.trace[-1]
             trace.add(index[row.view], row.loss, row.mean, row.reason, row.skip)
+        if log is not None:
+            log.iteration(iteration)
 
     trainer.on_step = on_step
 
 
-def evaluate(trainer: Trainer) -> Point:
-    return point(trainer, trainer.evaluate("test"))
+def evaluate(trainer: Trainer, log: ScalarLog | None) -> Point:
+    return point(trainer, trainer.evaluate("test"), log)
 
 
-def point(trainer: Trainer, stats: dict[str, Any]) -> Point:
+def point(trainer: Trainer, stats: dict[str, Any], log: ScalarLog | None) -> Point:
+    if log is not None:
+        log.evaluation(stats)
     if not (math.isfinite(stats["psnr"]) and math.isfinite(stats["ssim"])):
         raise DivergedError(f"held-out PSNR {stats['psnr']}, SSIM {stats['ssim']} after iteration {trainer.step - 1}")
     return Point(trainer.step, trainer.t_post, stats["psnr"], stats["ssim"])

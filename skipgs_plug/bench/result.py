@@ -21,7 +21,7 @@ def build_result(bench: Bench, records: Sequence[RunRecord], command: str) -> di
         `kind`, `schema_version`; `command`, `commits`, `versions`; `settings` (training, scene, machine, lpips);
         `seeds`, `policies`; `refinement` (first and last iteration + 1); `view_names` (traces index into
         them); `rows` (means and spreads); `ceiling`, `timing_noise` (see summary); `runs` (records without traces,
-        which are in runs/).
+        which are in runs/ and, without losses, in decisions.json).
     """
     last = bench.config.max_steps
     first = bench.refine_stop_iter

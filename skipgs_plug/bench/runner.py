@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from skipgs_plug.bench import provenance
@@ -24,6 +25,7 @@ class Bench:
     Args:
         config: settings of training; its seed is replaced by each of `seeds`.
         say: called with one line per event.
+        tensorboard: write TensorBoard scalars of every run that is missing.
 
     Raises:
         InputError: an unknown policy, no held-out views, or a folder made with other settings.
@@ -38,6 +40,7 @@ class Bench:
         policies: Sequence[str],
         say: Callable[[str], None] = print,
         progress: bool = True,
+        tensorboard: bool = False,
     ) -> None:
         check_policies(policies)
         if not seeds or len(set(seeds)) < len(seeds):
@@ -51,7 +54,7 @@ class Bench:
             raise InputError(f"Scene {scene.name} has no held-out views to measure on; give --test-every 8.")
         self.scene, self.config, self.folder = scene, config, folder
         self.seeds, self.policies = list(seeds), list(policies)
-        self.say, self.progress = say, progress
+        self.say, self.progress, self.tensorboard = say, progress, tensorboard
         self.backend = resolve_backend(config.backend)
         self.lpips_net = available_lpips()
         self.commit = provenance.commit()
@@ -103,7 +106,7 @@ class Bench:
             trainer.load_checkpoint(path)
             self.say(f"seed {seed}: continuing from its snapshot at iteration {trainer.step:,}")
         else:
-            densify(trainer, self.progress)
+            densify(trainer, self.progress, self._scalars(seed, "densify"))
             trainer.save_checkpoint(path)
             count = len(trainer.splats["means"])
             self.say(f"seed {seed}: densified to {count:,} Gaussians in {trainer.t_total:.1f} s of training")
@@ -117,9 +120,12 @@ class Bench:
         if lost:
             return RunRecord(seed, spec.name, "not run", f"{lost[0]} of this seed, which it copies, did not finish")
         try:
-            return refine(trainer, snapshot, spec, earlier, self.lpips_net)
+            return refine(trainer, snapshot, spec, earlier, self.lpips_net, self._scalars(seed, spec.name))
         except DivergedError as error:
             return RunRecord(seed, spec.name, "diverged", str(error))
+
+    def _scalars(self, seed: int, name: str) -> Path | None:
+        return self.folder.scalars(seed, name) if self.tensorboard else None
 
     def _store(self, record: RunRecord) -> RunRecord:
         record.commit = self.commit

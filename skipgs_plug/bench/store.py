@@ -12,7 +12,7 @@ from skipgs_plug.trainer.files import write_aside, write_json
 
 
 class BenchFolder:
-    """Names and writes `settings.json`, `snapshots/`, `runs/` and `bench.json`."""
+    """Names and writes `settings.json`, `snapshots/`, `runs/`, `tb/` and `bench.json`."""
 
     def __init__(self, root: str | Path) -> None:
         self.root = Path(root)
@@ -40,6 +40,10 @@ class BenchFolder:
     def snapshot(self, seed: int) -> Path:
         """Return where the checkpoint of a densified seed lies."""
         return self.root / "snapshots" / f"seed{seed}.pt"
+
+    def scalars(self, seed: int, name: str) -> Path:
+        """Return where the TensorBoard scalars of a run, or of a seed's densification, lie."""
+        return self.root / "tb" / f"seed{seed}_{name}"
 
     def load(self, seed: int, policy: str) -> RunRecord | None:
         """Return a finished run, None when it has not finished yet."""

@@ -9,6 +9,8 @@ from typing import Annotated
 
 import tyro
 
+from skipgs_plug.bench.decisions import FILE as DECISIONS
+from skipgs_plug.bench.decisions import write_decisions
 from skipgs_plug.bench.plots import write_plots
 from skipgs_plug.bench.policies import POLICIES, check_policies
 from skipgs_plug.bench.result import build_result
@@ -48,6 +50,8 @@ class Args:
     policies: tuple[str, ...] = tuple(POLICIES)
     """What to compare; controls copy rate or time of gate."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
+    tensorboard: bool = False
+    """Log gsplat's scalars and the gate's counters of every run to OUT/tb; the clock stands meanwhile."""
     no_progress: bool = False
     """No progress bars."""
 
@@ -59,12 +63,13 @@ def main(argv: list[str]) -> int:
 
 
 def run(args: Args, command: str) -> list[Row]:
-    """Run what is missing, print the table, write bench.json, table.md and plots; returns the rows."""
+    """Run what is missing, print the table, write bench.json, decisions.json, table.md and plots; returns the rows."""
     check_policies(args.policies)
     config = dataclasses.replace(args.train, data_dir=args.scene, result_dir=args.out)
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts)
     folder = BenchFolder(args.out)
-    bench = Bench(scene, config, folder, args.seeds, args.policies, progress=not args.no_progress)
+    progress, tensorboard = not args.no_progress, args.tensorboard
+    bench = Bench(scene, config, folder, args.seeds, args.policies, progress=progress, tensorboard=tensorboard)
     print(
         f"{scene.name}: {len(args.seeds)} seeds x {len(args.policies)} policies, iterations to {config.max_steps:,}, "
         f"densification to {bench.refine_stop_iter:,}, backend {bench.backend.name}"
@@ -81,6 +86,7 @@ def run(args: Args, command: str) -> list[Row]:
     ]
     text = "\n\n".join(parts) + "\n"
     write_json(folder.root / "bench.json", result)
+    write_decisions(folder.root / DECISIONS, records)
     with write_aside(folder.root / "table.md") as temporary:
         temporary.write_text(text)
     write_plots(folder.root, records, rows, result["view_names"])

@@ -83,7 +83,7 @@ def refine(name: str, trainer: Trainer, folder: RunFolder, progress: bool) -> Re
     """Train to the end, gated if the name says so, and evaluate."""
     gate = SkipGate(trainer) if name == "gated" else None
     curve = Curve(name)
-    trainer.on_step = lambda step, view, loss: curve.add(step, loss, gate is not None and gate.skipped)
+    trainer.on_step = lambda it: curve.add(it.step, it.loss, gate is not None and gate.skipped)
     trainer.train(progress=progress)
     trainer.on_step = None
     stats = trainer.evaluate("test")

@@ -16,6 +16,7 @@ from skipgs_plug.core.report import write_report
 from skipgs_plug.trainer import InputError, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.metrics import require_lpips
 from skipgs_plug.trainer.run_folder import RunFolder
+from skipgs_plug.trainer.scalars import ScalarLog
 
 INTERRUPTED = 130
 
@@ -61,7 +62,7 @@ class Args:
     resume: bool = False
     """Continue from the last checkpoint in --out."""
     tensorboard: bool = False
-    """Log losses and gate counters to RUN/tb."""
+    """Log gsplat's scalars and the gate's counters to RUN/tb, every tenth iteration."""
     lpips_net: Literal["alex", "vgg"] | None = None
     """Also report LPIPS; its weights must be on this machine."""
     no_progress: bool = False
@@ -93,24 +94,27 @@ def run(args: Args) -> int:
         f"backend {trainer.backend.name}, iterations {trainer.step:,} to {trainer.max_steps:,}"
         + (f", gate active from {trainer.refine_stop_iter:,}" if gate is not None else ", no gate")
     )
-    with stop_on_interrupt(trainer), logging(args, folder, trainer, gate):
-        trainer.train(progress=not args.no_progress)
-    if trainer.step > 0:
-        folder.write_checkpoint(trainer)
-    if trainer.step < trainer.max_steps:
-        print(f"Stopped after iteration {trainer.step - 1:,}; the same command with --resume continues.")
-        return INTERRUPTED
-    finish(args, folder, trainer, gate)
+    more = gate.scalars if gate is not None else dict
+    with ScalarLog(folder.root / "tb", trainer, more) if args.tensorboard else contextlib.nullcontext() as log:
+        trainer.on_step = None if log is None else log.iteration
+        with stop_on_interrupt(trainer):
+            trainer.train(progress=not args.no_progress)
+        if trainer.step > 0:
+            folder.write_checkpoint(trainer)
+        if trainer.step < trainer.max_steps:
+            print(f"Stopped after iteration {trainer.step - 1:,}; the same command with --resume continues.")
+            return INTERRUPTED
+        finish(args, folder, trainer, gate, log)
     return 0
 
 
-def finish(args: Args, folder: RunFolder, trainer: Trainer, gate: SkipGate | None) -> None:
+def finish(args: Args, folder: RunFolder, trainer: Trainer, gate: SkipGate | None, log: ScalarLog | None) -> None:
     """Evaluate and write everything that a finished run leaves."""
     split: Literal["val", "train"] = "val" if trainer.scene.test else "train"
     stats = trainer.evaluate("test" if split == "val" else "train", args.lpips_net)
     folder.write_stats(trainer, stats, split)
-    if args.tensorboard:
-        log_evaluation(folder, trainer, stats, split)
+    if log is not None:
+        log.evaluation(stats, split)
     folder.write_renders(trainer, split)
     ply = folder.write_ply(trainer)
     if gate is not None:
@@ -123,16 +127,6 @@ def finish(args: Args, folder: RunFolder, trainer: Trainer, gate: SkipGate | Non
         f"PSNR {stats['psnr']:.2f} dB, SSIM {stats['ssim']:.4f} (torchmetrics padding){lpips} on {where}; "
         f"{stats['num_GS']:,} Gaussians; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s\n{ply}"
     )
-
-
-def log_evaluation(folder: RunFolder, trainer: Trainer, stats: dict[str, Any], split: str) -> None:
-    """Write the numbers of an evaluation as TensorBoard scalars, tagged as gsplat does: val/psnr and so on."""
-    from torch.utils.tensorboard import SummaryWriter
-
-    with SummaryWriter(str(folder.root / "tb")) as writer:
-        for name, value in stats.items():
-            if name in ("psnr", "ssim", "num_GS") or name.startswith("lpips"):
-                writer.add_scalar(f"{split}/{name}", value, trainer.step - 1)
 
 
 def gate_settings(options: GateOptions) -> dict[str, Any]:
@@ -159,27 +153,3 @@ def stop_on_interrupt(trainer: Trainer) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, previous)
-
-
-@contextlib.contextmanager
-def logging(args: Args, folder: RunFolder, trainer: Trainer, gate: SkipGate | None) -> Iterator[None]:
-    """Write TensorBoard scalars after every tenth iteration, if asked to."""
-    if not args.tensorboard:
-        yield
-        return
-    from torch.utils.tensorboard import SummaryWriter
-
-    with SummaryWriter(str(folder.root / "tb")) as writer:
-
-        def log(step: int, view: str, loss: float) -> None:
-            if step % 10 == 0:
-                writer.add_scalar("train/loss", loss, step)
-                writer.add_scalar("train/num_GS", len(trainer.splats["means"]), step)
-                for name, value in (gate.scalars() if gate is not None else {}).items():
-                    writer.add_scalar(name, value, step)
-
-        trainer.on_step = log
-        try:
-            yield
-        finally:
-            trainer.on_step = None

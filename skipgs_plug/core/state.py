@@ -32,9 +32,7 @@ def policy_state(state: Mapping[str, Any], release_warmup_end: int) -> dict[str,
     """
     if is_release_state(state):
         state = _from_release(state, release_warmup_end)
-    version = state.get("version")
-    if version != POLICY_VERSION:
-        raise SkipGSError(f"Gate state has version {version!r}, expected {POLICY_VERSION}; start the gate afresh.")
+    require_version(state, POLICY_VERSION)
     require(state, POLICY_KEYS, "Gate state")
     require(state["budget"], BUDGET_KEYS, "Gate state's budget")
     return dict(state)
@@ -46,12 +44,17 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         SkipGSError: Another version, or something is missing.
     """
-    version = state.get("version")
-    if version != GATE_VERSION:
-        raise SkipGSError(f"Gate state has version {version!r}, expected {GATE_VERSION}; start the gate afresh.")
+    require_version(state, GATE_VERSION)
     require(state, GATE_KEYS, "Gate state")
     require(state["stats"], STATS_KEYS, "Gate state's stats")
     return dict(state)
+
+
+def require_version(state: Mapping[str, Any], expected: int) -> None:
+    """Raise SkipGSError that names the version of a state when it is another."""
+    version = state.get("version")
+    if version != expected:
+        raise SkipGSError(f"Gate state has version {version!r}, expected {expected}; start the gate afresh.")
 
 
 def require(state: Mapping[str, Any], keys: tuple[str, ...], what: str) -> None:

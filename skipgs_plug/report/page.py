@@ -72,6 +72,9 @@ def bench_section(bench: BenchSource) -> list[str]:
         html.paragraphs(notes(rows, data)),
     ]
     parts += [html.picture(plots.inline_png(path), text) for path, text in bench.pictures]
+    if any(any(trace.skipped) for trace in bench.decisions.values()):
+        text = "Share of backwards skipped in the course of refinement, one curve per policy that skips."
+        parts.append(picture(plots.skips_over_time(bench.decisions), text))
     parts.append(html.table("Policies", ("policy", "meaning"), legend(rows), text=True))
     facts = {"command": data["command"], "commits": ", ".join(data["commits"]), **data["versions"]}
     parts.append(html.details("Command, machine, versions, settings", settings_table({**facts, **data["settings"]})))

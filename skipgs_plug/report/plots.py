@@ -1,15 +1,17 @@
-"""Pictures of one gated run, drawn from its skipgs.json."""
+"""Pictures of one gated run, drawn from its skipgs.json, and of a bench, drawn from its decisions."""
 
 from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skipgs_plug.bench.plots import SMALL, new_figure
+from skipgs_plug.bench.plots import SMALL, STYLE, new_figure
+from skipgs_plug.bench.record import Trace
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,6 +26,25 @@ REASON_COLOURS = {
     "pause": "#F0E442",
     "non-finite": "#000000",
 }
+
+
+def skips_over_time(traces: Mapping[tuple[int, str], Trace], parts: int = 25) -> Figure:
+    """Share of skipped backwards in equal parts of refinement, mean over seeds, for policies that skip."""
+    figure, axes = new_figure(9.0, 3.2)
+    for i, (policy, (colour, _)) in enumerate(STYLE.items()):
+        runs = [np.array(trace.skipped) for (_, name), trace in traces.items() if name == policy]
+        if not any(run.any() for run in runs):
+            continue
+        start = next(trace.start for (_, name), trace in traces.items() if name == policy)
+        edges = np.linspace(0, len(runs[0]), min(parts, len(runs[0])) + 1).round().astype(int)
+        shares = [[100 * part.mean() for part in np.split(run, edges[1:-1])] for run in runs]
+        width = 4.0 - 0.5 * i  # policies may agree: then the earlier one shows behind the later
+        axes.stairs(np.mean(shares, axis=0), start + edges, baseline=None, color=colour, linewidth=width, label=policy)
+    axes.set_ylim(-2, 102)
+    axes.set_xlabel("iteration")
+    axes.set_ylabel("backwards skipped (%)")
+    figure.legend(frameon=False, fontsize=SMALL, ncols=4, loc="outside upper center")
+    return figure
 
 
 def view_shares(views: list[dict[str, Any]]) -> Figure:

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from skipgs_plug.bench.decisions import FILE as DECISIONS
+from skipgs_plug.bench.decisions import read_decisions
+from skipgs_plug.bench.record import Trace
 from skipgs_plug.bench.result import KIND
 from skipgs_plug.bench.result import SCHEMA_VERSION as BENCH_VERSION
 from skipgs_plug.core.errors import SkipGSError
@@ -56,12 +59,13 @@ class RunSource:
 
 @dataclass
 class BenchSource:
-    """A bench: content of bench.json, and the pictures beside it with what they show."""
+    """A bench: content of bench.json, the pictures beside it with what they show, and its decisions if it has them."""
 
     name: str
     path: Path
     data: dict[str, Any]
     pictures: list[tuple[Path, str]]
+    decisions: dict[tuple[int, str], Trace] = field(default_factory=dict)
 
 
 def read_source(path: str | Path) -> RunSource | BenchSource:
@@ -87,7 +91,8 @@ def read_source(path: str | Path) -> RunSource | BenchSource:
     if data.get("kind") == KIND:
         require(file, data, BENCH_FIELDS, BENCH_VERSION)
         pictures = [(folder / p, text) for p, text in BENCH_PICTURES.items() if (folder / p).is_file()]
-        return BenchSource(name, folder, data, pictures)
+        decisions = read_decisions(folder / DECISIONS) if (folder / DECISIONS).is_file() else {}
+        return BenchSource(name, folder, data, pictures, decisions)
     require(file, data, RUN_FIELDS, RUN_VERSION)
     metrics, renders = last_evaluation(folder)
     return RunSource(name, folder, data, metrics, renders)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -32,6 +32,16 @@ class Stateful(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
+class Iteration(NamedTuple):
+    """What one iteration saw, for whoever looks on."""
+
+    step: int
+    view: str
+    loss: float
+    image: Tensor  # [H, W, 3], detached
+    target: Tensor  # [H, W, 3]
+
+
 class Trainer:
     """Trains one scene by the 3DGS recipe.
 
@@ -40,7 +50,7 @@ class Trainer:
         splats: raw parameters `means scales quats opacities sh0 shN`.
         optimizers: one per parameter, by the same names.
         refine_stop_iter: end of densification in iterations of this run.
-        on_step: called after every iteration, outside the clock, with (step, view name, loss).
+        on_step: called after every iteration, outside the clock.
         stop_requested: set it (from a signal handler, say) to end `train` after the current iteration.
     """
 
@@ -59,7 +69,7 @@ class Trainer:
         self.view_names = [view.name for view in scene.train]
         self.clock = TrainClock(self.backend.device)
         self.registered: dict[str, Stateful] = {}
-        self.on_step: Callable[[int, str, float], None] | None = None
+        self.on_step: Callable[[Iteration], None] | None = None
         self.stop_requested = False
         self._order = ViewOrder(len(scene.train), config.seed)
         self._sh_interval = config.scaled(config.sh_degree_interval)
@@ -127,7 +137,7 @@ class Trainer:
 
         self.step += 1
         if self.on_step is not None:
-            self.on_step(step, view.name, value)
+            self.on_step(Iteration(step, view.name, value, image.detach(), target))
         return value
 
     def backward(self, loss: Tensor, view: str, step: int) -> None:

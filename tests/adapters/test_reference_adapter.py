@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from always import Always
 
 from skipgs_plug import SkipGate, SkipGSError
-from skipgs_plug.core.decision import Decision
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.synthetic import make_scene
 
@@ -32,18 +32,6 @@ def parameters(trainer: Trainer) -> dict[str, torch.Tensor]:
 
 def equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return all(torch.equal(a[name], b[name]) for name in a)
-
-
-class Always:
-    def decide(self, view, loss, step) -> Decision:
-        return Decision(True, "always")
-
-    def notify_event(self, step, n_views) -> None: ...
-
-    def state_dict(self) -> dict:
-        return {}
-
-    def load_state_dict(self, state) -> None: ...
 
 
 def test_off_and_never_skipping_change_no_bit(trainer: Trainer) -> None:

@@ -4,25 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from always import Always
 
 from skipgs_plug import SkipGate
-from skipgs_plug.core.decision import Decision
 
 STEPS = 300
-
-
-class Always:
-    """Skips every gated backward."""
-
-    def decide(self, view, loss, step) -> Decision:
-        return Decision(True, "always")
-
-    def notify_event(self, step, n_views) -> None: ...
-
-    def state_dict(self) -> dict:
-        return {}
-
-    def load_state_dict(self, state) -> None: ...
 
 
 def equal(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from always import Always
 
 from skipgs_plug import AdapterMismatchError, GateOrderError, SkipGate, SkipGSError, UnknownTrainerError
 from skipgs_plug.adapters.base import AbstractAdapter
-from skipgs_plug.core.decision import Decision
 
 
 class ToyTrainer:
@@ -70,22 +70,6 @@ class Toy(AbstractAdapter):
 
     def optimizers(self):
         return [self.trainer.optimizer]
-
-
-class Always:
-    def __init__(self) -> None:
-        self.asked: list[int] = []
-
-    def decide(self, view, loss, step) -> Decision:
-        self.asked.append(step)
-        return Decision(True, "always")
-
-    def notify_event(self, step, n_views) -> None: ...
-
-    def state_dict(self) -> dict:
-        return {}
-
-    def load_state_dict(self, state) -> None: ...
 
 
 def attach(trainer: ToyTrainer, **settings) -> SkipGate:

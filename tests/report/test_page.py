@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 
 import pytest
 from report_browser import body_count
@@ -40,7 +41,8 @@ def test_browser_shows_a_bench(bench_folder, tmp_path, dump_dom):
     assert all(len(row) == len(rows[0]) > 8 for row in rows)
     assert [row[0] for row in rows_of(dom, "Share of refinement time")] == ["ungated", "gate", "random"]
     assert "A perfect gate at this skip rate could save" in dom
-    assert body_count(dom, "images") == body_count(dom, "decoded") == 5
+    assert "Share of backwards skipped in the course of refinement" in dom
+    assert body_count(dom, "images") == body_count(dom, "decoded") == 6
 
 
 def test_browser_shows_the_run_of_an_upstream_script(script_folder, tmp_path, dump_dom):
@@ -54,7 +56,7 @@ def test_browser_shows_the_run_of_an_upstream_script(script_folder, tmp_path, du
 def test_browser_compares_several_runs(train_folder, script_folder, bench_folder, tmp_path, dump_dom):
     dom = dump_dom(make_page(tmp_path, train_folder, script_folder, bench_folder))
     assert [row[0] for row in rows_of(dom, "All runs")] == ["gated", "output &amp; &lt;model&gt;"]
-    assert body_count(dom, "images") == body_count(dom, "decoded") == 13
+    assert body_count(dom, "images") == body_count(dom, "decoded") == 14
 
 
 def test_page_loads_nothing_from_elsewhere(train_folder, bench_folder, tmp_path):
@@ -101,6 +103,15 @@ def test_unusable_input_is_one_sentence(tmp_path, capsys, content, sentence):
     error = capsys.readouterr().err.strip()
     assert sentence in error and "skipgs.json" in error and len(error.splitlines()) == 1
     assert not (tmp_path / "page.html").exists()
+
+
+def test_a_bench_without_decisions_is_shown_and_damaged_ones_are_named(bench_folder, tmp_path, capsys):
+    folder = tmp_path / "copy"
+    shutil.copytree(bench_folder, folder, ignore=shutil.ignore_patterns("decisions.json", "snapshots"))
+    assert "in the course of refinement" not in make_page(tmp_path, folder).read_text()
+    (folder / "decisions.json").write_text("{}")
+    assert main(["report", str(folder)]) == 2
+    assert "decisions.json holds no decisions" in capsys.readouterr().err
 
 
 def test_an_unfinished_bench_is_named_as_such(tmp_path, capsys):

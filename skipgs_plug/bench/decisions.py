@@ -1,0 +1,79 @@
+"""decisions.json: every decision of every run, small enough to be kept beside the results.
+
+    {"kind": "skipgs-decisions", "schema_version": 1, "start": 1500,
+     "views": {"0": "12 3 15 ..."},                          by seed: index of the view of each iteration
+     "runs": {"0": {"ungated": "-1500", "gate": "w34dD3b"}}}  by seed and policy: letters, each with its repetitions
+
+The letters are those of REASON_CODES; upper case means that the backward was skipped. All policies of a seed see the
+same views in the same order, a shortened run only the first of them. What is left out of a trace are losses and means.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from skipgs_plug.bench.record import RunRecord, Trace
+from skipgs_plug.trainer import InputError
+from skipgs_plug.trainer.files import write_json
+
+FILE = "decisions.json"
+KIND = "skipgs-decisions"
+SCHEMA_VERSION = 1
+
+
+def write_decisions(path: Path, records: Sequence[RunRecord]) -> None:
+    """Write the decisions of all runs that finished."""
+    views: dict[int, list[int]] = {}
+    runs: dict[int, dict[str, str]] = {}
+    start = None
+    for record in records:
+        if record.status == "done" and record.trace is not None:
+            start = record.trace.start
+            views[record.seed] = max(views.get(record.seed, []), record.trace.view, key=len)
+            runs.setdefault(record.seed, {})[record.policy] = packed(record.trace.codes)
+    orders = {seed: " ".join(map(str, order)) for seed, order in views.items()}
+    content = {"kind": KIND, "schema_version": SCHEMA_VERSION, "start": start, "views": orders, "runs": runs}
+    write_json(path, content)
+
+
+def read_decisions(path: Path) -> dict[tuple[int, str], Trace]:
+    """Return traces without losses and means, by seed and policy.
+
+    Raises:
+        InputError: the file is damaged or of another version; names it.
+    """
+    try:
+        content: dict[str, Any] = json.loads(path.read_text())
+        if content["kind"] != KIND or content["schema_version"] != SCHEMA_VERSION:
+            raise ValueError(f"kind {content['kind']!r}, schema version {content['schema_version']!r}")
+        traces = {}
+        for seed, runs in content["runs"].items():
+            order = [int(index) for index in content["views"][seed].split()]
+            for policy, letters in runs.items():
+                codes = unpacked(letters)
+                traces[int(seed), policy] = Trace(content["start"], order[: len(codes)], codes=codes)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path} holds no decisions that can be read ({error}); repeat its bench.") from error
+    return traces
+
+
+def packed(codes: str) -> str:
+    """Return letters with the number of times that each stands in a row, left out when it is one."""
+    runs = ((letter, len(list(same))) for letter, same in groupby(codes))
+    return "".join(letter if count == 1 else f"{letter}{count}" for letter, count in runs)
+
+
+def unpacked(letters: str) -> str:
+    """Undo `packed`.
+
+    Raises:
+        ValueError: it is not such a string.
+    """
+    if not re.fullmatch(r"([a-zA-Z-]\d*)*", letters):
+        raise ValueError("letters and repetitions are mixed up")
+    return re.sub(r"(.)(\d+)", lambda run: run[1] * int(run[2]), letters)

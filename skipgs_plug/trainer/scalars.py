@@ -1,0 +1,73 @@
+"""TensorBoard scalars of a run, with the tags of gsplat's examples/simple_trainer.py."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from skipgs_plug.trainer.loop import Iteration, Trainer
+
+EVERY = 10  # iterations between two points of a curve
+METRICS = ("psnr", "ssim", "lpips", "num_GS")
+
+
+class ScalarLog:
+    """Writes what a trainer does into a folder that TensorBoard reads.
+
+    A folder in which an earlier run got further is continued: TensorBoard drops what that run wrote from this
+    iteration on.
+
+    Args:
+        more: asked for further scalars with their own tags, at each iteration that is written.
+    """
+
+    def __init__(self, folder: Path, trainer: Trainer, more: Callable[[], Mapping[str, float]] = dict) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._trainer, self._more = trainer, more
+        self._writer = SummaryWriter(str(folder), purge_step=trainer.step)
+
+    def iteration(self, iteration: Iteration) -> None:
+        """Write `train/loss l1loss ssimloss num_GS mem` of every tenth iteration; may serve as `Trainer.on_step`."""
+        if iteration.step % EVERY:
+            return
+        trainer, image, target = self._trainer, iteration.image, iteration.target
+        with torch.no_grad():  # the parts of the loss that the trainer computes in one go
+            l1, ssim = (float(trainer.backend.loss(image, target, weight)) for weight in (0.0, 1.0))
+        scalars = {"loss": iteration.loss, "l1loss": l1, "ssimloss": ssim, "num_GS": len(trainer.splats["means"])}
+        memory = peak_memory(trainer.backend.device)
+        if memory is not None:
+            scalars["mem"] = memory / 2**30
+        self._write({f"train/{name}": value for name, value in scalars.items()} | dict(self._more()), iteration.step)
+
+    def evaluation(self, stats: Mapping[str, Any], split: str = "val") -> None:
+        """Write `val/psnr ssim lpips num_GS` of an evaluation; gsplat's tags do not name the flavour of LPIPS."""
+        tags = {name: "lpips" if name.startswith("lpips_") else name for name in stats}
+        shown = {f"{split}/{tag}": stats[name] for name, tag in tags.items() if tag in METRICS}
+        self._write(shown, self._trainer.step - 1)
+
+    def _write(self, scalars: Mapping[str, float], step: int) -> None:
+        for tag, value in scalars.items():
+            self._writer.add_scalar(tag, value, step)
+
+    def __enter__(self) -> ScalarLog:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._writer.close()
+
+
+def peak_memory(device: torch.device) -> int | None:
+    """Return the most bytes in use so far: torch's on the GPU, else the process's; None on Windows."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
