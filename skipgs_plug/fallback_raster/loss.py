@@ -7,8 +7,9 @@ the difference d = x - y of the images, with means m, variances v and covariance
     structure  1 - (2 c + C2) / (v_x + v_y + C2)           = v_d   / (v_x + v_y + C2)
 
 so that 1 - SSIM and its gradient come out of small numbers instead of differences of large ones. Every tile also
-subtracts one of its own pixels before it squares, because E[x^2] - E[x]^2 loses digits in float32 where an image is
-bright and flat.
+subtracts a row of its own before it squares, because E[x^2] - E[x]^2 loses digits in float32 where an image is
+bright and flat. For the same reason the parts of the gradient count x from 0.5 and d from its mean: where both images
+are flat they are thousands of times larger than their sum.
 
 Images stay channels-last, as the rasterizer returns them: a blur along a row is a blur with stride C over a flat
 row. A tile is 128 floats wide and 32 rows high; a ring of its last 11 blurred rows stays in the first-level cache.
@@ -40,6 +41,14 @@ _TILE = """
     const int first_vector = item % chunks * 8, last_vector = smaller(first_vector + 8, vectors);
     const long long start = (long long)(item / chunks / bands) * height;  // first row of this image
     const float *x = image + start * span, *y = target + start * span;
+    const float* offset = offsets + (long long)(item / chunks / bands) * 16 * vectors;
+    // Floats `i` to `i + 15` of a row that may end before.
+    auto piece = [&](const float* row, int i) -> v16 {
+        if (i + 16 <= span) return load(row + i);
+        v16 a = (v16)0.0f;
+        for (int j = 0; i + j < span; ++j) a[j] = row[i + j];
+        return a;
+    };
 """
 _ITEMS = "images * ((height + 31) / 32) * (((width * channels + 15) / 16 + 7) / 8)"
 
@@ -50,6 +59,12 @@ def _tiles(images: int, height: int, width: int, channels: int) -> int:
 
 def _pitch(width: int, channels: int) -> int:
     return -(-width * channels // 16) * 16 + 2 * (-(-5 * channels // 16) * 16)
+
+
+def _offsets(image: Tensor, target: Tensor, images: int, height: int, width: int, channels: int) -> Tensor:
+    """The mean difference of each channel, along a row of floats; every eighth pixel tells it well enough."""
+    some_x, some_y = (t.view(images, height, width, channels)[:, ::8, ::8] for t in (image, target))
+    return (some_x - some_y).mean((1, 2)).repeat(1, width + 16)[:, : -(-width * channels // 16) * 16].contiguous()
 
 
 @worker(
@@ -66,13 +81,13 @@ for (int item = first; item < last; ++item) {
     for (int row = top - 5; row < bottom + 5; ++row) {
         for (int vector = first_vector; vector < last_vector; ++vector) {
             const int i = 16 * vector;
-            const float shift_x = x[middle + i], shift_y = y[middle + i], shift_d = shift_x - shift_y;
+            const v16 shift_x = piece(x + middle, i), shift_y = piece(y + middle, i), shift_d = shift_x - shift_y;
             v16* out = ring[(row + 11) % 11][vector - first_vector];
             if (row < 0 || row >= height) {  // black
-                out[0] = (v16)-shift_x;
-                out[1] = (v16)-shift_d;
-                out[2] = (v16)(shift_x * shift_x + shift_y * shift_y);
-                out[3] = (v16)(shift_d * shift_d);
+                out[0] = -shift_x;
+                out[1] = -shift_d;
+                out[2] = shift_x * shift_x + shift_y * shift_y;
+                out[3] = shift_d * shift_d;
                 continue;
             }
             const float *px = x + (long long)row * span + i - reach, *py = y + (long long)row * span + i - reach;
@@ -109,7 +124,7 @@ for (int item = first; item < last; ++item) {
         const bool row_counts = !valid || (centre >= 5 && centre < height - 5);
         for (int vector = first_vector; vector < last_vector; ++vector) {
             const int i = 16 * vector;
-            const float shift_x = x[middle + i], shift_d = shift_x - y[middle + i];
+            const v16 shift_x = piece(x + middle, i), shift_d = shift_x - piece(y + middle, i);
             v16 blur[4] = {(v16)0.0f, (v16)0.0f, (v16)0.0f, (v16)0.0f};
             for (int k = 0; k < 11; ++k)
                 for (int m = 0; m < 4; ++m) blur[m] += w[k] * line[k][4 * (vector - first_vector) + m];
@@ -124,10 +139,10 @@ for (int item = first; item < last; ++item) {
             const v16 luminance = mean_d * mean_d * b1, structure = variance_d * b2;
             unlike += counts ? luminance + (1.0f - luminance) * structure : (v16)0.0f;
             if (!with_gradient) continue;
-            // The gradient of 1 - SSIM is blur(rest) + d blur(slope_d) + x blur(slope_x).
+            // The gradient of 1 - SSIM is blur(rest) + (d - offset) blur(slope_d) + (x - 0.5) blur(slope_x).
             const v16 slope_d = 2.0f * b2 * (1.0f - luminance), slope_x = -structure * slope_d;
             const v16 rest = 2.0f * (1.0f - structure) * b1 * mean_d * (1.0f - mean_x * mean_d * b1)
-                           - mean_d * slope_d - (mean_x - 0.5f) * slope_x;
+                           - (mean_d - load(offset + i)) * slope_d - (mean_x - 0.5f) * slope_x;
             float* out = slopes + (start + centre) * 3 * pitch + margin + i;
             store(out, counts ? rest : (v16)0.0f);
             store(out + pitch, counts ? slope_d : (v16)0.0f);
@@ -149,6 +164,7 @@ for (int item = first; item < last; ++item) {
 def compare_tiles(
     image: FloatArray,  # [B, H, W, C]
     target: FloatArray,  # [B, H, W, C]
+    offsets: FloatArray,  # [B, 16 ceil(W C / 16)], a value of d for every float of a row
     slopes: FloatArray,  # out [B, H, 3, pitch], only written with_gradient
     sums: FloatArray,  # out [tiles, 2], |image - target| and 1 - SSIM summed over each tile
     images: int,  # B
@@ -187,20 +203,12 @@ for (int item = first; item < last; ++item) {
             v16 blur[3] = {(v16)0.0f, (v16)0.0f, (v16)0.0f};
             for (int k = 0; k < 11; ++k)
                 for (int m = 0; m < 3; ++m) blur[m] += w[k] * line[k][3 * (vector - first_vector) + m];
-            const long long at = (long long)centre * span + i;
-            v16 a = (v16)0.0f, b = a;
-            if (i + 16 <= span) {
-                a = load(x + at);
-                b = load(y + at);
-            } else {
-                for (int j = 0; i + j < span; ++j) {
-                    a[j] = x[at + j];
-                    b[j] = y[at + j];
-                }
-            }
-            const v16 d = a - b, sign = d > 0.0f ? (v16)1.0f : (d < 0.0f ? (v16)-1.0f : (v16)0.0f);
-            const v16 v = l1_weight * sign + ssim_weight * (blur[0] + d * blur[1] + (a - 0.5f) * blur[2]);
-            float* out = gradient + start * span + at;
+            const long long row_start = (long long)centre * span;
+            const v16 a = piece(x + row_start, i), d = a - piece(y + row_start, i);
+            const v16 sign = d > 0.0f ? (v16)1.0f : (d < 0.0f ? (v16)-1.0f : (v16)0.0f);
+            const v16 v_unlike = blur[0] + (d - load(offset + i)) * blur[1] + (a - 0.5f) * blur[2];
+            const v16 v = l1_weight * sign + ssim_weight * v_unlike;
+            float* out = gradient + start * span + row_start + i;
             if (i + 16 <= span) store(out, v);
             else for (int j = 0; i + j < span; ++j) out[j] = v[j];
         }
@@ -213,6 +221,7 @@ for (int item = first; item < last; ++item) {
 def gradient_tiles(
     image: FloatArray,  # [B, H, W, C]
     target: FloatArray,  # [B, H, W, C]
+    offsets: FloatArray,  # [B, 16 ceil(W C / 16)], a value of d for every float of a row
     slopes: FloatArray,  # [B, H, 3, pitch]
     gradient: FloatArray,  # out [B, H, W, C]
     images: int,
@@ -233,13 +242,14 @@ class _L1Ssim(torch.autograd.Function):
         with_gradient = ctx.needs_input_grad[0]
         slopes = scratch("ssim_slopes", images * height * 3 if with_gradient else 0, _pitch(width, channels))
         sums = torch.empty(_tiles(*size), 2)
-        compare_tiles(image, target, slopes, sums, *size, int(valid), int(with_gradient))
+        offsets = _offsets(image, target, *size) if with_gradient else torch.empty(0)
+        compare_tiles(image, target, offsets, slopes, sums, *size, int(valid), int(with_gradient))
         border = WINDOW - 1 if valid else 0
         windows = images * (height - border) * (width - border) * channels
         weights = ((1.0 - ssim_lambda) / image.numel(), ssim_lambda / windows)
         gradient = torch.empty(image.shape if with_gradient else 0)
         if with_gradient:
-            gradient_tiles(image, target, slopes, gradient, *size, *weights)
+            gradient_tiles(image, target, offsets, slopes, gradient, *size, *weights)
         ctx.save_for_backward(gradient)
         # Tiles were summed in float32; adding them in float64, in a fixed order, keeps the last digits of the mean.
         l1, unlike = sums.sum(dim=0, dtype=torch.float64)
