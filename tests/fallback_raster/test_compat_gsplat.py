@@ -35,6 +35,15 @@ def test_relocation_is_equation_nine():
     assert torch.equal(column[:, 0], new_opacities) and torch.equal(scales_of_column, new_scales)
 
 
+def test_relocation_keeps_opacities_visible():
+    opacities, scales, twice = torch.tensor([0.004, 0.8]), torch.ones(2, 3), torch.tensor([2, 2])
+    free, _ = compute_relocation(opacities, scales, twice, binomials(51))
+    kept, grown = compute_relocation(opacities, scales, twice, binomials(51), min_opacity=0.005)
+    assert free[0] < 0.005 and kept.tolist() == [pytest.approx(0.005), free[1].item()]
+    # Equation 9 for two copies of opacity a: 2 a - a^2 / sqrt(2).
+    assert grown[0, 0].item() == pytest.approx(0.004 / (2 * 0.005 - 0.005**2 / math.sqrt(2)), rel=1e-4)
+
+
 def test_covariance_and_precision_are_gsplats_own_formula():
     from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
 
