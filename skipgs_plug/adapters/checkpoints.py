@@ -85,7 +85,7 @@ class Checkpoints:
         for path in self._found:
             content = _read(path)
             if content["gate"]["step"] == first - 1 and {name: content[name] for name in self._run} == self._run:
-                _say(f"The gate goes on from {path}.")
+                _say(f"The gate takes its state from {path}.")
                 return content["gate"]
             refused = (
                 f"The gate starts afresh: {path} is of {content['script']} and iteration {content['gate']['step']}, "

@@ -61,7 +61,7 @@ class Args:
     """Name of the trainer: inria, fastgs, taming, ..."""
     gate: tyro.conf.OmitArgPrefixes[GateOptions] = dataclasses.field(default_factory=GateOptions)
     resume_gate: str = "auto"
-    """State the gate goes on from: auto (the one beside the checkpoint the script loads), off, or a path."""
+    """State the gate goes on from: auto (the one beside the checkpoint the script loads), off (afresh), or a path."""
     no_gate: bool = False
     """Change nothing in training; skipgs.json then holds the seconds of the ungated run."""
     cpu: bool = False

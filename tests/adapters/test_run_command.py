@@ -197,7 +197,7 @@ def test_gate_goes_on_with_the_scripts_own_checkpoint(train, capfd):
     _, whole = train("whole", "--save")
     state = whole / "chkpnt40.pth.skipgs.json"
     code, resumed = train("resumed", "--start", str(whole / "chkpnt40.pth"))
-    assert code == 0 and f"The gate goes on from {state}." in capfd.readouterr().err
+    assert code == 0 and f"The gate takes its state from {state}." in capfd.readouterr().err
     assert counted(resumed) == counted(whole)
     models = [torch.load(folder / "model.pth", weights_only=False) for folder in (whole, resumed)]
     assert all(torch.equal(a, b) for a, b in zip(*models, strict=True))
