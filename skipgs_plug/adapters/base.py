@@ -27,6 +27,8 @@ class AbstractAdapter(ABC):
     Attributes:
         name: how users call it.
         checked: upstream version or commit that it was checked with, and how; part of error messages.
+        saved_state: gives the state of the gate that belongs to the checkpoint which the trainer goes on from,
+            if any; asked once, with the first iteration.
     """
 
     name: ClassVar[str]
@@ -34,6 +36,7 @@ class AbstractAdapter(ABC):
 
     def __init__(self, trainer: Any = None) -> None:
         self.trainer = trainer
+        self.saved_state: Callable[[int], dict[str, Any] | None] | None = None
 
     @classmethod
     @abstractmethod

@@ -70,7 +70,7 @@ REPLACED: dict[str, Any] = {
 def cuda_on_cpu() -> Iterator[None]:
     """Redirect CUDA to the CPU inside the block, in this thread."""
     # Optimizers load dynamo, which lists the functions of torch.cuda once and trips over replaced ones.
-    importlib.import_module("torch._dynamo")
+    dynamo = importlib.import_module("torch._dynamo")
     missing = object()
     before = {name: getattr(torch.cuda, name, missing) for name in REPLACED}
     load = torch.load
@@ -78,7 +78,8 @@ def cuda_on_cpu() -> Iterator[None]:
         setattr(torch.cuda, name, stand_in)
     torch.load = _load_on_cpu(load)
     try:
-        with _CpuPlacement():
+        # A compiler that believes in CUDA asks for its random state; uncompiled functions give the same.
+        with _CpuPlacement(), dynamo.config.patch(disable=True):
             yield
     finally:
         torch.load = load

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib.metadata
 import importlib.util
 import runpy
 import sys
@@ -10,7 +11,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -25,47 +26,70 @@ def run_script(command: Sequence[str], attach: Callable[[], None] | None = None)
 
     Args:
         command: What would follow `python`: a script and its arguments, or `-m`, a module and its arguments.
+            Or the name of a command that an installed package brings, such as `ns-train`, and its arguments.
         attach: Called where the script would be: its folder is on `sys.path`, nothing of it is imported.
 
     Raises:
         SkipGSError: There is no such script or module, or a module of the script's checkout was imported
             before from somewhere else.
     """
-    script, arguments, run = _resolve(command)
-    first_on_path = Path.cwd() if command[0] == "-m" else script.parent
-    with _as_main_program(script, arguments, first_on_path), _whole_checkpoints():
+    program = _resolve(command)
+    with _as_main_program(program), _whole_checkpoints():
         if attach is not None:
             attach()
         try:
-            run()
+            program.run()
         except SystemExit as stop:
             return _exit_code(stop.code)
         except SkipGSError:
             raise
         except BaseException as error:
-            _print_traceback(error, script)
+            _print_traceback(error, program.source)
             return 130 if isinstance(error, KeyboardInterrupt) else 1
     return 0
 
 
-def _resolve(command: Sequence[str]) -> tuple[Path, Sequence[str], Callable[[], Any]]:
+class _Program(NamedTuple):
+    argv: list[str]
+    folder: Path  # first on sys.path
+    source: Path  # whose frames the traceback begins with
+    run: Callable[[], Any]
+
+
+def _resolve(command: Sequence[str]) -> _Program:
     if not command or list(command) == ["-m"]:
         raise SkipGSError("There is no script to run: name it after '--', for example -- train.py -s data.")
-    if command[0] == "-m":
-        name = command[1]
-        try:
-            found = importlib.util.find_spec(name)
-        except ModuleNotFoundError:  # its package is not there either
-            found = None
-        if found is None or found.origin is None:
+    name, arguments = command[0], list(command[1:])
+    if name == "-m":
+        name, *arguments = arguments
+        source = _source_of(name)
+        if source is None:
             raise SkipGSError(f"There is no module {name}: install it, or name a training script after '--'.")
         run = functools.partial(runpy.run_module, name, run_name="__main__")
-        return Path(found.origin).resolve(), command[2:], run
-    script = Path(command[0]).resolve()
-    if not script.is_file():
-        raise SkipGSError(f"There is no script {script}: name the training script after '--'.")
-    _refuse_shadowed_modules(script.parent)
-    return script, command[1:], functools.partial(runpy.run_path, str(script), run_name="__main__")
+        return _Program([str(source), *arguments], Path.cwd(), source, run)
+    script = Path(name).resolve()
+    if script.is_file():
+        _refuse_shadowed_modules(script.parent)
+        run = functools.partial(runpy.run_path, str(script), run_name="__main__")
+        return _Program([str(script), *arguments], script.parent, script, run)
+    for installed in importlib.metadata.entry_points(group="console_scripts", name=name):
+        folder = Path(sys.executable).parent
+        source = _source_of(installed.module) or folder / name
+        return _Program([str(folder / name), *arguments], folder, source, functools.partial(_call, installed))
+    raise SkipGSError(f"There is no script {script}: name the training script after '--'.")
+
+
+def _call(installed: importlib.metadata.EntryPoint) -> None:
+    sys.exit(installed.load()())
+
+
+def _source_of(module: str) -> Path | None:
+    """File of a module that is not imported for it, though its packages are."""
+    try:
+        found = importlib.util.find_spec(module)
+    except ModuleNotFoundError:  # its package is not there either
+        return None
+    return None if found is None or found.origin is None else Path(found.origin).resolve()
 
 
 def _exit_code(code: Any) -> int:
@@ -75,10 +99,10 @@ def _exit_code(code: Any) -> int:
     return 1
 
 
-def _print_traceback(error: BaseException, script: Path) -> None:
+def _print_traceback(error: BaseException, source: Path) -> None:
     """As the interpreter prints it: from the script's own first frame on."""
     trace = error.__traceback__
-    while trace is not None and trace.tb_frame.f_code.co_filename != str(script):
+    while trace is not None and trace.tb_frame.f_code.co_filename != str(source):
         trace = trace.tb_next
     traceback.print_exception(type(error), error, trace or error.__traceback__)
 
@@ -94,10 +118,10 @@ def _refuse_shadowed_modules(checkout: Path) -> None:
 
 
 @contextmanager
-def _as_main_program(script: Path, arguments: Sequence[str], first_on_path: Path) -> Iterator[None]:
+def _as_main_program(program: _Program) -> Iterator[None]:
     argv, path, stdout = sys.argv, list(sys.path), sys.stdout
-    sys.argv = [str(script), *arguments]
-    sys.path.insert(0, str(first_on_path))
+    sys.argv = program.argv
+    sys.path.insert(0, str(program.folder))
     try:
         yield
     finally:

@@ -24,7 +24,7 @@ class Nerfstudio(AbstractAdapter):
     """
 
     name = "nerfstudio"
-    checked = "nerfstudio-project/nerfstudio 50e0e3c7, by its look-alike only"
+    checked = "nerfstudio-project/nerfstudio 50e0e3c7 (1.1.5)"
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)

@@ -14,6 +14,7 @@ import tyro
 
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.checkpoints import Checkpoints
 from skipgs_plug.adapters.cuda_redirect import cuda_on_cpu
 from skipgs_plug.adapters.launch import run_script
 from skipgs_plug.adapters.registry import get_adapter
@@ -59,6 +60,8 @@ class Args:
     adapter: tyro.conf.Positional[str]
     """Name of the trainer: inria, fastgs, taming, ..."""
     gate: tyro.conf.OmitArgPrefixes[GateOptions] = dataclasses.field(default_factory=GateOptions)
+    resume_gate: str = "auto"
+    """State the gate goes on from: auto (the one beside the checkpoint the script loads), off (afresh), or a path."""
     no_gate: bool = False
     """Change nothing in training; skipgs.json then holds the seconds of the ungated run."""
     cpu: bool = False
@@ -89,14 +92,19 @@ def run(args: Args, command: list[str]) -> int:
         SkipGSError: The script cannot be run or gated, or did not train.
     """
     adapter = get_adapter(args.adapter)()
+    checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
     gates: list[SkipGate] = []
 
     def attach() -> None:
+        if not args.no_gate:
+            adapter.saved_state = checkpoints.state_for
         gates.append(SkipGate(adapter=adapter, **gate_settings(args)))
+        checkpoints.gate = gates[0]
 
     with cpu_instead_of_cuda(args, command) if args.cpu else contextlib.nullcontext():
         try:
-            code = run_script(command, attach)
+            with checkpoints.watch():
+                code = run_script(command, attach)
         finally:
             for gate in gates:
                 gate.detach()
@@ -104,6 +112,11 @@ def run(args: Args, command: list[str]) -> int:
     if code == 0:
         gates[0].verify()
     return code
+
+
+def script_name(command: Sequence[str]) -> str:
+    """What is run, whatever folder it lies in."""
+    return next((Path(word).name for word in command if word != "-m"), "")
 
 
 def gate_settings(args: Args) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from skipgs_plug.core.errors import GateOrderError, SkipGSError
 from skipgs_plug.core.nonfinite import NonFiniteGuard
 from skipgs_plug.core.optimizers import OptimizerSteps
 from skipgs_plug.core.policy import Policy, SkipPolicy
+from skipgs_plug.core.scene_check import SceneCheck
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.core.trace import TraceRow
@@ -59,6 +60,8 @@ class Engine:
         self._view_names: list[str] | None = None
         self._pending_state: dict[str, Any] | None = None
         self._ranks_checked = False
+        self._asked_for_state = False
+        self._scene_check = SceneCheck()
 
     def configure(
         self,
@@ -144,6 +147,12 @@ class Engine:
         Raises:
             GateOrderError: It lies before the previous one.
         """
+        if self.step is None and not self._asked_for_state:
+            self._asked_for_state = True
+            saved_state = getattr(self.adapter, "saved_state", None)
+            state = None if saved_state is None else saved_state(step)
+            if state is not None:
+                self.load_state_dict(state)
         if self.step is not None and step < self.step:
             raise GateOrderError(
                 f"Iterations went back from {self.step} to {step}: load the gate state that belongs to "
@@ -186,6 +195,7 @@ class Engine:
         if not self.config.enabled or step < self.start - 1:
             return
         self.stats.events[kind] = self.stats.events.get(kind, 0) + 1
+        self._scene_check.stop()
         self.policy.notify_event(step, self.n_views)
         self.steps.accumulator.reset(stepped=False)
 
@@ -228,6 +238,7 @@ class Engine:
             self._guard.in_a_row = state["non_finite_in_a_row"]
             self.clock.load_state_dict(state["clock"])
             self.step = state["step"]
+        self._scene_check.start()
         self._forget_iteration()
 
     def _forget_iteration(self) -> None:
@@ -260,6 +271,8 @@ class Engine:
         self._guard.in_a_row = 0
         if self.adapter is not None and self.adapter.must_run(step):
             return decision.FORCED
+        if self._scene_check.running:
+            self._scene_check.see(loss, self.mean(view), step)
         return self.policy.decide(view, loss, step)
 
     def _refuse_other_scene(self, views: Iterable[Any]) -> None:

@@ -63,12 +63,16 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
 
 
 def write_report(gate: SkipGate, path: str | Path) -> None:
-    """Write `gate.report()` as JSON: aside first, then renamed, so that no half a file is ever seen."""
-    path = Path(path)
+    """Write `gate.report()` as JSON."""
+    write_aside(Path(path), json.dumps(_finite(gate.report()), indent=2, allow_nan=False) + "\n")
+
+
+def write_aside(path: Path, text: str) -> None:
+    """Write a file aside first, then rename it, so that no half a file is ever seen."""
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        aside.write_text(json.dumps(_finite(gate.report()), indent=2, allow_nan=False) + "\n")
+        aside.write_text(text)
         os.replace(aside, path)
     finally:
         aside.unlink(missing_ok=True)

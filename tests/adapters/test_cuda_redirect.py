@@ -81,6 +81,17 @@ def test_optimizers_run_inside():
     assert (parameter < 1).all()
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # PyTorch's own, on loading its compiler
+def test_compiled_functions_run_uncompiled():
+    @torch.compile
+    def doubled(values):
+        assert not torch.compiler.is_compiling()
+        return 2 * values
+
+    with cuda_on_cpu():
+        assert doubled(torch.ones(2, device="cuda")).tolist() == [2.0, 2.0]
+
+
 @pytest.mark.parametrize("fails", [False, True])
 def test_everything_is_back_afterwards(fails):
     missing = object()

@@ -17,7 +17,8 @@ def checkout(tmp_path, monkeypatch):
     (folder / "neighbour_of_script").mkdir(parents=True)
     (folder / "neighbour_of_script" / "__init__.py").write_text("VALUE = 'own'\n")
     yield folder
-    sys.modules.pop("neighbour_of_script", None)
+    for name in ("neighbour_of_script", "neighbour_of_script.train"):
+        sys.modules.pop(name, None)
 
 
 def write(checkout, body):
@@ -96,6 +97,34 @@ def test_a_module_is_run_as_python_does_with_m(checkout, monkeypatch, capfd):
     monkeypatch.syspath_prepend(checkout)
     assert run_script(["-m", "neighbour_of_script.train", "-i", "3"]) == 0
     assert capfd.readouterr().out == "own __main__ ['-i', '3']\n"
+
+
+@pytest.fixture
+def installed(checkout, monkeypatch):
+    """A package on the path that brings the command `train-neighbour`."""
+    facts = checkout / "neighbour_of_script-1.0.dist-info"
+    facts.mkdir()
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: neighbour-of-script\nVersion: 1.0\n")
+    (facts / "entry_points.txt").write_text("[console_scripts]\ntrain-neighbour = neighbour_of_script.train:entry\n")
+    monkeypatch.syspath_prepend(checkout)
+    return checkout / "neighbour_of_script" / "train.py"
+
+
+def test_an_installed_command_is_run_by_its_name(installed, capfd):
+    installed.write_text("import os, sys\ndef entry():\n    print(os.path.basename(sys.argv[0]), sys.argv[1:])\n")
+    assert run_script(["train-neighbour", "-i", "3"]) == 0
+    assert capfd.readouterr().out == "train-neighbour ['-i', '3']\n"
+
+
+def test_an_installed_command_fails_as_itself(installed, capfd):
+    installed.write_text("def entry():\n    raise ValueError('broken scene')\n")
+    sys.modules.pop("neighbour_of_script.train", None)
+    assert run_script(["train-neighbour"]) == 1
+    error = capfd.readouterr().err
+    assert "ValueError: broken scene" in error and "launch.py" not in error
+    installed.write_text("def entry():\n    return 3\n")
+    sys.modules.pop("neighbour_of_script.train", None)
+    assert run_script(["train-neighbour"]) == 3
 
 
 @pytest.mark.parametrize(

@@ -62,13 +62,20 @@ TRAIN = """
     def training(opt, out):
         gaussians = GaussianModel()
         gaussians.training_setup()
-        cameras = [Camera(f"view{i}", 0.2 * i) for i in range(4)]
+        first = 1
+        if "--start" in sys.argv:
+            (gaussians.xyz, gaussians.color), adam, first = torch.load(sys.argv[sys.argv.index("--start") + 1])
+            gaussians.training_setup()
+            gaussians.optimizer.load_state_dict(adam)
+            first += 1
+        name, more = "room" if "--room" in sys.argv else "view", 5.0 if "--bright" in sys.argv else 0.0
+        cameras = [Camera(f"{name}{i}", more + 0.2 * i) for i in range(4)]
         scene = SimpleNamespace(model_path=out, getTrainCameras=lambda: cameras)
         start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-        for iteration in range(1, opt.iterations + 1):
+        for iteration in range(first, opt.iterations + 1):
             start.record()
             gaussians.update_learning_rate(iteration)
-            viewpoint_cam = random.choice(cameras)
+            viewpoint_cam = random.Random(iteration).choice(cameras)
             loss = (render(viewpoint_cam, gaussians)["render"] - viewpoint_cam.image).abs().mean()
             if "--fail" in sys.argv and iteration == 5:
                 sys.exit(3)
@@ -77,6 +84,9 @@ TRAIN = """
             torch.cuda.synchronize()
             gaussians.optimizer.step()
             gaussians.optimizer.zero_grad(set_to_none=True)
+            if "--save" in sys.argv and iteration in (10, 40):
+                saved = (gaussians.xyz, gaussians.color), gaussians.optimizer.state_dict(), iteration
+                torch.save(saved, f"{out}/chkpnt{iteration}.pth")
         torch.save((gaussians.xyz, gaussians.color), out + "/model.pth")
 
     if __name__ == "__main__":
@@ -154,6 +164,7 @@ def test_script_that_never_trains_is_an_error(checkout, tmp_path, capfd):
         (["reference", "--cpu", "--", "train.py"], "no stand-ins for 'reference'"),
         (["inria"], "no script to run"),
         (["inria", "--", "absent.py"], "absent.py: name the training script after '--'"),
+        (["inria", "--resume-gate", __file__, "--", __file__], "holds no gate state: give a file that ends in"),
         (["inria", "--ema-decay", "2", "--", __file__], "ema_decay must be in [0, 1)"),
     ],
 )
@@ -161,3 +172,78 @@ def test_bad_input_is_one_sentence(arguments, sentence, capfd):
     assert cli.main(["run", *arguments]) == cli.BAD_INPUT
     error = capfd.readouterr().err
     assert sentence in error and error.count("\n") == 1
+
+
+@pytest.fixture
+def train(checkout, tmp_path):
+    """Run the look-alike gated: its output folder, options for it, options of the gate; give exit code and folder."""
+
+    def run(name, *options, gate=()):
+        folder = tmp_path / name
+        folder.mkdir(exist_ok=True)
+        code = cli.main(["run", "inria", "--cpu", "--warmup", "10", *gate, "--", checkout, str(folder), *options])
+        forget()
+        return code, folder
+
+    return run
+
+
+def counted(folder):
+    report = json.loads((folder / "skipgs.json").read_text())
+    return {name: report[name] for name in ("iterations", "gated_iterations", "backwards_skipped", "reasons")}
+
+
+def test_gate_goes_on_with_the_scripts_own_checkpoint(train, capfd):
+    _, whole = train("whole", "--save")
+    state = whole / "chkpnt40.pth.skipgs.json"
+    code, resumed = train("resumed", "--start", str(whole / "chkpnt40.pth"))
+    assert code == 0 and f"The gate takes its state from {state}." in capfd.readouterr().err
+    assert counted(resumed) == counted(whole)
+    models = [torch.load(folder / "model.pth", weights_only=False) for folder in (whole, resumed)]
+    assert all(torch.equal(a, b) for a, b in zip(*models, strict=True))
+
+    _, afresh = train("afresh", "--start", str(whole / "chkpnt40.pth"), gate=["--resume-gate", "off"])
+    assert counted(afresh)["iterations"] == 20 and counted(afresh)["reasons"]["warm-up"] == 10
+    copied = state.rename(state.parent / "moved.json")
+    _, given = train("given", "--start", str(whole / "chkpnt40.pth"), gate=["--resume-gate", str(copied)])
+    assert counted(given) == counted(whole)
+
+
+def test_gate_state_before_densification_ends_changes_nothing(train):
+    _, whole = train("whole", "--save")
+    _, resumed = train("resumed", "--start", str(whole / "chkpnt10.pth"))
+    assert counted(resumed) == counted(whole)
+
+
+def test_gate_state_of_another_scene_is_refused(train, capfd):
+    _, whole = train("whole", "--save")
+    start = ["--start", str(whole / "chkpnt40.pth")]
+    code, folder = train("room", *start, "--room")
+    assert code == cli.BAD_INPUT and "belongs to another scene: it knows view 'view0'" in capfd.readouterr().err
+    assert not (folder / "skipgs.json").exists()  # no iteration ran
+    code, folder = train("bright", *start, "--bright")
+    error = capfd.readouterr().err
+    assert code == cli.BAD_INPUT and "belongs to another scene: up to iteration" in error
+    assert counted(folder)["iterations"] == 40 + 10
+
+
+def test_gate_state_of_another_run_is_left_alone(train, capfd):
+    _, whole = train("whole", "--save")
+    state = whole / "chkpnt40.pth.skipgs.json"
+    state.write_text(state.read_text().replace("train.py", "prune.py"))
+    code, folder = train("other", "--start", str(whole / "chkpnt40.pth"))
+    assert code == 0 and "is of prune.py and iteration 40, while train.py begins with 41" in capfd.readouterr().err
+    assert counted(folder)["iterations"] == 20
+    code, _ = train("wrong", gate=["--resume-gate", str(state)])
+    assert code == cli.BAD_INPUT and "is of iteration 40, but the script goes on with 1" in capfd.readouterr().err
+
+
+def test_gate_states_go_with_their_checkpoints(train):
+    _, off = train("off", "--save", gate=["--no-gate"])
+    assert not list(off.glob("*.skipgs.json"))
+    _, gated = train("gated", "--save")
+    states = ["chkpnt10.pth.skipgs.json", "chkpnt40.pth.skipgs.json", "model.pth.skipgs.json"]
+    assert sorted(path.name for path in gated.glob("*.skipgs.json")) == states
+    (gated / "chkpnt10.pth").unlink()
+    train("gated")
+    assert sorted(path.name for path in gated.glob("*.skipgs.json")) == states[1:]

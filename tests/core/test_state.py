@@ -87,3 +87,30 @@ def test_ambiguous_view_keys_are_refused() -> None:
     policy.means.values[6] = 1.0
     with pytest.raises(SkipGSError, match="same text"):
         policy.state_dict()
+
+
+def resumed(factor: float, *, event: bool = False, steps: int = 40) -> SkipGate:
+    """A gate that learnt means of 1 and goes on with losses of `factor`."""
+    first = SkipGate(start_iter=0, warmup=2)
+    for step in range(20):
+        first.backward(torch.tensor(1.0, requires_grad=True), view=step % 3, step=step)
+    gate = SkipGate(start_iter=0, warmup=2)
+    gate.load_state_dict(first.state_dict())
+    if event:
+        gate.notify_event("prune")
+    for step in range(20, 20 + steps):
+        gate.backward(torch.tensor(factor, requires_grad=True), view=step % 3, step=step)
+    return gate
+
+
+@pytest.mark.parametrize("factor", [9.0, 0.1])
+def test_losses_far_from_all_means_are_another_scenes(factor: float) -> None:
+    resumed(factor, steps=9)
+    with pytest.raises(SkipGSError, match="another scene: up to iteration 29 each of 10 losses"):
+        resumed(factor)
+
+
+def test_losses_near_their_means_or_after_an_event_pass() -> None:
+    for factor in (0.6, 1.9):
+        resumed(factor)
+    resumed(9.0, event=True)

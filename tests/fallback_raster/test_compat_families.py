@@ -167,7 +167,7 @@ def test_sparse_adam_moves_visible_rows_only():
     assert (other == 1).all()
 
 
-@pytest.mark.parametrize("family", sorted(FAMILIES))
+@pytest.mark.parametrize("family", sorted(name for name in FAMILIES if FAMILIES[name]))
 def test_modules_are_served_and_taken_away(family):
     stranger = object()
     names = list(FAMILIES[family])

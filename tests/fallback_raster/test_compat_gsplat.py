@@ -1,5 +1,6 @@
 """The functions that stand in for gsplat's CUDA ones in its own training script."""
 
+import importlib
 import math
 
 import pytest
@@ -30,6 +31,17 @@ def test_relocation_is_equation_nine():
         factor = new_scales[row] / scales[row]
         assert factor.tolist() == pytest.approx([opacities[row].item() / total] * 3, rel=1e-2)
     torch.testing.assert_close(new_scales[0], scales[0])
+    column, scales_of_column = compute_relocation(opacities[:, None], scales, torch.tensor([1, 2, 70]), binomials(51))
+    assert torch.equal(column[:, 0], new_opacities) and torch.equal(scales_of_column, new_scales)
+
+
+def test_relocation_keeps_opacities_visible():
+    opacities, scales, twice = torch.tensor([0.004, 0.8]), torch.ones(2, 3), torch.tensor([2, 2])
+    free, _ = compute_relocation(opacities, scales, twice, binomials(51))
+    kept, grown = compute_relocation(opacities, scales, twice, binomials(51), min_opacity=0.005)
+    assert free[0] < 0.005 and kept.tolist() == [pytest.approx(0.005), free[1].item()]
+    # Equation 9 for two copies of opacity a: 2 a - a^2 / sqrt(2).
+    assert grown[0, 0].item() == pytest.approx(0.004 / (2 * 0.005 - 0.005**2 / math.sqrt(2)), rel=1e-4)
 
 
 def test_covariance_and_precision_are_gsplats_own_formula():
@@ -51,3 +63,27 @@ def test_gsplat_is_replaced_for_the_block_only():
         assert gsplat.rendering.rasterization is rasterization
         assert gsplat.strategy.ops.compute_relocation is compute_relocation
     assert (gsplat.rendering.rasterization, gsplat.strategy.ops.compute_relocation) == before
+
+
+def test_nerfstudio_gets_what_its_pinned_gsplat_returned(monkeypatch):
+    import gsplat.rendering
+
+    monkeypatch.setattr(gsplat, "__version__", "1.4.0")
+    scene = {
+        "means": torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.0, 3.0]]),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2),
+        "scales": torch.full((2, 3), 0.1),
+        "opacities": torch.tensor([0.5, 0.9]),
+        "colors": torch.rand(2, 3),
+        "viewmats": torch.eye(4)[None],
+        "Ks": torch.tensor([[[20.0, 0.0, 8.0], [0.0, 20.0, 8.0], [0.0, 0.0, 1.0]]]),
+        "width": 16,
+        "height": 16,
+    }
+    expected, _, info = rasterization(**scene, packed=False)
+    with serve("nerfstudio"):
+        importlib.import_module("torchvision.utils")  # nerfstudio saves pictures with it
+        image, _, old = gsplat.rendering.rasterization(**scene, packed=False)
+    assert torch.equal(image, expected)
+    assert old["radii"].shape == (1, 2) and torch.equal(old["radii"], info["radii"].amax(dim=-1))
+    assert gsplat.rendering.rasterization is not rasterization

@@ -1,7 +1,8 @@
-"""What gsplat's own `simple_trainer.py` needs on a machine without CUDA, beyond the rasterizer."""
+"""What gsplat's own `simple_trainer.py`, and nerfstudio, need on a machine without CUDA, beyond the rasterizer."""
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import warnings
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .. import rasterization
 from ..install import install_as_gsplat
 from ..torch_reference_projection import rotation_matrices
 
@@ -24,6 +26,7 @@ def gsplat_on_cpu() -> Iterator[None]:
     Raises:
         ImportError: gsplat is not installed.
     """
+    import gsplat.rendering
     import gsplat.strategy.ops
     import torchmetrics.image.lpip
 
@@ -33,37 +36,53 @@ def gsplat_on_cpu() -> Iterator[None]:
     ]
     if importlib.util.find_spec("torchvision") is None:
         replaced.append((torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", AbsentLpips))
-    before = [(owner, name, getattr(owner, name)) for owner, name, _ in replaced]
-    for owner, name, stand_in in replaced:
-        setattr(owner, name, stand_in)
-    try:
-        with install_as_gsplat():
+    if tuple(map(int, gsplat.__version__.split(".")[:2])) < (1, 5):
+        replaced += [(module, "rasterization", rasterization_1_4) for module in (gsplat, gsplat.rendering)]
+    with install_as_gsplat():
+        before = [(owner, name, getattr(owner, name)) for owner, name, _ in replaced]
+        for owner, name, stand_in in replaced:
+            setattr(owner, name, stand_in)
+        try:
             yield
-    finally:
-        for owner, name, original in before:
-            setattr(owner, name, original)
+        finally:
+            for owner, name, original in before:
+                setattr(owner, name, original)
 
 
-def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> tuple[Tensor, Tensor]:
+@functools.wraps(rasterization)
+def rasterization_1_4(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """With one radius per Gaussian, as gsplat's strategies read it before 1.5."""
+    image, alpha, info = rasterization(*args, **kwargs)
+    return image, alpha, info | {"radii": info["radii"].amax(dim=-1)}
+
+
+def compute_relocation(
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, min_opacity: float | None = None
+) -> tuple[Tensor, Tensor]:
     """Opacity and scales of a Gaussian split into `ratios` equal ones (3DGS-MCMC, equation 9).
 
     Args:
-        opacities: [N]
+        opacities: [N], or [N, 1] as nerfstudio keeps them
         scales: [N, 3]
         ratios: Number of copies, capped at n_max. [N]
         binoms: Binomial coefficients. [n_max, n_max]
+        min_opacity: Least new opacity; gsplat gives it since 1.6, and bounds it later itself before.
 
     Returns:
-        New opacities [N] and scales [N, 3]; n copies drawn over each other look like the original.
+        New opacities, in their old shape, and scales [N, 3]; n copies drawn over each other look like the
+        original.
     """
     n_max = len(binoms)
     copies = ratios.clamp(min=1, max=n_max).long()
-    shared = 1 - (1 - opacities) ** (1 / copies)
+    flat = opacities.flatten()
+    shared = 1 - (1 - flat) ** (1 / copies)
+    if min_opacity is not None:
+        shared = shared.clamp(min_opacity, 1 - torch.finfo(shared.dtype).eps)
     k = torch.arange(n_max)
     signs = torch.where(k % 2 == 0, 1.0, -1.0) / (k + 1).sqrt()
     rows = (binoms * signs * shared[:, None, None] ** (k + 1)).tril().sum(dim=2)  # [N, n_max]
     denominator = torch.where(k < copies[:, None], rows, 0.0).sum(dim=1)
-    return shared, (opacities / denominator)[:, None] * scales
+    return shared.view_as(opacities), (flat / denominator)[:, None] * scales
 
 
 def quat_scale_to_covar_preci(

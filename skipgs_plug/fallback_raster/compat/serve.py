@@ -38,7 +38,9 @@ FAMILIES: dict[str, _Source] = {
         **_SSIM,
     },
     "gsplat": _SSIM,
+    "nerfstudio": {},  # all of CUDA that splatfacto needs is in gsplat
 }
+_ON_GSPLAT = ("gsplat", "nerfstudio")
 
 
 @contextmanager
@@ -54,13 +56,14 @@ def serve(family: str) -> Iterator[None]:
     if family not in FAMILIES:
         raise ValueError(f"No stand-ins for {family!r}; there are some for: {', '.join(sorted(FAMILIES))}.")
     served = {name: _module(name, *source) for name, source in FAMILIES[family].items()}
-    # gsplat's script has no use for torchvision, and torchmetrics must not find a part of it.
+    # gsplat's script has no use for torchvision.
     if family != "gsplat" and importlib.util.find_spec("torchvision") is None:
         served |= importlib.import_module(".vision", __package__).modules()
     before = {name: sys.modules.get(name) for name in served}
-    sys.modules.update(served)
     try:
+        # First what torchmetrics is imported for: it must not find a part of torchvision.
         with _extras(family):
+            sys.modules.update(served)
             yield
     finally:
         for name, module in before.items():
@@ -72,7 +75,7 @@ def serve(family: str) -> Iterator[None]:
 
 def _extras(family: str) -> AbstractContextManager[None]:
     """gsplat's functions are replaced inside gsplat, which is a real package here."""
-    if family != "gsplat":
+    if family not in _ON_GSPLAT:
         return nullcontext()
     from .gsplat_script import gsplat_on_cpu
 
