@@ -77,8 +77,8 @@ MULTIPLY_ADDS_PER_PAIR = 13 + 25
 EXACT_IMAGES = 3  # per size, on which the loss is computed with PyTorch and in float64
 
 PHASES = {
-    "project": ("project_forward", "sh_forward"),
-    "bin and sort": ("depth_sort", "pack", "count_pairs", "scan_pairs", "fill_pairs"),
+    "project": ("project_forward", "list_visible", "sh_forward"),
+    "bin and sort": ("sort_and_pack", "count_pairs", "scan_pairs", "fill_pairs"),
     "blend": ("blend_forward_3",),
     "blend backward": ("blend_backward_3", "reduce_pairs"),
     "project backward": ("project_backward", "sh_backward"),

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .binning import MAX_CHANNELS, TILE, Bins, bin_gaussians, pack
+from .binning import MAX_CHANNELS, TILE, Bins, bin_gaussians, pack_colors
 from .blend import PAIR, backward_worker, forward_worker, reduce_pairs
 from .launch import scratch
 from .project import BLOCK, list_visible, project_backward, project_forward
@@ -163,14 +163,12 @@ class Blend(torch.autograd.Function):
         for channel in range(0, channels, MAX_CHANNELS):
             some = min(MAX_CHANNELS, channels - channel)
             if channel > 0:
-                _pack_colors(bins, means2d, conics, opacities, sigmas, colors, channel, some)
+                pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
             forward_worker(some)(
                 bins.records, bins.tile_start, bins.tile_list, image, transmittance, pixel_stop, tile_stop,
                 pair_blocks, width, height, tiles_x, tiles_y, channels, channel, some, active_shortcuts(),
             )  # fmt: skip
-        ctx.save_for_backward(
-            means2d, conics, opacities, colors, sigmas, transmittance, pixel_stop, tile_stop, pair_blocks
-        )  # fmt: skip
+        ctx.save_for_backward(means2d, conics, opacities, colors, transmittance, pixel_stop, tile_stop, pair_blocks)
         ctx.bins, ctx.absolute = bins, absolute
         ctx.mark_non_differentiable(bins.tiles_per_gauss)
         return image, transmittance, bins.tiles_per_gauss
@@ -178,9 +176,7 @@ class Blend(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor, _: Any) -> Any:  # type: ignore[override]
-        means2d, conics, opacities, colors, sigmas, transmittance, pixel_stop, tile_stop, pair_blocks = (
-            ctx.saved_tensors
-        )
+        means2d, conics, opacities, colors, transmittance, pixel_stop, tile_stop, pair_blocks = ctx.saved_tensors
         bins: Bins = ctx.bins
         height, width, channels = v_image.shape
         tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
@@ -193,7 +189,7 @@ class Blend(torch.autograd.Function):
         for channel in range(0, channels, MAX_CHANNELS):
             some = min(MAX_CHANNELS, channels - channel)
             if channels > MAX_CHANNELS:
-                _pack_colors(bins, means2d, conics, opacities, sigmas, colors, channel, some)
+                pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
             backward_worker(some, with_absolute)(
                 bins.records, bins.tile_start, bins.tile_list, tile_stop, pair_blocks, transmittance, pixel_stop,
                 v_image, v_transmittance, v_pairs, width, height, tiles_x, tiles_y, channels, channel, some,
@@ -206,19 +202,3 @@ class Blend(torch.autograd.Function):
             # The gradient of the transmittance belongs to the first pass alone.
             v_transmittance = torch.zeros_like(v_transmittance) if channels > MAX_CHANNELS else v_transmittance
         return v_means2d, v_conics, v_opacities, v_colors, *[None] * 6
-
-
-def _pack_colors(
-    bins: Bins,
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    sigmas: Tensor,
-    colors: Tensor,
-    channel: int,
-    channels: int,
-) -> None:
-    pack(
-        bins.visible, means2d, conics, opacities, sigmas, colors, bins.records,
-        len(bins.visible), colors.shape[1], channel, channels,
-    )  # fmt: skip

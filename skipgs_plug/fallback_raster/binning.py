@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .launch import FloatArray, IntArray, get_num_threads, scratch, worker
+from .launch import FloatArray, IntArray, get_num_threads, worker
 from .shortcuts import active_shortcuts
 
 TILE = 16
@@ -41,8 +41,8 @@ _TILE_ROWS = """
     // Small ones need no more than their bounding box.
     const bool whole = box_left / 16 == box_right / 16 || first_row == last_row || !(shortcuts & 1);
     // The ellipse's edges: x(dy) = mx + dy slope +- chord sqrt(1 - (dy / half_h)^2), farthest out at dy = -+extreme.
-    const float slope = r[12], extreme = r[13] * half_w, inverse_h = 1.0f / half_h;
-    const float chord = sqrtf(fmaxf(r[14], 0.0f)) / r[2];
+    const float slope = r[12], extreme = r[13] * half_w;
+    const float inverse_h = whole ? 0.0f : 1.0f / half_h, chord = whole ? 0.0f : sqrtf(fmaxf(r[14], 0.0f)) / r[2];
     auto columns = [&](int ty, int& left, int& right) {
         left = box_left / 16;
         right = box_right / 16;
@@ -60,79 +60,106 @@ _TILE_ROWS = """
 """
 
 
+# Least significant digit first, 11 bits at a time; depths are positive, so their bits sort like integers.
+_SORT = """
+    for (int i = 0; i < n; ++i) {
+        keys[i] = ((const int*)depths)[visible[i]];
+        values[i] = visible[i];
+    }
+    int histogram[2048];
+    for (int shift = 0; shift < 33; shift += 11) {
+        const int* from_keys = shift == 11 ? keys + n : keys;
+        const int* from_values = shift == 11 ? values + n : values;
+        int* to_keys = shift == 11 ? keys : keys + n;
+        int* to_values = shift == 11 ? values : values + n;
+        for (int b = 0; b < 2048; ++b) histogram[b] = 0;
+        for (int i = 0; i < n; ++i) ++histogram[((unsigned)from_keys[i] >> shift) & 2047];
+        int start = 0;
+        for (int b = 0; b < 2048; ++b) {
+            const int count = histogram[b];
+            histogram[b] = start;
+            start += count;
+        }
+        for (int i = 0; i < n; ++i) {
+            const int slot = histogram[((unsigned)from_keys[i] >> shift) & 2047]++;
+            to_keys[slot] = from_keys[i];
+            to_values[slot] = from_values[i];
+        }
+    }
+"""
+
+# Records of the visible rows `i` to `i + 15`.
+_PACK = """
+        const int lanes = n - i < 16 ? n - i : 16;
+        int row[16];
+        for (int l = 0; l < 16; ++l) row[l] = visible[i + (l < lanes ? l : lanes - 1)];
+        const float log2e = 1.44269504f;
+        v16 a = gather(conics, row, 3, 0), b = gather(conics, row, 3, 1), c = gather(conics, row, 3, 2);
+        v16 log2_opacity = log2(vmax(gather(opacities, row, 1, 0), (v16)1e-20f));
+        v16 reach = log2_opacity + 7.99435344f;
+        // a dx^2 + 2 b dx dy + c dy^2 = a (dx + b / a dy)^2 + dy^2 / sigma_y^2: no needle rounds to a negative value.
+        v16 along = vsqrt(0.5f * log2e * a), across = vsqrt((v16)(0.5f * log2e)) / gather(sigmas, row, 2, 1);
+        // Half axes of the box around alpha >= 1/255, a hair wider than exact: the blend tests every pixel itself.
+        v16 half = vsqrt(vmax(2.0f * reach / log2e, (v16)0.0f)) * 1.0001f + 1e-3f;
+        v16 value[16] = {
+            gather(means2d, row, 2, 0), gather(means2d, row, 2, 1), along, along * (b / a), across, log2_opacity,
+            half * gather(sigmas, row, 2, 1), half * gather(sigmas, row, 2, 0), {}, {}, {}, {}, -b / a, -b / c, reach};
+        for (int k = 0; k < channels; ++k) value[8 + k] = gather(colors, row, stride, k);
+        transpose(value);
+        for (int l = 0; l < lanes; ++l) store(records + 16ll * row[l], value[l]);
+"""
+
+
+# One core sorts while the others pack.
 @worker(
     """
-// Least significant digit first, 11 bits at a time; depths are positive, so their bits sort like integers.
-for (int i = 0; i < n; ++i) {
-    keys[i] = ((const int*)depths)[visible[i]];
-    values[i] = visible[i];
-}
-int histogram[2048];
-for (int shift = 0; shift < 33; shift += 11) {
-    const int* from_keys = shift == 11 ? keys + n : keys;
-    const int* from_values = shift == 11 ? values + n : values;
-    int* to_keys = shift == 11 ? keys : keys + n;
-    int* to_values = shift == 11 ? values : values + n;
-    for (int b = 0; b < 2048; ++b) histogram[b] = 0;
-    for (int i = 0; i < n; ++i) ++histogram[((unsigned)from_keys[i] >> shift) & 2047];
-    int start = 0;
-    for (int b = 0; b < 2048; ++b) {
-        const int count = histogram[b];
-        histogram[b] = start;
-        start += count;
+for (int item = first; item < last; ++item) {
+    if (item == 0) {
+"""
+    + _SORT
+    + """
     }
-    for (int i = 0; i < n; ++i) {
-        const int slot = histogram[((unsigned)from_keys[i] >> shift) & 2047]++;
-        to_keys[slot] = from_keys[i];
-        to_values[slot] = from_values[i];
+    const int begin = 512 * (item - 1);
+    for (int i = begin; item > 0 && i < smaller(begin + 512, n); i += 16) {
+"""
+    + _PACK
+    + """
     }
 }
 """,
-    items="1",
+    items="1 + (n + 511) / 512",
     grain=1,
 )
-def depth_sort(
-    depths: FloatArray,  # [N]
+def sort_and_pack(
+    depths: FloatArray,  # [R]
     visible: IntArray,  # [M]
     keys: IntArray,  # scratch [2M]
-    values: IntArray,  # scratch [2M]; the sorted rows end up in the second half
-    n: int,
-) -> None: ...
-
-
-@worker(
-    """
-for (int i = first; i < last; i += 16) {
-    const int lanes = last - i < 16 ? last - i : 16;
-    int row[16];
-    for (int l = 0; l < 16; ++l) row[l] = visible[i + (l < lanes ? l : lanes - 1)];
-    const float log2e = 1.44269504f;
-    v16 a = gather(conics, row, 3, 0), b = gather(conics, row, 3, 1), c = gather(conics, row, 3, 2);
-    v16 log2_opacity = log2(vmax(gather(opacities, row, 1, 0), (v16)1e-20f));
-    // Half axes of the box around alpha >= 1/255, a hair wider than exact: the blend tests every pixel itself.
-    v16 reach = log2_opacity + 7.99435344f;
-    // a dx^2 + 2 b dx dy + c dy^2 = a (dx + b / a dy)^2 + dy^2 / sigma_y^2: no needle rounds to a negative value.
-    v16 along = vsqrt(0.5f * log2e * a), across = 0.849321800f / gather(sigmas, row, 2, 1);
-    v16 half = vsqrt(vmax(2.0f * reach / log2e, (v16)0.0f)) * 1.0001f + 1e-3f;
-    v16 value[16] = {
-        gather(means2d, row, 2, 0), gather(means2d, row, 2, 1), along, along * (b / a), across, log2_opacity,
-        half * gather(sigmas, row, 2, 1), half * gather(sigmas, row, 2, 0), {}, {}, {}, {}, -b / a, -b / c, reach, {}};
-    for (int k = 0; k < channels; ++k) value[8 + k] = gather(colors + channel, row, stride, k);
-    transpose(value);
-    for (int l = 0; l < lanes; ++l) store(records + 16ll * row[l], value[l]);
-}
-""",
-    items="n",
-    grain=512,
-)
-def pack(
-    visible: IntArray,  # [M]
+    values: IntArray,  # out [2M], the rows front to back in its second half
     means2d: FloatArray,  # [R, 2]
     conics: FloatArray,  # [R, 3]
     opacities: FloatArray,  # [R]
     sigmas: FloatArray,  # [R, 2]
     colors: FloatArray,  # [R, D]
     records: FloatArray,  # out [R, RECORD], only visible rows are written
+    n: int,
+    stride: int,  # D
+    channels: int,
+) -> None: ...
+
+
+@worker(
+    """
+for (int i = first; i < last; ++i)
+    for (int k = 0; k < channels; ++k)
+        records[16ll * visible[i] + 8 + k] = colors[(long long)visible[i] * stride + channel + k];
+""",
+    items="n",
+    grain=512,
+)
+def pack_colors(
+    visible: IntArray,  # [M]
+    colors: FloatArray,  # [R, D]
+    records: FloatArray,  # [R, RECORD], the channels are replaced
     n: int,
     stride: int,  # D
     channel: int,
@@ -286,15 +313,14 @@ def bin_gaussians(
     n = visible.numel()
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     tiles = tiles_x * tiles_y
-    sorted_rows = torch.empty(2 * n, dtype=torch.int32)
-    depth_sort(depths, visible, scratch("depth_keys", 2 * n, dtype=torch.int32), sorted_rows, n)
-    order = sorted_rows[n:]
     rows, channels = colors.shape
+    keys, values = torch.empty(2, 2 * n, dtype=torch.int32)
     records = torch.empty(rows, RECORD)
-    pack(
-        visible, means2d, conics, opacities, sigmas, colors, records,
-        n, channels, 0, min(channels, MAX_CHANNELS),
+    sort_and_pack(
+        depths, visible, keys, values, means2d, conics, opacities, sigmas, colors, records,
+        n, channels, min(channels, MAX_CHANNELS),
     )  # fmt: skip
+    order = values[n:]
 
     # Any number of slices gives the same lists; one per thread keeps all busy.
     slices = 1 if n < 1024 else get_num_threads()
