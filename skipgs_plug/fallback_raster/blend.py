@@ -78,8 +78,6 @@ for (int t = first; t < last; ++t) {
         }
         for (unsigned todo = open; todo; todo &= todo - 1) {
             const int b = __builtin_ctz(todo);
-"""
-        + """
             // Exponent that a Gaussian needs to count; none suffices in a finished pixel.
             v16 transmitted = T[b], color[D], least = transmitted > 0.0f ? (v16)-7.99435344f : (v16)1e30f;
             for (int c = 0; c < D; ++c) color[c] = C[b][c];
@@ -209,7 +207,7 @@ for (int t = first; t < last; ++t) {
                 const v16 share = hit ? alpha * passed : (v16)0.0f;
                 const v16 weight = share * T[b];
                 // Where alpha is clamped, neither opacity nor shape moves it.
-                const v16 v_sigma = full <= 0.999f ? share * (behind[b] - T[b] * shade) : (v16)0.0f;
+                const v16 v_sigma = hit & (full <= 0.999f) ? share * (behind[b] - T[b] * shade) : (v16)0.0f;
                 T[b] += weight;
                 behind[b] += hit ? weight * shade : (v16)0.0f;
                 for (int c = 0; c < D; ++c) v_color[c] += weight * v[b][c];

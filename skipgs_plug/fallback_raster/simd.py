@@ -51,7 +51,6 @@ auto fminf = [](float a, float b) -> float { return a < b ? a : b; };
 auto larger = [](int a, int b) -> int { return a > b ? a : b; };
 auto smaller = [](int a, int b) -> int { return a < b ? a : b; };
 auto any = [](i16 mask) -> bool { return __builtin_reduce_or(mask) != 0; };
-auto all = [](i16 mask) -> bool { return __builtin_reduce_and(mask) != 0; };
 // Bit l is set where lane l of the mask is.
 auto bits = [](i16 mask) -> unsigned {
     return __builtin_bit_cast(unsigned short, __builtin_convertvector(mask != 0, b16));

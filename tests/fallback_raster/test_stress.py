@@ -314,6 +314,28 @@ def test_a_poisoned_gaussian_is_refused_or_stays_where_it_is(name: str, value: f
         torch.testing.assert_close(image[untouched], others[untouched], rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("value", [INF, NAN])
+def test_a_poisoned_colour_leaves_the_gradients_of_a_neighbour_alone(value: float) -> None:
+    """Two faint dots three pixels apart, in the same few pixels that the kernels handle at once."""
+    centres = torch.tensor([[0.5, 0.5], [3.5, 3.5]])
+    scene = {
+        "means": torch.cat([(centres - 4.0) / 100.0, torch.ones(2, 1)], 1),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1),
+        "scales": torch.full((2, 3), 1e-4),
+        "opacities": torch.full((2,), 0.02),
+        "colors": torch.tensor([[value, 0.5, 0.5], [0.2, 0.5, 0.8]]),
+        "viewmats": torch.eye(4)[None],
+        "Ks": torch.tensor([[[100.0, 0.0, 4.0], [0.0, 100.0, 4.0], [0.0, 0.0, 1.0]]]),
+    }
+    inputs = {name: t.requires_grad_(name in DIFFERENTIABLE) for name, t in scene.items()}
+    image, _, _ = rasterization(**inputs, width=8, height=8, packed=False)
+    assert not image[0, 0, 0].isfinite().all() and image[0, 2:, 2:].isfinite().all()
+    image.sum().backward()
+    for name in ("means", "scales", "opacities", "colors"):
+        assert inputs[name].grad[1].isfinite().all()
+        assert inputs[name].grad[1].any()
+
+
 @pytest.mark.parametrize("name", ["scales", "opacities", "viewmats", "Ks", "backgrounds"])
 @pytest.mark.parametrize("value", [INF, NAN])
 def test_a_poison_that_reaches_every_pixel_does_not_crash(name: str, value: float) -> None:
