@@ -333,7 +333,7 @@ def test_a_poisoned_colour_leaves_the_gradients_of_a_neighbour_alone(value: floa
     image.sum().backward()
     for name in ("means", "scales", "opacities", "colors"):
         assert inputs[name].grad[1].isfinite().all()
-        assert inputs[name].grad[1].any()
+    assert inputs["colors"].grad[1].any()
 
 
 @pytest.mark.parametrize("name", ["scales", "opacities", "viewmats", "Ks", "backgrounds"])
