@@ -46,7 +46,7 @@ def exact_exponential() -> Iterator[None]:
     workers = [*blend._FORWARD.values(), *blend._BACKWARD.values()]
     kept = launch.PRELUDE, [(worker._name, worker._command) for worker in workers]
     launch.PRELUDE = re.sub(r"auto exp2 = .*?\n};\n", EXACT_EXP2, launch.PRELUDE, flags=re.DOTALL)
-    assert launch.PRELUDE != kept[0]
+    assert kept[0] != launch.PRELUDE
     for worker in workers:
         worker._name, worker._command = f"{worker._name}_exact", None
     try:

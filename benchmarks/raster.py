@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
-import resource
 import subprocess
 import sys
 import time
@@ -46,6 +45,7 @@ from torch import Tensor
 from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
 from skipgs_plug.fallback_raster.shortcuts import SHORTCUTS, without_shortcuts
 from skipgs_plug.trainer.loss import l1_ssim_loss as convolved_loss
+from skipgs_plug.trainer.scalars import peak_memory
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "colors")
 FILE = RESULTS / "raster.json"
@@ -227,11 +227,10 @@ def measure_point(point: str, repeats: int) -> None:
         with contextlib.suppress(AttributeError):  # not glibc
             ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5")
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = peak_memory(torch.device("cpu")) or 0
     result = measure(scene_maker("random", n, size, sh_degree), repeats)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    per_mib = 1 << 20 if sys.platform == "darwin" else 1 << 10  # bytes there, KiB on Linux
-    print(json.dumps({**result, "peak_mib": (peak - before) / per_mib}))
+    peak = peak_memory(torch.device("cpu")) or 0
+    print(json.dumps({**result, "peak_mib": (peak - before) / 2**20}))
 
 
 def part_shortcuts(quick: bool, repeats: int) -> list[dict[str, Any]]:

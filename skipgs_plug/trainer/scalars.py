@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -65,6 +66,10 @@ def peak_memory(device: torch.device) -> int | None:
     """Return the most bytes in use so far: torch's on the GPU, else the process's; None on Windows."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
+    status = Path("/proc/self/status")
+    if status.exists():  # getrusage on Linux also counts what a parent process used before this one started
+        (kibibytes,) = re.findall(r"^VmHWM:\s*(\d+) kB$", status.read_text(), re.MULTILINE)
+        return int(kibibytes) * 1024
     try:
         import resource
     except ImportError:
