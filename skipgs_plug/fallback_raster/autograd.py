@@ -61,24 +61,36 @@ class Project(torch.autograd.Function):
         list_visible(radii, visible, block_start, n)
         visible = visible[: int(block_start[-1])]
         ctx.save_for_backward(means, quats, scales, viewmat, K, visible, block_start)
-        ctx.size = (width, height, eps2d, antialiased)
+        ctx.size = (width, height, eps2d)
         ctx.mark_non_differentiable(radii, sigmas, visible, block_start)
+        ctx.set_materialize_grads(False)  # depths rarely have a gradient: no zeros for them
         return means2d, depths, conics, compensations, radii, sigmas, visible, block_start
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor, *_: Any
-    ) -> Any:  # type: ignore[override]
+    def backward(  # type: ignore[override]
+        ctx: Any,
+        v_means2d: Tensor | None,
+        v_depths: Tensor | None,
+        v_conics: Tensor | None,
+        v_compensations: Tensor | None,
+        *_: Any,
+    ) -> Any:
         means, quats, scales, viewmat, K, visible, block_start = ctx.saved_tensors
-        width, height, eps2d, antialiased = ctx.size
+        width, height, eps2d = ctx.size
         with_pose = ctx.needs_input_grad[4]
         v_means, v_quats, v_scales = torch.empty(means.shape), torch.empty(quats.shape), torch.empty(scales.shape)
         v_poses = torch.zeros(_blocks(len(means)) if with_pose else 0, 3, 4)
+        n = len(means)
+        v_means2d = torch.zeros(n, 2) if v_means2d is None else v_means2d.contiguous()
+        v_conics = torch.zeros(n, 3) if v_conics is None else v_conics.contiguous()
+        v_depths, v_compensations = (
+            torch.empty(0) if v is None else v.contiguous() for v in (v_depths, v_compensations)
+        )  # fmt: skip
         project_backward(
-            means, quats, scales, viewmat, K, visible, block_start, v_means2d.contiguous(), v_depths.contiguous(),
-            v_conics.contiguous(), v_compensations.contiguous(), v_means, v_quats, v_scales, v_poses,
-            len(means), float(width), float(height), eps2d, int(antialiased), int(with_pose), active_shortcuts(),
+            means, quats, scales, viewmat, K, visible, block_start, v_means2d, v_depths, v_conics, v_compensations,
+            v_means, v_quats, v_scales, v_poses, n, float(width), float(height), eps2d,
+            v_depths.numel(), v_compensations.numel(), int(with_pose), active_shortcuts(),
         )  # fmt: skip
         v_viewmat = None
         if with_pose:

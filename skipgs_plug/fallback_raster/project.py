@@ -169,9 +169,10 @@ for (int base = block_start[block]; base < end; base += 16) {
     const int lanes = end - base < 16 ? end - base : 16;
     int row[16];
     for (int l = 0; l < 16; ++l) row[l] = visible[base + (l < lanes ? l : lanes - 1)];
-    v16 v_u = gather(v_means2d, row, 2, 0), v_v = gather(v_means2d, row, 2, 1), v_depth = gather(v_depths, row, 1, 0);
+    v16 v_u = gather(v_means2d, row, 2, 0), v_v = gather(v_means2d, row, 2, 1), v_depth = (v16)0.0f, v_comp = (v16)0.0f;
+    if (with_depth) v_depth = gather(v_depths, row, 1, 0);
+    if (antialiased) v_comp = gather(v_compensations, row, 1, 0);
     v16 va = gather(v_conics, row, 3, 0), vb = 0.5f * gather(v_conics, row, 3, 1), vc = gather(v_conics, row, 3, 2);
-    v16 v_comp = antialiased ? gather(v_compensations, row, 1, 0) : (v16)0.0f;
     // Most blocks of a close-up hold no Gaussian that received a gradient; their zeros are in place already.
     if ((shortcuts & 32) && !any((v_u != 0.0f) | (v_v != 0.0f) | (v_depth != 0.0f) | (va != 0.0f) | (vb != 0.0f)
                                  | (vc != 0.0f) | (v_comp != 0.0f))) continue;
@@ -277,7 +278,7 @@ def project_backward(
     visible: IntArray,  # [M], rows with a radius
     block_start: IntArray,  # [ceil(N / BLOCK) + 1], where each block of rows begins in `visible`
     v_means2d: FloatArray,  # [N, 2]
-    v_depths: FloatArray,  # [N]
+    v_depths: FloatArray,  # [N], only read with_depth
     v_conics: FloatArray,  # [N, 3]
     v_compensations: FloatArray,  # [N], only read when antialiased
     v_means: FloatArray,  # out [N, 3]
@@ -288,6 +289,7 @@ def project_backward(
     width: float,
     height: float,
     eps2d: float,
+    with_depth: int,
     antialiased: int,
     with_pose: int,
     shortcuts: int,
