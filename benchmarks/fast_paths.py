@@ -32,7 +32,7 @@ PARAMETERS = ("means", "scales", "quats", "opacities", "colors")
 EXACT_EXP2 = """auto exp2 = [](v16 t) -> v16 {
     typedef double d16 __attribute__((ext_vector_type(16)));
     typedef long long l16 __attribute__((ext_vector_type(16)));
-    d16 x = __builtin_convertvector(vmax(t, (v16)-120.0f), d16);
+    d16 x = __builtin_convertvector(t > -120.0f ? t : (v16)-120.0f, d16);
     d16 r = x + 6755399441055744.0, f = (x - (r - 6755399441055744.0)) * 0.69314718055994530942, p = (d16)1.0;
     for (int k = 14; k > 0; --k) p = 1.0 + p * f / (double)k;
     return __builtin_convertvector((d16)((l16)p + ((l16)r << 52)), v16);

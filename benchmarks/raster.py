@@ -271,7 +271,7 @@ def part_loss(quick: bool, repeats: int) -> list[dict[str, Any]]:
     """
     print(f"{'image':>10} {'threads':>7} {'fused ms':>8} {'torch ms':>8} {'value error':>20} {'gradient error':>20}")
     rows = []
-    for width, height in ((252, 189), (504, 378)) if quick else ((252, 189), (504, 378), (1008, 756)):
+    for width, height in ((252, 189), (504, 378)) if quick else ((252, 189), (504, 378), (1008, 756), (1920, 1080)):
         pairs = [image_pair(width, height, seed) for seed in range(repeats + 2)]
         with threads(1):
             truths = [loss_pass(convolved_loss, a.double(), b.double())[1:] for a, b in pairs[:EXACT_IMAGES]]
