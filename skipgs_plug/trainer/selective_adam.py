@@ -1,4 +1,4 @@
-"""Adam that touches only the Gaussians a view shows (Taming 3DGS; gsplat's SelectiveAdam, any device)."""
+"""Adam that touches only the Gaussians a view shows (Taming 3DGS; gsplat's SelectiveAdam)."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from skipgs_plug.fallback_raster.adam import adam_rows
+
 
 class SelectiveAdam(torch.optim.Adam):
     """Adam without bias correction whose moments and values move only for visible rows.
 
-    gsplat's class of that name runs in CUDA; this one has its semantics in plain torch.
+    gsplat's class of that name runs in CUDA only; this one has its semantics on the CPU too.
     """
 
     def __init__(self, params: Any, eps: float, betas: tuple[float, float] = (0.9, 0.999)) -> None:
@@ -20,7 +22,7 @@ class SelectiveAdam(torch.optim.Adam):
     @torch.no_grad()
     def step(self, visibility: Tensor) -> None:  # type: ignore[override]
         """Update rows where `visibility` [N] bool holds; no-op for parameters without gradient."""
-        rows = torch.nonzero(visibility)[:, 0]
+        rows = torch.nonzero(visibility)[:, 0] if visibility.is_cuda else None
         for group in self.param_groups:
             beta1, beta2 = group["betas"]
             for param in group["params"]:
@@ -32,6 +34,10 @@ class SelectiveAdam(torch.optim.Adam):
                     state["exp_avg"] = torch.zeros_like(param)
                     state["exp_avg_sq"] = torch.zeros_like(param)
                 state["step"] += 1
+                if rows is None:
+                    moments = state["exp_avg"], state["exp_avg_sq"]
+                    adam_rows(visibility, param, *moments, group["lr"], group["betas"], group["eps"])
+                    continue
                 grad = param.grad[rows]
                 mean = torch.lerp(grad, state["exp_avg"][rows], beta1)
                 square = torch.lerp(grad * grad, state["exp_avg_sq"][rows], beta2)

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..adam import adam_rows
+
 
 class SparseGaussianAdam(torch.optim.Adam):
     """One parameter per group, first dimension N; no bias correction, as in the CUDA kernel."""
@@ -30,9 +32,5 @@ class SparseGaussianAdam(torch.optim.Adam):
             if not state:
                 state["step"] = torch.tensor(0.0)
                 state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(param), torch.zeros_like(param)
-            rows = visibility.reshape(N)
-            grad = param.grad[rows]
-            mean = 0.9 * state["exp_avg"][rows] + 0.1 * grad
-            square = 0.999 * state["exp_avg_sq"][rows] + 0.001 * grad * grad
-            param[rows] -= group["lr"] * mean / (square.sqrt() + group["eps"])
-            state["exp_avg"][rows], state["exp_avg_sq"][rows] = mean, square
+            moments = state["exp_avg"], state["exp_avg_sq"]
+            adam_rows(visibility.reshape(N), param, *moments, group["lr"], (0.9, 0.999), group["eps"])
