@@ -73,7 +73,7 @@ def adam_rows(
 
     Args:
         visibility: Rows to update.
-        param: Parameter with a gradient, contiguous float32 on the CPU.
+        param: Parameter with a gradient, float32 on the CPU.
         mean: Its running mean of gradients.
         square: Its running mean of squared gradients.
         rate: Learning rate.
@@ -84,4 +84,9 @@ def adam_rows(
     width = param.numel() // max(len(param), 1)
     seen, gradient = visibility.to(torch.int32), param.grad.contiguous()
     decays = (share for beta in betas for share in (beta, 1.0 - beta))
-    _adam(seen, gradient, param, mean, square, len(param), width, rate, *decays, eps)
+    own = param, mean, square
+    dense = [t.contiguous() for t in own]
+    _adam(seen, gradient, *dense, len(param), width, rate, *decays, eps)
+    for tensor, copy in zip(own, dense, strict=True):
+        if copy is not tensor:  # Inria's features are transposed
+            tensor.copy_(copy)

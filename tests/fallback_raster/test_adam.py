@@ -28,6 +28,19 @@ def test_rows_follow_adam_without_bias_correction(shape: tuple[int, ...]) -> Non
         assert torch.equal(found[~seen], before[~seen])
 
 
+def test_a_transposed_parameter_is_updated_like_its_copy() -> None:
+    values, gradient = torch.randn(2, 50, 3, 15)
+    results = []
+    for order in (lambda t: t.transpose(1, 2), lambda t: t.transpose(1, 2).contiguous()):
+        param = torch.nn.Parameter(order(values.clone()))
+        param.grad = order(gradient)
+        mean, square = torch.zeros_like(param), torch.zeros_like(param)
+        adam_rows(torch.rand(50, generator=torch.manual_seed(0)) < 0.5, param, mean, square, 0.1, (0.9, 0.999), 1e-15)
+        results.append(torch.stack([param.data, mean, square]))
+    assert torch.equal(*results)
+    assert not torch.equal(results[0][0], values.transpose(1, 2))
+
+
 def test_a_row_without_gradient_stays() -> None:
     param = torch.nn.Parameter(torch.ones(2, 3))
     param.grad = torch.zeros(2, 3)
