@@ -24,6 +24,8 @@ from skipgs_plug.fallback_raster.launch import FloatArray, Worker, worker
 from skipgs_plug.trainer.files import write_aside
 
 RESULTS = Path(__file__).parent / "results"
+# What a pass differentiates.
+PARAMETERS = ("means", "scales", "quats", "opacities", "colors")
 SCENES = Path(os.environ.get("SKIPGS_SHARED", Path(__file__).parents[2] / "shared")) / "data"
 
 

@@ -19,14 +19,23 @@ from typing import Any
 
 import torch
 import tyro
-from common import RESULTS, SCENES, cores, frustum_scene, leaves, provenance, threads, write_part
+from common import (
+    PARAMETERS,
+    RESULTS,
+    SCENES,
+    cores,
+    frustum_scene,
+    leaves,
+    provenance,
+    relative_difference,
+    threads,
+    write_part,
+)
 
 from skipgs_plug.fallback_raster import blend, launch, rasterization
 from skipgs_plug.trainer import TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.loss import l1_ssim_loss as convolved_loss
-
-PARAMETERS = ("means", "scales", "quats", "opacities", "colors")
 
 # The whole part of t goes into the exponent, 14 terms of the Taylor series give the rest to 1e-17.
 EXACT_EXP2 = """auto exp2 = [](v16 t) -> v16 {
@@ -116,7 +125,7 @@ def main(steps: int = 2000, seeds: tuple[int, ...] = (0, 1)) -> None:
     for path in PATHS:
         found = one_pass(path)
         image = (found["image"] - truth["image"]).abs().max().item()
-        gradient = max(((found[p] - truth[p]).norm() / truth[p].norm()).item() for p in PARAMETERS)
+        gradient = max(relative_difference(found[p], truth[p]) for p in PARAMETERS)
         psnr, ms = zip(*(train(path, steps, seed) for seed in seeds), strict=True)
         row = {"path": path.label, "steps": steps, "seeds": seeds, "ms_per_iteration": ms, "psnr": psnr}
         rows.append(row | {"image_error": image, "gradient_error": gradient})

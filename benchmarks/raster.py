@@ -1,6 +1,6 @@
 """Speed of the CPU rasterizer: forward and backward pass, scaling, growth, memory, shortcuts, and the fused loss.
 
-    python benchmarks/raster.py                        # everything, about ten minutes on two cores
+    python benchmarks/raster.py                        # everything, about two minutes on two cores
     python benchmarks/raster.py --parts scenes --quick
 
 A pass is `rasterization`, a mean-L1 loss and the backward to means, scales, quats, opacities and colours; times are
@@ -25,6 +25,7 @@ from typing import Any, Literal
 import torch
 import tyro
 from common import (
+    PARAMETERS,
     RESULTS,
     cores,
     exponents,
@@ -47,7 +48,6 @@ from skipgs_plug.fallback_raster.shortcuts import SHORTCUTS, without_shortcuts
 from skipgs_plug.trainer.loss import l1_ssim_loss as convolved_loss
 from skipgs_plug.trainer.scalars import peak_memory
 
-PARAMETERS = ("means", "scales", "quats", "opacities", "colors")
 FILE = RESULTS / "raster.json"
 Part = Literal["scenes", "threads", "gaussians", "pixels", "sh_terms", "shortcuts", "loss"]
 

@@ -15,12 +15,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
-from common import RESULTS, frustum_scene, leaves, provenance, write_part
+from common import PARAMETERS, RESULTS, frustum_scene, leaves, provenance, write_part
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
-
-PARAMETERS = ("means", "scales", "quats", "opacities", "colors")
 
 
 def nodes(output: Tensor) -> Iterator[Any]:
