@@ -19,7 +19,7 @@ for (int row = first; row < last;) {
     while (row < last && seen[row]) ++row;
     const long long end = (long long)row * width;
     for (long long i = begin; i < end; i += 16) {
-        if (i + 16 > block_end) {  // of another core
+        if (i + 16 > block_end) {  // a whole vector would reach into rows of another core
             for (long long j = i; j < end; ++j) {
                 const float g = gradient[j];
                 mean[j] = keep1 * mean[j] + take1 * g;
@@ -73,7 +73,7 @@ def adam_rows(
 
     Args:
         visibility: Rows to update.
-        param: Parameter with a gradient, float32 on the CPU.
+        param: Parameter with a gradient, float32; elsewhere than on the CPU plain torch updates it.
         mean: Its running mean of gradients.
         square: Its running mean of squared gradients.
         rate: Learning rate.
@@ -81,6 +81,13 @@ def adam_rows(
         eps: Added to the root of the squares.
     """
     assert param.grad is not None
+    if param.device.type != "cpu":
+        rows = torch.nonzero(visibility)[:, 0]
+        gradient = param.grad[rows]
+        mean[rows] = torch.lerp(gradient, mean[rows], betas[0])
+        square[rows] = torch.lerp(gradient * gradient, square[rows], betas[1])
+        param[rows] -= rate * mean[rows] / (square[rows].sqrt() + eps)
+        return
     width = param.numel() // max(len(param), 1)
     seen, gradient = visibility.to(torch.int32), param.grad.contiguous()
     decays = (share for beta in betas for share in (beta, 1.0 - beta))

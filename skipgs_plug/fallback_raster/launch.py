@@ -61,8 +61,8 @@ def set_num_threads(n: int) -> None:
             _pool = None
 
 
-def scratch(name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """A buffer with undefined content that this thread reuses whenever it asks for the same name again.
+def scratch(name: str, *shape: int) -> Tensor:
+    """A float buffer with undefined content that this thread reuses whenever it asks for the same name again.
 
     Fresh memory of many megabytes costs a page fault per 4 KiB, as much as some kernels take. The buffer must not
     outlive the call that asked for it.
@@ -70,7 +70,7 @@ def scratch(name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tenso
     buffers: dict[str, Tensor] = _scratch.__dict__
     size = math.prod(shape)
     if name not in buffers or buffers[name].numel() < size:
-        buffers[name] = torch.empty(size, dtype=dtype)
+        buffers[name] = torch.empty(size)
     return buffers[name][:size].view(shape)
 
 

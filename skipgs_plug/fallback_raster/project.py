@@ -157,7 +157,7 @@ def list_visible(
 
 @worker(
     """
-for (int block = first; block < last; ++block) {
+const int block = first;
 v16 pose[12] = {};
 // Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
 const int row_begin = 512 * block, rows = n - row_begin < 512 ? n - row_begin : 512;
@@ -264,7 +264,6 @@ for (int base = block_start[block]; base < end; base += 16) {
 }
 if (with_pose)
     for (int i = 0; i < 12; ++i) v_poses[12 * block + i] = sum(pose[i]);
-}
 """,
     items="(n + 511) / 512",
     grain=1,

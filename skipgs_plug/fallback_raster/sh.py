@@ -46,7 +46,7 @@ _BASIS = """
 
 @worker(
     """
-for (int block = first; block < last; ++block) {
+const int block = first;
 clear(colors + 1536ll * block, 3 * smaller(512, n - 512 * block));
 for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
     const int g = visible[i];
@@ -63,7 +63,6 @@ for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
     colors[3 * g] = c0 < 0.0f ? 0.0f : c0;
     colors[3 * g + 1] = c1 < 0.0f ? 0.0f : c1;
     colors[3 * g + 2] = c2 < 0.0f ? 0.0f : c2;
-}
 }
 """,
     items="(n + 511) / 512",
@@ -87,7 +86,7 @@ def sh_forward(
 
 @worker(
     """
-for (int block = first; block < last; ++block) {
+const int block = first;
 float camera_sum[3] = {0.0f, 0.0f, 0.0f};
 // Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
 const long long row_begin = 512ll * block, rows = n - row_begin < 512 ? n - row_begin : 512;
@@ -145,7 +144,6 @@ for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
     }
 }
 for (int c = 0; c < 3; ++c) v_cameras[3 * block + c] = camera_sum[c];
-}
 """,
     items="(n + 511) / 512",
     grain=1,

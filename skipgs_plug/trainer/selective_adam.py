@@ -22,9 +22,7 @@ class SelectiveAdam(torch.optim.Adam):
     @torch.no_grad()
     def step(self, visibility: Tensor) -> None:  # type: ignore[override]
         """Update rows where `visibility` [N] bool holds; no-op for parameters without gradient."""
-        rows = torch.nonzero(visibility)[:, 0] if visibility.is_cuda else None
         for group in self.param_groups:
-            beta1, beta2 = group["betas"]
             for param in group["params"]:
                 if param.grad is None:
                     continue
@@ -34,13 +32,5 @@ class SelectiveAdam(torch.optim.Adam):
                     state["exp_avg"] = torch.zeros_like(param)
                     state["exp_avg_sq"] = torch.zeros_like(param)
                 state["step"] += 1
-                if rows is None:
-                    moments = state["exp_avg"], state["exp_avg_sq"]
-                    adam_rows(visibility, param, *moments, group["lr"], group["betas"], group["eps"])
-                    continue
-                grad = param.grad[rows]
-                mean = torch.lerp(grad, state["exp_avg"][rows], beta1)
-                square = torch.lerp(grad * grad, state["exp_avg_sq"][rows], beta2)
-                state["exp_avg"][rows] = mean
-                state["exp_avg_sq"][rows] = square
-                param[rows] -= group["lr"] * mean / (square.sqrt() + group["eps"])
+                moments = state["exp_avg"], state["exp_avg_sq"]
+                adam_rows(visibility, param, *moments, group["lr"], group["betas"], group["eps"])
