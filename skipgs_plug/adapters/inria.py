@@ -14,7 +14,7 @@ import warnings
 import weakref
 from abc import abstractmethod
 from collections import ChainMap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -76,6 +76,10 @@ class InriaFamily(AbstractAdapter):
         """First iteration whose gradients only the optimizers read; arguments as for `start_iter`."""
         return int(opt.densify_until_iter)
 
+    def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
+        """Whether optimizers step by the iteration's number, on gradients gathered since; as for `start_iter`."""
+        return False
+
     def attach(self, hooks: Hooks) -> None:
         names = namespace_of(self.trainer)
         if names is None or LOOP not in names or "GaussianModel" not in names:
@@ -84,15 +88,15 @@ class InriaFamily(AbstractAdapter):
                 f"{LOOP} function, as in {self.checked}."
             )
         self._refuse_fork(names)
-        self._attach_to(hooks, names, names["GaussianModel"])
+        self._attach_to(hooks, names, names["GaussianModel"], names)
 
     def attach_script(self, hooks: Hooks) -> None:
         # The script binds these names when it imports them, so they are replaced before.
         renderer = importlib.import_module("gaussian_renderer")
         model = importlib.import_module("scene.gaussian_model").GaussianModel
-        self._attach_to(hooks, vars(renderer), model)
+        self._attach_to(hooks, vars(renderer), model, hooks.script_globals)
 
-    def _attach_to(self, hooks: Hooks, names: dict[str, Any], model: type) -> None:
+    def _attach_to(self, hooks: Hooks, names: dict[str, Any], model: type, script: dict[str, Any]) -> None:
         present = [name for name in self.renders if name in names]
         if not present:
             raise AdapterMismatchError(
@@ -108,7 +112,7 @@ class InriaFamily(AbstractAdapter):
                 self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
                 self._model = weakref.ref(args[0])
             else:
-                self._step += 1
+                self._step = hooks.number(self._step + 1)
             hooks.iteration(self._step)
             return original(*args, **kwargs)
 
@@ -123,6 +127,11 @@ class InriaFamily(AbstractAdapter):
             hooks.wrap(names, name, rendered)
         hooks.events(model, *(name for name in self.structural if hasattr(model, name)))
         hooks.gate_tensor_backward(LOOP)
+        hooks.loop(script, LOOP, always=self.always_run)
+
+    def always_run(self, numbers: range) -> Iterable[int]:
+        """Those of these iterations on whose number something hangs that the loop itself does not say."""
+        return ()
 
     def is_training_render(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bool:
         """Whether a render with these arguments after the camera can be the training one."""
@@ -174,6 +183,7 @@ class InriaFamily(AbstractAdapter):
                 view_names=[view_key(key) for key in self.view_keys(cameras)],
                 max_steps=opt.iterations,
                 gradients_read_until=self.gradients_read_until(opt, loop),
+                accumulates=self.accumulates(opt, loop),
             )
         )
 

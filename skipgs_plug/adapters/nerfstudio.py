@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
 from skipgs_plug.adapters.loss_scaler import guard_scaler
+from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
@@ -65,6 +66,8 @@ class Nerfstudio(AbstractAdapter):
         hooks.wrap(pipeline, "get_train_loss_dict", forwarded)
         hooks.wrap(pipeline.datamanager, "next_train", batch_made)
         hooks.gate_tensor_backward(LOOP)
+        hooks.loop(function_names(type(trainer).train), "train", always=self.always_run, pure=("step_check",))
+        catch_up_schedulers(hooks, "scheduler_step_all")
         guard_scaler(hooks, trainer.grad_scaler)
         strategy = getattr(pipeline.model, "strategy", None)
         self._relocations = leave_out_noise(hooks, strategy, strategy)
@@ -81,6 +84,12 @@ class Nerfstudio(AbstractAdapter):
 
     def must_run(self, step: int) -> bool:
         return step in self._relocations
+
+    def always_run(self, numbers: range) -> Iterable[int]:
+        """Evaluations, whose intervals stand in a function that the loop calls."""
+        config = self.trainer.config
+        every = (config.steps_per_eval_batch, config.steps_per_eval_image, config.steps_per_eval_all_images)
+        return (n for n in numbers if any(interval and n % interval == 0 for interval in every))
 
 
 def view_names(files: list[Path]) -> list[str]:

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -72,11 +73,12 @@ def run(args: Args, command: list[str]) -> int:
     settings = args.gate.given() | ({"enabled": False} if args.no_gate else {})
     gates: list[SkipGate] = []
 
-    def attach() -> None:
+    def attach() -> dict[str, Any]:
         if not args.no_gate:
             adapter.saved_state = checkpoints.state_for
         gates.append(SkipGate(adapter=adapter, **settings))
         checkpoints.gate = gates[0]
+        return gates[0].script_globals
 
     with cpu_instead_of_cuda(args, command) if args.cpu else contextlib.nullcontext():
         try:

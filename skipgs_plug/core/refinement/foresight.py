@@ -22,7 +22,7 @@ LEAST_WATCHED, MOST_WATCHED = 3, 12
 
 
 def needed_share(iterations: int, n_views: int) -> float:
-    """Share of the refinement iterations that may be needed, known before the first: each view ten times, at least 0.4."""
+    """Share of the refinement iterations that may be needed, known beforehand: each view ten times, at least 0.4."""
     return min(1.0, max(LEAST_SHARE, LEAST_VISITS * n_views / max(iterations, 1)))
 
 

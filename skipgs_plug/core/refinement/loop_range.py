@@ -34,13 +34,12 @@ class LoopRange:
 
     Attributes:
         numbers: the range that the loop asked for.
-        names: what the function that asked had names for.
-        code: of that function.
+        source: code of the function that asked, and what it had names for; None where nothing is to be read there.
         current: number that was handed out last, None before the first and after the last.
     """
 
-    def __init__(self, numbers: range, names: Mapping[str, Any], code: CodeType, owner: Owner) -> None:
-        self.numbers, self.names, self.code = numbers, names, code
+    def __init__(self, numbers: range, owner: Owner, source: tuple[CodeType, Mapping[str, Any]] | None = None) -> None:
+        self.numbers, self.source = numbers, source
         self.current: int | None = None
         self._owner = owner
 
@@ -69,6 +68,21 @@ class LoopRange:
         return repr(self.numbers)
 
 
+class _Every:
+    """Owner of a loop that runs all its numbers."""
+
+    wants_loop = False
+
+    def runs(self, loop: LoopRange, number: int) -> bool:
+        return True
+
+    def expected(self, loop: LoopRange) -> int:
+        return len(loop.numbers)
+
+
+EVERY = _Every()
+
+
 def replace_range(patches: Patches, names: dict[str, Any], functions: tuple[str, ...], owner: Owner) -> None:
     """Let functions of a module that say `range(a, b)` get a `LoopRange`, until it is known which loop trains.
 
@@ -90,7 +104,7 @@ def replace_range(patches: Patches, names: dict[str, Any], functions: tuple[str,
         if numbers.step != 1:
             return numbers
         # The training loop has not begun, so these names hold no iteration's tensors.
-        return LoopRange(numbers, {**frame.f_globals, **frame.f_locals}, frame.f_code, owner)
+        return LoopRange(numbers, owner, (frame.f_code, {**frame.f_globals, **frame.f_locals}))
 
     def undo() -> None:
         if before is absent:

@@ -57,7 +57,8 @@ class Condition:
         Raises:
             SkipGSError: It depends on something that changes in the loop.
         """
-        maybe, rest = set(), set()
+        maybe: set[int] = set()
+        rest: set[int] = set()
         for number in numbers:
             values = {**names, self._loop.target: number}
             if any(self._value(outer, values) is False for outer in self._path):

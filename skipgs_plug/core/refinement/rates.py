@@ -9,7 +9,7 @@ import torch
 from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
 
 
-def path_factor(share: float, progress: float) -> float:
+def path_factor(share: float, progress: float, peak: float | None = None) -> float:
     """Factor on learning rates at some progress through refinement, when a share of the iterations runs.
 
     Adam's steps are about as long as its learning rate, and refinement is limited by how far parameters travel: a
@@ -19,8 +19,9 @@ def path_factor(share: float, progress: float) -> float:
     Args:
         share: Share of the iterations that run, in (0, 1].
         progress: Share of refinement that is over, in [0, 1].
+        peak: Factor at the beginning, instead of 2 / share.
     """
-    return 2.0 / share * (1.0 - progress)
+    return (2.0 / share if peak is None else peak) * (1.0 - progress)
 
 
 class ScaledRates:

@@ -18,6 +18,7 @@ log = logging.getLogger(__name__)
 
 SEARCHED = 10  # iterations from the start on, after which the training loop must have been recognised
 ALL = 0.95  # a share above this is not worth leaving anything out
+RECOVERY = 500  # iterations that run after a structural change which comes when refinement has ended
 
 Always = Callable[[range], Iterable[int]]
 
@@ -51,9 +52,10 @@ class Refinement:
         self.foresight: Foresight | None = None
         self.always: dict[str, set[int]] = {}
         self.watched: frozenset[str] = frozenset()
-        self.gap = 0
+        self.gap = self._left_out = 0
         self._rates: ScaledRates | None = None
         self._start = 0
+        self._last: int | None = None
         self._views: list[str] | None = None
         self._keeps_rates = False
         self._hidden: Always = nothing_always
@@ -63,19 +65,25 @@ class Refinement:
         self._without_loop = 0
         self._first: int | None = None  # of refinement, and what ends it
         self._must: frozenset[int] = frozenset()
-        self._loaded = False
+        self._recovery = self._recovered = 0  # iterations to run after a change, and those that have
+        self._loaded = self._removed = False
 
     # What is known of the trainer.
 
-    def configure(self, start: int, views: list[str] | None, keeps_rates: bool) -> None:
+    def configure(self, start: int, last: int | None, views: list[str] | None, keeps_rates: bool) -> None:
         """Take what is known before the first iteration.
 
         Args:
             start: First iteration that may be left out.
+            last: Last iteration of the run; None where the loop's range says it.
             views: Keys of all training views, when they are known.
             keeps_rates: Leave learning rates alone: the trainer takes as many steps as before.
         """
-        self._start, self._views, self._keeps_rates = start, views, keeps_rates
+        self._start, self._last, self._views, self._keeps_rates = start, last, views, keeps_rates
+
+    def know_views(self, views: list[str]) -> None:
+        """Take the keys of all training views."""
+        self._views = views
 
     def describe(self, always: Always = nothing_always, pure: Iterable[str] = ()) -> None:
         """Take what cannot be read off the loop: hidden numbers, and functions that only look at numbers."""
@@ -83,6 +91,7 @@ class Refinement:
 
     def remove(self) -> None:
         """Let go of the optimizers."""
+        self._removed = True
         if self._rates is not None:
             self._rates.remove()
             self._rates = None
@@ -92,7 +101,7 @@ class Refinement:
     @property
     def wants_loop(self) -> bool:
         """Whether it is not known yet which loop trains."""
-        return self._driver is None
+        return self._driver is None and not self._removed
 
     @property
     def number(self) -> int | None:
@@ -123,6 +132,8 @@ class Refinement:
 
     def runs(self, loop: LoopRange, number: int) -> bool:
         """Whether the loop runs with this number; asked once for each, in order."""
+        if self._removed:
+            return True
         if loop is not self._driver:
             if self._driver is None and loop not in self._loops:
                 self._loops.append(loop)
@@ -131,25 +142,19 @@ class Refinement:
             return True
         if self._first is None or self._loaded:
             self._begin(loop, number)
-        self._set_pace(loop, number)
-        must = number in self._must or number == loop.numbers[-1]
+        self._set_pace(number)
+        must = number in self._must or number == self._last
         if not self.thinning.runs(must):
-            self.gap += 1
+            self._left_out += 1
             return False
+        self.gap, self._left_out = self._left_out, 0
         return True
 
-    def began(self) -> None:
-        """The iteration whose number was handed out last is over, with all that was caught up in it."""
-        self.gap = 0
-
     def expected(self, loop: LoopRange) -> int:
-        """How many numbers the loop will run, as far as is known."""
+        """How many numbers the loop will run, as far as is known: nobody counts another range with a progress bar."""
         numbers = loop.numbers
-        if loop is not self._driver and not self._loops:
-            before = len(range(numbers.start, min(max(self._start, numbers.start), numbers.stop)))
-            share = self.share if self.share is not None else 1.0
-            return before + round((len(numbers) - before) * share)
-        return len(numbers)
+        before = len(range(numbers.start, min(max(self._start, numbers.start), numbers.stop)))
+        return before + round((len(numbers) - before) * (self.share or 1.0))
 
     # Refinement.
 
@@ -161,20 +166,31 @@ class Refinement:
     @property
     def over(self) -> bool:
         """Whether refinement has ended, so that what still runs need not train."""
-        return self.foresight is not None and self.foresight.ended
+        return self.foresight is not None and self.foresight.ended and self._recovered == self._recovery
+
+    def notify_event(self, n_views: int) -> None:
+        """A structural change happened; when refinement has ended, the model is given time to recover."""
+        if self.over:
+            self._recovery, self._recovered = max(n_views, RECOVERY), 0
 
     def _begin(self, loop: LoopRange, number: int) -> None:
         numbers = range(number, loop.numbers.stop)
         if self._first is None:
             self._first = number
         self._loaded = False
-        found = milestones(loop.code, line_of(loop.code), numbers, loop.names, self._pure)
+        found = {}
+        if loop.source is not None:
+            code, names = loop.source
+            found = milestones(code, line_of(code), numbers, names, self._pure)
+            loop.source = None
         hidden = {n for n in self._hidden(numbers) if n in numbers}
         if hidden:
-            found["named by the adapter"] = hidden
+            found["named for this trainer"] = hidden
         self.always = found
         self._must = frozenset().union(*found.values()) if found else frozenset()
-        total = loop.numbers.stop - self._first
+        if self._last is None:
+            self._last = loop.numbers[-1]
+        total = self._last + 1 - self._first
         if self._config.refine_share == "auto" and self.share is None:
             if self._views is None:
                 raise SkipGSError('refine_share="auto" must know the training views; give views=, or a share.')
@@ -186,34 +202,37 @@ class Refinement:
         if self._config.refine_share != "auto":
             assert self.share is not None
             self.thinning.share = self.share
-        loop.names = {}
         if self._scales and self._rates is None:
             self._rates = ScaledRates()
         log.info(
             "Refinement: at most %.0f %% of iterations %d to %d run, %d of them in any case.",
-            100 * (self.share or 1.0), number, loop.numbers[-1], len(self._must),
+            100 * (self.share or 1.0),
+            number,
+            self._last,
+            len(self._must),
         )
 
     @property
     def _scales(self) -> bool:
-        config = self._config
-        if self._keeps_rates or config.compensate is False or self.share is None:
+        if self._keeps_rates or not self._config.compensates:
             return False
-        return self.share < ALL or config.rate_peak is not None
+        return self._config.rate_peak is not None or (self.share is not None and self.share < ALL)
 
-    def _set_pace(self, loop: LoopRange, number: int) -> None:
+    def _set_pace(self, number: int) -> None:
         """Set the share and the factor with which this number is decided on."""
-        assert self._first is not None and self.share is not None
-        total = loop.numbers.stop - self._first
-        if self.foresight is not None:
-            progress = self.foresight.progress(self.thinning.run / (self.share * total))
-            self.thinning.share = 0.0 if self.foresight.ended else 1.0
+        assert self._first is not None and self._last is not None and self.share is not None
+        total = self._last + 1 - self._first
+        if self._recovered < self._recovery:
+            self.thinning.share, factor = 1.0, 1.0 - self._recovered / self._recovery
+            self._recovered += 1
         else:
             progress = (number - self._first) / total
+            if self.foresight is not None:
+                progress = self.foresight.progress(self.thinning.run / (self.share * total))
+                self.thinning.share = 0.0 if self.foresight.ended else 1.0
+            factor = path_factor(self.share, progress, self._config.rate_peak)
         if self._rates is not None:
             self._rates.follow_thread()
-            peak = self._config.rate_peak
-            factor = path_factor(self.share, progress) if peak is None else peak * (1.0 - progress)
             self._rates.factor = factor
 
     # State and report.
@@ -243,6 +262,7 @@ class Refinement:
             "share": self.share,
             "first": self._first,
             "thinning": self.thinning.state_dict(),
+            "recovery": [self._recovery, self._recovered],
             "foresight": None if self.foresight is None else self.foresight.state_dict(),
         }
 
@@ -254,6 +274,7 @@ class Refinement:
             )
         self.share, self._first = state["share"], state["first"]
         self.thinning.load_state_dict(state["thinning"])
+        self._recovery, self._recovered = state["recovery"]
         if state["foresight"] is not None:
             self.foresight = Foresight(self._config.tolerance)
             self.foresight.load_state_dict(state["foresight"])
