@@ -15,7 +15,7 @@ from skipgs_plug.core.errors import SkipGSError
 
 CHECKED_KEYS = 5_000  # when as many have come, some must have come again
 RECURRING = 0.01  # least share of decisions on views that were seen before
-MAX_VIEWS = 200_000  # kept per table, some 100 MB in all; more than any scene has
+MAX_VIEWS = 200_000  # kept per table, some 60 MB in all; more than any scene has
 
 
 def view_key(view: Any) -> str:
