@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.errors import InputError
 
 BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
@@ -41,9 +41,8 @@ class View:
 class Scene:
     """Training views, held-out views and the points that training starts from.
 
-    Positions stay in the coordinates of the dataset, so an exported PLY lies where its cameras do:
-    `transform` (dataset frame to training frame) is the identity for all loaders of this package.
-    Everything in the recipe that has a length is multiplied by `scene_scale` instead.
+    Positions stay in the coordinates of the dataset, so an exported PLY lies where its cameras do; everything
+    in the recipe that has a length is multiplied by `scene_scale` instead.
     """
 
     name: str
@@ -52,45 +51,7 @@ class Scene:
     points: Tensor  # [M, 3] float32
     points_rgb: Tensor  # [M, 3] uint8
     scene_scale: float  # 1.1 x largest distance of a training camera from their centre
-    transform: Tensor = field(default_factory=lambda: torch.eye(4))  # [4, 4]
     background: tuple[float, float, float] = BLACK  # colour in [0, 1] behind the scene
-
-
-def load_scene(path: str | Path, data_factor: int = 1, test_every: int = 8, init_num_pts: int = 100_000) -> Scene:
-    """Load a COLMAP folder, a Blender folder or a packed .npz. Writes nothing.
-
-    Args:
-        path: folder with `sparse/0` or `sparse`, folder with `transforms_train.json`, or .npz file.
-        data_factor: use `images_{data_factor}`; resized in memory when that folder is missing.
-        test_every: views sorted by name, index % test_every == 0 held out; 0 holds out none. Blender scenes
-            with `transforms_test.json` and packed files bring their own split.
-        init_num_pts: random points for a Blender scene, which has no point cloud.
-
-    Raises:
-        MissingFileError: a folder or image is not there.
-        InputError: the content cannot be used (camera model, empty or non-finite points, damaged image...).
-    """
-    path = Path(path).expanduser()
-    if not path.exists():
-        raise MissingFileError(f"Scene {path} does not exist; give a COLMAP folder, Blender folder or packed .npz.")
-    if path.is_file():
-        from skipgs_plug.trainer.packed import load_packed
-
-        if path.suffix != ".npz":
-            raise InputError(f"Scene {path} is a file but not a packed .npz; give the folder that holds it.")
-        return load_packed(path)
-    if (path / "sparse").is_dir():
-        from skipgs_plug.trainer.colmap import load_colmap
-
-        return load_colmap(path, data_factor, test_every)
-    if (path / "transforms_train.json").is_file():
-        from skipgs_plug.trainer.blender import load_blender
-
-        return load_blender(path, data_factor, test_every, init_num_pts)
-    raise MissingFileError(
-        f"Scene {path} holds neither {path / 'sparse' / '0'} (COLMAP) nor "
-        f"{path / 'transforms_train.json'} (Blender); run COLMAP on it or give another folder."
-    )
 
 
 def split_views(views: list[View], test_every: int) -> tuple[list[View], list[View]]:

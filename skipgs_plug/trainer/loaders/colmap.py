@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from skipgs_plug.trainer.errors import InputError, MissingFileError
-from skipgs_plug.trainer.images import find_image, read_image
+from skipgs_plug.trainer.loaders.images import find_image, read_image
 from skipgs_plug.trainer.scene import BLACK, Scene, View, assemble_scene, split_views
 
 log = logging.getLogger(__name__)

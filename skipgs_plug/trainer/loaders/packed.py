@@ -12,7 +12,7 @@ from PIL import Image
 
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.files import write_aside
-from skipgs_plug.trainer.images import read_image
+from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.scene import BLACK, Scene, View, assemble_scene
 
 VERSION = 1

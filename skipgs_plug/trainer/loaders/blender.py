@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from skipgs_plug.trainer.errors import InputError
-from skipgs_plug.trainer.images import find_image, read_image
+from skipgs_plug.trainer.loaders.images import find_image, read_image
 from skipgs_plug.trainer.scene import BLACK, WHITE, Scene, View, assemble_scene, split_views
 
 BOX = 1.3  # half edge of the cube of initial points, as in 3DGS
