@@ -117,16 +117,7 @@ def read_vertices(path: Path) -> dict[str, np.ndarray]:
     try:
         vertices = PlyData.read(str(path), mmap=False)["vertex"]
         return {prop.name: np.asarray(vertices[prop.name]) for prop in vertices.properties}
-    except (
-        PlyParseError,
-        PlyHeaderParseError,
-        KeyError,
-        ValueError,
-        TypeError,
-        EOFError,
-        MemoryError,
-        OSError,
-    ) as error:
+    except (PlyParseError, KeyError, ValueError, TypeError, EOFError, MemoryError, OSError) as error:
         raise InputError(f"PLY {path} is damaged or not a PLY ({error}); export it again.") from error
 
 
