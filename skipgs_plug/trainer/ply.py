@@ -145,9 +145,7 @@ def check_header(path: Path) -> None:
             if element == b"vertex" and words[1:2] == [b"list"]:
                 raise InputError(f"PLY {path} has lists in its vertices, so it is neither a model nor a point cloud.")
     if needed > size:
-        raise InputError(
-            f"PLY {path} is damaged: it claims at least {needed:,} bytes and has {size:,}; export it again."
-        )
+        raise InputError(f"PLY {path} is damaged: it claims {needed:,} bytes at least, has {size:,}; export it again.")
 
 
 def columns(path: Path, vertices: Mapping[str, np.ndarray], names: list[str]) -> np.ndarray:
