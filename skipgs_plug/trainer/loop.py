@@ -15,6 +15,7 @@ from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.mask import leave_out
 from skipgs_plug.trainer.model import create_optimizers, create_splats
 from skipgs_plug.trainer.order import ViewOrder, derive_seed
 from skipgs_plug.trainer.ply import write_ply
@@ -191,8 +192,8 @@ class Trainer:
         }
 
     def _measure(self, view: View, lpips_net: str | None) -> dict[str, float]:
-        image, target = self.render(view), self._target(view)
-        row = {"psnr": metrics.psnr(image, target), "ssim": metrics.ssim(image, target)}
+        image, target = leave_out(self.render(view), self._target(view), view.mask)
+        row = {"psnr": metrics.psnr(image, target, view.mask), "ssim": metrics.ssim(image, target, view.mask)}
         if lpips_net is not None:
             row[f"lpips_{lpips_net}"] = metrics.lpips(image, target, lpips_net)
         return row
@@ -227,7 +228,7 @@ class Trainer:
             generator = torch.Generator().manual_seed(derive_seed(self.config.seed, step))
             background = torch.rand(1, 3, generator=generator).to(self.backend.device)
         colors, _, info = self._rasterize(view, degree, background)
-        return colors[0], self._target(view), info
+        return (*leave_out(colors[0], self._target(view), view.mask), info)
 
     def _rasterize(self, view: View, degree: int, background: Tensor | None) -> tuple[Tensor, Tensor, dict[str, Any]]:
         device = self.backend.device

@@ -15,17 +15,25 @@ SSIM_FLAVOUR = "torchmetrics: 11x11 Gaussian window, reflect padding, border cro
 LPIPS_WEIGHTS = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 
 
-def psnr(render: Tensor, target: Tensor) -> float:
-    """Return PSNR in dB of images [H, W, 3] clamped to [0, 1]; infinite for equal images."""
-    error = float(((render.clamp(0, 1) - target) ** 2).mean())
+def psnr(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Return PSNR in dB of images [H, W, 3] clamped to [0, 1], over the pixels of `mask`; infinite for equal images."""
+    squares = (render.clamp(0, 1) - target) ** 2
+    error = float((squares if mask is None else squares[mask.to(squares.device)]).mean())
     return -10.0 * math.log10(error) if error > 0.0 else math.inf
 
 
-def ssim(render: Tensor, target: Tensor) -> float:
-    """Return SSIM of images [H, W, 3] in [0, 1], as torchmetrics pads (see SSIM_FLAVOUR)."""
+def ssim(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Return SSIM of images [H, W, 3] in [0, 1], as torchmetrics pads (see SSIM_FLAVOUR).
+
+    With a mask [H, W]: the mean over windows whose centre counts. Both images should be black outside it.
+    """
     from torchmetrics.functional.image import structural_similarity_index_measure
 
-    return float(structural_similarity_index_measure(batch(render.clamp(0, 1)), batch(target), data_range=1.0))  # type: ignore[arg-type]
+    images = batch(render.clamp(0, 1)), batch(target)
+    if mask is None:
+        return float(structural_similarity_index_measure(*images, data_range=1.0))  # type: ignore[arg-type]
+    _, windows = structural_similarity_index_measure(*images, data_range=1.0, return_full_image=True)
+    return float(windows[0].permute(1, 2, 0)[mask.to(windows.device)].mean())
 
 
 def require_lpips(net: str) -> None:

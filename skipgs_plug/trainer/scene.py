@@ -13,6 +13,8 @@ from skipgs_plug.trainer.errors import InputError
 
 BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
+MIN_SIDE = 11  # window of SSIM
+MAX_COORDINATE = 1e15  # squares of distances stay finite in float32
 
 
 @dataclass
@@ -27,6 +29,7 @@ class View:
     image: Tensor  # [H, W, 3] uint8
     K: Tensor  # [3, 3] float32, pixels of `image`
     viewmat: Tensor  # [4, 4] float32, world to camera
+    mask: Tensor | None = None  # [H, W] bool, False where a pixel does not count; None: all count
 
     @property
     def width(self) -> int:
@@ -80,13 +83,12 @@ def assemble_scene(
         if view.name in seen:
             raise InputError(f"{source} names two views {view.name!r}; image paths must be unique.")
         seen.add(view.name)
-        if not (torch.isfinite(view.viewmat).all() and torch.isfinite(view.K).all()):
-            raise InputError(f"{source}: camera of {view.name!r} holds NaN or infinity; reconstruct it again.")
+        check_view(view, source)
     if len(points) < 4:
         raise InputError(f"{source} has {len(points)} points, at least 4 are needed; run the reconstruction again.")
-    bad = int((~np.isfinite(points).all(axis=1)).sum())
+    bad = int((~(np.abs(points) < MAX_COORDINATE).all(axis=1)).sum())
     if bad:
-        raise InputError(f"{source} has {bad} points with NaN or infinite coordinates; remove them.")
+        raise InputError(f"{source} has {bad} points with NaN, infinite or huge coordinates; remove them.")
     return Scene(
         name=name,
         train=train,
@@ -96,6 +98,30 @@ def assemble_scene(
         scene_scale=camera_extent(train),
         background=background,
     )
+
+
+def check_view(view: View, source: Path) -> None:
+    """Refuse what cannot be trained on, before training begins."""
+    if not is_text(view.name):
+        raise InputError(f"{source}: view name {view.name[:80]!r} holds control characters or no UTF-8; rename it.")
+    if not (torch.isfinite(view.viewmat).all() and torch.isfinite(view.K).all()):
+        raise InputError(f"{source}: camera of {view.name!r} holds NaN or infinity; reconstruct it again.")
+    if view.K[0, 0] <= 0 or view.K[1, 1] <= 0:
+        raise InputError(f"{source}: camera of {view.name!r} has a focal length of 0 or less; reconstruct it again.")
+    if abs(float(torch.linalg.det(view.viewmat[:3, :3].double()))) < 1e-6:
+        raise InputError(f"{source}: the pose of {view.name!r} cannot be inverted; reconstruct it again.")
+    if min(view.width, view.height) < MIN_SIDE:
+        raise InputError(
+            f"{source}: {view.name!r} is {view.width}x{view.height}, SSIM needs {MIN_SIDE} pixels on each side; "
+            "use larger images or a smaller data_factor."
+        )
+    if view.mask is not None and not view.mask.any():
+        raise InputError(f"{source}: the mask of {view.name!r} leaves no pixel; white is what counts.")
+
+
+def is_text(name: str) -> bool:
+    """Whether a name can be printed and written: no control characters, none of the surrogates of other encodings."""
+    return not any(ord(c) < 32 or 0xD800 <= ord(c) <= 0xDFFF for c in name)
 
 
 def camera_extent(views: list[View]) -> float:

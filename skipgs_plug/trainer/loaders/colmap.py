@@ -1,4 +1,4 @@
-"""COLMAP folders: sparse/0 or sparse, images, images_{factor}."""
+"""COLMAP folders: sparse/0 or sparse, images, images_{factor}, masks."""
 
 from __future__ import annotations
 
@@ -7,38 +7,44 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from skipgs_plug.trainer.errors import InputError, MissingFileError
-from skipgs_plug.trainer.loaders.images import find_image, read_image
-from skipgs_plug.trainer.scene import BLACK, Scene, View, assemble_scene, split_views
+from skipgs_plug.trainer.loaders.colmap_files import check_lengths
+from skipgs_plug.trainer.loaders.native import import_pycolmap
+from skipgs_plug.trainer.loaders.paths import find_image
+from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, find_mask, load_photograph, model_name
+from skipgs_plug.trainer.scene import Scene, View, assemble_scene, split_views
 
 log = logging.getLogger(__name__)
 
-PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
-
 
 def load_colmap(path: Path, data_factor: int, test_every: int) -> Scene:
-    """Load a COLMAP reconstruction with pinhole cameras; see `load_scene`."""
+    """Load a COLMAP reconstruction; see `load_scene`."""
     model = find_model(path)
     reconstruction = read_model(model)
     folder, factor = image_folder(path, data_factor)
-    views = []
+    masks = path / "masks"
+    views, bare, distorted = [], 0, set()
     for image in reconstruction.images.values():
         if not image.has_pose:
             continue
-        pixels, _ = read_image(find_image(folder, image.name), folder / image.name, BLACK, factor)
+        name = image_name(image, model)
+        mask = find_mask(masks, name) if masks.is_dir() else None
+        bare += mask is None
         camera = reconstruction.cameras[image.camera_id]
-        K = pinhole_matrix(camera, model)
-        # The downscaled image has a rounded size: scale by what was really loaded, not by the factor.
-        K[0] *= pixels.shape[1] / camera.width
-        K[1] *= pixels.shape[0] / camera.height
-        pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
-        viewmat = np.eye(4)
-        viewmat[:3] = pose.matrix()
-        views.append(View(image.name, pixels, torch.from_numpy(K).float(), torch.from_numpy(viewmat).float()))
+        if model_name(camera) not in PINHOLE_MODELS:
+            distorted.add(model_name(camera))
+        views.append(load_photograph(name, find_image(folder, name), camera, pose_of(image, name, model), factor, mask))
     if not views:
         raise InputError(f"{model} registers no image; run COLMAP again with more overlap between photographs.")
+    if distorted:
+        log.warning("%s: lens distortion (%s) is removed on load.", path, ", ".join(sorted(distorted)))
+    if masks.is_dir() and bare:
+        log.warning("%s: %d of %d views have no mask there and count whole.", masks, bare, len(views))
+    return assemble(path, model, views, reconstruction, test_every)
+
+
+def assemble(path: Path, model: Path, views: list[View], reconstruction: Any, test_every: int) -> Scene:
     train, test = split_views(views, test_every)
     points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
@@ -60,25 +66,37 @@ def find_model(path: Path) -> Path:
 
 def read_model(model: Path) -> Any:
     """Read the reconstruction, turning pycolmap's failures into one sentence."""
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise InputError("Reading COLMAP folders needs pycolmap; run: pip install 'skipgs_plug[full]'.") from error
+    pycolmap = import_pycolmap()
+    check_lengths(model, camera_models(pycolmap))
     try:
         return pycolmap.Reconstruction(str(model))
     except Exception as error:  # pycolmap raises bare RuntimeError, ValueError or IndexError by kind of damage
         raise InputError(f"COLMAP model {model} cannot be read ({error}); export it again.") from error
 
 
-def pinhole_matrix(camera: Any, model: Path) -> np.ndarray:
-    """Return K [3, 3] in pixels of the size COLMAP saw, or name the model that is not supported."""
-    kind = getattr(camera.model, "name", str(camera.model))
-    if kind not in PINHOLE_MODELS:
-        raise InputError(
-            f"Camera {camera.camera_id} of {model} has model {kind}, only {' and '.join(PINHOLE_MODELS)} are "
-            "supported; run: colmap image_undistorter."
-        )
-    return np.array(camera.calibration_matrix(), dtype=np.float64)
+def camera_models(pycolmap: Any) -> dict[int, int]:
+    """Return the number of parameters of each camera model by its id in files."""
+    create = getattr(pycolmap.Camera, "create_from_model_id", pycolmap.Camera.create)  # create: before pycolmap 4
+    models = [model for model in pycolmap.CameraModelId.__members__.values() if int(model) >= 0]
+    return {int(model): len(create(1, model, 1.0, 2, 2).params) for model in models}
+
+
+def image_name(image: Any, model: Path) -> str:
+    try:
+        return image.name
+    except UnicodeDecodeError as error:
+        raise InputError(f"{model} names image {image.image_id} in no UTF-8; rename the file and map again.") from error
+
+
+def pose_of(image: Any, name: str, model: Path) -> np.ndarray:
+    """Return world to camera [4, 4]."""
+    pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+    viewmat = np.eye(4)
+    viewmat[:3] = pose.matrix()
+    length = np.linalg.norm(pose.rotation.quat)
+    if not (np.isfinite(viewmat).all() and abs(length - 1) < 1e-3 and np.abs(viewmat).max() < 1e12):
+        raise InputError(f"{model}: the pose of {name!r} is not one (quaternion of length {length:g}); map it again.")
+    return viewmat
 
 
 def image_folder(path: Path, data_factor: int) -> tuple[Path, int]:
