@@ -104,6 +104,8 @@ class SkipGate:
     ) -> LoopRange:
         """Return the iterations of your loop that run: `for step in gate.iterations(range(30_000))`.
 
+        Also for a loop of yours around a trainer that the gate is attached to.
+
         Iterations that something hangs on always run: those for which the loop's own conditions on the number
         hold (`if step % 1000 == 0`), read from its source, and the last one. What advances per call, such as a
         scheduler, is yours to advance by number.
@@ -116,7 +118,6 @@ class SkipGate:
         Raises:
             SkipGSError: The numbers do not go up by one, or a condition of the loop cannot be foreseen.
         """
-        self._require_manual("iterations")
         if not isinstance(numbers, range) or numbers.step != 1:
             raise SkipGSError("iterations() takes a range that goes up by one, such as range(30_000).")
         engine = self._engine

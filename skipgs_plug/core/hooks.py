@@ -203,6 +203,12 @@ class Hooks:
         number = None if refinement is None else refinement.number
         return counted if number is None else number
 
+    @property
+    def gap(self) -> int:
+        """Iterations that were left out right before the present one."""
+        refinement = self._engine.refinement
+        return 0 if refinement is None else refinement.gap
+
     def catch_up(self, owner: Any, name: str, caller: str) -> None:
         """Call `owner.name` once more for every iteration that was left out before the present one.
 
@@ -214,11 +220,10 @@ class Hooks:
         """
         if self._engine.refinement is None:
             return
-        refinement = self._engine.refinement
 
         def repeated(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             if sys._getframe(2).f_code.co_name == caller:  # 0 is this function, 1 the wrapper
-                for _ in range(refinement.gap):
+                for _ in range(self.gap):
                     original(*args, **kwargs)
             return original(*args, **kwargs)
 

@@ -8,6 +8,7 @@ the source is changed.
 from __future__ import annotations
 
 import ast
+import copy
 import inspect
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
@@ -16,6 +17,7 @@ from typing import Any, NamedTuple
 
 from skipgs_plug.core.errors import SkipGSError
 
+SAFE = frozenset({"abs", "bool", "int", "len", "max", "min", "round"})
 _POINT = (ast.Eq, ast.NotEq, ast.In, ast.NotIn, ast.Is, ast.IsNot)
 _MAY_BE: None = None  # third truth value: depends on more than the number
 
@@ -104,15 +106,28 @@ class _Loop:
     def __init__(self, statement: ast.For, file: str, first_line: int, pure: frozenset[str]) -> None:
         assert isinstance(statement.target, ast.Name)
         self.target = statement.target.id
-        self.body = statement.body
         self.file, self.first_line = file, first_line
-        self._pure = pure
-        self._changing = {
+        self._pure = pure | SAFE
+        stored = [
             node.id
             for one in statement.body
             for node in ast.walk(one)
-            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
-        } - {self.target}
+            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id != self.target
+        ]
+        self._changing = set(stored)
+        self.body = self._spelled_out(statement.body, stored)
+
+    def _spelled_out(self, body: list[ast.stmt], stored: list[str]) -> list[ast.stmt]:
+        """Replace names that stand for something of the number: `epoch_step = step % len(views)`."""
+        for statement in body:
+            if not (isinstance(statement, ast.Assign) and len(statement.targets) == 1):
+                continue
+            (name,), value = statement.targets, statement.value
+            if not isinstance(name, ast.Name) or stored.count(name.id) != 1:
+                continue
+            if self.mentions(value) and not self.leaf(value).unforeseeable:
+                body = [_Inline(name.id, value).visit(copy.deepcopy(one)) for one in body]
+        return body
 
     def leaf(self, node: ast.expr) -> _Leaf:
         if not self.mentions(node):
@@ -150,6 +165,18 @@ class _Loop:
                 given = [*call.args, *(keyword.value for keyword in call.keywords)]
                 if any(isinstance(value, ast.Name) and value.id == self.target for value in given):
                     yield from (value for value in given if isinstance(value, (ast.Name, ast.Attribute)))
+
+
+class _Inline(ast.NodeTransformer):
+    """Puts an expression where a name is read."""
+
+    def __init__(self, name: str, value: ast.expr) -> None:
+        self._name, self._value = name, value
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        if node.id != self._name or not isinstance(node.ctx, ast.Load):
+            return node
+        return ast.copy_location(copy.deepcopy(self._value), node)
 
 
 def milestones(

@@ -144,7 +144,7 @@ class Refinement:
             self._begin(loop, number)
         self._set_pace(number)
         must = number in self._must or number == self._last
-        if not self.thinning.runs(must):
+        if not self.thinning.runs(number, must):
             self._left_out += 1
             return False
         self.gap, self._left_out = self._left_out, 0

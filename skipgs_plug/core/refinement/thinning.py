@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+GOLDEN = 0.6180339887498949  # its multiples modulo 1 are as even as can be, and periodic with nothing
+
 
 class Thinning:
-    """Spreads a share of the iterations evenly over all of them (error diffusion, as in Bresenham's lines).
+    """Spreads a share of the iterations evenly over all of them (error diffusion with a dithered threshold).
 
+    Strictly even gaps would meet loops that take view `step % n` at the same views again and again, so gaps vary.
     An iteration that must run is paid for by those after it, so that the share stays what was asked for as long
     as fewer iterations must run than may.
 
@@ -19,13 +22,12 @@ class Thinning:
         self.share = share
         self.run = 0
         self.left_out = 0
-        self._credit = 0.5  # the first gap is half as long as the others, as is the last
+        self._credit = 0.5  # as many too many as too few, on average
 
-    def runs(self, must: bool) -> bool:
-        """Whether the next iteration runs; `must` says that something hangs on it."""
+    def runs(self, number: int, must: bool) -> bool:
+        """Whether the next iteration, of this number, runs; `must` says that something hangs on it."""
         self._credit += self.share
-        # Rounding must not leave out an iteration of a loop that runs them all.
-        if not must and self._credit < 1.0 - 1e-9:
+        if not must and self.share < 1.0 and self._credit < 0.5 + number * GOLDEN % 1.0:
             self.left_out += 1
             return False
         self._credit -= 1.0

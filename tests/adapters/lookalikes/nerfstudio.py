@@ -47,7 +47,9 @@ class Pipeline:
 class Trainer:
     def __init__(self, strategy=None, max_norm=None, accumulate=1, scaled=False, world_size=1):
         self.strategy = strategy or DefaultStrategy()
-        self.config = SimpleNamespace(max_num_iterations=LAST + 1)
+        self.config = SimpleNamespace(
+            max_num_iterations=LAST + 1, steps_per_eval_batch=25, steps_per_eval_image=50, steps_per_eval_all_images=0
+        )
         self.world_size, self.max_norm, self.accumulate = world_size, max_norm, accumulate
         self.grad_scaler = torch.amp.GradScaler("cpu", enabled=scaled)
         self.base_dir = Path("output")
