@@ -86,10 +86,14 @@ class Nerfstudio(AbstractAdapter):
         return step in self._relocations
 
     def always_run(self, numbers: range) -> Iterable[int]:
-        """Evaluations, whose intervals stand in a function that the loop calls."""
+        """Evaluations, and the first and last of several whose gradients are gathered: other functions decide there."""
         config = self.trainer.config
         every = (config.steps_per_eval_batch, config.steps_per_eval_image, config.steps_per_eval_all_images)
-        return (n for n in numbers if any(interval and n % interval == 0 for interval in every))
+        gathered = [steps for steps in config.gradient_accumulation_steps.values() if steps > 1]
+        for n in numbers:
+            evaluates = any(interval and n % interval == 0 for interval in every)
+            if evaluates or any(n % steps in (0, steps - 1) for steps in gathered):
+                yield n
 
 
 def view_names(files: list[Path]) -> list[str]:

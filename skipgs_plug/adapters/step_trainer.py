@@ -48,7 +48,7 @@ class StepTrainer(AbstractAdapter):
             return self.trainer
 
         hooks.wrap(prepare, "prepare_trainer", prepared)
-        hooks.loop(hooks.script_globals, "training", always=self.always_run)
+        hooks.loop(hooks.script_globals, "training")
 
     def attach(self, hooks: Hooks) -> None:
         trainer = self.trainer
@@ -82,6 +82,7 @@ class StepTrainer(AbstractAdapter):
 
         # Other wrappers may be put around this trainer later: they call all of these, but not its `step`.
         hooks.wrap(trainer, "update_learning_rate", advanced)
+        hooks.always(self.always_run)
         hooks.before(trainer, "preprocess", lambda camera: hooks.view(camera.ground_truth_image_path))
         hooks.wrap(trainer, "before_optim_hook", hooked)
         hooks.wrap(trainer, "optim_step", watched)

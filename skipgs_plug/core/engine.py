@@ -68,7 +68,9 @@ class Engine:
         self.stats = GateStats()
         self.clock = GateClock()
         self.steps = OptimizerSteps(config, self.iteration)
-        self.refinement = Refinement(config) if config.enabled and config.refine_share is not None else None
+        self.refinement: Refinement | None = None
+        if config.enabled and config.refine_share is not None:
+            self.refinement = Refinement(config, self._go_on_from_saved)
         self.compensation: Compensation | None = None
         self.trace: list[TraceRow] | None = [] if record_trace else None
         self._guard = NonFiniteGuard(config.on_nonfinite)
@@ -160,11 +162,9 @@ class Engine:
         Raises:
             GateOrderError: It lies before the previous one.
         """
-        if self.iteration.step is None and self._saved_state is not None:
-            ask, self._saved_state = self._saved_state, None
-            state = ask(step)
-            if state is not None:
-                self.load_state_dict(state)
+        if self.iteration.step is None:
+            self._go_on_from_saved(step)
+            self._saved_state = None
         before = self.iteration.step
         if before is not None and step < before:
             raise GateOrderError(
@@ -242,8 +242,10 @@ class Engine:
             raise SkipGSError("The gate state is empty: it was saved before training began; start afresh.")
         if self.policy is None:
             self._pending_state = dict(state)
+            # The loop asks about its first number before the trainer says anything else.
+            self._load_refinement(state.get("refinement"))
             return
-        self._pending_state = None
+        pending, self._pending_state = self._pending_state is not None, None
         accumulator = self.steps.accumulator
         if is_release_state(state):
             self._refuse_other_scene(state.get("view_loss_ema", ()))
@@ -253,7 +255,8 @@ class Engine:
             step = None
         else:
             state = gate_state(state)
-            self._load_refinement(state.get("refinement"))
+            if not pending:
+                self._load_refinement(state.get("refinement"))
             self._refuse_other_scene(state["stats"]["views"])
             self.policy.load_state_dict(state["policy"])
             self.stats.load_state_dict(state["stats"])
@@ -263,6 +266,13 @@ class Engine:
             step = state["step"]
         self._scene_check.start()
         self.iteration.begin(step)
+
+    def _go_on_from_saved(self, step: int) -> None:
+        """Load the state that belongs to what training goes on from with iteration `step`, if there is one."""
+        state = None if self._saved_state is None else self._saved_state(step)
+        if state is not None:
+            self._saved_state = None
+            self.load_state_dict(state)
 
     def _load_refinement(self, state: dict[str, Any] | None) -> None:
         if (state is None) != (self.refinement is None):

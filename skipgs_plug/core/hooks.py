@@ -186,6 +186,11 @@ class Hooks:
             self._engine.refinement.describe(always, pure)
             replace_range(self._patches, names, functions, self._engine.refinement)
 
+    def always(self, always: Always) -> None:
+        """Iterations that must run, as for `loop`, where the loop is the user's own."""
+        if self._engine.refinement is not None:
+            self._engine.refinement.describe(always)
+
     def own_loop(self, owner: Any, name: str) -> None:
         """`owner.name(...)` gives the range that the training loop counts with, and nothing hangs on its numbers."""
         if self._engine.refinement is None:

@@ -12,7 +12,7 @@ GATE_VERSION = 2
 POLICY_KEYS = ("means", "budget", "warmup_end", "pause_until", "events")
 GATE_KEYS = ("policy", "stats", "accumulator", "non_finite_in_a_row", "clock", "step")
 STATS_KEYS = ("iterations", "backwards", "skips", "reasons", "events", "views")
-REFINEMENT_KEYS = ("asked", "share", "first", "thinning", "recovery", "foresight")
+REFINEMENT_KEYS = ("asked", "share", "first", "next", "thinning", "recovery", "foresight")
 BUDGET_KEYS = ("floor", "backwards", "skips", "calibrating", "would_skip", "would_total")
 
 

@@ -19,7 +19,6 @@ from skipgs_plug.core.errors import SkipGSError
 
 SAFE = frozenset({"abs", "bool", "int", "len", "max", "min", "round"})
 _POINT = (ast.Eq, ast.NotEq, ast.In, ast.NotIn, ast.Is, ast.IsNot)
-_MAY_BE: None = None  # third truth value: depends on more than the number
 
 
 class _Leaf(NamedTuple):
@@ -48,50 +47,47 @@ class Condition:
         self._test = test
         self._path = path
         self._leaves: dict[int, _Leaf] = {}
-        self.foreseeable = True
-        for leaf in _leaves(test):
-            if self._leaf(leaf).unforeseeable:
-                self.foreseeable = False
 
     def numbers(self, numbers: range, names: Mapping[str, Any]) -> set[int]:
-        """Return those numbers for which the condition does, or may do, the rarer of its two things.
+        """Return those numbers for which the condition does the rarer of its two things, whatever else it depends on.
 
         Raises:
             SkipGSError: It depends on something that changes in the loop.
         """
-        maybe: set[int] = set()
-        rest: set[int] = set()
-        for number in numbers:
-            values = {**names, self._loop.target: number}
-            if any(self._value(outer, values) is False for outer in self._path):
-                continue
-            value = self._value(self._test, values)
-            if value is _MAY_BE and not self.foreseeable:
-                raise SkipGSError(
-                    f"Line {self.line} of {self._loop.file} decides by the iteration's number in a way that cannot be "
-                    f"foreseen ({self.text}), so leaving out iterations could lose what it does; gate without "
-                    "refine_share, or name the iterations that must run (always=)."
-                )
-            (rest if value is False else maybe).add(number)
-        return maybe if len(maybe) <= len(rest) else rest
+        found: set[int] = set()
+        for assumed in (True, False):  # of parts that say nothing of the number
+            holds: set[int] = set()
+            rest: set[int] = set()
+            for number in numbers:
+                values = {**names, self._loop.target: number}
+                if all(self._value(outer, values, True) for outer in self._path):
+                    (holds if self._value(self._test, values, assumed) else rest).add(number)
+            found |= holds if len(holds) <= len(rest) else rest
+        return found
 
-    def _value(self, node: ast.expr, values: Mapping[str, Any]) -> bool | None:
+    def _value(self, node: ast.expr, values: Mapping[str, Any], assumed: bool) -> bool:
         if isinstance(node, ast.BoolOp):
-            parts = [self._value(part, values) for part in node.values]
-            decisive = isinstance(node.op, ast.Or)
-            if decisive in parts:
-                return decisive
-            return _MAY_BE if _MAY_BE in parts else not decisive
+            combine = all if isinstance(node.op, ast.And) else any
+            return combine(self._value(part, values, assumed) for part in node.values)
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
-            inner = self._value(node.operand, values)
-            return _MAY_BE if inner is _MAY_BE else not inner
-        code = self._leaf(node).code
-        if code is None:
-            return _MAY_BE
+            return not self._value(node.operand, values, not assumed)
+        leaf = self._leaf(node)
+        if leaf.unforeseeable and self._is_tested(node):
+            raise SkipGSError(
+                f"Line {self.line} of {self._loop.file} decides by the iteration's number in a way that cannot be "
+                f"foreseen ({self.text}), so leaving out iterations could lose what it does; gate without "
+                "refine_share, or name the iterations that must run (always=)."
+            )
+        if leaf.code is None:
+            return assumed
         try:
-            return bool(eval(code, dict(values)))
-        except Exception:  # a name that is not bound yet, a number of another kind: it may hold
-            return _MAY_BE
+            return bool(eval(leaf.code, dict(values)))
+        except Exception:  # a name that is not bound yet, a number of another kind
+            return assumed
+
+    def _is_tested(self, node: ast.expr) -> bool:
+        """Whether a part is one of the condition itself, not of those around it, and picks single numbers."""
+        return _is_point(node) and any(leaf is node for leaf in _leaves(self._test))
 
     def _leaf(self, node: ast.expr) -> _Leaf:
         found = self._leaves.get(id(node))
@@ -287,4 +283,5 @@ def _is_point(leaf: ast.expr) -> bool:
         return any(isinstance(operator, _POINT) for operator in leaf.ops) or any(
             isinstance(part, ast.Mod) for part in ast.walk(leaf)
         )
-    return True
+    # The training backward of a loop of one's own, which gets the number too, is no milestone.
+    return not (isinstance(leaf, ast.Call) and isinstance(leaf.func, ast.Attribute) and leaf.func.attr == "backward")

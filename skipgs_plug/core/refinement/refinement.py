@@ -35,6 +35,7 @@ class Refinement:
 
     Args:
         config: With `refine_share`.
+        go_on: Loads the state that belongs to what training goes on from with an iteration, if there is one.
 
     Attributes:
         share: of the iterations that run, or may run where it is found automatically; None before refinement.
@@ -45,8 +46,9 @@ class Refinement:
         gap: iterations left out right before the present one.
     """
 
-    def __init__(self, config: SkipConfig) -> None:
+    def __init__(self, config: SkipConfig, go_on: Callable[[int], None]) -> None:
         self._config = config
+        self._go_on = go_on
         self.share: float | None = None if config.refine_share == "auto" else config.refine_share  # type: ignore[assignment]
         self.thinning = Thinning(1.0)
         self.foresight: Foresight | None = None
@@ -66,7 +68,8 @@ class Refinement:
         self._first: int | None = None  # of refinement, and what ends it
         self._must: frozenset[int] = frozenset()
         self._recovery = self._recovered = 0  # iterations to run after a change, and those that have
-        self._loaded = self._removed = False
+        self._next: int | None = None  # number that is asked about next, also by the loop of a loaded state
+        self._begun = self._removed = False
 
     # What is known of the trainer.
 
@@ -122,6 +125,9 @@ class Refinement:
         if self._driver is None:
             self._driver = next((loop for loop in self._loops if loop.current == step), None)
             self._loops.clear()
+            if self._driver is not None and step >= self._start and self._first is None:
+                self._first = step  # it began before its loop was known
+                self.thinning.runs(must=True)
         if self._driver is None:
             self._without_loop += step >= self._start
             if self._without_loop == SEARCHED:
@@ -134,17 +140,22 @@ class Refinement:
         """Whether the loop runs with this number; asked once for each, in order."""
         if self._removed:
             return True
+        if self._driver is None and number == loop.numbers.start > 0:
+            self._go_on(number)
+        if self._driver is None and number == self._next:
+            self._driver = loop  # goes on where the saved state left it
         if loop is not self._driver:
             if self._driver is None and loop not in self._loops:
                 self._loops.append(loop)
             return True
+        self._next = number + 1
         if number < self._start:
             return True
-        if self._first is None or self._loaded:
+        if not self._begun:
             self._begin(loop, number)
         self._set_pace(number)
         must = number in self._must or number == self._last
-        if not self.thinning.runs(number, must):
+        if not self.thinning.runs(must):
             self._left_out += 1
             return False
         self.gap, self._left_out = self._left_out, 0
@@ -177,7 +188,7 @@ class Refinement:
         numbers = range(number, loop.numbers.stop)
         if self._first is None:
             self._first = number
-        self._loaded = False
+        self._begun = True
         found = {}
         if loop.source is not None:
             code, names = loop.source
@@ -261,6 +272,7 @@ class Refinement:
             "asked": self._config.refine_share,
             "share": self.share,
             "first": self._first,
+            "next": self._next,
             "thinning": self.thinning.state_dict(),
             "recovery": [self._recovery, self._recovered],
             "foresight": None if self.foresight is None else self.foresight.state_dict(),
@@ -278,4 +290,4 @@ class Refinement:
         if state["foresight"] is not None:
             self.foresight = Foresight(self._config.tolerance)
             self.foresight.load_state_dict(state["foresight"])
-        self._loaded = True
+        self._next, self._begun = state["next"], False
