@@ -20,6 +20,24 @@ from .sh import sh_backward, sh_forward
 from .shortcuts import SHORTCUTS, active_shortcuts
 
 
+def _saved(ctx: Any, **shapes: torch.Size) -> tuple[Tensor, ...]:
+    """The saved tensors, if those that came from outside still have the sizes that the forward pass saw.
+
+    Torch notices what is changed in place, but not that `.data` was replaced, as code that densifies does.
+
+    Raises:
+        RuntimeError: A tensor has another size now.
+    """
+    tensors = ctx.saved_tensors
+    for tensor, (name, shape) in zip(tensors, shapes.items(), strict=False):
+        if tensor.shape != shape:
+            raise RuntimeError(
+                f"{name} had shape {list(shape)} when it was rendered and has {list(tensor.shape)} now: call backward() "
+                "before the number of Gaussians changes."
+            )
+    return tensors  # type: ignore[no-any-return]
+
+
 class Project(torch.autograd.Function):
     """Gaussians of one camera on its image plane.
 
@@ -56,6 +74,7 @@ class Project(torch.autograd.Function):
         list_visible(radii, visible, block_start, n)
         visible = visible[: int(block_start[-1])]
         ctx.save_for_backward(means, quats, scales, viewmat, K, visible, block_start)
+        ctx.shapes = {"means": means.shape, "quats": quats.shape, "scales": scales.shape, "viewmats": viewmat.shape}
         ctx.size = (width, height, eps2d)
         ctx.mark_non_differentiable(radii, sigmas, visible, block_start)
         ctx.set_materialize_grads(False)  # depths rarely have a gradient: no zeros for them
@@ -71,7 +90,7 @@ class Project(torch.autograd.Function):
         v_compensations: Tensor | None,
         *_: Any,
     ) -> Any:
-        means, quats, scales, viewmat, K, visible, block_start = ctx.saved_tensors
+        means, quats, scales, viewmat, K, visible, block_start = _saved(ctx, **ctx.shapes)
         width, height, eps2d = ctx.size
         with_pose = ctx.needs_input_grad[4]
         v_means, v_quats, v_scales = (floats(*t.shape) for t in (means, quats, scales))
@@ -121,13 +140,14 @@ class SphericalHarmonics(torch.autograd.Function):
         ctx.joined = rest is None
         rest = base if rest is None else rest
         sh_forward(means, camera, base, rest, visible, block_start, colors, n, *ctx.layout, degree)
-        ctx.save_for_backward(means, camera, base, rest, colors, visible, block_start)
+        ctx.save_for_backward(means, base, rest, camera, colors, visible, block_start)
+        ctx.shapes = {"means": means.shape, "colors": base.shape, "the higher bands of colors": rest.shape}
         return colors
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> Any:  # type: ignore[override]
-        means, camera, base, rest, colors, visible, block_start = ctx.saved_tensors
+        means, base, rest, camera, colors, visible, block_start = _saved(ctx, **ctx.shapes)
         v_means, v_base = floats(*means.shape), floats(*base.shape)
         v_rest = v_base if ctx.joined else floats(*rest.shape)
         v_cameras = zeros(blocks(len(means)), 3)
@@ -174,6 +194,13 @@ class Blend(torch.autograd.Function):
                 pair_blocks, width, height, tiles_x, tiles_y, channels, channel, some, active_shortcuts(),
             )  # fmt: skip
         ctx.save_for_backward(means2d, conics, opacities, colors, transmittance, pixel_stop, tile_stop, pair_blocks)
+        ctx.shapes = {
+            "means2d": means2d.shape,
+            "conics": conics.shape,
+            "opacities": opacities.shape,
+            "colors": colors.shape,
+            "alphas": transmittance.shape,
+        }
         ctx.bins, ctx.absolute = bins, absolute
         ctx.mark_non_differentiable(bins.tiles_per_gauss)
         return image, transmittance, bins.tiles_per_gauss
@@ -181,7 +208,9 @@ class Blend(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor, _: Any) -> Any:  # type: ignore[override]
-        means2d, conics, opacities, colors, transmittance, pixel_stop, tile_stop, pair_blocks = ctx.saved_tensors
+        means2d, conics, opacities, colors, transmittance, pixel_stop, tile_stop, pair_blocks = _saved(
+            ctx, **ctx.shapes
+        )
         bins: Bins = ctx.bins
         height, width, channels = v_image.shape
         tiles_x, tiles_y = tiles(width, height)

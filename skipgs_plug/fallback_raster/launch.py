@@ -20,8 +20,9 @@ import math
 import os
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Annotated, Any, NamedTuple, get_args, get_origin
 
@@ -36,6 +37,8 @@ _lock = threading.RLock()
 _scratch = threading.local()
 _num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _pool: ThreadPoolExecutor | None = None
+_busy = False  # threads of the pool may still be at work
+_forked = False  # this process inherited torch's OpenMP without its threads, and has not been told so
 
 # The counter has a cache line of its own, so that nothing else is slowed down by it.
 _Counter = ctypes.c_int32 * 32
@@ -189,6 +192,8 @@ class Worker:
         with _lock:
             if self._command is None:
                 self._command = self._record()
+            if _forked:
+                _warn_after_fork()
             command, bounds, parameters = self._command
             counter = _Counter()
             block = parameters(ctypes.addressof(counter) + _COUNTER_OFFSET, *values)
@@ -303,15 +308,53 @@ def _quiet_stderr() -> Iterator[None]:
 
 
 def _on_all_threads(work: Callable[[], None]) -> None:
-    global _pool
+    """Runs `work` on every thread and returns when all are done, also when an exception arrives meanwhile.
+
+    KeyboardInterrupt and what signal handlers raise may come between any two steps, and another one while the threads
+    are awaited. So the pool counts as busy until all is known to be done, and the next call waits for it.
+    """
+    global _pool, _busy
     if _num_threads == 1:
         work()
         return
+    if _busy and _pool is not None:
+        _pool.shutdown()
+        _pool = None
     if _pool is None:
         _pool = ThreadPoolExecutor(_num_threads - 1, thread_name_prefix="skipgs-raster")
-    others = [_pool.submit(work) for _ in range(_num_threads - 1)]
-    work()
-    for other in others:
-        # A worker that has not started by now would find no item left.
-        if not other.cancel():
-            other.result()
+    others: list[Future[None]] = []
+    _busy = True
+    try:
+        for _ in range(_num_threads - 1):
+            others.append(_pool.submit(work))
+        work()
+    finally:
+        for other in others:
+            # A worker that has not started by now would find no item left.
+            if not other.cancel():
+                other.result()
+    _busy = False
+
+
+def _warn_after_fork() -> None:
+    global _forked
+    _forked = False
+    warnings.warn(
+        "This process was forked from one in which torch had several threads, which do not survive a fork: torch "
+        'may hang here. Start processes with multiprocessing\'s "spawn", or call torch.set_num_threads(1) first.',
+        RuntimeWarning,
+        stacklevel=4,
+    )
+
+
+def _after_fork_in_child() -> None:
+    """Threads do not survive a fork: a child starts its own."""
+    global _pool, _busy, _forked
+    _pool, _busy = None, False
+    _forked = torch.get_num_threads() > 1
+    _lock.release()
+
+
+# A child must not inherit the lock from a thread that renders; so a fork waits until it has finished.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_after_fork_in_child)

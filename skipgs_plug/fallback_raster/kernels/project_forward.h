@@ -1,23 +1,29 @@
 // Centre, depth, inverse covariance and extent on the image plane of rows [first, last).
 #include "geometry.h"
-const Camera camera(viewmat, K, width, height);
 for (int base = first; base < last; base += 16) {
     const int lanes = last - base < 16 ? last - base : 16;
     int row[16];
     for (int l = 0; l < 16; ++l) row[l] = base + (l < lanes ? l : lanes - 1);
-    const Projection p(camera, row, means, quats, scales, eps2d);
+    v16 world[3], x, y, z, qw, qx, qy, qz, q_scale, q_norm, R[3][3];
+    v16 iz, ux, uy, J00, J02, J11, J12, WM[3][3], T0[3], T1[3];
+    v16 sharp_xx, sharp_yy, cov_xx, cov_yy, sharp_det, det, slope, conic_a, conic_b, conic_c;
+    const v16 S[3] = {gather(scales, row, 3, 0), gather(scales, row, 3, 1), gather(scales, row, 3, 2)};
+    centres(viewmat, means, row, world, x, y, z);
+    rotations(quats, row, qw, qx, qy, qz, q_scale, q_norm, R);
+    splat_axes(viewmat, K, width, height, x, y, z, R, S, iz, ux, uy, J00, J02, J11, J12, WM, T0, T1);
+    covariances(T0, T1, eps2d, sharp_xx, sharp_yy, cov_xx, cov_yy, sharp_det, det, slope, conic_a, conic_b, conic_c);
 
-    v16 compensation = vsqrt(p.ratio);
+    v16 compensation = vsqrt(sharp_det / det);
     v16 opacity = gather(opacities, row, 1, 0) * (antialiased ? compensation : (v16)1.0f);
     // Written so that a NaN anywhere fails the test and the Gaussian is left out.
-    i16 visible = (p.z >= near_plane) & (p.z <= far_plane) & (p.det > 0.0f) & (opacity >= ALPHA_MIN);
+    i16 visible = (z >= near_plane) & (z <= far_plane) & (det > 0.0f) & (opacity >= ALPHA_MIN);
     v16 reach = vmin((v16)3.33f, vsqrt(LN_4 * log2(255.0f * vmax(opacity, (v16)1e-3f))));
-    v16 u = camera.fx * p.x * p.iz + camera.cx, v = camera.fy * p.y * p.iz + camera.cy;
-    v16 sigma_x = vsqrt(p.cov_xx), sigma_y = vsqrt(p.cov_yy);
+    v16 u = K[0] * x * iz + K[2], v = K[4] * y * iz + K[5];
+    v16 sigma_x = vsqrt(cov_xx), sigma_y = vsqrt(cov_yy);
     v16 radius_x = vmin((v16)1e9f, __builtin_elementwise_ceil(reach * sigma_x));
     v16 radius_y = vmin((v16)1e9f, __builtin_elementwise_ceil(reach * sigma_y));
     // Thinner than a millionth of a pixel (only without eps2d): it meets no pixel centre, but overflows gradients.
-    visible &= (p.conic_a < 1e12f) & (p.conic_c < 1e12f);
+    visible &= (conic_a < 1e12f) & (conic_c < 1e12f);
     visible &= (radius_x > radius_clip) | (radius_y > radius_clip);
     visible &= (u + radius_x > 0.0f) & (u - radius_x < width) & (v + radius_y > 0.0f) & (v - radius_y < height);
 
@@ -30,10 +36,10 @@ for (int base = first; base < last; base += 16) {
     }
     scatter(means2d, row, 2, 0, visible ? u : none, lanes);
     scatter(means2d, row, 2, 1, visible ? v : none, lanes);
-    scatter(depths, row, 1, 0, visible ? p.z : none, lanes);
-    scatter(conics, row, 3, 0, visible ? p.conic_a : none, lanes);
-    scatter(conics, row, 3, 1, visible ? p.conic_b : none, lanes);
-    scatter(conics, row, 3, 2, visible ? p.conic_c : none, lanes);
+    scatter(depths, row, 1, 0, visible ? z : none, lanes);
+    scatter(conics, row, 3, 0, visible ? conic_a : none, lanes);
+    scatter(conics, row, 3, 1, visible ? conic_b : none, lanes);
+    scatter(conics, row, 3, 2, visible ? conic_c : none, lanes);
     scatter(sigmas, row, 2, 0, visible ? sigma_x : none, lanes);
     scatter(sigmas, row, 2, 1, visible ? sigma_y : none, lanes);
     if (antialiased) scatter(compensations, row, 1, 0, visible ? compensation : none, lanes);

@@ -15,20 +15,21 @@ for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
     float v1 = colors[3 * g + 1] > 0.0f ? v_colors[3 * g + 1] : 0.0f;
     float v2 = colors[3 * g + 2] > 0.0f ? v_colors[3 * g + 2] : 0.0f;
     if (v0 == 0.0f && v1 == 0.0f && v2 == 0.0f && (shortcuts & CONTRIBUTED_ONLY)) continue;
-    const Harmonics h(means + 3ll * g, camera, degree);
-    const float x = h.x, y = h.y, z = h.z, xx = h.xx, yy = h.yy, zz = h.zz;
+    float basis[16], x, y, z, norm, shrink;
+    harmonics(means + 3ll * g, camera, degree, basis, x, y, z, norm, shrink);
+    const float xx = x * x, yy = y * y, zz = z * z;
     const int terms = (degree + 1) * (degree + 1);
     const float* sh = rest + (long long)g * rest_stride + rest_offset - 3;  // sh[3 k] is band k, from 1 on
     float* v_constant = v_base + (long long)g * base_stride;
     float* v_sh = v_rest + (long long)g * rest_stride + rest_offset - 3;
-    v_constant[0] = h.basis[0] * v0;
-    v_constant[1] = h.basis[0] * v1;
-    v_constant[2] = h.basis[0] * v2;
+    v_constant[0] = basis[0] * v0;
+    v_constant[1] = basis[0] * v1;
+    v_constant[2] = basis[0] * v2;
     float along[16];
     for (int k = 1; k < terms; ++k) {
-        v_sh[3 * k] = h.basis[k] * v0;
-        v_sh[3 * k + 1] = h.basis[k] * v1;
-        v_sh[3 * k + 2] = h.basis[k] * v2;
+        v_sh[3 * k] = basis[k] * v0;
+        v_sh[3 * k + 1] = basis[k] * v1;
+        v_sh[3 * k + 2] = basis[k] * v2;
         along[k] = sh[3 * k] * v0 + sh[3 * k + 1] * v1 + sh[3 * k + 2] * v2;
     }
     if (degree == 0) continue;
@@ -52,7 +53,7 @@ for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
             + 1.1195289977703462f * (2.0f * zz - xx - yy) * along[12] + 1.445305721320277f * (xx - yy) * along[14];
     }
     // Through the normalisation of the direction.
-    const float back = h.norm * h.shrink, radial = vx * x + vy * y + vz * z;
+    const float back = norm * shrink, radial = vx * x + vy * y + vz * z;
     const float v_direction[3] = {(vx - radial * x) * back, (vy - radial * y) * back, (vz - radial * z) * back};
     for (int c = 0; c < 3; ++c) {
         v_means[3 * g + c] = v_direction[c];
