@@ -32,8 +32,8 @@ def _saved(ctx: Any, **shapes: torch.Size) -> tuple[Tensor, ...]:
     for tensor, (name, shape) in zip(tensors, shapes.items(), strict=False):
         if tensor.shape != shape:
             raise RuntimeError(
-                f"{name} had shape {list(shape)} when it was rendered and has {list(tensor.shape)} now: call backward() "
-                "before the number of Gaussians changes."
+                f"{name} had shape {list(shape)} when it was rendered and has {list(tensor.shape)} now: call "
+                "backward() before the number of Gaussians changes."
             )
     return tensors  # type: ignore[no-any-return]
 

@@ -24,12 +24,14 @@ import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_args, get_origin
 
 import torch
 from torch import Tensor
 
 from . import guard
+from .cache import load_or_rebuild
 from .guard import Sizes
 from .source import PRELUDE, SHARED, declare
 
@@ -227,7 +229,13 @@ class Worker:
         namespace[f"{self._name}_body"] = wp.func_native(PRELUDE + pointers + self._code)(body)
         kernel = wp.kernel(enable_backward=False)(namespace[self._name])
         inputs = [0] * len(declared)
-        command = wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
+        # Warp compiles for blocks of one thread on the CPU.
+        folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(1)
+        command = load_or_rebuild(
+            folder,
+            lambda: wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False),
+            kernel.module.unload,
+        )
         # Every call fills a block of parameters of its own, which the threads share.
         bounds, *parameters = command.params
         fields = [(name, type(parameter)) for name, parameter in zip(declared, parameters, strict=True)]
