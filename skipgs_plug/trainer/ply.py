@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.files import write_aside
 
 REST = 15  # coefficients of SH degrees 1 to 3
@@ -118,7 +118,7 @@ def read_vertices(path: Path) -> dict[str, np.ndarray]:
         vertices = PlyData.read(str(path), mmap=False)["vertex"]
         return {prop.name: np.asarray(vertices[prop.name]) for prop in vertices.properties}
     except (PlyParseError, KeyError, ValueError, TypeError, EOFError, MemoryError, OSError) as error:
-        raise InputError(f"PLY {path} is damaged or not a PLY ({error}); export it again.") from error
+        raise InputError(f"PLY {path} is damaged or not a PLY ({reason(error)}); export it again.") from error
 
 
 def check_header(path: Path) -> None:
@@ -129,7 +129,7 @@ def check_header(path: Path) -> None:
         with open(path, "rb") as stream:
             size, head = os.fstat(stream.fileno()).st_size, stream.read(MAX_HEADER)
     except OSError as error:
-        raise InputError(f"PLY {path} cannot be read ({error}).") from error
+        raise InputError(f"PLY {path} cannot be read ({reason(error)}).") from error
     header, found, _ = head.partition(b"end_header")
     if not header.startswith(b"ply") or not found:
         raise InputError(f"PLY {path} is damaged or not a PLY (no header); export it again.")

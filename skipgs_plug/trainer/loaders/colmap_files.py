@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.errors import InputError, reason
 
 POINT_2D = 24  # x, y, id of the 3D point
 TRACK_ELEMENT = 8  # image id, index of the 2D point
@@ -31,7 +31,7 @@ def check_lengths(model: Path, camera_models: dict[int, int]) -> None:
         try:
             data = path.read_bytes()
         except OSError as error:
-            raise InputError(f"{path} cannot be read ({error}).") from error
+            raise InputError(f"{path} cannot be read ({reason(error)}).") from error
         at = 0
         try:
             for at in walk(data, camera_models):

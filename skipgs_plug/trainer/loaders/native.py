@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.errors import InputError, reason
 
 
 def import_pycolmap() -> Any:
@@ -21,6 +21,6 @@ def import_pycolmap() -> Any:
         import pycolmap
     except ImportError as error:
         raise InputError(
-            f"Cameras of photographs need pycolmap ({error}); run: pip install 'skipgs_plug[full]'."
+            f"Cameras of photographs need pycolmap ({reason(error)}); run: pip install 'skipgs_plug[full]'."
         ) from error
     return pycolmap

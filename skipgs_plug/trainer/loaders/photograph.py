@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.errors import InputError, reason
 from skipgs_plug.trainer.loaders.images import read_image, read_mask
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.paths import inside
@@ -67,7 +67,7 @@ def undistort(
             mask = torch.from_numpy(np.array(cut.to_array())).reshape(straight.shape[:2]) >= 128
     except Exception as error:  # pycolmap raises bare RuntimeError or ValueError
         raise InputError(
-            f"Image {image_path}: its camera, a {model_name(camera)}, cannot be undistorted ({error}); "
+            f"Image {image_path}: its camera, a {model_name(camera)}, cannot be undistorted ({reason(error)}); "
             "run: colmap image_undistorter."
         ) from error
     return straight, mask, np.array(pinhole.calibration_matrix(), dtype=np.float64)
