@@ -83,7 +83,7 @@ def run(args: Args) -> int:
     if not args.resume and folder.has_checkpoints():
         raise InputError(f"{args.out} already holds a run; add --resume to continue it or give another --out.")
     checkpoint = folder.latest_checkpoint() if args.resume else None
-    scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts)
+    scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
     trainer = Trainer(config, scene)
     gate = None if args.no_gate else SkipGate(trainer, **gate_settings(args.gate))
     if checkpoint is not None:
