@@ -232,6 +232,10 @@ TARGETS = [  # (source, file); the binary model twice, for it is what others sen
     ("text", "masks/view_002.png"),
     ("blender", "transforms_train.json"),
     ("blender", "view_001.png"),
+    ("nerfstudio", "transforms.json"),
+    ("nerfstudio", "transforms.json"),
+    ("nerfstudio", "sparse_pc.ply"),
+    ("nerfstudio", "view_001.png"),
     ("packed", "scene.npz"),
     ("packed", "scene.npz"),
     *(("images", f"picture.{suffix}") for suffix in ("png", "jpg", "tif", "webp", "gif", "bmp")),
@@ -252,6 +256,7 @@ def write_sources(root: Path) -> dict[str, Source]:
         "text": Source(text, [file for source, file in TARGETS if source == "text"], lambda: load(text)),
         "binary": Source(binary, [f"sparse/0/{path.name}" for path in model.iterdir()], lambda: load(binary)),
         "blender": write_blender(scene, root / "blender"),
+        "nerfstudio": write_nerfstudio(scene, root / "nerfstudio"),
         "packed": write_packed(scene, root / "packed"),
         "images": write_images(root / "images"),
         "ply": write_plys(scene, root / "ply"),
@@ -297,16 +302,43 @@ def write_colmap(scene: Scene, root: Path) -> Path:
 
 
 def write_blender(scene: Scene, root: Path) -> Source:
+    content = {"camera_angle_x": 0.9, "frames": write_frames(scene, root)}
+    (root / "transforms_train.json").write_text(json.dumps(content))
+    return Source(root, ["transforms_train.json", "view_001.png"], lambda: load(root))
+
+
+def write_nerfstudio(scene: Scene, root: Path) -> Source:
+    K = scene.train[0].K.tolist()
+    lens = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2], "k1": 0.02, "k2": 0, "p1": 0.001, "p2": 0}
+    frames = write_frames(scene, root)
+    frames[0]["mask_path"] = scene.train[1].name
+    names = [view.name for view in scene.train]
+    content = {"w": 20, "h": 16, "camera_model": "OPENCV", **lens, "ply_file_path": "sparse_pc.ply", "frames": frames}
+    content |= {"train_filenames": names[:3], "val_filenames": names[3:]}
+    (root / "transforms.json").write_text(json.dumps(content))
+    write_cloud(scene, root / "sparse_pc.ply")
+    return Source(root, ["transforms.json", "sparse_pc.ply", "view_001.png"], lambda: load(root))
+
+
+def write_frames(scene: Scene, root: Path) -> list[dict[str, object]]:
+    """Write RGBA images and return what a transforms file says of each."""
     from PIL import Image
 
     root.mkdir()
-    frames = []
+    frames: list[dict[str, object]] = []
     for view in scene.train:
         Image.fromarray(view.image.numpy()).convert("RGBA").save(root / view.name)
         pose = np.linalg.inv(view.viewmat.double().numpy()) @ np.diag([1.0, -1.0, -1.0, 1.0])
         frames.append({"file_path": view.name, "transform_matrix": pose.tolist()})
-    (root / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.9, "frames": frames}))
-    return Source(root, ["transforms_train.json", "view_001.png"], lambda: load(root))
+    return frames
+
+
+def write_cloud(scene: Scene, path: Path) -> None:
+    from plyfile import PlyData, PlyElement
+
+    kinds = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    rows = [(*p, *c) for p, c in zip(scene.points.tolist(), scene.points_rgb.tolist(), strict=True)]
+    PlyData([PlyElement.describe(np.array(rows, dtype=kinds), "vertex")]).write(str(path))
 
 
 def write_packed(scene: Scene, root: Path) -> Source:
@@ -340,7 +372,7 @@ def write_images(root: Path) -> Source:
 
 def write_plys(scene: Scene, root: Path) -> Source:
     """Write a model in binary and in text, and a point cloud."""
-    from plyfile import PlyData, PlyElement
+    from plyfile import PlyData
 
     root.mkdir()
     n = len(scene.points)
@@ -348,9 +380,7 @@ def write_plys(scene: Scene, root: Path) -> Source:
     generator = torch.Generator().manual_seed(0)
     write_ply({k: torch.randn(n, *shape, generator=generator) for k, shape in shapes.items()}, root / "model.ply")
     PlyData(PlyData.read(str(root / "model.ply")).elements, text=True).write(str(root / "text.ply"))
-    kinds = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    rows = [(*p, *c) for p, c in zip(scene.points.tolist(), scene.points_rgb.tolist(), strict=True)]
-    PlyData([PlyElement.describe(np.array(rows, dtype=kinds), "vertex")]).write(str(root / "points.ply"))
+    write_cloud(scene, root / "points.ply")
 
     def load_plys() -> None:
         for name in ("model.ply", "text.ply"):

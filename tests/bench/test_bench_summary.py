@@ -126,7 +126,10 @@ def test_every_policy_looks_different():
 
 
 def test_a_new_metric_is_one_entry(scene, tmp_path, monkeypatch):
-    worst = Metric("worst", "Worst pixel", 3, "greatest difference", lambda a, b: float((a - b).abs().max()), unit="%")
+    def greatest(render, target, mask):
+        return float((render - target).abs().max())
+
+    worst = Metric("worst", "Worst pixel", 3, "greatest difference", greatest, unit="%")
     monkeypatch.setitem(METRICS, "worst", worst)
     bench = make_bench(scene, tmp_path, seeds=(0,), policies=("ungated",), max_steps=20, tensorboard=True)
     (done,) = bench.run()

@@ -19,7 +19,7 @@ def soak_files(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_error_or_right_load(soak_files: ModuleType) -> None:
     outcomes = soak_files.run(count=400, seed=20)
-    assert sum(outcomes.values()) == 400 and min(outcomes["refused"], outcomes["loaded"]) > 50
+    assert sum(outcomes.values()) == 400 and min(outcomes["refused"], outcomes["loaded"]) > 20
 
 
 def test_cases_repeat(soak_files: ModuleType) -> None:
