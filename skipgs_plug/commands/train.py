@@ -32,10 +32,10 @@ class Options(TrainConfig):
 
 @dataclass
 class Args:
-    """Train a COLMAP folder, a Blender folder or a packed .npz."""
+    """Train a COLMAP, nerfstudio or Blender folder or a packed .npz."""
 
     scene: tyro.conf.Positional[str]
-    """Folder with sparse/0 or transforms_train.json, or packed .npz."""
+    """Folder with sparse/0, transforms.json or transforms_train.json, or packed .npz."""
     out: str
     """Run folder to write."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)

@@ -59,7 +59,7 @@ class TrainConfig:
     """
 
     data_dir: str = ""
-    """Scene: COLMAP folder, Blender folder or packed .npz."""
+    """Scene: COLMAP, nerfstudio or Blender folder or packed .npz."""
     result_dir: str = ""
     """Run folder to write."""
     data_factor: int = 1

@@ -94,6 +94,24 @@ def test_colmap(tmp_path: Path, model: str, caplog: pytest.LogCaptureFixture) ->
     assert wrong.mean() < 0.01  # the column at the edge
 
 
+def test_no_pinhole_sees_a_sphere(tmp_path: Path) -> None:
+    folder = write_lens(tmp_path / "scan", "OPENCV")
+    (folder / "sparse/0/cameras.txt").write_text(f"1 EQUIRECTANGULAR {WIDTH} {HEIGHT} {WIDTH} {HEIGHT}\n")
+    with pytest.raises(InputError, match=r"EQUIRECTANGULAR, cannot be undistorted|cannot be read"):
+        load_scene(folder)
+
+
+@pytest.mark.parametrize("k1", [5.0, -5.0])
+def test_absurd_lenses_end_in_a_sentence_or_a_picture(tmp_path: Path, k1: float) -> None:
+    folder = write_lens(tmp_path / "scan", "OPENCV")
+    (folder / "sparse/0/cameras.txt").write_text(f"1 OPENCV {WIDTH} {HEIGHT} 100 98 61 44 {k1} 0 0 0\n")
+    try:
+        view = load_scene(folder, test_every=0).train[1]
+    except InputError:
+        return
+    assert min(view.width, view.height) >= 11 and view.K.isfinite().all()
+
+
 def test_smaller_copies_scale_the_lens(tmp_path: Path) -> None:
     folder = write_lens(tmp_path / "scan", "OPENCV")
     half = load_scene(folder, data_factor=2, test_every=0).train[1]

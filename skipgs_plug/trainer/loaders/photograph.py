@@ -70,7 +70,7 @@ def undistort(
             f"Image {image_path}: its camera, a {model_name(camera)}, cannot be undistorted ({reason(error)}); "
             "run: colmap image_undistorter."
         ) from error
-    return straight, mask, np.array(pinhole.calibration_matrix(), dtype=np.float64)
+    return straight, mask, K
 
 
 def check_camera(camera: Any, source: Path) -> None:
