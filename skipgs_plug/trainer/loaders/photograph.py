@@ -60,6 +60,7 @@ def undistort(
         fitted.rescale(pixels.shape[1], pixels.shape[0])
         options = pycolmap.UndistortCameraOptions()
         bitmap, pinhole = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(pixels.numpy()), fitted)
+        K = np.array(pinhole.calibration_matrix(), dtype=np.float64)  # not of a camera that sees a sphere
         straight = torch.from_numpy(np.array(bitmap.to_array()))
         if mask is not None:
             drawn = pycolmap.Bitmap.from_array(mask.byte().numpy() * 255)
