@@ -145,7 +145,7 @@ def read_vertices(path: Path) -> dict[str, np.ndarray]:
 def check_header(path: Path) -> None:
     """Refuse counts that the file cannot hold: each value takes a byte at least, and vertices have no lists."""
     if not os.path.isfile(path):
-        raise MissingFileError(f"PLY {path} does not exist; give the path of a point_cloud_*.ply.")
+        raise MissingFileError(f"PLY {path} does not exist; give the path of a PLY file.")
     try:
         with open(path, "rb") as stream:
             size, head = os.fstat(stream.fileno()).st_size, stream.read(MAX_HEADER)
