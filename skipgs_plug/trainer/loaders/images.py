@@ -55,7 +55,7 @@ def read_image(
     if factor > 1:
         reduced = (max(1, round(picture.width / factor)), max(1, round(picture.height / factor)))
         picture = picture.resize(reduced, Image.Resampling.BICUBIC)
-        alpha = alpha and alpha.resize(reduced, Image.Resampling.BICUBIC)
+        alpha = None if alpha is None else alpha.resize(reduced, Image.Resampling.BICUBIC)
     return torch.from_numpy(np.array(picture)), None if alpha is None else torch.from_numpy(np.array(alpha))
 
 
