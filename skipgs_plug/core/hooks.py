@@ -168,7 +168,7 @@ class Hooks:
         self,
         names: dict[str, Any],
         *functions: str,
-        always: Always = nothing_always,
+        always: Always | None = None,
         pure: Iterable[str] = (),
     ) -> None:
         """The training loop counts with `range` in one of these functions: iterations can be left out there.
@@ -183,7 +183,7 @@ class Hooks:
             pure: Functions that only look at numbers, and may stand in the loop's conditions.
         """
         if self._engine.refinement is not None:
-            self._engine.refinement.describe(always, pure)
+            self._engine.refinement.describe(always or nothing_always, pure)
             replace_range(self._patches, names, functions, self._engine.refinement)
 
     def always(self, always: Always) -> None:

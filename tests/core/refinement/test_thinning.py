@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skipgs_plug.core.refinement.thinning import Thinning
@@ -14,6 +14,7 @@ def ran(share: float, numbers: range, must: frozenset[int] = frozenset()) -> lis
     return [n for n in numbers if thinning.runs(n in must)]
 
 
+@settings(deadline=None)
 @given(st.floats(0.05, 1.0), st.integers(0, 40_000), st.integers(1, 3000))
 def test_the_share_is_kept_everywhere(share: float, first: int, count: int) -> None:
     chosen = ran(share, range(first, first + count))
@@ -21,6 +22,7 @@ def test_the_share_is_kept_everywhere(share: float, first: int, count: int) -> N
         assert abs(sum(n < end for n in chosen) - share * (end - first)) <= 2.0
 
 
+@settings(deadline=None)
 @given(st.floats(0.05, 0.9), st.sets(st.integers(0, 999), max_size=40))
 def test_what_must_run_runs_and_is_paid_for(share: float, must: set[int]) -> None:
     chosen = ran(share, range(1000), frozenset(must))
