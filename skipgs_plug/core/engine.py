@@ -21,6 +21,7 @@ from skipgs_plug.core.optimizers import OptimizerSteps
 from skipgs_plug.core.policy import Policy, SkipPolicy
 from skipgs_plug.core.refinement.compensation import Compensation
 from skipgs_plug.core.refinement.policy import RefinementPolicy
+from skipgs_plug.core.refinement.rates import Optimizers
 from skipgs_plug.core.refinement.refinement import Refinement
 from skipgs_plug.core.scene_check import SceneCheck
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state
@@ -72,6 +73,7 @@ class Engine:
         if config.enabled and config.refine_share is not None:
             self.refinement = Refinement(config, self._go_on_from_saved)
         self.compensation: Compensation | None = None
+        self._optimizers: Optimizers | None = None
         self.trace: list[TraceRow] | None = [] if record_trace else None
         self._guard = NonFiniteGuard(config.on_nonfinite)
         self._must_run = must_run
@@ -125,10 +127,16 @@ class Engine:
         if self._pending_state is not None:
             self.load_state_dict(self._pending_state)
 
+    def scale_only(self, optimizers: Optimizers) -> None:
+        """Scale the learning rates of these optimizers only: others may step in this thread too."""
+        self._optimizers = optimizers
+        if self.refinement is not None:
+            self.refinement.optimizers = optimizers
+
     def compensate_until(self, last: int) -> None:
         """Scale learning rates for the paper's gate, if that was asked for; `last` is the run's last iteration."""
         if self.config.compensates and self.refinement is None and self.compensation is None:
-            self.compensation = Compensation(self.config, self.start, last)
+            self.compensation = Compensation(self.config, self.start, last, self._optimizers)
 
     def release(self) -> None:
         """Let go of loops and optimizers; counts stay readable."""
