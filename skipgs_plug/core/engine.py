@@ -19,7 +19,7 @@ from skipgs_plug.core.nonfinite import NonFiniteGuard
 from skipgs_plug.core.optimizers import OptimizerSteps
 from skipgs_plug.core.policy import Policy, SkipPolicy
 from skipgs_plug.core.scene_check import SceneCheck
-from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state
+from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, require_state
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.views import require_unique
@@ -216,21 +216,20 @@ class Engine:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As `SkipGate.load_state_dict`; before `configure` the state is kept until then."""
-        if not state:
-            raise SkipGSError("The gate state is empty: it was saved before training began; start afresh.")
+        require_state(state)
         if self.policy is None:
             self._pending_state = dict(state)
             return
         self._pending_state = None
         accumulator = self.steps.accumulator
+        state = gate_state(state)
         if is_release_state(state):
-            self._refuse_other_scene(state.get("view_loss_ema", ()))
+            self._refuse_other_scene(state["view_loss_ema"])
             self.policy.load_state_dict(state)
             self.stats.load_release_state(state)
             accumulator.load_release_state(state)
             self.step = None
         else:
-            state = gate_state(state)
             self._refuse_other_scene(state["stats"]["views"])
             self.policy.load_state_dict(state["policy"])
             self.stats.load_state_dict(state["stats"])
