@@ -36,7 +36,7 @@ class ReferenceTrainer(AbstractAdapter):
 
         hooks.wrap(trainer, "backward", gated)
         n_views = len(trainer.view_names)
-        scale = trainer.max_steps / FULL_SCHEDULE
+        scale = trainer.config.schedule / FULL_SCHEDULE
         hooks.ready(
             trainer.refine_stop_iter,
             view_names=trainer.view_names,

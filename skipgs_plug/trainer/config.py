@@ -41,6 +41,9 @@ class TrainConfig:
     """Seed of view order, split noise and random backgrounds."""
     max_steps: int = 30_000
     """Training iterations."""
+    schedule_steps: int | None = None
+    """Iterations that milestones and learning rates are scaled to; default: max_steps. A run that is extended
+    keeps the schedule that it began with, and ends with the rates of its end."""
     ssim_lambda: float = 0.2
     """Loss = (1 - ssim_lambda) * L1 + ssim_lambda * (1 - SSIM)."""
 
@@ -106,6 +109,8 @@ class TrainConfig:
             value = getattr(self, name)
             if not isinstance(value, int) or value < least:
                 raise InputError(f"{name}={value!r} is not an integer of at least {least}.")
+        if self.schedule_steps is not None and (not isinstance(self.schedule_steps, int) or self.schedule_steps < 1):
+            raise InputError(f"schedule_steps={self.schedule_steps!r} is not an integer of at least 1.")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree={self.sh_degree} is outside 0..3.")
         if not 0.0 <= self.ssim_lambda <= 1.0:
@@ -115,9 +120,14 @@ class TrainConfig:
             if isinstance(value, float) and not math.isfinite(value):
                 raise InputError(f"{field.name}={value} is not a finite number.")
 
+    @property
+    def schedule(self) -> int:
+        """Iterations that milestones and learning rates are scaled to."""
+        return self.schedule_steps or self.max_steps
+
     def scaled(self, milestone: int) -> int:
         """Return a milestone of the 30,000-iteration schedule in iterations of this run, at least 1."""
-        return max(1, round(milestone * self.max_steps / REFERENCE_STEPS))
+        return max(1, round(milestone * self.schedule / REFERENCE_STEPS))
 
     def scaled_interval(self, interval: int, least: int) -> int:
         """Like `scaled`, but shrinks an interval no further than to `least` (or to itself if smaller)."""

@@ -21,7 +21,7 @@ from skipgs_plug.trainer.ply import write_ply
 from skipgs_plug.trainer.scene import Scene, View
 from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
 
-MEANS_LR_END = 0.01  # share of the positions' learning rate that is left at max_steps
+MEANS_LR_END = 0.01  # share of the positions' learning rate that is left at the end of the schedule
 
 
 class Stateful(Protocol):
@@ -51,7 +51,8 @@ class Trainer:
         optimizers: one per parameter, by the same names.
         refine_stop_iter: end of densification in iterations of this run.
         on_step: called after every iteration, outside the clock.
-        stop_requested: set it (from a signal handler, say) to end `train` after the current iteration.
+        stop_requested: set it (from a signal handler, say) to end `train` after the current iteration, or, before it,
+            the next `train` at once.
     """
 
     def __init__(self, config: TrainConfig, scene: Scene, backend: Backend | None = None) -> None:
@@ -91,11 +92,10 @@ class Trainer:
         return self.clock.t_post
 
     def train(self, until: int | None = None, progress: bool = True) -> None:
-        """Run iterations up to `until` (exclusive; default max_steps)."""
+        """Run iterations up to `until` (exclusive; default max_steps), fewer when `stop_requested` is set."""
         from tqdm import tqdm
 
         until = self.max_steps if until is None else min(until, self.max_steps)
-        self.stop_requested = False
         bar = tqdm(total=until, initial=self.step, desc="Training", disable=not progress, mininterval=0.5)
         with bar:
             while self.step < until and not self.stop_requested:
@@ -103,6 +103,7 @@ class Trainer:
                 bar.update()
                 if self.step % 10 == 0:
                     bar.set_postfix_str(f"loss={loss:.3f} | GS={len(self.splats['means'])}", refresh=False)
+        self.stop_requested = False
 
     def train_step(self) -> float:
         """Run one iteration and return its loss."""
@@ -157,7 +158,7 @@ class Trainer:
 
     def set_learning_rate(self, step: float) -> None:
         """Set the positions' learning rate to that of iteration `step`; the others are constant."""
-        decay = MEANS_LR_END ** (step / self.max_steps)
+        decay = MEANS_LR_END ** min(step / self.config.schedule, 1.0)
         rate = self.config.means_lr * self.scene.scene_scale * decay
         self.optimizers["means"].param_groups[0]["lr"] = rate
 
