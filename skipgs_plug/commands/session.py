@@ -67,9 +67,8 @@ class Session:
             trainer.on_step = self._after_iteration
             with stop_on_signal(trainer) as stop:
                 trainer.train(progress=not self._options.no_progress)
-                if trainer.step > begun_at:
-                    with keep_going(self._failed):
-                        self._folder.write_checkpoint(trainer)
+                with keep_going(self._failed):
+                    self._autosave.save()
             trainer.on_step = None
             if not stop.exit_code:
                 if self._gate is not None and trainer.step > begun_at:

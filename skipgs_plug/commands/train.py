@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
 from skipgs_plug import SkipGate
+from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.commands.gate_settings import GateSettings
 from skipgs_plug.commands.session import Session, SessionOptions
 from skipgs_plug.trainer import InputError, MissingFileError, TrainConfig, Trainer, load_scene
@@ -18,24 +19,6 @@ from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.metrics import require_lpips
 from skipgs_plug.trainer.resume import first_sound, lengths
 from skipgs_plug.trainer.run_folder import RunFolder
-
-
-@dataclass
-class GateOptions:
-    """Settings of the gate, named as in SkipConfig."""
-
-    start_iter: int | None = None
-    """First iteration that may be skipped; default: end of densification."""
-    threshold: float = 0.0
-    """Skip when loss <= mean * (1 + threshold)."""
-    ema_decay: float = 0.95
-    """Decay of each view's mean loss."""
-    warmup: int | None = None
-    """Gated iterations without skipping; default: 500 scaled by max_steps / 30,000, at least two per view."""
-    min_bwd_ratio: float | Literal["auto"] = "auto"
-    """Least share of gated iterations with a backward."""
-    on_nonfinite: Literal["skip", "raise", "pass"] = "skip"
-    """What a NaN or infinite loss does."""
 
 
 @dataclass
@@ -59,7 +42,7 @@ class Args:
     max_steps: int | None = None
     """Training iterations; default: 30,000, or with --resume those of the run, which a larger number extends."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
-    gate: GateOptions = dataclasses.field(default_factory=GateOptions)
+    gate: tyro.conf.OmitArgPrefixes[GateOptions] = dataclasses.field(default_factory=GateOptions)
     no_gate: bool = False
     """Train without the gate."""
     resume: bool = False
@@ -84,7 +67,7 @@ def run(args: Args) -> int:
     checkpoints, config = configure(args, found)
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts)
     trainer = Trainer(config, scene)
-    gate = None if args.no_gate else SkipGate(trainer, **gate_settings(args.gate))
+    gate = None if args.no_gate else SkipGate(trainer, **args.gate.given())
     trainer.register_state("gate_settings", GateSettings(gate))
     with exclusive(folder.root):
         if folder.checkpoints() != found:
@@ -127,8 +110,3 @@ def configure(args: Args, checkpoints: list[Path]) -> tuple[list[Path], TrainCon
     if args.max_steps is not None:
         run["max_steps"] = args.max_steps
     return checkpoints, dataclasses.replace(args.train, data_dir=args.scene, result_dir=args.out, **run)
-
-
-def gate_settings(options: GateOptions) -> dict[str, Any]:
-    """Return the options that were given; what is None stays the adapter's choice."""
-    return {name: value for name, value in dataclasses.asdict(options).items() if value is not None}

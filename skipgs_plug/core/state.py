@@ -51,7 +51,6 @@ class AccumulatorState(TypedDict):
 
     norm_mean: Real | None
     square_mean: Real | None
-    steps: int
 
 
 class ClockState(TypedDict):
@@ -95,7 +94,6 @@ class ReleaseGateState(ReleaseState):
     """The same with what only a whole gate reads."""
 
     single_scale_ema: Real | None
-    step_count: int
 
 
 def is_release_state(state: Mapping[str, Any]) -> bool:

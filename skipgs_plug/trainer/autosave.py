@@ -18,14 +18,24 @@ class Autosave:
 
     def __init__(self, folder: RunFolder, trainer: Trainer, every: int | None) -> None:
         self._folder, self._trainer, self._every = folder, trainer, every
-        self._saved_at = trainer.t_total
+        self._saved_at, self._saved_step = trainer.t_total, trainer.step
+
+    def save(self) -> None:
+        """Write a checkpoint, unless this session began or saved in this iteration.
+
+        Raises:
+            WriteError: it cannot be written.
+        """
+        if self._trainer.step != self._saved_step:
+            self._folder.write_checkpoint(self._trainer)
+            self._saved_step = self._trainer.step
 
     def iteration(self, iteration: Iteration) -> None:
         """Save when it is time; may serve as `Trainer.on_step`."""
         if not self._due(iteration.step + 1):
             return
         with keep_going([]):
-            self._folder.write_checkpoint(self._trainer)
+            self.save()
         self._saved_at = self._trainer.t_total
 
     def _due(self, done: int) -> bool:
