@@ -9,9 +9,9 @@ from typing import Any, Literal
 from skipgs_plug import SkipGate
 from skipgs_plug.commands.signals import stop_on_signal
 from skipgs_plug.core.report import write_report
-from skipgs_plug.trainer import InputError, Trainer, WriteError
+from skipgs_plug.files import WriteError, keep_going
+from skipgs_plug.trainer import InputError, Trainer
 from skipgs_plug.trainer.autosave import Autosave
-from skipgs_plug.trainer.files import keep_going
 from skipgs_plug.trainer.loop import Iteration
 from skipgs_plug.trainer.run_folder import RunFolder
 from skipgs_plug.trainer.scalars import ScalarLog

@@ -26,6 +26,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from skipgs_plug.install import install_command
+
 from .simd import PRELUDE
 
 # A counter fills a cache line, so that nothing else is slowed down by it.
@@ -162,7 +164,7 @@ def _warp() -> Any:
     try:
         wp: Any = importlib.import_module("warp")
     except ImportError as error:
-        raise ImportError('The CPU rasterizer needs NVIDIA Warp: pip install "skipgs_plug[full]".') from error
+        raise ImportError(f"The CPU rasterizer needs NVIDIA Warp: {install_command()}.") from error
     wp.config.quiet = True
     wp.config.log_level = wp.LOG_ERROR
     with _quiet_stderr():

@@ -4,7 +4,7 @@ It knows nothing of the gate, which is attached to it like to any other trainer.
 """
 
 from skipgs_plug.trainer.config import TrainConfig
-from skipgs_plug.trainer.errors import InputError, MissingFileError, WriteError
+from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.loop import Trainer
 from skipgs_plug.trainer.packed import save_packed
 from skipgs_plug.trainer.scene import Scene, View, load_scene
@@ -16,7 +16,6 @@ __all__ = [
     "TrainConfig",
     "Trainer",
     "View",
-    "WriteError",
     "load_scene",
     "save_packed",
 ]

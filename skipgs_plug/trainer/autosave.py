@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from skipgs_plug.trainer.files import keep_going
+from skipgs_plug.files import keep_going
 from skipgs_plug.trainer.loop import Iteration, Trainer
 from skipgs_plug.trainer.run_folder import RunFolder
 

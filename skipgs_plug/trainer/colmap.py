@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from skipgs_plug.install import install_command
 from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.images import find_image, read_image
 from skipgs_plug.trainer.scene import BLACK, Scene, View, assemble_scene, split_views
@@ -63,7 +64,7 @@ def read_model(model: Path) -> Any:
     try:
         import pycolmap
     except ImportError as error:
-        raise InputError("Reading COLMAP folders needs pycolmap; run: pip install 'skipgs_plug[full]'.") from error
+        raise InputError(f"Reading COLMAP folders needs pycolmap; run: {install_command()}.") from error
     try:
         return pycolmap.Reconstruction(str(model))
     except Exception as error:  # pycolmap raises bare RuntimeError, ValueError or IndexError by kind of damage

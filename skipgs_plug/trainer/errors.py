@@ -13,7 +13,3 @@ class MissingFileError(InputError, FileNotFoundError):
 
 class DamagedCheckpointError(InputError):
     """A checkpoint that does not hold what it should; an older one may."""
-
-
-class WriteError(InputError, OSError):
-    """A file that cannot be written: the disk is full, read-only, or out of reach."""

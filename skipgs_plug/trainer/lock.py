@@ -10,8 +10,9 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
+from skipgs_plug.files import write_error
 from skipgs_plug.trainer.errors import InputError
-from skipgs_plug.trainer.files import write_error, write_json
+from skipgs_plug.trainer.files import write_json
 
 log = logging.getLogger(__name__)
 

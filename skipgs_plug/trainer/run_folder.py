@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from skipgs_plug.files import remove_leftovers, write_aside
 from skipgs_plug.trainer.config import TrainConfig
-from skipgs_plug.trainer.files import remove_leftovers, write_aside, write_json
+from skipgs_plug.trainer.files import write_json
 from skipgs_plug.trainer.loop import Trainer
 
 CHECKPOINT = re.compile(r"ckpt_(\d+)_rank0\.pt")

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from skipgs_plug import schema
+from skipgs_plug.files import write_aside
 from skipgs_plug.trainer.errors import DamagedCheckpointError, InputError, MissingFileError
-from skipgs_plug.trainer.files import write_aside
 
 if TYPE_CHECKING:
     from skipgs_plug.trainer.loop import Trainer
