@@ -17,7 +17,8 @@ from skipgs_plug.adapters.registry import get_adapter
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster.compat import FAMILIES, serve
-from skipgs_plug.scripts.checkpoints import Checkpoints
+from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
+from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED
 from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu
 from skipgs_plug.scripts.launch import run_script
 
@@ -69,6 +70,7 @@ def run(args: Args, command: list[str]) -> int:
     """
     adapter = get_adapter(args.adapter)()
     checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
+    adapter.replaced = (*REPLACED, *(f"torch.cuda.{name}" for name in CUDA_REPLACED if args.cpu))
     settings = args.gate.given() | ({"enabled": False} if args.no_gate else {})
     gates: list[SkipGate] = []
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, Protocol
 
@@ -24,6 +24,7 @@ class Adapter(Protocol):
     checked: ClassVar[str]
     saved_state: Callable[[int], dict[str, Any] | None] | None
     output_folder: str | None
+    replaced: Sequence[str]
 
     def attach(self, hooks: Hooks) -> None: ...
 

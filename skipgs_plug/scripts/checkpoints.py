@@ -17,6 +17,7 @@ from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.files import write_aside
 from skipgs_plug.gate import SkipGate
 
+REPLACED = ("torch.save", "torch.load")  # by `watch`; `torch.load` by `run_script` too
 SUFFIX = ".skipgs.json"  # behind the name of the checkpoint
 
 

@@ -1,9 +1,12 @@
-"""PSNR, SSIM and LPIPS of rendered images; each names its flavour."""
+"""PSNR, SSIM and LPIPS of rendered images; each names its flavour. A new metric is one entry of METRICS."""
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -15,17 +18,55 @@ SSIM_FLAVOUR = "torchmetrics: 11x11 Gaussian window, reflect padding, border cro
 LPIPS_WEIGHTS = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 
 
-def psnr(render: Tensor, target: Tensor) -> float:
-    """Return PSNR in dB of images [H, W, 3] clamped to [0, 1]; infinite for equal images."""
-    error = float(((render.clamp(0, 1) - target) ** 2).mean())
+@dataclass(frozen=True)
+class Metric:
+    """What evaluations, tables and logs need to know of one metric.
+
+    Attributes:
+        name: key in stats and results.
+        label: name for people.
+        digits: shown after the point.
+        flavour: what tells it from others of that name; a clause.
+        measure: function of render and target, images [H, W, 3], the target in [0, 1], and mask [H, W] or None.
+        unit: shown after the label.
+        tag: name in TensorBoard, where gsplat names no flavour; the key itself if empty.
+        net: LPIPS backbone, which must be asked for; None for a metric of every evaluation.
+    """
+
+    name: str
+    label: str
+    digits: int
+    flavour: str
+    measure: Callable[[Tensor, Tensor, Tensor | None], float]
+    unit: str = ""
+    tag: str = ""
+    net: str | None = None
+
+    @property
+    def heading(self) -> str:
+        """Label and unit."""
+        return f"{self.label} {self.unit}".strip()
+
+
+def psnr(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Return PSNR in dB of images [H, W, 3] clamped to [0, 1], over the pixels of `mask`; infinite for equal images."""
+    squares = (render.clamp(0, 1) - target) ** 2
+    error = float((squares if mask is None else squares[mask.to(squares.device)]).mean())
     return -10.0 * math.log10(error) if error > 0.0 else math.inf
 
 
-def ssim(render: Tensor, target: Tensor) -> float:
-    """Return SSIM of images [H, W, 3] in [0, 1], as torchmetrics pads (see SSIM_FLAVOUR)."""
+def ssim(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Return SSIM of images [H, W, 3] in [0, 1], as torchmetrics pads (see SSIM_FLAVOUR).
+
+    With a mask [H, W]: the mean over windows whose centre counts. Both images should be black outside it.
+    """
     from torchmetrics.functional.image import structural_similarity_index_measure
 
-    return float(structural_similarity_index_measure(batch(render.clamp(0, 1)), batch(target), data_range=1.0))  # type: ignore[arg-type]
+    images = batch(render.clamp(0, 1)), batch(target)
+    if mask is None:
+        return float(structural_similarity_index_measure(*images, data_range=1.0))  # type: ignore[arg-type]
+    _, windows = structural_similarity_index_measure(*images, data_range=1.0, return_full_image=True)
+    return float(windows[0].permute(1, 2, 0)[mask.to(windows.device)].mean())
 
 
 def require_lpips(net: str) -> None:
@@ -41,8 +82,11 @@ def require_lpips(net: str) -> None:
         raise InputError(f"LPIPS needs the backbone weights {weights}; put them there, or leave out --lpips-net.")
 
 
-def lpips(render: Tensor, target: Tensor, net: str) -> float:
-    """Return LPIPS (`net` alex or vgg, inputs normalised to [-1, 1]) of images [H, W, 3] in [0, 1]."""
+def lpips(render: Tensor, target: Tensor, mask: Tensor | None = None, *, net: str) -> float:
+    """Return LPIPS (`net` alex or vgg, inputs normalised to [-1, 1]) of images [H, W, 3] in [0, 1].
+
+    It has no mask of its own: both images should be black outside one.
+    """
     from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
 
     require_lpips(net)
@@ -53,3 +97,33 @@ def lpips(render: Tensor, target: Tensor, net: str) -> float:
 def batch(image: Tensor) -> Tensor:
     """Return [H, W, 3] as [1, 3, H, W]."""
     return image.permute(2, 0, 1)[None]
+
+
+METRICS = {
+    metric.name: metric
+    for metric in (
+        Metric("psnr", "PSNR", 2, "mean of per-image PSNR, float render clamped to [0, 1]", psnr, unit="dB"),
+        Metric("ssim", "SSIM", 4, SSIM_FLAVOUR, ssim),
+        *(
+            Metric(
+                f"lpips_{net}", f"LPIPS {net}", 4, f"torchmetrics, backbone {net}, inputs normalised to [-1, 1]",
+                functools.partial(lpips, net=net), tag="lpips", net=net,
+            )
+            for net in LPIPS_WEIGHTS
+        ),
+    )
+}  # fmt: skip
+
+
+def chosen(lpips_net: str | None = None) -> list[Metric]:
+    """Return the metrics of every evaluation, and LPIPS with a backbone if one is named."""
+    return [metric for metric in METRICS.values() if metric.net in (None, lpips_net)]
+
+
+def measure(metrics: Sequence[Metric], render: Tensor, target: Tensor, mask: Tensor | None = None) -> dict[str, float]:
+    """Return the metrics of a render against its target, images [H, W, 3], by name.
+
+    Args:
+        mask: Pixels that count  # [H, W]
+    """
+    return {metric.name: metric.measure(render, target, mask) for metric in metrics}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import math
 from collections.abc import Iterator
@@ -163,10 +162,9 @@ def test_an_entry_that_is_missing_or_of_another_type_is_an_error_or_harmless(
     refused = taken = 0
     for path in entries(whole):
         for wrong in (KeyError, *WRONG):
-            state = copy.deepcopy(whole)
-            parent = state
+            state = parent = dict(whole)
             for key in path[:-1]:
-                parent = parent[key]
+                parent[key] = parent = dict(parent[key])
             if wrong is KeyError:
                 del parent[path[-1]]
             else:
