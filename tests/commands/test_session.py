@@ -6,6 +6,7 @@ import errno
 import json
 import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -229,3 +230,21 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(
     assert train(packed, tmp_path / "file/run") == 2
     error = capsys.readouterr().err
     assert "cannot be written (Not a directory)" in error and "Traceback" not in error
+
+
+def test_a_run_folder_that_vanishes_is_made_anew(
+    tmp_path: Path, packed: str, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train_step, out = Trainer.train_step, tmp_path / "run"
+
+    def vanishing(self: Trainer) -> float:
+        if self.step == 30:
+            shutil.rmtree(out)
+        return train_step(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "train_step", vanishing)
+        assert train(packed, out) == 0
+    assert checkpoints(out) == checkpoints(whole)[-2:]
+    assert (out / "ply/point_cloud_59.ply").read_bytes() == (whole / "ply/point_cloud_59.ply").read_bytes()
+    assert train(packed, out, "--resume") == 0
