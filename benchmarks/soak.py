@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import argparse
 import random
+import shlex
 import signal
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -67,7 +69,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "soak.json")
     args = parser.parse_args()
     seed = random.randrange(10**6) if args.seed is None else args.seed
-    result: dict[str, Any] = {**provenance(), "seed": seed}
+    result: dict[str, Any] = {
+        **provenance(),
+        "command": shlex.join(["python", "-m", "benchmarks.soak", *sys.argv[1:]]),
+        "seed": seed,
+    }
     begun = time.perf_counter()
 
     def record(section: str, name: str, measure: Callable[[], Any]) -> None:
