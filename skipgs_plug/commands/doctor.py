@@ -15,7 +15,7 @@ from skipgs_plug.install import install_command
 EXTRAS = (
     ("warp", "warp-lang", "rasterizer on the CPU"),
     ("gsplat", "gsplat", "densification, rasterizer on CUDA"),
-    ("PIL", "pillow", "images"),
+    ("PIL.Image", "pillow", "images"),
     ("pycolmap", "pycolmap", "COLMAP scenes"),  # after Pillow, see IMPORT_ORDER
     ("plyfile", "plyfile", "PLY"),
     ("scipy", "scipy", "initial scales"),
@@ -30,8 +30,8 @@ EXTRAS = (
 
 # Not tried here: the process that does it wrong crashes, or hangs in pycolmap's handler of crashes.
 IMPORT_ORDER = """
-      In scripts of your own, import PIL.Image before pycolmap, as this package does. Each brings a libpng: in the
-      other order (seen with pycolmap 4.2.1, Pillow 13.0) the first PNG that is saved ends the process."""
+      In scripts of your own, import PIL.Image before pycolmap, as this package does. In the other order
+      Pillow is bound to the zlib of pycolmap (seen with 4.2.1), and the first PNG that is saved ends the process."""
 
 
 def main(argv: list[str]) -> int:
@@ -43,7 +43,7 @@ def main(argv: list[str]) -> int:
     print(f"Python {platform.python_version()}, torch {torch.__version__}, {cuda}, {torch.get_num_threads()} threads")
     print("\nPackages")
     missing = [check_package(*extra) for extra in EXTRAS].count(False)
-    if "PIL" in sys.modules and "pycolmap" in sys.modules:
+    if "PIL.Image" in sys.modules and "pycolmap" in sys.modules:
         print(IMPORT_ORDER)
     print("\nBackends")
     works = [check_backend(name) for name in ("gsplat", "warp")]

@@ -33,10 +33,10 @@ class Options(TrainConfig):
 
 @dataclass
 class Args:
-    """Train a COLMAP folder, a Blender folder or a packed .npz."""
+    """Train a COLMAP, nerfstudio or Blender folder or a packed .npz."""
 
     scene: tyro.conf.Positional[str]
-    """Folder with sparse/0 or transforms_train.json, or packed .npz."""
+    """Folder with sparse/0, transforms.json or transforms_train.json, or packed .npz."""
     out: str
     """Run folder to write."""
     max_steps: int | None = None
@@ -65,7 +65,7 @@ def run(args: Args) -> int:
     found = folder.checkpoints()
     check(args, found)
     checkpoints, config = configure(args, found)
-    scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts)
+    scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
     trainer = Trainer(config, scene)
     gate = None if args.no_gate else SkipGate(trainer, **args.gate.given())
     trainer.register_state("gate_settings", GateSettings(gate))
