@@ -1,6 +1,8 @@
-"""What the package survives: kills, full disks, broken groups, a million decisions. Takes a quarter of an hour or more.
+"""What the package survives: kills, full disks, broken groups, mutated files, a million decisions.
 
-python -m benchmarks.soak [--kills N] [--seed N] [--out FILE]
+Takes a quarter of an hour or more.
+
+python -m benchmarks.soak [--kills N] [--files N] [--seed N] [--out FILE]
 
 Draws a fresh seed unless one is given, and ends with an error at the first run that does not end as it should.
 """
@@ -19,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common import provenance
+from benchmarks.soak_files import run as mutate_files
 from benchmarks.soak_ranks import TIME_OUT, train_together
 from benchmarks.soak_runs import kill_at_random, make_tiny_scene, strike_every_file
 from skipgs_plug import SkipGate
@@ -65,6 +68,7 @@ def decide_often(seed: int) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=50, help="of each signal, half of them in gated runs")
+    parser.add_argument("--files", type=int, default=20_000, help="mutated scene, image and PLY files")
     parser.add_argument("--seed", type=int, default=None)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "soak.json")
     args = parser.parse_args()
@@ -91,6 +95,7 @@ def main() -> None:
                 group = folder / f"{kind}{size}"
                 record("ranks", f"{size} {kind}", lambda: train_together(group, size, kind))  # noqa: B023
         result["ranks"]["time_out"] = TIME_OUT
+        record("mutated files", "outcomes", lambda: mutate_files(args.files, seed))
         for gated in (True, False):
             name = "gated" if gated else "ungated"
             for number in (signal.SIGKILL, signal.SIGTERM):
