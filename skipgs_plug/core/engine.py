@@ -24,7 +24,7 @@ from skipgs_plug.core.refinement.policy import RefinementPolicy
 from skipgs_plug.core.refinement.rates import Optimizers
 from skipgs_plug.core.refinement.refinement import Refinement
 from skipgs_plug.core.scene_check import SceneCheck
-from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state
+from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, require_state
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.views import require_unique, warn_unless_recurring
@@ -246,25 +246,24 @@ class Engine:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As `SkipGate.load_state_dict`; before `configure` the state is kept until then."""
-        if not state:
-            raise SkipGSError("The gate state is empty: it was saved before training began; start afresh.")
+        require_state(state)
         if self.policy is None:
             self._pending_state = dict(state)
             # The loop asks about its first number before the trainer says anything else.
-            self._load_refinement(state.get("refinement"))
+            self._load_refinement(gate_state(state).get("refinement"))
             return
         pending, self._pending_state = self._pending_state is not None, None
         accumulator = self.steps.accumulator
+        state = gate_state(state)
         if is_release_state(state):
-            self._refuse_other_scene(state.get("view_loss_ema", ()))
+            self._refuse_other_scene(state["view_loss_ema"])
             self.policy.load_state_dict(state)
             self.stats.load_release_state(state)
             accumulator.load_release_state(state)
             step = None
         else:
-            state = gate_state(state)
             if not pending:
-                self._load_refinement(state.get("refinement"))
+                self._load_refinement(state["refinement"])
             self._refuse_other_scene(state["stats"]["views"])
             self.policy.load_state_dict(state["policy"])
             self.stats.load_state_dict(state["stats"])
