@@ -8,6 +8,7 @@ import traceback
 from collections.abc import Sequence
 
 COMMANDS = {
+    "sfm": "turn photographs or a video into a scene",
     "demo": "train a scene the package makes itself, with and without the gate, and compare",
     "train": "train a COLMAP, Blender or packed scene, gated",
     "run": "run an unmodified training script of another project, gated",
