@@ -13,6 +13,8 @@ COMMANDS = {
     "train": "train a COLMAP, Blender or packed scene, gated",
     "run": "run an unmodified training script of another project, gated",
     "bench": "compare the gate with its controls on a scene",
+    "render": "film or picture a trained model: colour and depth, along a path or from held-out cameras",
+    "export": "convert a trained model for web viewers",
     "report": "make one HTML page of finished runs: tables, plots, comparison",
     "doctor": "say which backends and extras work here, and how to get the rest",
 }
