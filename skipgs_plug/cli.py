@@ -13,6 +13,7 @@ COMMANDS = {
     "train": "train a COLMAP, Blender or packed scene, gated",
     "run": "run an unmodified training script of another project, gated",
     "bench": "compare the gate with its controls on a scene",
+    "view": "show a trained model in the browser, with its cameras, photographs and errors",
     "render": "film or picture a trained model: colour and depth, along a path or from held-out cameras",
     "export": "convert a trained model for web viewers",
     "report": "make one HTML page of finished runs: tables, plots, comparison",
