@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import re
 
 import pytest
 
 from skipgs_plug import SkipGate, SkipGSError, UnknownTrainerError, register_adapter
-from skipgs_plug.adapters import registry
-from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters import AbstractAdapter, TrainerFacts, registry
 
 
 class Mine:
@@ -28,7 +28,7 @@ class MyAdapter(AbstractAdapter):
 
     def attach(self, hooks) -> None:
         self.trainer.attached = True
-        hooks.ready(5)
+        hooks.ready(TrainerFacts(5))
 
 
 @pytest.fixture(autouse=True)
@@ -78,5 +78,5 @@ def test_every_built_in_adapter_loads_under_its_name(name: str) -> None:
     module, _, attribute = registry.BUILTIN[name].partition(":")
     adapter = getattr(importlib.import_module(module), attribute)
     assert adapter.name == name
-    assert adapter.checked
+    assert re.fullmatch(r".*\w \([^()]*\w\)", adapter.checked)  # with what, and in brackets how
     assert not adapter.matches(object())

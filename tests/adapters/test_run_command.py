@@ -1,6 +1,7 @@
 """`skipgs-plug run` on a look-alike of Inria's checkout that asks for CUDA and its extension modules."""
 
 import json
+import operator
 import sys
 import textwrap
 
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from skipgs_plug import cli
+from skipgs_plug.scripts.checkpoints import Checkpoints
 
 RENDERER = """
     import torch
@@ -129,6 +131,21 @@ def test_script_is_gated_on_the_cpu(checkout, tmp_path, capfd):
     assert {row["view"] for row in report["views"]} <= {f"view{i}" for i in range(4)}
     assert report["settings"]["warmup"] == 10 and report["settings"]["start_iter"] == 20
     assert torch.Tensor.backward is before and "diff_gaussian_rasterization" not in sys.modules
+
+
+def test_patched_lists_what_is_replaced_around_the_script_too(checkout, tmp_path, monkeypatch):
+    names = ("save", "load", "cuda.is_available", "cuda.synchronize", "cuda.Event", "Tensor.backward")
+    before = {f"torch.{name}": operator.attrgetter(name)(torch) for name in names}
+    seen = []
+
+    def note(checkpoints, path):
+        replaced = {name for name, own in before.items() if operator.attrgetter(name[6:])(torch) is not own}
+        seen.append((set(checkpoints.gate.patched) & set(before), replaced))
+
+    monkeypatch.setattr(Checkpoints, "_save_beside", note)
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 0
+    assert seen == [(set(before), set(before))]
+    assert all(operator.attrgetter(name[6:])(torch) is own for name, own in before.items())
 
 
 def test_inert_and_never_skipping_train_bit_for_bit_alike(checkout, tmp_path):
