@@ -15,9 +15,12 @@ from skipgs_plug import SkipGate
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.core.report import write_report
 from skipgs_plug.trainer import InputError, TrainConfig, Trainer, load_scene
+from skipgs_plug.trainer.curve import LossCurve
+from skipgs_plug.trainer.loop import Iteration
 from skipgs_plug.trainer.metrics import require_lpips
 from skipgs_plug.trainer.run_folder import RunFolder
 from skipgs_plug.trainer.scalars import ScalarLog
+from skipgs_plug.view.live import LiveView
 
 INTERRUPTED = 130
 
@@ -46,6 +49,8 @@ class Args:
     """Continue from the last checkpoint in --out."""
     tensorboard: bool = False
     """Log gsplat's scalars and the gate's counters to RUN/tb, every tenth iteration."""
+    view: bool = False
+    """Show training in the browser; costs at most 2 % of its time."""
     lpips_net: Literal["alex", "vgg"] | None = None
     """Also report LPIPS; its weights must be on this machine."""
     no_progress: bool = False
@@ -69,6 +74,7 @@ def run(args: Args) -> int:
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts)
     trainer = Trainer(config, scene)
     gate = None if args.no_gate else SkipGate(trainer, **args.gate.given())
+    curve = LossCurve(trainer)
     if checkpoint is not None:
         trainer.load_checkpoint(checkpoint)
     folder.write_config(config, gate=None if gate is None else gate.config.as_dict())
@@ -79,16 +85,35 @@ def run(args: Args) -> int:
     )
     more = gate.scalars if gate is not None else dict
     with ScalarLog(folder.root / "tb", trainer, more) if args.tensorboard else contextlib.nullcontext() as log:
-        trainer.on_step = None if log is None else log.iteration
-        with stop_on_interrupt(trainer):
+        with onlookers(args, trainer, log, curve), stop_on_interrupt(trainer):
             trainer.train(progress=not args.no_progress)
         if trainer.step > 0:
             folder.write_checkpoint(trainer)
         if trainer.step < trainer.max_steps:
             print(f"Stopped after iteration {trainer.step - 1:,}; the same command with --resume continues.")
             return INTERRUPTED
+        curve.write(folder.root / "stats" / "train_curve.json")
         finish(args, folder, trainer, gate, log)
     return 0
+
+
+@contextlib.contextmanager
+def onlookers(args: Args, trainer: Trainer, log: ScalarLog | None, curve: LossCurve) -> Iterator[None]:
+    """Let those who record and show training see every iteration."""
+    called = [curve.iteration]
+    if log is not None:
+        called.append(log.iteration)
+    with LiveView(trainer) if args.view else contextlib.nullcontext() as live:
+        if live is not None:
+            called.append(live.iteration)
+            print(f"Watch it at http://127.0.0.1:{live.page.port}")
+
+        def look(iteration: Iteration) -> None:
+            for onlooker in called:
+                onlooker(iteration)
+
+        trainer.on_step = look
+        yield
 
 
 def finish(args: Args, folder: RunFolder, trainer: Trainer, gate: SkipGate | None, log: ScalarLog | None) -> None:
