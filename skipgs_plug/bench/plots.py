@@ -193,7 +193,7 @@ def loss_and_mean(run: RunRecord, view_names: Sequence[str]) -> Figure:
         panel.plot(steps[out], loss[out], linestyle="none", marker="o", markersize=3.6, color="#D55E00",
                    markerfacecolor="white", label="loss, backward skipped")  # fmt: skip
         share = f"{out.sum()} of {len(out)} visits skipped"
-        panel.set_title(f"{view_names[view]}: {share}", loc="left", fontsize=SMALL + 1)
+        panel.set_title(f"{view_names[view]}: {share}", loc="left", fontsize=SMALL + 1, parse_math=False)
         panel.set_ylabel("loss")
     panels[-1].set_xlabel("iteration")
     handles, labels = panels[0].get_legend_handles_labels()
