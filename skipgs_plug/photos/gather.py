@@ -9,15 +9,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 
 from skipgs_plug.photos.video import VIDEO_SUFFIXES, sharpest_frames
 from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.loaders.images import ORIENTATION, decode
 
 AS_THEY_ARE = (".jpg", ".jpeg", ".png")
 CONVERTED = (".webp", ".bmp", ".tif", ".tiff")
 UNREADABLE = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
-ORIENTATION, MODEL, FOCAL_LENGTH, EXIF_BLOCK = 0x0112, 0x0110, 0x920A, 0x8769
+MODEL, FOCAL_LENGTH, EXIF_BLOCK = 0x0110, 0x920A, 0x8769  # EXIF tags
 QUALITY: dict[str, Any] = {"quality": 97, "subsampling": 0}
 LEAST = 3  # photographs, below which nothing can be reconstructed
 
@@ -92,23 +93,19 @@ def gather_folder(source: Path, folder: Path, progress: Callable[[int], None]) -
 
 def place(path: Path, source: Path, folder: Path) -> tuple[str, tuple[object, ...]]:
     """Link or convert one photograph; return its name and what tells its camera from others."""
-    try:
-        with Image.open(path) as picture:
-            exif = picture.getexif()
-            turned = exif.get(ORIENTATION, 1) != 1
-            target = folder / path.relative_to(source)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if turned or path.suffix.lower() in CONVERTED:
-                picture = ImageOps.exif_transpose(picture)
-                target = target.with_name(f"{path.name}.jpg") if path.suffix.lower() in CONVERTED else target
-                options: dict[str, Any] = {} if target.suffix.lower() == ".png" else QUALITY
-                picture.convert("RGB").save(target, exif=picture.getexif(), **options)
-            else:
-                picture.load()  # a damaged file is named here, not by C++ code later
-                link(path, target)
-            camera = (picture.size, exif.get(MODEL), exif.get_ifd(EXIF_BLOCK).get(FOCAL_LENGTH))
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
-        raise InputError(f"Photograph {path} cannot be decoded ({error}); remove or replace it.") from error
+    picture = decode(path, path)  # also so that a damaged file is named here, not by C++ code later
+    exif = picture.getexif()
+    target = folder / path.relative_to(source)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix.lower() in CONVERTED:
+        target = target.with_name(f"{path.name}.jpg")
+    if exif.get(ORIENTATION, 1) != 1 or path.suffix.lower() in CONVERTED:
+        picture = ImageOps.exif_transpose(picture)
+        options: dict[str, Any] = {} if target.suffix.lower() == ".png" else QUALITY
+        picture.convert("RGB").save(target, exif=picture.getexif(), **options)
+    else:
+        link(path, target)
+    camera = (picture.size, exif.get(MODEL), exif.get_ifd(EXIF_BLOCK).get(FOCAL_LENGTH))
     return target.relative_to(folder).as_posix(), camera
 
 

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-from skipgs_plug.photos.colmap_import import import_pycolmap
 from skipgs_plug.photos.gather import Gathered
 from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.loaders.native import import_pycolmap
 
 EXHAUSTIVE_UP_TO = 100  # photographs; beyond, all pairs take longer than neighbours in order
 OVERLAP = 10  # neighbours on either side, then those 16, 32, ... away

@@ -11,7 +11,7 @@ from typing import Any
 from PIL import Image
 
 from skipgs_plug.trainer.errors import InputError
-from skipgs_plug.trainer.images import read_image
+from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.scene import BLACK
 
 FACTORS = (2, 4, 8)

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from skipgs_plug.photos.colmap_import import import_pycolmap
 from skipgs_plug.photos.gather import Gathered
 from skipgs_plug.photos.video import sharpness
-from skipgs_plug.trainer.images import read_image
+from skipgs_plug.trainer.loaders.images import read_image
+from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.scene import BLACK
 
 FEW_FEATURES = 0.25  # of the median of the placed photographs

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.loaders import load_scene
 from skipgs_plug.trainer.ply import read_ply
-from skipgs_plug.trainer.scene import Scene, load_scene
+from skipgs_plug.trainer.scene import Scene
 
 # Where trainers leave their models: ours and gsplat's, then Inria's and those of its family. The last one of an
 # iteration counts: it is the format that is quickest to read.

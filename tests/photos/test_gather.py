@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from skipgs_plug.photos.gather import ORIENTATION, gather
+from skipgs_plug.photos.gather import gather
 from skipgs_plug.photos.video import sharpest_frames, sharpness
 from skipgs_plug.trainer import InputError
+from skipgs_plug.trainer.loaders.images import ORIENTATION
 
 # imageio-ffmpeg leaves the pipes of a decoder that has ended to the garbage collector.
 LEAVES_PIPES = "ignore:unclosed file:ResourceWarning"
