@@ -35,7 +35,7 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
 @contextlib.contextmanager
 def serve(*arguments: str) -> Iterator[str]:
     """Run the command; yields the address it prints, ends it as Ctrl-C does."""
-    command = [sys.executable, "-m", "skipgs_plug.cli", "view", *arguments]
+    command = [sys.executable, "-m", "skipgs_plug", "view", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
