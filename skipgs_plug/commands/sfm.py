@@ -93,6 +93,4 @@ def print_unplaced(reasons: dict[str, str], matching: str) -> None:
         more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
         print(f"  {', '.join(names[:NAMES_SHOWN])}{more}: {reason}")
     if matching == "sequential":
-        print(
-            "  Only neighbours in the order of names were compared; --matching exhaustive compares all, and takes long."
-        )
+        print("  Mostly neighbours in the order of names were compared; --matching exhaustive compares all, slowly.")

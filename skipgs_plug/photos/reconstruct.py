@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +16,7 @@ from skipgs_plug.trainer.loaders.native import import_pycolmap
 
 EXHAUSTIVE_UP_TO = 100  # photographs; beyond, all pairs take longer than neighbours in order
 OVERLAP = 10  # neighbours on either side, then those 16, 32, ... away
+KEY_PHOTOGRAPHS = 40  # of a sequence, compared each with each
 FEATURE_SIZE = 1600  # larger sides are reduced for feature detection, which gains little above
 SEED = 0
 POLL_SECONDS = 0.3
@@ -59,6 +61,10 @@ class Reconstruction:
                 options = self._colmap.SequentialPairingOptions()
                 options.overlap = OVERLAP
                 self._colmap.match_sequential(self.database, pairing_options=options, verification_options=verification)
+                pairs = self._colmap.ImportedPairingOptions()
+                pairs.match_list_path = self._work / "pairs.txt"
+                pairs.match_list_path.write_text("\n".join(f"{a} {b}" for a, b in key_pairs(self._photos.names)))
+                self._colmap.match_image_pairs(self.database, pairing_options=pairs, verification_options=verification)
         return matching
 
     def map(self, progress: Progress) -> list[Any]:
@@ -96,6 +102,15 @@ class Reconstruction:
         model.write(chosen)
         self._colmap.undistort_images(output, chosen, self._photos.folder, jpeg_quality=97)
         return output
+
+
+def key_pairs(names: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield all pairs among photographs that are evenly spread over the sequence: walks return to where they were.
+
+    COLMAP's list of pairs is separated by spaces, so names that hold some are left out.
+    """
+    spread = names[:: max(1, len(names) // KEY_PHOTOGRAPHS)]
+    return itertools.combinations([name for name in spread if not any(map(str.isspace, name))], 2)
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from skipgs_plug.cli import main
+from skipgs_plug.photos.reconstruct import key_pairs
 from skipgs_plug.trainer import load_scene
 
 # imageio-ffmpeg leaves the pipes of a decoder that has ended to the garbage collector.
@@ -70,6 +71,13 @@ def test_bad_input_is_one_sentence(tmp_path, capsys, make, arguments, sentence):
     error = capsys.readouterr().err
     assert sentence in error and len(error.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir() if path.name != "nowhere"] == []
+
+
+def test_a_long_sequence_is_also_compared_across_its_length():
+    names = [f"{i:03d}.jpg" for i in range(120)] + ["with a space.jpg"]
+    pairs = list(key_pairs(names))
+    assert len(pairs) == 40 * 39 / 2 and ("000.jpg", "117.jpg") in pairs
+    assert not any(" " in name for pair in pairs for name in pair)
 
 
 def test_photographs_without_overlap_are_refused_and_leave_nothing(tmp_path, capsys):
