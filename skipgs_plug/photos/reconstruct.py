@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import sqlite3
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from skipgs_plug.photos.gather import Gathered
+from skipgs_plug.photos.progress import counted
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 
@@ -19,7 +17,6 @@ OVERLAP = 10  # neighbours on either side, then those 16, 32, ... away
 KEY_PHOTOGRAPHS = 40  # of a sequence, compared each with each
 FEATURE_SIZE = 1600  # larger sides are reduced for feature detection, which gains little above
 SEED = 0
-POLL_SECONDS = 0.3
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 Progress = Callable[[int], None]
@@ -111,33 +108,3 @@ def key_pairs(names: Sequence[str]) -> Iterator[tuple[str, str]]:
     """
     spread = names[:: max(1, len(names) // KEY_PHOTOGRAPHS)]
     return itertools.combinations([name for name in spread if not any(map(str.isspace, name))], 2)
-
-
-@contextlib.contextmanager
-def counted(database: Path, table: str, progress: Progress) -> Iterator[None]:
-    """Report the rows that a call into pycolmap adds to a table, while it runs and when it is done."""
-    done, reported = threading.Event(), 0
-
-    def report() -> None:
-        nonlocal reported
-        with contextlib.suppress(sqlite3.Error):  # not there yet, or locked: the next look will tell
-            connection = sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=POLL_SECONDS)
-            try:
-                (rows,) = connection.execute(f"select count(*) from {table}").fetchone()
-            finally:
-                connection.close()
-            progress(rows - reported)
-            reported = rows
-
-    def watch() -> None:
-        while not done.wait(POLL_SECONDS):
-            report()
-
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    try:
-        yield
-    finally:
-        done.set()
-        watcher.join()
-    report()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import sqlite3
+import time
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -11,6 +13,7 @@ import pytest
 from PIL import Image
 
 from skipgs_plug.cli import main
+from skipgs_plug.photos.progress import counted
 from skipgs_plug.photos.reconstruct import key_pairs
 from skipgs_plug.trainer import load_scene
 
@@ -71,6 +74,22 @@ def test_bad_input_is_one_sentence(tmp_path, capsys, make, arguments, sentence):
     error = capsys.readouterr().err
     assert sentence in error and len(error.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir() if path.name != "nowhere"] == []
+
+
+def test_progress_is_read_by_another_process(tmp_path):
+    database = tmp_path / "some ?#% database.db"
+    connection = sqlite3.connect(database)
+    connection.execute("create table descriptors (k integer)")
+    seen = []
+    with counted(database, "descriptors", seen.append):
+        for total in (2, 5):
+            while sum(seen) < total:
+                if connection.execute("select count(*) from descriptors").fetchone()[0] < total:
+                    connection.execute("insert into descriptors values (1)")
+                    connection.commit()
+                time.sleep(0.05)
+    connection.close()
+    assert sum(seen) == 5
 
 
 def test_a_long_sequence_is_also_compared_across_its_length():
