@@ -38,5 +38,5 @@ def load_scene(path: str | Path, data_factor: int = 1, test_every: int = 8, init
         return load_blender(path, data_factor, test_every, init_num_pts)
     raise MissingFileError(
         f"Scene {path} holds neither {path / 'sparse' / '0'} (COLMAP) nor "
-        f"{path / 'transforms_train.json'} (Blender); run COLMAP on it or give another folder."
+        f"{path / 'transforms_train.json'} (Blender); for a folder of photographs run: skipgs-plug sfm {path} SCENE."
     )
