@@ -25,6 +25,9 @@ EXTRAS = (
     ("yaml", "pyyaml", "cfg.yml"),
     ("torchmetrics", "torchmetrics", "SSIM"),
     ("matplotlib", "matplotlib", "plots"),
+    ("jinja2", "jinja2", "report"),
+    ("imageio_ffmpeg", "imageio-ffmpeg", "videos"),
+    ("viser", "viser", "view"),
     ("tensorboard", "tensorboard", "--tensorboard"),
 )
 

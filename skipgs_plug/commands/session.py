@@ -12,14 +12,16 @@ from skipgs_plug.core.report import write_report
 from skipgs_plug.files import WriteError, keep_going
 from skipgs_plug.trainer import InputError, Trainer
 from skipgs_plug.trainer.autosave import Autosave
+from skipgs_plug.trainer.curve import LossCurve
 from skipgs_plug.trainer.loop import Iteration
 from skipgs_plug.trainer.run_folder import RunFolder
 from skipgs_plug.trainer.scalars import ScalarLog
+from skipgs_plug.view.live import LiveView
 
 
 @dataclass
 class SessionOptions:
-    """What a session writes, and when; none of it changes what is trained."""
+    """What a session writes and shows, and when; none of it changes what is trained."""
 
     save_every: int | None = None
     """Iterations between two checkpoints, of which two are kept; default: five minutes of training; 0: the end only."""
@@ -27,6 +29,8 @@ class SessionOptions:
     """Iterations between two evaluations on the way; 0: the end only."""
     tensorboard: bool = False
     """Log gsplat's scalars and the gate's counters to RUN/tb, every tenth iteration."""
+    view: bool = False
+    """Show training in the browser; costs at most 2 % of its time."""
     lpips_net: Literal["alex", "vgg"] | None = None
     """Also report LPIPS; its weights must be on this machine."""
     no_progress: bool = False
@@ -46,8 +50,12 @@ class Session:
     says how to get it. The folder is held by this process alone (`trainer.lock`).
     """
 
-    def __init__(self, options: SessionOptions, folder: RunFolder, trainer: Trainer, gate: SkipGate | None) -> None:
+    def __init__(
+        self, options: SessionOptions, folder: RunFolder, trainer: Trainer, gate: SkipGate | None, curve: LossCurve
+    ) -> None:
         self._options, self._folder, self._trainer, self._gate = options, folder, trainer, gate
+        self._curve = curve
+        self._live: LiveView | None = None
         self._autosave = Autosave(folder, trainer, options.save_every)
         self._split = "val" if trainer.scene.test else "train"
         self._log: ScalarLog | None = None
@@ -63,7 +71,7 @@ class Session:
             InputError: a file could not be written.
         """
         trainer, begun_at = self._trainer, self._trainer.step
-        with self._open_log() as self._log:
+        with self._open_log() as self._log, self._open_view() as self._live:
             trainer.on_step = self._after_iteration
             with stop_on_signal(trainer) as stop:
                 trainer.train(progress=not self._options.no_progress)
@@ -83,6 +91,13 @@ class Session:
             print(f"Stopped after iteration {trainer.step - 1:,}; the same command with --resume continues.")
         return stop.exit_code
 
+    def _open_view(self) -> contextlib.AbstractContextManager[LiveView | None]:
+        if not self._options.view:
+            return contextlib.nullcontext()
+        live = LiveView(self._trainer)
+        print(f"Watch it at http://127.0.0.1:{live.page.port}")
+        return live
+
     def _open_log(self) -> contextlib.AbstractContextManager[ScalarLog | None]:
         if not self._options.tensorboard:
             return contextlib.nullcontext()
@@ -90,6 +105,9 @@ class Session:
         return ScalarLog(self._folder.root / "tb", self._trainer, more)
 
     def _after_iteration(self, iteration: Iteration) -> None:
+        self._curve.iteration(iteration)
+        if self._live is not None:
+            self._live.iteration(iteration)
         if self._log is not None:
             self._log.iteration(iteration)
         every = self._options.eval_every
@@ -111,6 +129,8 @@ class Session:
         """Evaluate and write everything that a finished run leaves; also what an earlier session did not get to."""
         folder, trainer = self._folder, self._trainer
         stats = self._evaluate(self._failed)
+        with keep_going(self._failed):
+            self._curve.write(folder.root / "stats" / "train_curve.json")
         with keep_going(self._failed):
             folder.write_renders(trainer, self._split)
         ply = None

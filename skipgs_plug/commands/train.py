@@ -15,6 +15,7 @@ from skipgs_plug.commands.gate_settings import GateSettings
 from skipgs_plug.commands.session import Session, SessionOptions
 from skipgs_plug.trainer import InputError, MissingFileError, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.config import REFERENCE_STEPS
+from skipgs_plug.trainer.curve import LossCurve
 from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.metrics import require_lpips
 from skipgs_plug.trainer.resume import first_sound, lengths
@@ -69,6 +70,7 @@ def run(args: Args) -> int:
     trainer = Trainer(config, scene)
     gate = None if args.no_gate else SkipGate(trainer, **args.gate.given())
     trainer.register_state("gate_settings", GateSettings(gate))
+    curve = LossCurve(trainer)
     with exclusive(folder.root):
         if folder.checkpoints() != found:
             raise InputError(f"Another process trained in {args.out} just now; give the command again.")
@@ -82,7 +84,7 @@ def run(args: Args) -> int:
             f"iterations {trainer.step:,} to {trainer.max_steps:,}"
             + (f", gate active from {trainer.refine_stop_iter:,}" if gate is not None else ", no gate")
         )
-        return Session(args.session, folder, trainer, gate).run()
+        return Session(args.session, folder, trainer, gate, curve).run()
 
 
 def check(args: Args, checkpoints: list[Path]) -> None:

@@ -198,7 +198,11 @@ class Trainer:
         return colors[0]
 
     def evaluate(self, split: str = "test", lpips_net: str | None = None) -> dict[str, Any]:
-        """Return the means of the chosen metrics over the views of "test" or "train", `num_GS`, and the flavours."""
+        """Return the means of the chosen metrics over the views of "test" or "train", and what belongs to them.
+
+        Returns:
+            The means by name, their flavours, `num_GS step split views`, and `per_view`: the metrics of each.
+        """
         views = {"test": self.scene.test, "train": self.scene.train}[split]
         if not views:
             raise InputError(f"Scene {self.scene.name} has no {split} views; lower test_every to hold some out.")
@@ -212,6 +216,7 @@ class Trainer:
             "step": self.step,
             "split": split,
             "views": len(views),
+            "per_view": [{"view": view.name, **row} for view, row in zip(views, rows, strict=True)],
             **{f"{metric.name}_flavour": metric.flavour for metric in wanted},
         }
 

@@ -66,9 +66,9 @@ class Checkpoint(TypedDict):
 def capture(trainer: Trainer) -> dict[str, Any]:
     """Return an independent copy of everything that the next iteration depends on.
 
-    Keys: `version`, `step` (next iteration), `ran` (iterations that ran), `splats`, `optimizers` (moments by parameter), `strategy`,
-    `clock` (seconds), `registered` (state_dict of each registered object). View order and split noise are
-    functions of seed and step and need no entry.
+    Keys: `version`, `step` (next iteration), `ran` (iterations that ran), `splats`, `optimizers` (moments by
+    parameter), `strategy`, `clock` (seconds), `registered` (state_dict of each registered object). View order and
+    split noise are functions of seed, step and `ran` and need no entry.
     """
     return copy.deepcopy(_view(trainer))
 
