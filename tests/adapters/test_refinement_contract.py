@@ -39,7 +39,7 @@ def begun(monkeypatch):
 def test_a_share_of_the_iterations_runs_and_nothing_that_hangs_on_numbers_is_lost(case, begun):
     plain = run(case)[0]
     begun.clear()
-    gated, gate = run(case, refine_share=SHARE)
+    gated, gate = run(case, refine_share=SHARE, pause_iters=0)
     start, last = case.module.START, case.module.LAST
     assert begun[: start - case.module.FIRST] == list(range(case.module.FIRST, start))
     refined = [n for n in begun if n >= start]
@@ -47,10 +47,12 @@ def test_a_share_of_the_iterations_runs_and_nothing_that_hangs_on_numbers_is_los
     assert refined == sorted(set(refined)) and refined[-1] == last and len(refined) == report["iterations_run"]
     assert report["iterations_run"] + report["iterations_skipped"] == last + 1 - start
     always = sum(report["always_run"].values())
-    assert len(refined) <= max(SHARE * (last + 1 - start), always) + 2
+    assert len(refined) <= SHARE * (last + 1 - start) + always + 2
     assert gated.structure == plain.structure  # prunes, resets, relocations: same iterations, same counts
     assert gated.other_backwards == plain.other_backwards
-    assert gated.backwards == begun
+    assert gated.backwards == [n for n in begun if n in gated.backwards]
+    assert report["backwards_run"] == len([n for n in gated.backwards if n >= start])
+    assert report["backwards_run"] <= max(SHARE * (last + 1 - start), always) + 2
 
 
 @pytest.mark.parametrize(
@@ -102,7 +104,9 @@ def test_interrupted_and_resumed_leaves_out_the_same(case, begun):
     settings = {"refine_share": SHARE}
     whole, _ = run(case, **settings)
     numbers = list(begun)
-    middle = next(n for n in numbers if n >= case.module.LAST - 16)  # nothing is pending: no trainer saves gradients
+    last = case.module.LAST
+    later = [n for n in numbers if last - 16 <= n < last]  # nothing is pending at first: no trainer saves gradients
+    middle = later[0] if later else numbers[-2]
     new_log()
     begun.clear()
     trainer, train = case.make()
@@ -143,7 +147,7 @@ def test_a_loop_around_a_pip_trainer_is_written_with_the_gates_iterations():
         for step in gate.iterations(range(1, 61)):
             trainer.step(step_trainer.pick_camera(step_trainer.dataset(), step))
             assert trainer.curr_step == step
-    assert gate.report()["iterations_run"] == pytest.approx(16, abs=1)
+    assert gate.report()["iterations_run"] == 16 + 3  # those in which the SH degree is raised
     assert trainer.raised == plain.raised == 6
     assert [event for event in structure if event[0] < 21] == log.structure
     trainer = step_trainer.make()

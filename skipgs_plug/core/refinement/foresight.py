@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from typing import Any
 
 CYCLE_ENDS = (0.125, 0.25, 0.5, 1.0)
+ONE_CYCLE = (1.0,)  # for a share that is given: nothing is to be foreseen
 LEAST_VISITS = 10  # of each view: with fewer, larger steps did not make up for what was left out
 LEAST_SHARE = 0.4
 WATCHED_SHARE = 1 / 12  # of the views
@@ -38,6 +39,7 @@ class Foresight:
 
     Args:
         tolerance: Decibels that the rest may be worth when refinement ends.
+        ends: Where cycles end, as shares of the iterations that may run.
 
     Attributes:
         cycle: index of the present cycle.
@@ -46,8 +48,8 @@ class Foresight:
         foreseen: decibels that the rest was worth when it was last judged, with two standard errors added.
     """
 
-    def __init__(self, tolerance: float) -> None:
-        self._tolerance = tolerance
+    def __init__(self, tolerance: float, ends: tuple[float, ...] = CYCLE_ENDS) -> None:
+        self._tolerance, self._ends = tolerance, ends
         self.cycle = 0
         self.ended = False
         self.gains: list[tuple[float, float]] = []
@@ -58,7 +60,7 @@ class Foresight:
     @property
     def watching(self) -> bool:
         """Whether watched views are left out of training at present."""
-        return not self.ended and self.cycle < len(CYCLE_ENDS) - 1
+        return not self.ended and self.cycle < len(self._ends) - 1
 
     def see(self, view: str, loss: float) -> None:
         """A watched view was rendered; its last loss in a cycle counts."""
@@ -71,15 +73,15 @@ class Foresight:
         Args:
             share_done: Iterations run, of those that may run, in [0, 1].
         """
-        while not self.ended and share_done >= CYCLE_ENDS[self.cycle]:
+        while not self.ended and share_done >= self._ends[self.cycle]:
             self._end_cycle()
         if self.ended:
             return 1.0
-        begin = CYCLE_ENDS[self.cycle - 1] if self.cycle else 0.0
-        return (share_done - begin) / (CYCLE_ENDS[self.cycle] - begin)
+        begin = self._ends[self.cycle - 1] if self.cycle else 0.0
+        return (share_done - begin) / (self._ends[self.cycle] - begin)
 
     def _end_cycle(self) -> None:
-        end = CYCLE_ENDS[self.cycle]
+        end = self._ends[self.cycle]
         if end == 1.0:
             self.ended = True
             return

@@ -8,7 +8,7 @@ from typing import Any
 
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
-from skipgs_plug.core.refinement.foresight import Foresight, needed_share, watched_views
+from skipgs_plug.core.refinement.foresight import CYCLE_ENDS, ONE_CYCLE, Foresight, needed_share, watched_views
 from skipgs_plug.core.refinement.loop_range import LoopRange, line_of
 from skipgs_plug.core.refinement.milestones import milestones
 from skipgs_plug.core.refinement.rates import Optimizers, ScaledRates, path_factor
@@ -32,6 +32,8 @@ class Refinement:
     """Says which iterations of refinement run, and by what factor their learning rates are larger.
 
     The training loop is the one whose numbers the trainer's iterations follow. Before `start` every number runs.
+    Where steps are larger and shrink to nothing, the iterations that run come first: trainers lower the rate of
+    positions by number, and an end that comes sooner leaves a finished model sooner. Elsewhere they are spread evenly.
 
     Args:
         config: With `refine_share`.
@@ -71,6 +73,7 @@ class Refinement:
         self._must: frozenset[int] = frozenset()
         self._recovery = self._recovered = 0  # iterations to run after a change, and those that have
         self._next: int | None = None  # number that is asked about next, also by the loop of a loaded state
+        self._over = False  # what holds for the present iteration
         self._begun = self._removed = False
 
     # What is known of the trainer.
@@ -178,13 +181,14 @@ class Refinement:
 
     @property
     def over(self) -> bool:
-        """Whether refinement has ended, so that what still runs need not train."""
-        return self.foresight is not None and self.foresight.ended and self._recovered == self._recovery
+        """Whether steps have shrunk to nothing, so that what still runs need not train."""
+        return self._over
 
     def notify_event(self, n_views: int) -> None:
         """A structural change happened; when refinement has ended, the model is given time to recover."""
         if self.over:
-            self._recovery, self._recovered = max(n_views, RECOVERY), 0
+            pause = self._config.pause_iters
+            self._recovery, self._recovered = max(n_views, RECOVERY) if pause is None else pause, 0
 
     def _begin(self, loop: LoopRange, number: int) -> None:
         numbers = range(number, loop.numbers.stop)
@@ -204,17 +208,17 @@ class Refinement:
         if self._last is None:
             self._last = loop.numbers[-1]
         total = self._last + 1 - self._first
-        if self._config.refine_share == "auto" and self.share is None:
+        if self._auto and self.share is None:
             if self._views is None:
                 raise SkipGSError('refine_share="auto" must know the training views; give views=, or a share.')
             self.share = needed_share(total, len(self._views))
-            if self.share < ALL:
-                self.foresight = Foresight(self._config.tolerance)
-        if self.foresight is not None and self._views is not None:
-            self.watched = watched_views(self._views)
-        if self._config.refine_share != "auto":
-            assert self.share is not None
+        assert self.share is not None
+        if not self._scales:
             self.thinning.share = self.share
+        elif self.foresight is None:
+            self.foresight = self._new_foresight()
+        if self._auto and self._views is not None:
+            self.watched = watched_views(self._views)
         if self._scales and self._rates is None:
             self._rates = ScaledRates(self.optimizers)
         log.info(
@@ -224,6 +228,13 @@ class Refinement:
             self._last,
             len(self._must),
         )
+
+    @property
+    def _auto(self) -> bool:
+        return self._config.refine_share == "auto"
+
+    def _new_foresight(self) -> Foresight:
+        return Foresight(self._config.tolerance, CYCLE_ENDS if self._auto else ONE_CYCLE)
 
     @property
     def _scales(self) -> bool:
@@ -238,11 +249,13 @@ class Refinement:
         if self._recovered < self._recovery:
             self.thinning.share, factor = 1.0, 1.0 - self._recovered / self._recovery
             self._recovered += 1
+            self._over = False
         else:
             progress = (number - self._first) / total
             if self.foresight is not None:
                 progress = self.foresight.progress(self.thinning.run / (self.share * total))
-                self.thinning.share = 0.0 if self.foresight.ended else 1.0
+                self._over = self.foresight.ended
+                self.thinning.share = 0.0 if self._over else 1.0
             factor = path_factor(self.share, progress, self._config.rate_peak)
         if self._rates is not None:
             self._rates.follow_thread()
@@ -259,7 +272,7 @@ class Refinement:
             "iterations_skipped": self.thinning.left_out,
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
             "foresight": None
-            if foresight is None
+            if foresight is None or not self._auto
             else {
                 "ended": foresight.ended,
                 "cycle": foresight.cycle,
@@ -290,6 +303,6 @@ class Refinement:
         self.thinning.load_state_dict(state["thinning"])
         self._recovery, self._recovered = state["recovery"]
         if state["foresight"] is not None:
-            self.foresight = Foresight(self._config.tolerance)
+            self.foresight = self._new_foresight()
             self.foresight.load_state_dict(state["foresight"])
         self._next, self._begun = state["next"], False

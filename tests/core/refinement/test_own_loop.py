@@ -39,14 +39,34 @@ class Loop:
 def test_a_share_of_the_iterations_runs_with_all_that_hangs_on_numbers():
     with SkipGate(start_iter=40, refine_share=0.25) as gate:
         loop = Loop().train(gate)
-    assert loop.ran[:40] == list(range(40)) and len(loop.ran) == 40 + 16  # the last one comes on top
-    assert loop.saved == [0, 25, 50, 75] and loop.ran[-1] == 99
+    assert loop.ran == [*range(55), 75, 99]  # steps have shrunk to nothing; a save and the last one follow
+    assert loop.saved == [0, 25, 50, 75]
     assert loop.rates == [0.1 * 0.99**step for step in loop.ran]
     report = gate.report()
-    assert (report["refine_share"], report["iterations_run"], report["iterations_skipped"]) == (0.25, 16, 44)
+    assert (report["refine_share"], report["iterations_run"], report["iterations_skipped"]) == (0.25, 17, 43)
     assert sum(report["always_run"].values()) == 2
-    assert report["backwards_run"] == 16 and report["reasons"] == {"full": 16}
-    assert "16 of 60 iterations run (26.7 %)" in gate.summary()
+    assert report["backwards_run"] == 15 and report["reasons"] == {"full": 15, "over": 2}
+    assert "17 of 60 iterations run (28.3 %)" in gate.summary()
+
+
+def test_without_larger_steps_they_are_spread_evenly():
+    with SkipGate(start_iter=40, refine_share=0.25, compensate=False) as gate:
+        loop = Loop().train(gate)
+    assert loop.ran[:40] == list(range(40)) and len(loop.ran) == 40 + 16  # the last one comes on top
+    assert loop.saved == [0, 25, 50, 75] and loop.ran[-1] == 99
+    assert all(2 <= sum(begin <= n < begin + 15 for n in loop.ran) <= 6 for begin in (40, 55, 70, 85))
+    assert gate.report()["reasons"] == {"full": 16}
+
+
+def test_a_change_after_the_end_is_followed_by_iterations_that_train():
+    ran = []
+    with SkipGate(start_iter=40, refine_share=0.25, pause_iters=6) as gate:
+        for step in gate.iterations(range(100), always=[70]):
+            gate.backward(torch.ones((), requires_grad=True) * 1.0, view="a", step=step)
+            ran.append((step, gate.skipped))
+            if step == 70:
+                gate.notify_event("prune")
+    assert [row for row in ran if row[0] >= 55] == [(70, True), *((n, False) for n in range(71, 77)), (99, True)]
 
 
 def test_steps_are_larger_while_the_gate_is_attached():
@@ -59,7 +79,8 @@ def test_steps_are_larger_while_the_gate_is_attached():
     gate = SkipGate(start_iter=40, refine_share=0.4)
     loop.train(gate)
     assert all(moved[step] == pytest.approx(1.0) for step in range(40))
-    assert all(moved[step] == pytest.approx(path_factor(0.4, (step - 40) / 60)) for step in loop.ran[40:])
+    assert all(moved[step] == pytest.approx(path_factor(0.4, (step - 40) / 24)) for step in range(40, 64))
+    assert loop.ran[64:] == [75, 99] and not {75, 99} & set(moved)  # nothing to step
     gate.detach()
     before = loop.value.detach().clone()
     loop.value.grad = torch.ones(2)
