@@ -32,6 +32,7 @@ FORK_MARKS = {
     "speedy_splat": "score_func",
     "lightgaussian": "calculate_v_imp_score",
     "gaussianspa": "OptimizingSpa",
+    "mcmc": "build_scaling_rotation",
 }
 
 

@@ -19,6 +19,7 @@ BUILTIN = {
     "taming": "skipgs_plug.adapters.taming:Taming",
     "speedy_splat": "skipgs_plug.adapters.speedy_splat:SpeedySplat",
     "lightgaussian": "skipgs_plug.adapters.lightgaussian:LightGaussian",
+    "mcmc": "skipgs_plug.adapters.mcmc:MCMC",
     "gaussianspa": "skipgs_plug.adapters.gaussianspa:GaussianSpa",
     "inria": "skipgs_plug.adapters.inria:Inria",
 }

@@ -17,6 +17,7 @@ from lookalikes import (
     lightgaussian_densify_prune,
     lightgaussian_distill,
     lightgaussian_prune_finetune,
+    mcmc,
     nerfstudio,
     speedy_splat,
     step_trainer,
@@ -122,6 +123,7 @@ SCRIPTS = [
     script("lightgaussian_distill_plain", lightgaussian_distill, augmented_view=False),
     script("gaussianspa", gaussianspa),
     script("gaussianspa_op", gaussianspa_op),
+    script("mcmc", mcmc),
 ]
 CASES = [
     *SCRIPTS,

@@ -31,6 +31,7 @@ FAMILIES: dict[str, _Source] = {
         _RASTERIZER: (".inria", _CLASSES),
         **_KNN,
     },
+    "mcmc": {_RASTERIZER: (".mcmc", (*_CLASSES, "compute_relocation")), **_KNN},
     "pip_gaussian_splatting": {
         f"{_PIP}{_RASTERIZER}": (".inria", _CLASSES),
         f"{_PIP}simple_knn": (".knn", ()),

@@ -1,0 +1,53 @@
+"""3DGS-MCMC: positions are noised in every iteration, inside the loop."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+
+from skipgs_plug.adapters.inria import LOOP, InriaFamily
+from skipgs_plug.core.hooks import Hooks
+
+NOISE = "build_scaling_rotation"  # the loop calls it for nothing but its noise
+
+
+class MCMC(InriaFamily):
+    """The noise belongs to the gradient step: left alone, it is a random walk.
+
+    It is computed between the lines of `training`, but its covariance comes from a function of another module:
+    in skipped iterations the loop is given zeros there. The random numbers are drawn as ever.
+    Relocation reads no gradients. A gate that is started before it ends runs the iterations that relocate.
+    """
+
+    name = "mcmc"
+    checked = "ubc-vision/3dgs-mcmc 7b4fc9f7"
+
+    def __init__(self, trainer: Any = None) -> None:
+        super().__init__(trainer)
+        self._relocations = range(0)
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        interval = int(opt.densification_interval)
+        first = int(opt.densify_from_iter) // interval * interval + interval
+        self._relocations = range(first, int(opt.densify_until_iter), interval)
+        return int(opt.densify_until_iter)
+
+    def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return 0
+
+    def must_run(self, step: int) -> bool:
+        return step in self._relocations
+
+    def _hang(self, hooks: Hooks, names: dict[str, Any], model: type) -> None:
+        super()._hang(hooks, names, model)
+
+        def covariance(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            factor = original(*args, **kwargs)
+            # Frame 2 called it; the model does so too, where it matters.
+            in_loop = sys._getframe(2).f_code.co_name == LOOP
+            return torch.zeros_like(factor) if in_loop and hooks.state.skipped else factor
+
+        hooks.wrap(names if NOISE in names else vars(sys.modules[model.__module__]), NOISE, covariance)
