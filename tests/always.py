@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from skipgs_plug.core.decision import Decision
+from skipgs_plug.core.policy import Policy
 
 
-class Always:
+class Always(Policy):
     """Remembers at which iterations it was asked."""
 
     def __init__(self) -> None:

@@ -48,7 +48,7 @@ def test_bad_input_is_one_sentence(tmp_path: Path, packed: str, capsys: pytest.C
     assert "nowhere does not exist" in one_sentence(capsys)
     assert main(["train", packed, "--out", out, "--resume"]) == 2
     assert "start without --resume" in one_sentence(capsys)
-    assert main(["train", packed, "--out", out, "--gate.threshold", "-2", *SHORT]) == 2
+    assert main(["train", packed, "--out", out, "--threshold", "-2", *SHORT]) == 2
     assert "threshold must be" in one_sentence(capsys)
     assert main(["train", packed, "--out", out, "--max-steps", "0"]) == 2
     assert not Path(out).exists()
@@ -58,7 +58,7 @@ def test_bad_input_is_one_sentence(tmp_path: Path, packed: str, capsys: pytest.C
 
 def test_run_folder(tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
-    command = ["train", packed, "--out", str(out), "--tensorboard", "--gate.warmup", "4", *SHORT]
+    command = ["train", packed, "--out", str(out), "--tensorboard", "--warmup", "4", *SHORT]
     assert main(command) == 0
     shown = capsys.readouterr().out
     assert re.search(r"8 training views, 2 held out", shown) and "backwards skipped" in shown

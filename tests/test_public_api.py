@@ -9,8 +9,9 @@ import sys
 import torch
 
 import skipgs_plug
-from skipgs_plug import SkipConfig, SkipGate
-from skipgs_plug.core.policy import SkipPolicy
+from skipgs_plug import SkipConfig, SkipGate, adapters
+from skipgs_plug.adapters import AbstractAdapter, Hooks, TrainerFacts
+from skipgs_plug.core.policy import Policy, SkipPolicy
 
 NAMES = {
     "AdapterMismatchError",
@@ -41,6 +42,45 @@ GATE = {
 }
 GATE_PROPERTIES = {"adapter", "config", "patched", "policy", "skipped", "trace"}
 
+ADAPTER = {
+    "attach": "(self, hooks: 'Hooks') -> 'None'",
+    "attach_on_call": "(self, hooks: 'Hooks', owner: 'Any', method: 'str') -> 'None'",
+    "attach_script": "(self, hooks: 'Hooks') -> 'None'",
+    "matches": "(trainer: 'Any') -> 'bool'",
+    "must_run": "(self, step: 'int') -> 'bool'",
+    "optimizers": "(self) -> 'Iterable[torch.optim.Optimizer]'",
+    "timing": "(self) -> 'tuple[float, float] | None'",
+}
+HOOKS = {
+    "backward": "(self, loss: 'torch.Tensor', run: 'Callable[[], Any]', view: 'Any' = None) -> 'Any'",
+    "before": "(self, owner: 'Any', name: 'str', call: 'Callable[..., Any]') -> 'None'",
+    "event": "(self, kind: 'str') -> 'None'",
+    "events": "(self, owner: 'Any', *names: 'str') -> 'None'",
+    "gate_tensor_backward": "(self, *callers: 'str') -> 'None'",
+    "iteration": "(self, step: 'int') -> 'None'",
+    "on_detach": "(self, label: 'str', undo: 'Callable[[], None]') -> 'None'",
+    "ready": "(self, facts: 'TrainerFacts') -> 'None'",
+    "restore": "(self) -> 'None'",
+    "signal": "(self, value: 'float | torch.Tensor') -> 'None'",
+    "suppress_on_skip": "(self, owner: 'Any', *names: 'str') -> 'None'",
+    "verify": "(self) -> 'None'",
+    "view": "(self, key: 'Any') -> 'None'",
+    "wrap": "(self, owner: 'Any', name: 'str', around: 'Around') -> 'None'",
+}
+FACTS = (
+    "(start_iter: 'int | None', *, view_names: 'Iterable[str] | None' = None, max_steps: 'int | None' = None, "
+    "world_size: 'int | None' = None, gradients_read_until: 'int | None' = None, "
+    "defaults: 'Mapping[str, Any]' = <factory>) -> None"
+)
+POLICY = {
+    "decide": "(self, view: 'Hashable', loss: 'float', step: 'int') -> 'Decision'",
+    "load_state_dict": "(self, state: 'dict[str, Any]') -> 'None'",
+    "mean": "(self, view: 'Hashable') -> 'float | None'",
+    "notify_event": "(self, step: 'int', n_views: 'int') -> 'None'",
+    "overrule_skip": "(self) -> 'None'",
+    "state_dict": "(self) -> 'dict[str, Any]'",
+}
+
 DEFAULTS = {
     "start_iter": None,
     "threshold": 0.0,
@@ -66,10 +106,38 @@ def test_errors_are_one_family() -> None:
             assert issubclass(getattr(skipgs_plug, name), skipgs_plug.SkipGSError)
 
 
+def signatures(cls: type) -> dict[str, str]:
+    """Of everything public that can be called."""
+    names = [name for name in vars(cls) if not name.startswith("_") and callable(getattr(cls, name))]
+    return {name: str(inspect.signature(getattr(cls, name))) for name in names}
+
+
+def properties(cls: type) -> set[str]:
+    return {name for name, member in vars(cls).items() if isinstance(member, property) and not name.startswith("_")}
+
+
 def test_gate_verbs_and_their_signatures() -> None:
-    members = {n: m for n, m in vars(SkipGate).items() if not n.startswith("_")}
-    assert {n: str(inspect.signature(m)) for n, m in members.items() if callable(m)} == GATE
-    assert {n for n, m in members.items() if isinstance(m, property)} == GATE_PROPERTIES
+    assert signatures(SkipGate) == GATE
+    assert properties(SkipGate) == GATE_PROPERTIES
+
+
+def test_what_adapters_are_written_with() -> None:
+    assert set(adapters.__all__) == {"AbstractAdapter", "Hooks", "TrainerFacts", "register_adapter"}
+    assert signatures(AbstractAdapter) == ADAPTER
+    assert AbstractAdapter.__abstractmethods__ == {"attach", "matches"}
+    assert set(AbstractAdapter.__annotations__) == {"name", "checked", "saved_state", "output_folder"}
+    assert signatures(Hooks) == HOOKS
+    assert properties(Hooks) == {"patched", "state"}
+    assert str(inspect.signature(TrainerFacts)) == FACTS
+    assert str(inspect.signature(adapters.register_adapter)) == (
+        "(adapter: 'type[AbstractAdapter]') -> 'type[AbstractAdapter]'"
+    )
+
+
+def test_what_policies_are_written_with() -> None:
+    assert signatures(Policy) == POLICY
+    assert properties(Policy) == {"floor", "start_iter"}
+    assert Policy.__abstractmethods__ == {"decide", "load_state_dict", "notify_event", "state_dict"}
 
 
 def test_settings_and_their_defaults() -> None:
@@ -79,6 +147,15 @@ def test_settings_and_their_defaults() -> None:
 def test_policy_takes_the_authors_names() -> None:
     names = list(inspect.signature(SkipPolicy).parameters)
     assert names[:6] == ["start_iter", "threshold", "ema_decay", "warmup", "min_bwd_ratio", "enabled"]
+
+
+def test_a_policy_takes_every_setting_that_is_its_own() -> None:
+    settings = SkipConfig(3, 0.1, 0.5, 7, 0.25, False, pause_iters=9)
+    ours, theirs = SkipPolicy.from_config(settings), SkipPolicy(3, 0.1, 0.5, 7, 0.25, False, 9)
+    for name in ("start_iter", "enabled", "floor", "_ceiling", "_warmup"):
+        assert getattr(ours, name) == getattr(theirs, name)
+    assert ours.means._decay == theirs.means._decay == 0.5
+    assert ours.pause._iters == theirs.pause._iters == 9
 
 
 def test_state_keys() -> None:

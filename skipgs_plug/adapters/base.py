@@ -1,4 +1,4 @@
-"""What an adapter is: one trainer's answers, and the hooks it hangs them on."""
+"""What an adapter is: one trainer's answers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class AbstractAdapter(ABC):
     """Knows one trainer: what its iteration, view, backward and end of densification are called.
 
     It holds no loop and decides nothing. It tells the gate through `Hooks`
-    - once, `ready(start_iter, view_names=...)`, at attach or at the latest before the first iteration;
+    - once, `ready(TrainerFacts(start_iter, ...))`, at attach or at the latest before the first iteration;
     - per iteration `iteration(step)`, `view(key)`, and the backward (`gate_tensor_backward`, or a wrapped
       method that calls `backward(loss, run)`);
     - per structural change `event(kind)`.
@@ -26,17 +26,19 @@ class AbstractAdapter(ABC):
 
     Attributes:
         name: how users call it.
-        checked: upstream version or commit that it was checked with, and how; part of error messages.
+        checked: upstream version or commit that it was checked with, and in brackets how; part of error messages.
         saved_state: gives the state of the gate that belongs to the checkpoint which the trainer goes on from,
-            if any; asked once, with the first iteration.
+            if any; called once, with the first iteration. Set before the gate is made.
+        output_folder: where the trainer writes, as far as it is known.
     """
 
     name: ClassVar[str]
     checked: ClassVar[str]
+    saved_state: Callable[[int], dict[str, Any] | None] | None = None
+    output_folder: str | None = None
 
     def __init__(self, trainer: Any = None) -> None:
         self.trainer = trainer
-        self.saved_state: Callable[[int], dict[str, Any] | None] | None = None
 
     @classmethod
     @abstractmethod

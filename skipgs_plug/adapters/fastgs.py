@@ -16,7 +16,8 @@ class FastGS(InriaFamily):
     """
 
     name = "fastgs"
-    checked = "fastgs/FastGS 44e02a5c"
+    checked = "fastgs/FastGS 44e02a5c (its script, run on the CPU)"
+    mark = "render_fastgs"
     renders = ("render_fastgs",)
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:

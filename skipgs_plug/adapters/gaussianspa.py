@@ -17,20 +17,23 @@ class GaussianSpa(InriaFamily):
     """
 
     name = "gaussianspa"
-    checked = "noodle-lab/GaussianSpa abdfaf64"
+    checked = "noodle-lab/GaussianSpa abdfaf64 (its three scripts, run on the CPU)"
+    mark = "OptimizingSpa"
     renders = ("render_imp", "render")
     structural = (*InriaFamily.structural, "reinitial_pts")
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
-        self._admm = range(0)
+        self._admm = range(0)  # iterations whose loss holds the term
 
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+    def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
         first, last = int(opt.optimizing_spa_start_iter) + 1, int(opt.optimizing_spa_stop_iter)
         interval = int(opt.optimizing_spa_interval)
         # The scripts disagree on whether the last of these carries the term; it is run either way.
         self._admm = range(first + -first % interval, last + 1, interval)
-        return max(last + 1, int(opt.densify_until_iter))
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return max(int(opt.optimizing_spa_stop_iter) + 1, int(opt.densify_until_iter))
 
     def must_run(self, step: int) -> bool:
         return step in self._admm

@@ -11,6 +11,7 @@ import torch
 from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
 from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
 
 EXPECTED = ("cfg", "parser", "trainset", "rasterize_splats", "world_size")
@@ -25,11 +26,10 @@ class GsplatRunner(AbstractAdapter):
     """
 
     name = "gsplat"
-    checked = "nerfstudio-project/gsplat v1.5.3 and 90d7b4b3 (v1.6.0)"
+    checked = "nerfstudio-project/gsplat v1.5.3 and v1.6.0 90d7b4b3 (its script, run on the CPU)"
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
-        self.output_folder: str | None = None
         self._relocations = range(0)
 
     @classmethod
@@ -76,11 +76,13 @@ class GsplatRunner(AbstractAdapter):
         self._relocations = leave_out_noise(hooks, strategy, type(strategy))
         self.output_folder = runner.cfg.result_dir
         hooks.ready(
-            strategy.refine_stop_iter,
-            view_names=names,
-            max_steps=runner.cfg.max_steps - 1,
-            world_size=runner.world_size,
-            gradients_read_until=gradients_read_until(strategy),
+            TrainerFacts(
+                strategy.refine_stop_iter,
+                view_names=names,
+                max_steps=runner.cfg.max_steps - 1,
+                world_size=runner.world_size,
+                gradients_read_until=gradients_read_until(strategy),
+            )
         )
 
     def must_run(self, step: int) -> bool:

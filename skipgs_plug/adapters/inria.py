@@ -19,39 +19,33 @@ from typing import Any, ClassVar
 
 import torch
 
+from skipgs_plug.adapters import registry
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.views import view_key
 
 LOOP = "training"  # name of the function that holds the loop, in the whole family
-# By adapter: a global name that only this fork's training scripts have.
-FORK_MARKS = {
-    "fastgs": "render_fastgs",
-    "taming": "get_count_array",
-    "speedy_splat": "score_func",
-    "lightgaussian": "calculate_v_imp_score",
-    "gaussianspa": "OptimizingSpa",
-    "mcmc": "build_scaling_rotation",
-}
 
 
 class InriaFamily(AbstractAdapter):
     """Shared by Inria 3DGS and its forks: only the backward is gated, optimizers keep their schedules.
 
     Attributes:
+        mark: a global name that only this fork's training scripts have.
         renders: names of the functions that render a training view; at least one must exist.
         structural: methods of `GaussianModel` that make losses jump.
         scenes: names that the loop's variable for its Scene can have.
     """
 
+    mark: ClassVar[str] = ""
     renders: ClassVar[tuple[str, ...]] = ("render",)
     structural: ClassVar[tuple[str, ...]] = ("prune_points", "reset_opacity", "training_setup")
     scenes: ClassVar[tuple[str, ...]] = ("scene",)
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
-        self.output_folder: str | None = None  # `model_path` of the run, known when training begins
         self._step = 0
         self._model: Callable[[], Any] = lambda: None  # a new model means a new run
         self._label = "image_name"  # attribute of a camera that names its view
@@ -63,8 +57,11 @@ class InriaFamily(AbstractAdapter):
 
     @classmethod
     def recognises(cls, names: Mapping[str, Any]) -> bool:
-        """Whether a train module with these global names is this trainer's."""
-        return fork_of(names) == cls.name
+        """Whether a train module with these global names is this trainer's, unless one asked before it knows it."""
+        return cls.mark in names
+
+    def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
+        """Keep what later answers need of a run, which begins now; arguments as for `start_iter`."""
 
     @abstractmethod
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
@@ -87,15 +84,15 @@ class InriaFamily(AbstractAdapter):
                 f"{LOOP} function, as in {self.checked}."
             )
         self._refuse_fork(names)
-        self._hang(hooks, names, names["GaussianModel"])
+        self._attach_to(hooks, names, names["GaussianModel"])
 
     def attach_script(self, hooks: Hooks) -> None:
         # The script binds these names when it imports them, so they are replaced before.
         renderer = importlib.import_module("gaussian_renderer")
         model = importlib.import_module("scene.gaussian_model").GaussianModel
-        self._hang(hooks, vars(renderer), model)
+        self._attach_to(hooks, vars(renderer), model)
 
-    def _hang(self, hooks: Hooks, names: dict[str, Any], model: type) -> None:
+    def _attach_to(self, hooks: Hooks, names: dict[str, Any], model: type) -> None:
         present = [name for name in self.renders if name in names]
         if not present:
             raise AdapterMismatchError(
@@ -108,7 +105,7 @@ class InriaFamily(AbstractAdapter):
             if self._model() is not args[0]:
                 frame = sys._getframe(2)
                 self._refuse_fork(frame.f_globals)
-                self._begin(hooks, ChainMap(frame.f_locals, frame.f_globals))
+                self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
                 self._model = weakref.ref(args[0])
             else:
                 self._step += 1
@@ -140,13 +137,16 @@ class InriaFamily(AbstractAdapter):
         return [getattr(camera, self._label) for camera in cameras]
 
     def _refuse_fork(self, names: Mapping[str, Any]) -> None:
-        if not self.recognises(names):
+        own, family = type(self), [one for one in registry.builtin_adapters() if issubclass(one, InriaFamily)]
+        asked = family if own in family else [own, *family]
+        right = next(one for one in asked if one.recognises(names))  # the last one does in any case
+        if right is not own:
             raise AdapterMismatchError(
                 f"Adapter {self.name!r} is for {self.checked}, but {names.get('__file__') or names.get('__name__')} "
-                f"looks like the training script of {fork_of(names)!r}."
+                f"looks like the training script of {right.name!r}."
             )
 
-    def _begin(self, hooks: Hooks, loop: Mapping[str, Any]) -> None:
+    def _read_run(self, hooks: Hooks, loop: Mapping[str, Any]) -> None:
         """Read options, views and first iteration from the loop's variables."""
         scene = next((loop[name] for name in self.scenes if name in loop), None)
         missing = [name for name in ("opt", "iteration") if name not in loop]
@@ -167,11 +167,14 @@ class InriaFamily(AbstractAdapter):
                 stacklevel=2,
             )
             self._label = "uid"
+        self.begin(opt, loop)
         hooks.ready(
-            self.start_iter(opt, loop),
-            view_names=[view_key(key) for key in self.view_keys(cameras)],
-            max_steps=opt.iterations,
-            gradients_read_until=self.gradients_read_until(opt, loop),
+            TrainerFacts(
+                self.start_iter(opt, loop),
+                view_names=[view_key(key) for key in self.view_keys(cameras)],
+                max_steps=opt.iterations,
+                gradients_read_until=self.gradients_read_until(opt, loop),
+            )
         )
 
 
@@ -179,15 +182,14 @@ class Inria(InriaFamily):
     """graphdeco-inria/gaussian-splatting: densification ends before `densify_until_iter`."""
 
     name = "inria"
-    checked = "graphdeco-inria/gaussian-splatting 8a70a8cd and 54c035f"
+    checked = "graphdeco-inria/gaussian-splatting 8a70a8cd and 54c035f (their scripts, run on the CPU)"
+
+    @classmethod
+    def recognises(cls, names: Mapping[str, Any]) -> bool:
+        return True  # asked last: what is not a fork's is the original's
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter)
-
-
-def fork_of(names: Mapping[str, Any]) -> str:
-    """Name of the adapter for a train module with these global names."""
-    return next((fork for fork, mark in FORK_MARKS.items() if mark in names), Inria.name)
 
 
 def namespace_of(trainer: Any) -> dict[str, Any] | None:

@@ -18,15 +18,18 @@ class LightGaussian(InriaFamily):
     """
 
     name = "lightgaussian"
-    checked = "VITA-Group/LightGaussian 6676b983"
+    checked = "VITA-Group/LightGaussian 6676b983 (its three scripts, run on the CPU)"
+    mark = "calculate_v_imp_score"
     scenes = ("scene", "student_scene")
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
         self._jitters = False
 
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+    def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
         self._jitters = distills(loop) and loop["args"].augmented_view
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         first = int(loop["iteration"])
         if distills(loop):
             return first

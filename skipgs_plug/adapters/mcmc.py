@@ -23,16 +23,19 @@ class MCMC(InriaFamily):
     """
 
     name = "mcmc"
-    checked = "ubc-vision/3dgs-mcmc 7b4fc9f7"
+    checked = "ubc-vision/3dgs-mcmc 7b4fc9f7 (its script, run on the CPU)"
+    mark = NOISE
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
         self._relocations = range(0)
 
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+    def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
         interval = int(opt.densification_interval)
         first = int(opt.densify_from_iter) // interval * interval + interval
         self._relocations = range(first, int(opt.densify_until_iter), interval)
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter)
 
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
@@ -41,8 +44,8 @@ class MCMC(InriaFamily):
     def must_run(self, step: int) -> bool:
         return step in self._relocations
 
-    def _hang(self, hooks: Hooks, names: dict[str, Any], model: type) -> None:
-        super()._hang(hooks, names, model)
+    def _attach_to(self, hooks: Hooks, names: dict[str, Any], model: type) -> None:
+        super()._attach_to(hooks, names, model)
 
         def covariance(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             factor = original(*args, **kwargs)

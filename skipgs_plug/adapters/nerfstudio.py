@@ -12,6 +12,7 @@ from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
 from skipgs_plug.adapters.loss_scaler import guard_scaler
 from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
 
 LOOP = "train_iteration"
@@ -24,11 +25,10 @@ class Nerfstudio(AbstractAdapter):
     """
 
     name = "nerfstudio"
-    checked = "nerfstudio-project/nerfstudio 50e0e3c7 (1.1.5)"
+    checked = "nerfstudio-project/nerfstudio 1.1.5 50e0e3c7 (ns-train, run on the CPU)"
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
-        self.output_folder: str | None = None
         self._relocations = range(0)
 
     @classmethod
@@ -70,11 +70,13 @@ class Nerfstudio(AbstractAdapter):
         self._relocations = leave_out_noise(hooks, strategy, strategy)
         self.output_folder = getattr(trainer, "base_dir", None)
         hooks.ready(
-            getattr(strategy, "refine_stop_iter", None),
-            view_names=names,
-            max_steps=trainer.config.max_num_iterations - 1,
-            world_size=trainer.world_size,
-            gradients_read_until=gradients_read_until(strategy),
+            TrainerFacts(
+                getattr(strategy, "refine_stop_iter", None),
+                view_names=names,
+                max_steps=trainer.config.max_num_iterations - 1,
+                world_size=trainer.world_size,
+                gradients_read_until=gradients_read_until(strategy),
+            )
         )
 
     def must_run(self, step: int) -> bool:

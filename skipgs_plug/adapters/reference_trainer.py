@@ -8,8 +8,10 @@ from typing import Any
 import torch
 
 from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.events import MIN_PAUSE_ITERS
+from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
 
 FULL_SCHEDULE = 30_000  # iterations that the default settings of gate and trainer are made for
@@ -19,7 +21,7 @@ class ReferenceTrainer(AbstractAdapter):
     """Gates the instance's `backward(loss, view, step)`; gate state travels in snapshots and checkpoints."""
 
     name = "reference"
-    checked = "the trainer of this package"
+    checked = "the trainer of this package (itself, on the CPU, by the tests)"
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:
@@ -38,13 +40,15 @@ class ReferenceTrainer(AbstractAdapter):
         n_views = len(trainer.view_names)
         scale = trainer.max_steps / FULL_SCHEDULE
         hooks.ready(
-            trainer.refine_stop_iter,
-            view_names=trainer.view_names,
-            max_steps=trainer.max_steps - 1,
-            defaults={
-                "warmup": max(2 * n_views, round(500 * scale)),
-                "pause_iters": max(n_views, round(MIN_PAUSE_ITERS * scale)),
-            },
+            TrainerFacts(
+                trainer.refine_stop_iter,
+                view_names=trainer.view_names,
+                max_steps=trainer.max_steps - 1,
+                defaults={
+                    "warmup": max(2 * n_views, round(SkipConfig.warmup * scale)),
+                    "pause_iters": max(n_views, round(MIN_PAUSE_ITERS * scale)),
+                },
+            )
         )
         trainer.register_state("skipgs", hooks.state)
         hooks.on_detach("Trainer.registered['skipgs']", lambda: trainer.registered.pop("skipgs", None))

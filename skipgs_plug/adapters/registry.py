@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
 from typing import Any
 
 from skipgs_plug.adapters.base import AbstractAdapter
-from skipgs_plug.core.adapter import use_finder
 from skipgs_plug.core.errors import SkipGSError, UnknownTrainerError
 
-# In the order in which they are asked. Loaded when asked for.
+# In the order in which they are asked: forks before what they were forked from. Loaded when asked for.
 BUILTIN = {
     "reference": "skipgs_plug.adapters.reference_trainer:ReferenceTrainer",
     "gsplat": "skipgs_plug.adapters.gsplat_runner:GsplatRunner",
@@ -60,8 +60,12 @@ def get_adapter(name: str) -> type[AbstractAdapter]:
             f"There is no adapter {name!r}; there are {', '.join(adapter_names())}. "
             "Any other loop can be gated by hand: SkipGate(start_iter=...) and gate.backward(loss, view, step)."
         )
-    module, _, attribute = BUILTIN[name].partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    return _load(BUILTIN[name])
+
+
+def builtin_adapters() -> Iterator[type[AbstractAdapter]]:
+    """The adapters of this package, in the order in which they are asked."""
+    return map(_load, BUILTIN.values())
 
 
 def find_adapter(trainer: Any, name: str | None = None) -> AbstractAdapter:
@@ -82,9 +86,11 @@ def find_adapter(trainer: Any, name: str | None = None) -> AbstractAdapter:
     )
 
 
+def _load(place: str) -> type[AbstractAdapter]:
+    module, _, attribute = place.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
 def _describe(trainer: Any) -> str:
     name = getattr(trainer, "__name__", None)
     return f"{name!r}" if name else f"a {type(trainer).__module__}.{type(trainer).__qualname__}"
-
-
-use_finder(find_adapter)

@@ -16,7 +16,8 @@ class SpeedySplat(InriaFamily):
     """
 
     name = "speedy_splat"
-    checked = "j-alex-hanson/speedy-splat 6b523aa3"
+    checked = "j-alex-hanson/speedy-splat 6b523aa3 (its script, run on the CPU)"
+    mark = "score_func"
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter) + 1

@@ -11,6 +11,7 @@ import torch
 
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
 
 # What `step` calls on the outermost trainer, and what is looked at.
@@ -28,15 +29,11 @@ class StepTrainer(AbstractAdapter):
     """
 
     name = "step_trainer"
-    checked = "gaussian-splatting 2.11.0 (PyPI)"
+    checked = "gaussian-splatting 2.11.0 of PyPI (its script, run on the CPU)"
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:
         return all(hasattr(trainer, name) for name in EXPECTED)
-
-    def __init__(self, trainer: Any = None) -> None:
-        super().__init__(trainer)
-        self.output_folder: str | None = None
 
     def attach_script(self, hooks: Hooks) -> None:
         # `python -m gaussian_splatting.train` binds this name when it is run.
@@ -81,7 +78,7 @@ class StepTrainer(AbstractAdapter):
         hooks.wrap(trainer, "before_optim_hook", hooked)
         hooks.wrap(trainer, "optim_step", watched)
         hooks.gate_tensor_backward("step")
-        hooks.ready(end, gradients_read_until=end)
+        hooks.ready(TrainerFacts(end, gradients_read_until=end))
 
 
 def layers(part: Any) -> Iterator[Any]:

@@ -15,7 +15,8 @@ class Taming(InriaFamily):
     """
 
     name = "taming"
-    checked = "humansensinglab/taming-3dgs fd0f7d9e"
+    checked = "humansensinglab/taming-3dgs fd0f7d9e (its script, run on the CPU)"
+    mark = "get_count_array"
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter)

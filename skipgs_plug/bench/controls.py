@@ -8,12 +8,13 @@ from typing import Any
 
 from skipgs_plug.core import decision
 from skipgs_plug.core.decision import Decision
+from skipgs_plug.core.policy import Policy
 
 RUN = Decision(False, "planned")
 SKIP = Decision(True, "planned")
 
 
-class PlannedSkipping:
+class PlannedSkipping(Policy):
     """Skips exactly the iterations of a plan made beforehand.
 
     Args:

@@ -8,45 +8,21 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
 
 import tyro
 
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.adapters.base import AbstractAdapter
-from skipgs_plug.adapters.checkpoints import Checkpoints
-from skipgs_plug.adapters.cuda_redirect import cuda_on_cpu
-from skipgs_plug.adapters.launch import run_script
 from skipgs_plug.adapters.registry import get_adapter
+from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster.compat import FAMILIES, serve
+from skipgs_plug.scripts.checkpoints import Checkpoints
+from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu, exclusive_cores
+from skipgs_plug.scripts.launch import run_script
 
 # Stand-ins are named after the extension modules, which not every adapter has to itself.
 FAMILY_OF = {"step_trainer": "pip_gaussian_splatting"}
-
-
-@dataclass
-class GateOptions:
-    """Settings of the gate, named as in SkipConfig; what is left out is the adapter's choice."""
-
-    start_iter: int | None = None
-    """First iteration that may be skipped; default: end of densification."""
-    threshold: float | None = None
-    """Skip when loss <= mean * (1 + threshold); default 0."""
-    ema_decay: float | None = None
-    """Decay of each view's mean loss; default 0.95."""
-    warmup: int | None = None
-    """Gated iterations without skipping; default 500."""
-    min_bwd_ratio: float | Literal["auto"] | None = None
-    """Least share of gated iterations with a backward; default auto."""
-    on_nonfinite: Literal["skip", "raise", "pass"] | None = None
-    """What a NaN or infinite loss does; default skip."""
-    pause_iters: int | None = None
-    """Real backwards after a prune or reset; default: one round of the views, at least 500."""
-    step_mode: Literal["off", "adaptive_norm"] | None = None
-    """Accumulate gradients over several backwards before a step; default off."""
-    step_trigger: Literal["snr", "ref_k"] | None = None
-    """When an accumulated step is taken; default snr."""
 
 
 @dataclass
@@ -93,12 +69,13 @@ def run(args: Args, command: list[str]) -> int:
     """
     adapter = get_adapter(args.adapter)()
     checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
+    settings = args.gate.given() | ({"enabled": False} if args.no_gate else {})
     gates: list[SkipGate] = []
 
     def attach() -> None:
         if not args.no_gate:
             adapter.saved_state = checkpoints.state_for
-        gates.append(SkipGate(adapter=adapter, **gate_settings(args)))
+        gates.append(SkipGate(adapter=adapter, **settings))
         checkpoints.gate = gates[0]
 
     with cpu_instead_of_cuda(args, command) if args.cpu else contextlib.nullcontext():
@@ -119,17 +96,11 @@ def script_name(command: Sequence[str]) -> str:
     return next((Path(word).name for word in command if word != "-m"), "")
 
 
-def gate_settings(args: Args) -> dict[str, Any]:
-    """Return the options that were given."""
-    given = {name: value for name, value in dataclasses.asdict(args.gate).items() if value is not None}
-    return given | ({"enabled": False} if args.no_gate else {})
-
-
 def report(gate: SkipGate, adapter: AbstractAdapter) -> None:
     """Write what is known, also of a run that failed half-way, once the script has an output folder."""
     if gate.stats()["iterations"] == 0:
         return
-    folder = Path(getattr(adapter, "output_folder", None) or ".")
+    folder = Path(adapter.output_folder or ".")
     write_report(gate, folder / "skipgs.json")
     print(gate.summary(), file=sys.stderr)
 
@@ -147,5 +118,5 @@ def cpu_instead_of_cuda(args: Args, command: Sequence[str]) -> Iterator[None]:
     if family not in FAMILIES:
         names = sorted((set(FAMILIES) | set(FAMILY_OF)) - {"inria_accelerated", *FAMILY_OF.values()})
         raise SkipGSError(f"--cpu has no stand-ins for {args.adapter!r}; it has for {', '.join(names)}.")
-    with serve(family), cuda_on_cpu():
+    with serve(family), cuda_on_cpu(), exclusive_cores():
         yield

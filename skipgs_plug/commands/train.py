@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from skipgs_plug import SkipGate
+from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.core.report import write_report
 from skipgs_plug.trainer import InputError, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.metrics import require_lpips
@@ -19,24 +20,6 @@ from skipgs_plug.trainer.run_folder import RunFolder
 from skipgs_plug.trainer.scalars import ScalarLog
 
 INTERRUPTED = 130
-
-
-@dataclass
-class GateOptions:
-    """Settings of the gate, named as in SkipConfig."""
-
-    start_iter: int | None = None
-    """First iteration that may be skipped; default: end of densification."""
-    threshold: float = 0.0
-    """Skip when loss <= mean * (1 + threshold)."""
-    ema_decay: float = 0.95
-    """Decay of each view's mean loss."""
-    warmup: int | None = None
-    """Gated iterations without skipping; default: 500 scaled by max_steps / 30,000, at least two per view."""
-    min_bwd_ratio: float | Literal["auto"] = "auto"
-    """Least share of gated iterations with a backward."""
-    on_nonfinite: Literal["skip", "raise", "pass"] = "skip"
-    """What a NaN or infinite loss does."""
 
 
 @dataclass
@@ -56,7 +39,7 @@ class Args:
     out: str
     """Run folder to write."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
-    gate: GateOptions = dataclasses.field(default_factory=GateOptions)
+    gate: tyro.conf.OmitArgPrefixes[GateOptions] = dataclasses.field(default_factory=GateOptions)
     no_gate: bool = False
     """Train without the gate."""
     resume: bool = False
@@ -85,7 +68,7 @@ def run(args: Args) -> int:
     checkpoint = folder.latest_checkpoint() if args.resume else None
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts)
     trainer = Trainer(config, scene)
-    gate = None if args.no_gate else SkipGate(trainer, **gate_settings(args.gate))
+    gate = None if args.no_gate else SkipGate(trainer, **args.gate.given())
     if checkpoint is not None:
         trainer.load_checkpoint(checkpoint)
     folder.write_config(config, gate=None if gate is None else gate.config.as_dict())
@@ -127,11 +110,6 @@ def finish(args: Args, folder: RunFolder, trainer: Trainer, gate: SkipGate | Non
         f"PSNR {stats['psnr']:.2f} dB, SSIM {stats['ssim']:.4f} (torchmetrics padding){lpips} on {where}; "
         f"{stats['num_GS']:,} Gaussians; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s\n{ply}"
     )
-
-
-def gate_settings(options: GateOptions) -> dict[str, Any]:
-    """Return the options that were given; what is None stays the adapter's choice."""
-    return {name: value for name, value in dataclasses.asdict(options).items() if value is not None}
 
 
 @contextlib.contextmanager

@@ -29,7 +29,6 @@ class StepAccumulator:
         self.visible: Any = None
         self.count = 0
         self.last_norm = 0.0
-        self.steps = 0
 
     def observe(self, norm: float) -> None:
         """Take in the norm of the accumulated gradients after a backward."""
@@ -54,10 +53,8 @@ class StepAccumulator:
         reference = REF_K * self._norm_mean
         return reference > 0 and self.last_norm >= reference
 
-    def reset(self, stepped: bool = True) -> None:
+    def reset(self) -> None:
         """Begin a new window: after a step, or when a structural change dropped the gradients."""
-        if stepped and self.count > 0:
-            self.steps += 1
         self.count = 0
         self.last_norm = 0.0
         self._stale = True
@@ -72,18 +69,16 @@ class StepAccumulator:
 
     def state_dict(self) -> dict[str, Any]:
         """What outlives a window. A checkpoint holds no gradients, so a resumed run begins a new window."""
-        return {"norm_mean": self._norm_mean, "square_mean": self._square_mean, "steps": self.steps}
+        return {"norm_mean": self._norm_mean, "square_mean": self._square_mean}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._norm_mean, self._square_mean = state["norm_mean"], state["square_mean"]
-        self.steps = state["steps"]
-        self.reset(stepped=False)
+        self.reset()
 
     def load_release_state(self, state: dict[str, Any]) -> None:
         """Continue from a state of the authors' controller (`state_version` 1)."""
         self._norm_mean, self._square_mean = state["single_scale_ema"], state.get("single_sq_ema")
-        self.steps = state["step_count"]
-        self.reset(stepped=False)
+        self.reset()
 
 
 def parameters_of(optimizers: Iterable[torch.optim.Optimizer]) -> list[Tensor]:

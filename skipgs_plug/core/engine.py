@@ -10,11 +10,12 @@ from typing import Any
 from torch import Tensor
 
 from skipgs_plug.core import decision, distributed
-from skipgs_plug.core.adapter import Adapter
 from skipgs_plug.core.clock import GateClock
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
+from skipgs_plug.core.facts import TrainerFacts
+from skipgs_plug.core.iteration import Iteration
 from skipgs_plug.core.nonfinite import NonFiniteGuard
 from skipgs_plug.core.optimizers import OptimizerSteps
 from skipgs_plug.core.policy import Policy, SkipPolicy
@@ -26,111 +27,96 @@ from skipgs_plug.core.views import require_unique
 
 log = logging.getLogger(__name__)
 
-# Optimizers step at once in these iterations even when gradients are accumulated otherwise.
-STEP_AT_ONCE = frozenset({"inactive", "warm-up", "pause"})
-
 
 class Engine:
     """Decides, runs or skips, counts; holds all state of a gate.
 
+    Args:
+        config: Settings that the user gave.
+        policy: Decides in place of `SkipPolicy`.
+        record_trace: Keep every gated decision.
+        must_run: Whether skipping is forbidden in an iteration, whose loss is not to be recorded either.
+        saved_state: Gives the state that belongs to the checkpoint which training goes on from, if any; asked
+            once, with the first iteration.
+
     Attributes:
         config: settings in force.
-        adapter: answers about the trainer, None for a loop driven by hand.
         policy: None until `configure` was called.
         start: first iteration that may be skipped.
-        step: present iteration, None before the first.
-        ran: a real backward ran in the present iteration.
+        iteration: what is known of the present iteration.
         stats, clock, steps: counts, seconds, optimizer steps.
         trace: rows of gated decisions; None when they are not recorded.
     """
 
-    def __init__(self, config: SkipConfig, policy: Policy | None, record_trace: bool) -> None:
+    def __init__(
+        self,
+        config: SkipConfig,
+        policy: Policy | None = None,
+        record_trace: bool = False,
+        must_run: Callable[[int], bool] | None = None,
+        saved_state: Callable[[int], dict[str, Any] | None] | None = None,
+    ) -> None:
         self.config = config
-        self.adapter: Adapter | None = None
         self.policy = policy
         self.start = 0
-        self.step: int | None = None
-        self.ran = False
+        self.iteration = Iteration()
         self.stats = GateStats()
         self.clock = GateClock()
-        self.steps = OptimizerSteps(config)
+        self.steps = OptimizerSteps(config, self.iteration)
         self.trace: list[TraceRow] | None = [] if record_trace else None
         self._guard = NonFiniteGuard(config.on_nonfinite)
-        self._decision: Decision = decision.INACTIVE
+        self._must_run = must_run
+        self._saved_state = saved_state
         self._view_names: list[str] | None = None
         self._pending_state: dict[str, Any] | None = None
         self._ranks_checked = False
-        self._asked_for_state = False
         self._scene_check = SceneCheck()
 
-    def configure(
-        self,
-        start_iter: int | None,
-        view_names: Iterable[str] | None = None,
-        max_steps: int | None = None,
-        world_size: int | None = None,
-        gradients_read_until: int | None = None,
-        defaults: dict[str, Any] | None = None,
-    ) -> None:
+    def configure(self, facts: TrainerFacts, given: frozenset[str] = frozenset()) -> None:
         """Complete the settings with what is known of the trainer, and make the policy.
 
         Args:
-            start_iter: Used when the settings give none.
-            view_names: Keys of all training views.
-            max_steps: Last iteration.
-            world_size: Number of processes.
-            gradients_read_until: No skip may happen before this iteration.
-            defaults: Further settings to replace.
+            facts: About the trainer.
+            given: Names of settings that the user gave, which no default replaces.
 
         Raises:
             SkipGSError: Nothing says when to begin, the settings begin too early, view names repeat, or other
                 processes are out of reach.
         """
-        if world_size is not None:
-            distributed.refuse_unreachable_ranks(world_size)
-        settings = dict(defaults or {})
+        if facts.world_size is not None:
+            distributed.refuse_unreachable_ranks(facts.world_size)
+        settings = {name: value for name, value in facts.defaults.items() if name not in given}
         if self.config.start_iter is None:
-            settings["start_iter"] = start_iter if start_iter is not None or self.config.enabled else 0
+            settings["start_iter"] = 0 if facts.start_iter is None and not self.config.enabled else facts.start_iter
         self.config = config = dataclasses.replace(self.config, **settings)
         if config.start_iter is None:
             raise SkipGSError("This trainer does not densify, so the gate cannot know when to begin; give start_iter=.")
         self.start = config.start_iter
-        if config.enabled and gradients_read_until is not None and self.start < gradients_read_until:
+        read_until = facts.gradients_read_until
+        if config.enabled and read_until is not None and self.start < read_until:
             raise SkipGSError(
-                f"start_iter={self.start} is too early: up to iteration {gradients_read_until} this trainer's "
+                f"start_iter={self.start} is too early: up to iteration {read_until} this trainer's "
                 "densification reads the gradients; start there or later, or leave start_iter out."
             )
-        if view_names is not None:
-            self._view_names = require_unique(view_names)
-        if config.enabled and max_steps is not None and self.start > max_steps:
-            log.warning("The gate starts at %d, after the last iteration %d.", self.start, max_steps)
+        if facts.view_names is not None:
+            self._view_names = require_unique(facts.view_names)
+        if config.enabled and facts.max_steps is not None and self.start > facts.max_steps:
+            log.warning("The gate starts at %d, after the last iteration %d.", self.start, facts.max_steps)
         if self.policy is None:
-            self.policy = SkipPolicy(
-                start_iter=config.start_iter,
-                threshold=config.threshold,
-                ema_decay=config.ema_decay,
-                warmup=config.warmup,
-                min_bwd_ratio=config.min_bwd_ratio,
-                enabled=config.enabled,
-                pause_iters=config.pause_iters,
-            )
+            self.policy = SkipPolicy.from_config(config)
         if self._pending_state is not None:
             self.load_state_dict(self._pending_state)
 
     @property
     def active(self) -> bool:
         """Whether the present iteration is gated."""
-        return self.config.enabled and self.step is not None and self.step >= self.start
+        step = self.iteration.step
+        return self.config.enabled and step is not None and step >= self.start
 
     @property
     def skipped(self) -> bool:
         """Whether the present iteration has a backward that was skipped, and none that ran."""
-        return self._decision.skip and not self.ran
-
-    @property
-    def step_at_once(self) -> bool:
-        """Whether this iteration's gradients are stepped without accumulating."""
-        return self._decision.reason in STEP_AT_ONCE
+        return self.iteration.skipped
 
     @property
     def n_views(self) -> int:
@@ -139,7 +125,7 @@ class Engine:
 
     def mean(self, view: str) -> float | None:
         """Running mean of a view's loss, None for a view without one or a policy without means."""
-        return self.policy.means.get(view) if isinstance(self.policy, SkipPolicy) else None
+        return None if self.policy is None else self.policy.mean(view)
 
     def open_iteration(self, step: int) -> None:
         """Iteration `step` begins.
@@ -147,19 +133,18 @@ class Engine:
         Raises:
             GateOrderError: It lies before the previous one.
         """
-        if self.step is None and not self._asked_for_state:
-            self._asked_for_state = True
-            saved_state = getattr(self.adapter, "saved_state", None)
-            state = None if saved_state is None else saved_state(step)
+        if self.iteration.step is None and self._saved_state is not None:
+            ask, self._saved_state = self._saved_state, None
+            state = ask(step)
             if state is not None:
                 self.load_state_dict(state)
-        if self.step is not None and step < self.step:
+        before = self.iteration.step
+        if before is not None and step < before:
             raise GateOrderError(
-                f"Iterations went back from {self.step} to {step}: load the gate state that belongs to "
+                f"Iterations went back from {before} to {step}: load the gate state that belongs to "
                 "the checkpoint, or attach a new gate."
             )
-        self.step = step
-        self._forget_iteration()
+        self.iteration.begin(step)
         self.clock.open(post=step >= self.start)
 
     def gate(self, view: str, signal: float | Tensor, run: Callable[[], Any]) -> bool:
@@ -167,7 +152,7 @@ class Engine:
         skip = self.decide(view, signal).skip
         if not skip:
             run()
-            self.ran = True
+            self.iteration.ran = True
         self.clock.mark()
         return not skip
 
@@ -176,17 +161,18 @@ class Engine:
 
         The signal is read on the host only from `start` on.
         """
-        assert self.step is not None
+        now = self.iteration
+        assert now.step is not None
         self.stats.iterations += 1
         if not self.active:
-            self._decision = decision.INACTIVE
-            return self._decision
+            now.decision = decision.INACTIVE
+            return now.decision
         loss = float(signal.detach() if isinstance(signal, Tensor) else signal)
         mean = None if self.trace is None else self.mean(view)
-        answer = self._decision = self._agreed(view, loss, self.step)
+        answer = now.decision = self._agreed(view, loss, now.step)
         self.stats.record(answer, view, loss)
         if self.trace is not None:
-            self.trace.append(TraceRow(self.step, view, loss, mean, answer.reason, answer.skip))
+            self.trace.append(TraceRow(now.step, view, loss, mean, answer.reason, answer.skip))
         return answer
 
     def notify_event(self, kind: str, step: int) -> None:
@@ -197,7 +183,7 @@ class Engine:
         self.stats.events[kind] = self.stats.events.get(kind, 0) + 1
         self._scene_check.stop()
         self.policy.notify_event(step, self.n_views)
-        self.steps.accumulator.reset(stepped=False)
+        self.steps.accumulator.reset()
 
     def state_dict(self) -> dict[str, Any]:
         """As `SkipGate.state_dict`."""
@@ -211,7 +197,7 @@ class Engine:
             "accumulator": self.steps.accumulator.state_dict(),
             "non_finite_in_a_row": self._guard.in_a_row,
             "clock": self.clock.state_dict(),
-            "step": self.step,
+            "step": self.iteration.step,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -228,7 +214,7 @@ class Engine:
             self.policy.load_state_dict(state)
             self.stats.load_release_state(state)
             accumulator.load_release_state(state)
-            self.step = None
+            step = None
         else:
             state = gate_state(state)
             self._refuse_other_scene(state["stats"]["views"])
@@ -237,14 +223,9 @@ class Engine:
             accumulator.load_state_dict(state["accumulator"])
             self._guard.in_a_row = state["non_finite_in_a_row"]
             self.clock.load_state_dict(state["clock"])
-            self.step = state["step"]
+            step = state["step"]
         self._scene_check.start()
-        self._forget_iteration()
-
-    def _forget_iteration(self) -> None:
-        self._decision = decision.INACTIVE
-        self.ran = False
-        self.steps.begin_iteration()
+        self.iteration.begin(step)
 
     def _agreed(self, view: str, loss: float, step: int) -> Decision:
         if distributed.group_size() == 1:
@@ -258,10 +239,9 @@ class Engine:
             distributed.abort()
             raise
         answer = distributed.agree(own)
-        # A policy that counts its skips is told of one that did not happen.
-        overrule = getattr(self.policy, "overrule_skip", None)
-        if answer is decision.OTHER_RANK and overrule is not None:
-            overrule()
+        if answer is decision.OTHER_RANK:
+            assert self.policy is not None
+            self.policy.overrule_skip()
         return answer
 
     def _own(self, view: str, loss: float, step: int) -> Decision:
@@ -269,7 +249,7 @@ class Engine:
         if loss - loss != 0.0:  # NaN or infinite
             return self._guard.answer(view, loss, step, self.mean(view), self.n_views)
         self._guard.in_a_row = 0
-        if self.adapter is not None and self.adapter.must_run(step):
+        if self._must_run is not None and self._must_run(step):
             return decision.FORCED
         if self._scene_check.running:
             self._scene_check.see(loss, self.mean(view), step)

@@ -1,22 +1,39 @@
-"""What an adapter has in its hands while it attaches a gate to a trainer."""
+"""What a gate asks of an adapter, and what the adapter has in its hands while it attaches."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar, Protocol
 
 import torch
 
+from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
+from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.intercept import Around, Patches, intercept_tensor_backward
 from skipgs_plug.core.views import view_key
 
-if TYPE_CHECKING:
-    from skipgs_plug.core.adapter import Adapter
-    from skipgs_plug.core.engine import Engine
-
 CHECKED_ITERATIONS = 10  # after these, exactly one training backward each must have been seen
+
+
+class Adapter(Protocol):
+    """One trainer's answers; see `skipgs_plug.adapters.AbstractAdapter` for their meaning."""
+
+    name: ClassVar[str]
+    checked: ClassVar[str]
+    saved_state: Callable[[int], dict[str, Any] | None] | None
+    output_folder: str | None
+
+    def attach(self, hooks: Hooks) -> None: ...
+
+    def attach_script(self, hooks: Hooks) -> None: ...
+
+    def must_run(self, step: int) -> bool: ...
+
+    def optimizers(self) -> Iterable[torch.optim.Optimizer]: ...
+
+    def timing(self) -> tuple[float, float] | None: ...
 
 
 class Hooks:
@@ -34,44 +51,20 @@ class Hooks:
         self._expectation = f"Adapter {adapter.name!r} was checked with {adapter.checked}."
         self._patches = Patches(self._expectation)
         self._ready = False
-        self._view: Any = None
-        self._signal: Any = None
+        self._iteration = engine.iteration
         self._iterations = 0
-        self._backwards_now = 0  # in the present iteration
         self._backwards = 0
-        self._odd_iterations = 0
+        self._odd_iterations = 0  # those with another number of backwards than one, so far
 
     # What the adapter learns, at attach or when training begins.
 
-    @property
-    def is_ready(self) -> bool:
-        """Whether `ready` was called."""
-        return self._ready
-
-    def ready(
-        self,
-        start_iter: int | None,
-        *,
-        view_names: Iterable[str] | None = None,
-        max_steps: int | None = None,
-        world_size: int | None = None,
-        gradients_read_until: int | None = None,
-        defaults: dict[str, Any] | None = None,
-    ) -> None:
+    def ready(self, facts: TrainerFacts) -> None:
         """Give what must be known before the first iteration.
 
-        Args:
-            start_iter: First iteration after densification, in the trainer's counting; None when it has no
-                densification to end.
-            view_names: Keys of all training views, checked for uniqueness.
-            max_steps: Last iteration; a gate that starts after it is worth a warning.
-            world_size: Number of processes, when the trainer knows better than WORLD_SIZE.
-            gradients_read_until: Before this iteration more than the optimizers reads gradients, densification
-                say, so that a gate which the user starts earlier is refused.
-            defaults: Settings that suit this trainer, used where the user gave none.
+        Raises:
+            SkipGSError: As `Engine.configure`.
         """
-        suggested = {name: value for name, value in (defaults or {}).items() if name not in self._given}
-        self._engine.configure(start_iter, view_names, max_steps, world_size, gradients_read_until, suggested)
+        self._engine.configure(facts, self._given)
         self._ready = True
 
     # What the trainer does.
@@ -81,13 +74,13 @@ class Hooks:
         with self._detaching_on_error():
             if not self._ready:
                 raise self._mismatch("the trainer iterates before it said when densification ends")
-            self._close_iteration()
+            if self._iterations == CHECKED_ITERATIONS:
+                self._require_one_backward_each()
             self._iterations += 1
-            self._backwards_now = 0
-            self._view = self._signal = None
+            self._odd_iterations += 1  # until its backward is seen
             self._engine.open_iteration(step)
             if self._engine.steps.accumulating:
-                self._engine.steps.attach(self, self._adapter.optimizers, self._engine)
+                self._engine.steps.attach(self.wrap, self._adapter.optimizers)
 
     def view(self, key: Any) -> None:
         """The present iteration renders this view for training; the last one before the backward counts.
@@ -96,34 +89,38 @@ class Hooks:
             key: As for `SkipGate.backward`; or a function that gives it, called in gated iterations only, for
                 a key that has to be read from the device.
         """
-        self._view = key
+        self._iteration.view = key
 
     def signal(self, value: float | torch.Tensor) -> None:
         """Decide on this value in the present iteration, instead of on the loss that is backpropagated."""
-        self._signal = value
+        self._iteration.signal = value
 
     def event(self, kind: str) -> None:
         """A structural change (prune, opacity reset, optimizer rebuild) happens now; before training none counts."""
-        if self._engine.policy is not None and self._engine.step is not None:
-            self._engine.notify_event(kind, self._engine.step)
+        step = self._iteration.step
+        if self._engine.policy is not None and step is not None:
+            self._engine.notify_event(kind, step)
 
     def backward(self, loss: torch.Tensor, run: Callable[[], Any], view: Any = None) -> Any:
         """Gate a training backward: `run()` is the real one, and is called unless it is skipped."""
         with self._detaching_on_error():
-            self._backwards_now += 1
             self._backwards += 1
             if self._iterations == 0:
                 if self._backwards >= CHECKED_ITERATIONS:
                     raise self._mismatch(f"{self._backwards} training backwards ran in no iteration")
                 return run()
-            if self._backwards_now > 1:
+            now = self._iteration
+            now.backwards += 1
+            if now.backwards > 1:
+                self._odd_iterations += now.backwards == 2
                 return run()
-            view = self._view if view is None else view
+            self._odd_iterations -= 1
+            view = now.view if view is None else view
             if view is None:
                 raise self._mismatch("no training view was rendered before the backward")
             if callable(view):
                 view = view() if self._engine.active else "not read"
-            self._engine.gate(view_key(view), loss if self._signal is None else self._signal, run)
+            self._engine.gate(view_key(view), loss if now.signal is None else now.signal, run)
             return None
 
     # How to hold on to the trainer.
@@ -186,14 +183,11 @@ class Hooks:
         """Raise AdapterMismatchError unless training ran, with one training backward per iteration."""
         if self._iterations == 0:
             raise self._mismatch("no iteration of a training loop was seen")
-        self._close_iteration(final=True)
+        if self._iterations <= CHECKED_ITERATIONS:
+            self._require_one_backward_each()
 
-    def _close_iteration(self, final: bool = False) -> None:
-        if self._iterations == 0 or self._iterations > CHECKED_ITERATIONS:
-            return
-        if self._backwards_now != 1:
-            self._odd_iterations += 1
-        if self._odd_iterations and (final or self._iterations == CHECKED_ITERATIONS):
+    def _require_one_backward_each(self) -> None:
+        if self._odd_iterations:
             raise self._mismatch(
                 f"{self._backwards} training backwards were seen in {self._iterations} iterations, "
                 f"where one per iteration was expected"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import torch
 
@@ -15,49 +15,37 @@ from skipgs_plug.core.accumulate import (
 )
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
-
-if TYPE_CHECKING:
-    from skipgs_plug.core.hooks import Hooks
-
-
-class Iteration(Protocol):
-    """What is known of the present iteration, as in `OptimizerSteps.step`."""
-
-    ran: bool
-
-    @property
-    def step_at_once(self) -> bool: ...
+from skipgs_plug.core.intercept import Wrap
+from skipgs_plug.core.iteration import Iteration
 
 
 class OptimizerSteps:
     """Decides in each iteration whether optimizers step.
 
+    Args:
+        config: Settings of the gate.
+        iteration: The present iteration.
+
     Attributes:
         accumulator: the window of gradients, in use when `step_mode` is "adaptive_norm".
     """
 
-    def __init__(self, config: SkipConfig) -> None:
+    def __init__(self, config: SkipConfig, iteration: Iteration) -> None:
         self.accumulating = config.enabled and config.step_mode == "adaptive_norm"
         self._always = not config.enabled
         self.accumulator = StepAccumulator(config.step_trigger)
-        self._answer: bool | None = None  # of the present iteration
+        self._iteration = iteration
         self._may_zero = True
         self._attached: dict[int, torch.optim.Optimizer] = {}
 
-    def begin_iteration(self) -> None:
-        """Forget the previous iteration's answer."""
-        self._answer = None
-
-    def step(self, optimizers: list[torch.optim.Optimizer], args: tuple[Any, ...], ran: bool, at_once: bool) -> bool:
+    def step(self, optimizers: list[torch.optim.Optimizer], args: tuple[Any, ...]) -> bool:
         """Step those optimizers that have a pending gradient; True when one was stepped.
 
         Args:
             optimizers: All that step together.
             args: Passed to each `step`.
-            ran: A real backward ran in this iteration.
-            at_once: No accumulation in this iteration (warm-up, pause).
         """
-        if self.accumulating and not self._due(optimizers, ran, at_once):
+        if self.accumulating and not self._due(optimizers):
             return False
         stepped = False
         for optimizer in optimizers:
@@ -66,20 +54,14 @@ class OptimizerSteps:
                 stepped = True
         return stepped
 
-    def attach(
-        self,
-        hooks: Hooks,
-        optimizers: Callable[[], Iterable[torch.optim.Optimizer]],
-        iteration: Iteration,
-    ) -> None:
+    def attach(self, wrap: Wrap, optimizers: Callable[[], Iterable[torch.optim.Optimizer]]) -> None:
         """Make the trainer's own `step` and `zero_grad` calls wait for the window.
 
         Called in every iteration, since trainers rebuild optimizers.
 
         Args:
-            hooks: Where replaced methods are listed.
+            wrap: Replaces a method, as `Patches.wrap` does.
             optimizers: Gives all optimizers of the trainer.
-            iteration: What happened in the present iteration.
 
         Raises:
             SkipGSError: The adapter names no optimizers.
@@ -89,11 +71,10 @@ class OptimizerSteps:
             raise SkipGSError("This trainer keeps its own schedule of optimizer steps; leave step_mode at 'off'.")
 
         def around_step(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            ran, at_once = iteration.ran, iteration.step_at_once
             masked = bool(args) and isinstance(args[0], torch.Tensor) and args[0].dtype == torch.bool
-            if masked and ran and self._answer is None:
+            if masked and self._iteration.ran and self._iteration.due is None:
                 self.accumulator.see(args[0])
-            if not self._due(list(optimizers()), ran, at_once):
+            if not self._due(list(optimizers())):
                 return None
             if masked:
                 args = (self.accumulator.visible, *args[1:])
@@ -105,19 +86,19 @@ class OptimizerSteps:
         for optimizer in present:
             if id(optimizer) not in self._attached:
                 self._attached[id(optimizer)] = optimizer  # kept, so that no id is used again
-                hooks.wrap(optimizer, "step", around_step)
-                hooks.wrap(optimizer, "zero_grad", around_zero)
+                wrap(optimizer, "step", around_step)
+                wrap(optimizer, "zero_grad", around_zero)
 
-    def _due(self, optimizers: list[torch.optim.Optimizer], ran: bool, at_once: bool) -> bool:
+    def _due(self, optimizers: list[torch.optim.Optimizer]) -> bool:
         """The one answer for all optimizers of this iteration."""
-        if self._answer is None:
-            if ran:
+        now = self._iteration
+        if now.due is None:
+            if now.ran:
                 self.accumulator.observe(gradient_norm(parameters_of(optimizers)))
-            self._answer = ran and (at_once or self.accumulator.due())
-            self._may_zero = self._answer
-            if self._answer:
+            now.due = self._may_zero = now.ran and (now.step_at_once or self.accumulator.due())
+            if now.due:
                 self.accumulator.reset()
-        return self._answer
+        return now.due
 
 
 def listed(optimizer: Any) -> list[torch.optim.Optimizer]:

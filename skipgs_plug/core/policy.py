@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Hashable
-from typing import Any, Protocol
+from typing import Any
 
 from skipgs_plug.core import decision
 from skipgs_plug.core.budget import BackwardBudget
@@ -17,27 +18,50 @@ from skipgs_plug.core.state import POLICY_VERSION, policy_state
 EPS = 1e-8  # keeps the deviation score defined for a mean of zero
 
 
-class Policy(Protocol):
-    """What a gate asks of a policy; anything with these methods will do, a control for a benchmark too."""
+class Policy(ABC):
+    """What a gate asks of a policy, be it the rule or a control for a benchmark.
 
+    Derive from it and write the four abstract methods; the other members suit a policy without start, means or floor.
+    """
+
+    __slots__ = ()
+
+    @property
+    def start_iter(self) -> int:
+        """First iteration that may be skipped, for a gate without a trainer and without that setting."""
+        return 0
+
+    @property
+    def floor(self) -> float | None:
+        """Least share of real backwards in force, None without one."""
+        return None
+
+    def mean(self, view: Hashable) -> float | None:
+        """Running mean of a view's loss, None for a view or a policy without."""
+        return None
+
+    @abstractmethod
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
         """Decide on one view in one iteration, and record the answer."""
-        ...
 
+    def overrule_skip(self) -> None:
+        """The skip just decided became a backward after all: another process needed it."""
+        return None
+
+    @abstractmethod
     def notify_event(self, step: int, n_views: int) -> None:
         """A structural change happened in iteration `step`."""
-        ...
 
+    @abstractmethod
     def state_dict(self) -> dict[str, Any]:
         """Plain values from which `load_state_dict` continues exactly."""
-        ...
 
+    @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a saved state."""
-        ...
 
 
-class SkipPolicy:
+class SkipPolicy(Policy):
     """Skip a view's backward when its loss is at or below the view's own running mean.
 
     From `start_iter` on, the deviation score of a view is loss / (mean + 1e-8), and its backward is skipped
@@ -49,29 +73,29 @@ class SkipPolicy:
 
     __slots__ = (
         "_ceiling",
+        "_start_iter",
         "_warmup",
         "_warmup_end",
         "budget",
         "enabled",
         "means",
         "pause",
-        "start_iter",
     )
 
     def __init__(
         self,
-        start_iter: int,
-        threshold: float = 0.0,
-        ema_decay: float = 0.95,
-        warmup: int = 500,
-        min_bwd_ratio: float | str = "auto",
-        enabled: bool = True,
-        pause_iters: int | None = None,
+        start_iter: int | None,
+        threshold: float = SkipConfig.threshold,
+        ema_decay: float = SkipConfig.ema_decay,
+        warmup: int = SkipConfig.warmup,
+        min_bwd_ratio: float | str = SkipConfig.min_bwd_ratio,
+        enabled: bool = SkipConfig.enabled,
+        pause_iters: int | None = SkipConfig.pause_iters,
     ) -> None:
         if start_iter is None:
             raise SkipGSError("SkipPolicy needs start_iter, the iteration at which densification has ended.")
         SkipConfig(start_iter, threshold, ema_decay, warmup, min_bwd_ratio, enabled, pause_iters=pause_iters)
-        self.start_iter = start_iter
+        self._start_iter = start_iter
         self.enabled = enabled
         self.means = ViewMeans(ema_decay)
         self.budget = BackwardBudget(min_bwd_ratio)
@@ -80,12 +104,36 @@ class SkipPolicy:
         self._warmup = warmup
         self._warmup_end: int | None = None
 
+    @classmethod
+    def from_config(cls, config: SkipConfig) -> SkipPolicy:
+        """Return the policy of these settings.
+
+        Raises:
+            SkipGSError: They hold no `start_iter`.
+        """
+        names = ("threshold", "ema_decay", "warmup", "min_bwd_ratio", "enabled", "pause_iters")
+        return cls(config.start_iter, **{name: getattr(config, name) for name in names})
+
+    @property
+    def start_iter(self) -> int:
+        """First iteration that may be skipped."""
+        return self._start_iter
+
+    @property
+    def floor(self) -> float:
+        """Least share of real backwards in force."""
+        return self.budget.floor
+
+    def mean(self, view: Hashable) -> float | None:
+        """Running mean of a view's loss, None for a view without one."""
+        return self.means.get(view)
+
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
         """Decide whether to skip the backward of `view`, whose loss is `loss`, in iteration `step`.
 
         Call it once per view and iteration, after the forward; the answer is recorded as followed.
         """
-        if step < self.start_iter or not self.enabled:
+        if step < self._start_iter or not self.enabled:
             return decision.INACTIVE
         if loss - loss != 0.0:  # NaN or infinite
             return decision.NON_FINITE
@@ -127,16 +175,11 @@ class SkipPolicy:
         Changes before the iteration that precedes `start_iter` belong to densification and are ignored. A
         pause inside warm-up postpones the rest of warm-up.
         """
-        if not self.enabled or step < self.start_iter - 1:
+        if not self.enabled or step < self._start_iter - 1:
             return
         added = self.pause.extend(step, n_views)
         if self._warmup_end is not None and step < self._warmup_end:
             self._warmup_end += added
-
-    @property
-    def floor(self) -> float:
-        """Least share of real backwards in force."""
-        return self.budget.floor
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that changes, as plain values with string keys.
@@ -161,7 +204,7 @@ class SkipPolicy:
         Raises:
             SkipGSError: The state is of another version, or something is missing from it.
         """
-        state = policy_state(state, self.start_iter + self._warmup)
+        state = policy_state(state, self._start_iter + self._warmup)
         self.means.load_state_dict(state["means"])
         self.budget.load_state_dict(state["budget"])
         self._warmup_end = state["warmup_end"]

@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.stats import GateStats
 
-if TYPE_CHECKING:
-    from skipgs_plug.core.gate import SkipGate
-
 SCHEMA_VERSION = 1
+
+
+class Reporting(Protocol):
+    """What has a report: a `SkipGate`."""
+
+    def report(self) -> dict[str, Any]: ...
 
 
 def counters(stats: GateStats, floor: float | None, t_total: float, t_post: float) -> dict[str, Any]:
@@ -62,7 +65,7 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
     )
 
 
-def write_report(gate: SkipGate, path: str | Path) -> None:
+def write_report(gate: Reporting, path: str | Path) -> None:
     """Write `gate.report()` as JSON."""
     write_aside(Path(path), json.dumps(_finite(gate.report()), indent=2, allow_nan=False) + "\n")
 

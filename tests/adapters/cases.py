@@ -27,6 +27,7 @@ from lookalikes.splats import NAMES, log, new_log
 
 from skipgs_plug import SkipGate
 from skipgs_plug.core import decision
+from skipgs_plug.core.policy import Policy
 
 PAUSE = 4  # iterations
 
@@ -139,7 +140,7 @@ CASES = [
 ]
 
 
-class SkipAlways:
+class SkipAlways(Policy):
     """A policy that skips whatever it is asked about."""
 
     def decide(self, view, loss, step):

@@ -1,7 +1,7 @@
 """FastGS and Taming: gradients of earlier iterations are applied in iterations that are skipped themselves."""
 
 import torch
-from cases import run, script
+from cases import SkipAlways, run, script
 from lookalikes import fastgs, taming
 from lookalikes.splats import Log
 
@@ -10,14 +10,11 @@ from skipgs_plug.core import decision
 CASES = {"fastgs": script("fastgs", fastgs), "taming": script("taming", taming, sh_lower=True)}
 
 
-class SkipWhenDue:
+class SkipWhenDue(SkipAlways):
     """Skips exactly the iterations in which accumulated gradients are to be applied."""
 
     def decide(self, view, loss, step):
         return decision.AT_OR_BELOW_MEAN if step % 8 == 0 else decision.ABOVE_MEAN
-
-    def notify_event(self, step, n_views):
-        pass
 
 
 def moved(log: Log, name: str) -> list[int]:

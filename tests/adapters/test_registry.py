@@ -7,8 +7,7 @@ import importlib
 import pytest
 
 from skipgs_plug import SkipGate, SkipGSError, UnknownTrainerError, register_adapter
-from skipgs_plug.adapters import registry
-from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters import AbstractAdapter, TrainerFacts, registry
 
 
 class Mine:
@@ -28,7 +27,7 @@ class MyAdapter(AbstractAdapter):
 
     def attach(self, hooks) -> None:
         self.trainer.attached = True
-        hooks.ready(5)
+        hooks.ready(TrainerFacts(5))
 
 
 @pytest.fixture(autouse=True)

@@ -47,7 +47,7 @@ def read(folder):
 
 def test_train_writes_the_tags_of_gsplat(packed, tmp_path):
     command = ["train", packed, "--out", str(tmp_path), "--max-steps", "40", "--no-progress", "--tensorboard"]
-    assert main([*command, "--ssim-lambda", "0.3", "--gate.warmup", "4"]) == 0
+    assert main([*command, "--ssim-lambda", "0.3", "--warmup", "4"]) == 0
     logged = read(tmp_path / "tb")
     assert {tag for tag in logged if not tag.startswith("skipgs/")} == TRAIN | VAL
     for tag in TRAIN:

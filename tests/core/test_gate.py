@@ -7,13 +7,14 @@ import torch
 
 from skipgs_plug import GateOrderError, SkipConfig, SkipGate, SkipGSError
 from skipgs_plug.core.decision import Decision
+from skipgs_plug.core.policy import Policy
 
 
 def loss_of(value: float) -> torch.Tensor:
     return torch.tensor(value, requires_grad=True)
 
 
-class Scripted:
+class Scripted(Policy):
     """A policy that answers from a list."""
 
     def __init__(self, *skips: bool) -> None:

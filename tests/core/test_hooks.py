@@ -7,7 +7,7 @@ import torch
 from always import Always
 
 from skipgs_plug import AdapterMismatchError, GateOrderError, SkipGate, SkipGSError, UnknownTrainerError
-from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters import AbstractAdapter, TrainerFacts
 
 
 class ToyTrainer:
@@ -63,7 +63,9 @@ class Toy(AbstractAdapter):
         hooks.suppress_on_skip(trainer, "add_noise")
         hooks.gate_tensor_backward("train")
         if not self.hurried:
-            hooks.ready(20, view_names=[f"v{i}" for i in range(10)], defaults={"warmup": 12, "pause_iters": 15})
+            hooks.ready(
+                TrainerFacts(20, view_names=[f"v{i}" for i in range(10)], defaults={"warmup": 12, "pause_iters": 15})
+            )
 
     def must_run(self, step: int) -> bool:
         return step == 45
@@ -220,7 +222,7 @@ def test_backwards_outside_iterations_are_an_error() -> None:
     class Deaf(Toy):
         def attach(self, hooks) -> None:
             hooks.gate_tensor_backward("train")
-            hooks.ready(20)
+            hooks.ready(TrainerFacts(20))
 
     trainer = ToyTrainer()
     with SkipGate(trainer, adapter=Deaf(trainer)), pytest.raises(AdapterMismatchError, match="in no iteration"):
@@ -241,7 +243,7 @@ class Endless(Toy):
 
     def attach(self, hooks) -> None:
         super().attach(hooks)
-        hooks.ready(None)
+        hooks.ready(TrainerFacts(None))
 
 
 def test_two_views_of_one_name_are_refused() -> None:
@@ -250,7 +252,7 @@ def test_two_views_of_one_name_are_refused() -> None:
 
         def attach(self, hooks) -> None:
             super().attach(hooks)
-            hooks.ready(20, view_names=["a", "a"])
+            hooks.ready(TrainerFacts(20, view_names=["a", "a"]))
 
     trainer = ToyTrainer()
     with pytest.raises(SkipGSError, match="'a' names 2"):
@@ -318,7 +320,7 @@ def test_a_trainer_that_knows_of_more_processes_is_believed() -> None:
 
         def attach(self, hooks) -> None:
             super().attach(hooks)
-            hooks.ready(20, world_size=4)
+            hooks.ready(TrainerFacts(20, world_size=4))
 
     with pytest.raises(SkipGSError, match="4 processes"):
         SkipGate(trainer := ToyTrainer(), adapter=Crowd(trainer))

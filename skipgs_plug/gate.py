@@ -8,12 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from skipgs_plug.core import adapter as adapters
+from skipgs_plug.adapters.registry import find_adapter
 from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
-from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.facts import TrainerFacts
+from skipgs_plug.core.hooks import Adapter, Hooks
 from skipgs_plug.core.optimizers import listed
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.report import build_report, counters, summarise
@@ -50,41 +51,42 @@ class SkipGate:
             that is about to be run in this process.
         adapter: Name of an adapter, when the right one is not found by itself.
         config: All settings in one object, instead of `config_fields`.
-        policy: Decides in place of `SkipPolicy`; see `skipgs_plug.core.policy.Policy`.
+        policy: Decides in place of `SkipPolicy`; derived from `skipgs_plug.core.policy.Policy`.
         record_trace: Keep every gated decision in `trace`.
         **config_fields: Fields of `SkipConfig`.
 
     Raises:
         UnknownTrainerError: No adapter knows the trainer.
         AdapterMismatchError: The trainer lacks something that its adapter needs.
-        SkipGSError: A setting is out of range, or the trainer is gated already.
+        SkipGSError: A setting is out of range, the policy is none, or the trainer is gated already.
     """
 
     def __init__(
         self,
         trainer: Any = None,
         *,
-        adapter: str | adapters.Adapter | None = None,
+        adapter: str | Adapter | None = None,
         config: SkipConfig | None = None,
         policy: Policy | None = None,
         record_trace: bool = False,
         **config_fields: Any,
     ) -> None:
         settings = _settings(config, config_fields)
-        self._engine = Engine(settings, policy, record_trace)
+        if not (policy is None or isinstance(policy, Policy)):
+            raise SkipGSError(f"{type(policy).__name__} is no policy; derive it from skipgs_plug.core.policy.Policy.")
         self._hooks: Hooks | None = None
-        # What the verbs were called on in the present iteration.
-        self._views_now: set[str] = set()
-        self._stepped: set[int] = set()
-        self._updated = False
-
+        self._adapter: Adapter | None = None
         if trainer is not None or adapter is not None:
-            given = _FIELDS if config is not None else frozenset(config_fields)
-            self._attach(trainer, adapter, given)
+            found = find_adapter(trainer, adapter) if adapter is None or isinstance(adapter, str) else adapter
+            self._adapter = found
+            self._engine = Engine(settings, policy, record_trace, found.must_run, found.saved_state)
+            self._attach(trainer, found, _FIELDS if config is not None else frozenset(config_fields))
         elif settings.start_iter is None and policy is None and settings.enabled:
             raise SkipGSError("SkipGate needs a trainer, or start_iter=, the iteration at which densification ends.")
         else:
-            self._engine.configure(getattr(policy, "start_iter", 0))
+            self._engine = Engine(settings, policy, record_trace)
+            self._engine.configure(TrainerFacts(0 if policy is None else policy.start_iter))
+        self._iteration = self._engine.iteration
 
     # Verbs for a loop of your own.
 
@@ -105,14 +107,11 @@ class SkipGate:
             SkipGSError: The key is not usable, or losses stay non-finite.
         """
         self._require_manual("backward")
-        engine, step = self._engine, int(step)
-        if step != engine.step:
+        engine, now, step = self._engine, self._iteration, int(step)
+        if step != now.step:
             engine.open_iteration(step)
-            self._views_now.clear()
-            self._stepped.clear()
-            self._updated = False
-        elif self._updated or self._stepped:
-            verb = "update" if self._updated else "step"
+        elif now.ended or now.stepped:
+            verb = "update" if now.ended else "step"
             raise GateOrderError(
                 f"backward() was called after {verb}() in iteration {step}; all backwards of an iteration "
                 "come first, and each iteration has its own step number."
@@ -138,10 +137,10 @@ class SkipGate:
         self._require_backward_before("step")
         optimizers = listed(optimizer)
         for one in optimizers:
-            if id(one) in self._stepped:
+            if id(one) in self._iteration.stepped:
                 raise GateOrderError("step() was called twice for one optimizer in this iteration.")
-        self._stepped.update(id(one) for one in optimizers)
-        return self._engine.steps.step(optimizers, args, self._engine.ran, self._engine.step_at_once)
+        self._iteration.stepped.update(id(one) for one in optimizers)
+        return self._engine.steps.step(optimizers, args)
 
     def update(self) -> None:
         """End the iteration. Optional: a new step number ends it too.
@@ -150,7 +149,7 @@ class SkipGate:
             GateOrderError: No `backward` came first in this iteration.
         """
         self._require_backward_before("update")
-        self._updated = True
+        self._iteration.ended = True
 
     def visible(self, mask: Tensor) -> Tensor:
         """Return the mask that a sparse optimizer must step with: `gate.step(opt, gate.visible(mask), N)`.
@@ -161,7 +160,7 @@ class SkipGate:
             mask: Gaussians visible in this iteration, bool  # [N]
         """
         steps = self._engine.steps
-        return steps.accumulator.see(mask) if steps.accumulating and self._engine.ran else mask
+        return steps.accumulator.see(mask) if steps.accumulating and self._iteration.ran else mask
 
     def notify_event(self, kind: str, step: int | None = None) -> None:
         """Tell of a structural change: real backwards follow for a while, and means are left alone.
@@ -173,7 +172,7 @@ class SkipGate:
         Raises:
             GateOrderError: No iteration was seen yet and no step is given.
         """
-        step = self._engine.step if step is None else step
+        step = self._iteration.step if step is None else step
         if step is None or self._engine.policy is None:
             raise GateOrderError("notify_event() came before the first iteration; give its step.")
         self._engine.notify_event(kind, step)
@@ -183,7 +182,7 @@ class SkipGate:
     @property
     def skipped(self) -> bool:
         """Whether the present iteration's backward was skipped."""
-        return self._engine.skipped
+        return self._iteration.skipped
 
     @property
     def config(self) -> SkipConfig:
@@ -196,9 +195,9 @@ class SkipGate:
         return self._engine.policy
 
     @property
-    def adapter(self) -> adapters.Adapter | None:
+    def adapter(self) -> Adapter | None:
         """The adapter that is attached, None for a loop of your own."""
-        return self._engine.adapter
+        return self._adapter
 
     @property
     def trace(self) -> list[TraceRow]:
@@ -221,7 +220,7 @@ class SkipGate:
         own = None if self.adapter is None else self.adapter.timing()
         clock = self._engine.clock
         t_total, t_post = (clock.t_total, clock.t_post) if own is None else own
-        return counters(self._engine.stats, getattr(self.policy, "floor", None), t_total, t_post)
+        return counters(self._engine.stats, self._floor, t_total, t_post)
 
     def report(self) -> dict[str, Any]:
         """The content of skipgs.json: settings, counters, seconds, per-view table."""
@@ -236,7 +235,7 @@ class SkipGate:
         """A flat dict of numbers for a logger, keys "skipgs/...": call it at any iteration."""
         scalars = self._engine.stats.scalars()
         scalars["skipgs/skipped"] = float(self.skipped)
-        scalars["skipgs/floor"] = float(getattr(self.policy, "floor", 0.0))
+        scalars["skipgs/floor"] = self._floor or 0.0
         return scalars
 
     def summary(self) -> str:
@@ -287,10 +286,11 @@ class SkipGate:
     def __exit__(self, *exception: object) -> None:
         self.detach()
 
-    def _attach(self, trainer: Any, adapter: str | adapters.Adapter | None, given: frozenset[str]) -> None:
-        if adapter is None or isinstance(adapter, str):
-            adapter = adapters.find(trainer, adapter)
-        self._engine.adapter = adapter
+    @property
+    def _floor(self) -> float | None:
+        return None if self.policy is None else self.policy.floor
+
+    def _attach(self, trainer: Any, adapter: Adapter, given: frozenset[str]) -> None:
         self._hooks = Hooks(self._engine, adapter, given)
         try:
             if trainer is None:
@@ -310,17 +310,17 @@ class SkipGate:
         kept = [loss for loss, answer in zip(losses, answers, strict=True) if not answer.skip]
         if kept:
             torch.stack(kept).sum().backward()
-            self._engine.ran = True
+            self._iteration.ran = True
         return bool(kept)
 
     def _new_in_iteration(self, view: Any) -> str:
         key = view_key(view)
-        if key in self._views_now:
+        if key in self._iteration.keys:
             raise GateOrderError(
-                f"backward() was called twice for view {key!r} in iteration {self._engine.step}; "
+                f"backward() was called twice for view {key!r} in iteration {self._iteration.step}; "
                 "give each iteration its own step number."
             )
-        self._views_now.add(key)
+        self._iteration.keys.add(key)
         return key
 
     def _require_manual(self, verb: str) -> None:
@@ -332,7 +332,7 @@ class SkipGate:
 
     def _require_backward_before(self, verb: str) -> None:
         self._require_manual(verb)
-        if self._updated or not self._views_now:
+        if self._iteration.ended or not self._iteration.keys:
             raise GateOrderError(f"{verb}() was called before backward() in this iteration.")
 
 

@@ -14,8 +14,8 @@ from typing import Any
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.gate import SkipGate
 from skipgs_plug.core.report import write_aside
+from skipgs_plug.gate import SkipGate
 
 SUFFIX = ".skipgs.json"  # behind the name of the checkpoint
 

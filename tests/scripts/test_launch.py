@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from skipgs_plug.adapters.launch import run_script
 from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.scripts.launch import run_script
 
 
 @pytest.fixture

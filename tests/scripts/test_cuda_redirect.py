@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from skipgs_plug.adapters.cuda_redirect import REPLACED, HostEvent, cuda_on_cpu
+from skipgs_plug.scripts.cuda_redirect import REPLACED, HostEvent, cuda_on_cpu
 
 CALLS = {
     "tensor": lambda: torch.tensor([1.0], device="cuda"),

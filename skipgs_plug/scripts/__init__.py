@@ -1,0 +1,1 @@
+"""Training scripts of others, run in this process: the launcher, their checkpoints, CUDA redirected to the CPU."""
