@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.hooks import Hooks
 
@@ -45,6 +46,11 @@ class AbstractAdapter(ABC):
     def matches(cls, trainer: Any) -> bool:
         """Whether this is the trainer that the adapter knows. Imports nothing of it."""
 
+    @classmethod
+    def recognises_script(cls, code: LoopCode) -> bool:
+        """Whether a training script with these names is of the trainer that the adapter knows."""
+        return False
+
     @abstractmethod
     def attach(self, hooks: Hooks) -> None:
         """Hold on to `self.trainer`, which exists and has not begun training.
@@ -56,7 +62,7 @@ class AbstractAdapter(ABC):
     def attach_script(self, hooks: Hooks) -> None:
         """Hold on to a training script that is about to run in this process.
 
-        Its folder is first on `sys.path`, and none of its modules is imported yet.
+        Its file is `sys.argv[0]`, its folder is first on `sys.path`, and none of its modules is imported yet.
         """
         raise SkipGSError(f"Adapter {self.name!r} needs a trainer object; it has no script to run.")
 

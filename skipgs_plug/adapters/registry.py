@@ -19,8 +19,15 @@ BUILTIN = {
     "taming": "skipgs_plug.adapters.taming:Taming",
     "speedy_splat": "skipgs_plug.adapters.speedy_splat:SpeedySplat",
     "lightgaussian": "skipgs_plug.adapters.lightgaussian:LightGaussian",
-    "mcmc": "skipgs_plug.adapters.mcmc:MCMC",
     "gaussianspa": "skipgs_plug.adapters.gaussianspa:GaussianSpa",
+    "mcmc": "skipgs_plug.adapters.mcmc:MCMC",
+    "mip_splatting": "skipgs_plug.adapters.mip_splatting:MipSplatting",
+    "absgs": "skipgs_plug.adapters.absgs:AbsGS",
+    "pixel_gs": "skipgs_plug.adapters.pixel_gs:PixelGS",
+    "2dgs": "skipgs_plug.adapters.surfels:Surfels",
+    "scaffold_gs": "skipgs_plug.adapters.scaffold_gs:ScaffoldGS",
+    "dash_gaussian": "skipgs_plug.adapters.dash_gaussian:DashGaussian",
+    "improved_gs": "skipgs_plug.adapters.improved_gs:ImprovedGS",
     "inria": "skipgs_plug.adapters.inria:Inria",
 }
 

@@ -91,6 +91,8 @@ def training(dataset, opt, pipe):
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         loss = photo_loss(render(viewpoint_cam, gaussians)["render"], viewpoint_cam)
         {backward}
+        if iteration < opt.densify_until_iter:
+            pass  # densification
         done.append(iteration)
 """
 

@@ -81,6 +81,8 @@ TRAIN = """
                 sys.exit(3)
             loss.backward()
             end.record()
+            if iteration < opt.densify_until_iter:
+                pass  # densification
             torch.cuda.synchronize()
             gaussians.optimizer.step()
             gaussians.optimizer.zero_grad(set_to_none=True)

@@ -32,6 +32,16 @@ FAMILIES: dict[str, _Source] = {
         **_KNN,
     },
     "mcmc": {_RASTERIZER: (".mcmc", (*_CLASSES, "compute_relocation")), **_KNN},
+    "mip_splatting": {_RASTERIZER: (".mip_splatting", _CLASSES), **_KNN},
+    "absgs": {f"{_RASTERIZER}_abs": (".absgs", _CLASSES), **_KNN},
+    "pixel_gs": {_RASTERIZER: (".pixel_gs", _CLASSES), **_KNN},
+    "scaffold_gs": {
+        _RASTERIZER: (".scaffold_gs", _CLASSES),
+        "torch_scatter": (".scaffold_gs", ("scatter_max",)),
+        **_KNN,
+    },
+    "dash_gaussian": {_RASTERIZER: (".inria_accelerated", _ACCELERATED), **_KNN, **_SSIM},
+    "improved_gs": {_RASTERIZER: (".improved_gs", _ACCELERATED), **_KNN, **_SSIM},
     "pip_gaussian_splatting": {
         f"{_PIP}{_RASTERIZER}": (".inria", _CLASSES),
         f"{_PIP}simple_knn": (".knn", ()),

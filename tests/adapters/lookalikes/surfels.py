@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import torch
 from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
 
-ADAPTER, FIRST, START, LAST = "surfels", 1, 20, 60
+ADAPTER, FIRST, START, LAST = "2dgs", 1, 20, 60
 
 
 class GaussianModel(SplatModel):
