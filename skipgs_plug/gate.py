@@ -212,8 +212,13 @@ class SkipGate:
 
     @property
     def patched(self) -> list[str]:
-        """Every name replaced in the trainer and in PyTorch, as "owner.name"."""
-        return [] if self._hooks is None else self._hooks.patched
+        """Every name replaced in the trainer and in PyTorch, as "owner.name"; empty once detached.
+
+        In a script under `skipgs-plug run` also what that replaces around it for as long as it runs: `torch.save` and
+        `torch.load` (with `weights_only=False` unless the script says otherwise), with `--cpu` names of `torch.cuda`.
+        """
+        own = [] if self._hooks is None else self._hooks.patched
+        return [*own, *self._adapter.replaced] if own and self._adapter is not None else own
 
     def stats(self) -> dict[str, Any]:
         """Counters and seconds, by their names in skipgs.json; see `skipgs_plug.core.report`."""
@@ -266,6 +271,11 @@ class SkipGate:
             SkipGSError: The state is damaged, of another version, or of another scene.
         """
         self._engine.load_state_dict(state)
+
+    @property
+    def trained(self) -> bool:
+        """Whether anything of a training was seen so far: an iteration, or a backward in none."""
+        return self._engine.iteration.step is not None if self._hooks is None else self._hooks.trained
 
     def verify(self) -> None:
         """Raise AdapterMismatchError unless the attached trainer ran one training backward per iteration.

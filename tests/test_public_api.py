@@ -125,7 +125,7 @@ def test_what_adapters_are_written_with() -> None:
     assert set(adapters.__all__) == {"AbstractAdapter", "Hooks", "TrainerFacts", "register_adapter"}
     assert signatures(AbstractAdapter) == ADAPTER
     assert AbstractAdapter.__abstractmethods__ == {"attach", "matches"}
-    assert set(AbstractAdapter.__annotations__) == {"name", "checked", "saved_state", "output_folder"}
+    assert set(AbstractAdapter.__annotations__) == {"name", "checked", "saved_state", "output_folder", "replaced"}
     assert signatures(Hooks) == HOOKS
     assert properties(Hooks) == {"patched", "state"}
     assert str(inspect.signature(TrainerFacts)) == FACTS

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -31,12 +31,15 @@ class AbstractAdapter(ABC):
         saved_state: gives the state of the gate that belongs to the checkpoint which the trainer goes on from,
             if any; called once, with the first iteration. Set before the gate is made.
         output_folder: where the trainer writes, as far as it is known.
+        replaced: names that whoever runs the trainer has replaced around it, for `SkipGate.patched`. Set before the
+            gate is made.
     """
 
     name: ClassVar[str]
     checked: ClassVar[str]
     saved_state: Callable[[int], dict[str, Any] | None] | None = None
     output_folder: str | None = None
+    replaced: Sequence[str] = ()
 
     def __init__(self, trainer: Any = None) -> None:
         self.trainer = trainer

@@ -10,6 +10,7 @@ import torch
 
 from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
+from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
@@ -36,6 +37,10 @@ class GsplatRunner(AbstractAdapter):
     def matches(cls, trainer: Any) -> bool:
         strategy = getattr(getattr(trainer, "cfg", None), "strategy", None)
         return hasattr(strategy, "step_pre_backward") and hasattr(trainer, "rasterize_splats")
+
+    @classmethod
+    def recognises_script(cls, code: LoopCode) -> bool:
+        return "Runner" in code.names and any(name.startswith("gsplat.") for name in code.names)
 
     def attach_script(self, hooks: Hooks) -> None:
         def launched(original: Callable[..., Any], main: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

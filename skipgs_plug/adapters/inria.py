@@ -22,15 +22,13 @@ import torch
 
 from skipgs_plug.adapters import registry
 from skipgs_plug.adapters.base import AbstractAdapter
-from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.adapters.loop_code import LOOP, LoopCode
 from skipgs_plug.adapters.stillness import Stillness
 from skipgs_plug.adapters.strangers import refuse_strangers
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.views import view_key
-
-LOOP = "training"  # name of the function that holds the loop, in the whole family
 
 
 class InriaFamily(AbstractAdapter):
@@ -57,7 +55,11 @@ class InriaFamily(AbstractAdapter):
     @classmethod
     def matches(cls, trainer: Any) -> bool:
         names = namespace_of(trainer)
-        return names is not None and {LOOP, "GaussianModel"} <= names.keys() and cls.recognises_script(LoopCode.of_module(names, LOOP))
+        return (
+            names is not None
+            and {LOOP, "GaussianModel"} <= names.keys()
+            and cls.recognises_script(LoopCode.of_module(names))
+        )
 
     @classmethod
     def recognises_script(cls, code: LoopCode) -> bool:
@@ -107,13 +109,13 @@ class InriaFamily(AbstractAdapter):
                 f"Adapter {self.name!r} expects a train module with {LOOP}() and GaussianModel, or its "
                 f"{LOOP} function, as in {self.checked}."
             )
-        code = LoopCode.of_module(names, LOOP)
+        code = LoopCode.of_module(names)
         self._refuse_fork(code)
         self.examine(code, names, names["GaussianModel"])
         self._attach_to(hooks, names, names["GaussianModel"])
 
     def attach_script(self, hooks: Hooks) -> None:
-        code = LoopCode.of_script(Path(sys.argv[0]), LOOP)
+        code = LoopCode.of_script(Path(sys.argv[0]))
         if not code.used:
             raise AdapterMismatchError(
                 f"Adapter {self.name!r} expects a function {LOOP}(), which {code.place} does not have; "
@@ -140,7 +142,7 @@ class InriaFamily(AbstractAdapter):
             # Frame 2 is the loop. Its variables are read once, before they hold an iteration's graph.
             if self._model() is not args[0]:
                 frame = sys._getframe(2)
-                self._refuse_fork(LoopCode.of_module(frame.f_globals, LOOP))
+                self._refuse_fork(LoopCode.of_module(frame.f_globals))
                 self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
                 self._model = weakref.ref(args[0])
             else:

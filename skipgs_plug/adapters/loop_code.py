@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 from skipgs_plug.core.errors import AdapterMismatchError
 
+LOOP = "training"  # name of the function that holds the loop, in the whole Inria family
+
 
 class LoopCode(NamedTuple):
     """The names in a training script.
@@ -16,7 +18,7 @@ class LoopCode(NamedTuple):
     Attributes:
         place: file of the script, or name of the module, for sentences.
         names: global names of the script, and every global and attribute that its loop uses.
-        used: those of the loop alone.
+        used: those of the loop alone, which is its function `training`; none where it has no such function.
         keywords: names by which the loop passes arguments.
     """
 
@@ -26,14 +28,14 @@ class LoopCode(NamedTuple):
     keywords: frozenset[str] = frozenset()
 
     @classmethod
-    def of_module(cls, namespace: Mapping[str, Any], loop: str) -> LoopCode:
-        """Of a module that was imported; the loop is its function of that name, if it has one."""
+    def of_module(cls, namespace: Mapping[str, Any]) -> LoopCode:
+        """Of a module that was imported."""
         place = str(namespace.get("__file__") or namespace.get("__name__"))
-        code = getattr(namespace.get(loop), "__code__", None)
+        code = getattr(namespace.get(LOOP), "__code__", None)
         return cls._made(place, set(namespace), code)
 
     @classmethod
-    def of_script(cls, path: Path, loop: str) -> LoopCode:
+    def of_script(cls, path: Path) -> LoopCode:
         """Of a script that is about to run.
 
         Raises:
@@ -44,7 +46,7 @@ class LoopCode(NamedTuple):
         except (SyntaxError, ValueError) as error:
             raise AdapterMismatchError(f"{path} is not a Python script: {error}.") from error
         inner = [const for const in script.co_consts if isinstance(const, types.CodeType)]
-        code = next((one for one in inner if one.co_name == loop), None)
+        code = next((one for one in inner if one.co_name == LOOP), None)
         return cls._made(str(path), {*script.co_names, *(one.co_name for one in inner)}, code)
 
     @classmethod

@@ -8,7 +8,8 @@ from typing import Any
 
 import torch
 
-from skipgs_plug.adapters.inria import LOOP, InriaFamily
+from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.adapters.loop_code import LOOP
 from skipgs_plug.core.hooks import Hooks
 
 NOISE = "build_scaling_rotation"  # the loop calls it for nothing but its noise

@@ -10,6 +10,7 @@ from typing import Any
 
 from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
+from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.loss_scaler import guard_scaler
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import TrainerFacts
@@ -34,6 +35,10 @@ class Nerfstudio(AbstractAdapter):
     @classmethod
     def matches(cls, trainer: Any) -> bool:
         return hasattr(trainer, LOOP) and hasattr(trainer, "grad_scaler")
+
+    @classmethod
+    def recognises_script(cls, code: LoopCode) -> bool:
+        return any(name.startswith("nerfstudio.") for name in code.names)
 
     def attach_script(self, hooks: Hooks) -> None:
         refuse_other_processes(hooks)

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
@@ -34,6 +35,10 @@ class StepTrainer(AbstractAdapter):
     @classmethod
     def matches(cls, trainer: Any) -> bool:
         return all(hasattr(trainer, name) for name in EXPECTED)
+
+    @classmethod
+    def recognises_script(cls, code: LoopCode) -> bool:
+        return "prepare_trainer" in code.names
 
     def attach_script(self, hooks: Hooks) -> None:
         # `python -m gaussian_splatting.train` binds this name when it is run.

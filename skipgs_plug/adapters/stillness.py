@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import torch
 
-from skipgs_plug.core.accumulate import has_pending_gradient, parameters_of
+from skipgs_plug.core.accumulate import has_pending_gradient
 from skipgs_plug.core.engine import Engine
 
 CHECKED_SKIPS = 5  # skipped iterations that are looked at, from the second on
@@ -22,7 +22,8 @@ class Stillness:
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._left = CHECKED_SKIPS
-        self._before: tuple[int, list[tuple[str, list[float]]]] | None = None  # events so far, and what the parameters were like
+        # Events so far, and what the parameters were like, when the iteration began.
+        self._before: tuple[int, list[tuple[str, list[float]]]] | None = None
 
     def moved(self, optimizers: Iterable[torch.optim.Optimizer]) -> list[str]:
         """Names of the parameters that the iteration which ends here moved, in an iteration that was skipped.

@@ -57,8 +57,9 @@ def refuse_strangers(code: LoopCode, render: Callable[..., Any], model: type, ev
     arguments = sorted(code.keywords & set(inspect.signature(render).parameters) - ARGUMENTS)
     if calls or arguments:
         strange = [*(f"render({name}=)" for name in arguments), *(f"{name}()" for name in calls)]
+        recognised = ", ".join(sorted(code.used & known))
         warnings.warn(
-            f"{who}. Recognised: render, backward, {', '.join(sorted(code.used & known))}. Not recognised, and left to go on in skipped "
+            f"{who}. Recognised: render, backward, {recognised}. Not recognised, and left to go on in skipped "
             f"iterations: {', '.join(strange)}.",
             RuntimeWarning,
             stacklevel=2,
@@ -68,4 +69,3 @@ def refuse_strangers(code: LoopCode, render: Callable[..., Any], model: type, ev
 def _writes(name: str) -> bool:
     """Whether this is a method that changes a tensor in place."""
     return name.endswith("_") and not name.startswith("_") and callable(getattr(torch.Tensor, name, None))
-

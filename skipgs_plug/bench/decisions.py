@@ -4,8 +4,9 @@
      "views": {"0": "12 3 15 ..."},                          by seed: index of the view of each iteration
      "runs": {"0": {"ungated": "-1500", "gate": "w34dD3b"}}}  by seed and policy: letters, each with its repetitions
 
-The letters are those of REASON_CODES; upper case means that the backward was skipped. All policies of a seed see the
-same views in the same order, a shortened run only the first of them. What is left out of a trace are losses and means.
+The letters are those of REASON_CODES; upper case means that the backward was skipped, a point that the whole iteration
+was left out. All policies of a seed have the same views in the same order, a shortened run only the first of them. What
+is missing here of a trace are losses and means.
 """
 
 from __future__ import annotations
@@ -74,6 +75,6 @@ def unpacked(letters: str) -> str:
     Raises:
         ValueError: it is not such a string.
     """
-    if not re.fullmatch(r"([a-zA-Z-]\d*)*", letters):
+    if not re.fullmatch(r"([a-zA-Z.-]\d*)*", letters):
         raise ValueError("letters and repetitions are mixed up")
     return re.sub(r"(.)(\d+)", lambda run: run[1] * int(run[2]), letters)

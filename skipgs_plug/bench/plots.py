@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from skipgs_plug.bench.policies import POLICIES
 from skipgs_plug.bench.record import RunRecord, Trace
-from skipgs_plug.bench.summary import Quantity, Row
+from skipgs_plug.bench.summary import HEADLINE, Quantity, Row
 from skipgs_plug.trainer.files import write_aside
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STYLE = {  # colour, marker
-    "ungated": ("#000000", "s"),
-    "gate": ("#D55E00", "o"),
-    "gate-no-floor": ("#E69F00", "^"),
-    "gate-accumulate": ("#CC79A7", "v"),
-    "random": ("#0072B2", "D"),
-    "periodic": ("#56B4E9", "P"),
-    "shortened": ("#009E73", "X"),
-}
+COLOURS = ("#000000", "#D55E00", "#E69F00", "#CC79A7", "#0072B2", "#56B4E9", "#009E73")
+MARKERS = "so^vDPX"
 PHASES = {"forward": "#0072B2", "loss": "#56B4E9", "backward": "#D55E00", "optimizer": "#E69F00"}
 NOT_VISITED, RUN, SKIPPED = 0, 1, 2
 EXAMPLES = 3  # views shown one by one
@@ -39,12 +34,24 @@ def write_plots(folder: Path, records: Sequence[RunRecord], rows: Sequence[Row],
     save(folder / "psnr_over_time.png", psnr_over_time(done, rows))
     save(folder / "time_against_error.png", time_against_error(rows))
     save(folder / "phases.png", phases(rows))
-    gated = [r for r in done if r.policy == "gate"] or [r for r in done if r.policy.startswith("gate")]
-    if gated:
-        seed = gated[0].seed
-        shown = [gated[0], *(r for r in done if r.seed == seed and r.policy == "random")]
-        save(folder / "skipped_views.png", skipped_views(shown, len(view_names)))
-        save(folder / "loss_and_mean.png", loss_and_mean(gated[0], view_names))
+    skipping = [record for record in done if record.skips]
+    gated = next((record for record in skipping if looks_at_losses(record)), None)
+    if gated is not None:
+        control = (r for r in skipping if r.seed == gated.seed and not looks_at_losses(r))
+        save(folder / "skipped_views.png", skipped_views([gated, *itertools.islice(control, 1)], len(view_names)))
+        save(folder / "loss_and_mean.png", loss_and_mean(gated, view_names))
+
+
+def style(policy: str) -> tuple[str, str]:
+    """Return colour and marker of a policy by its place in POLICIES, the last ones for one that is not there."""
+    place = list(POLICIES).index(policy) if policy in POLICIES else -1
+    # The markers lag behind the colours by one in every further round, so that the pairs differ.
+    return COLOURS[place % len(COLOURS)], MARKERS[(place + place // len(COLOURS)) % len(MARKERS)]
+
+
+def looks_at_losses(run: RunRecord) -> bool:
+    """Whether a policy that keeps means of losses decided in this run."""
+    return run.trace is not None and any(mean is not None for mean in run.trace.mean)
 
 
 def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row]) -> Figure:
@@ -55,8 +62,8 @@ def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row]) -> Figure:
         if not runs:
             continue
         seconds = np.mean([[point.seconds for point in run.points] for run in runs], axis=0)
-        psnr = np.mean([[point.psnr for point in run.points] for run in runs], axis=0)
-        colour, marker = STYLE[row.policy]
+        psnr = np.mean([[point.metrics[HEADLINE] for point in run.points] for run in runs], axis=0)
+        colour, marker = style(row.policy)
         axes.plot(seconds, psnr, color=colour, marker=marker, markersize=5, linewidth=1.6, label=row.policy)
     axes.set_xlabel("training time since the end of densification (s)")
     axes.set_ylabel("held-out PSNR (dB)")
@@ -90,7 +97,7 @@ def scatter(axes: Axes, rows: Sequence[Row], x_name: str, y_name: str) -> None:
         x, y = row.values.get(x_name), row.values.get(y_name)
         if x is None or y is None:
             continue
-        colour, marker = STYLE[row.policy]
+        colour, marker = style(row.policy)
         axes.errorbar(
             x.mean, y.mean, xerr=bar(x), yerr=bar(y), color=colour, marker=marker, markersize=8, linestyle="none",
             linewidth=1.2, capsize=3, label=row.policy,
@@ -138,7 +145,7 @@ def skipped_views(runs: Sequence[RunRecord], n_views: int) -> Figure:
         panel.yaxis.get_major_locator().set_params(integer=True)
         if run.warm_up:
             panel.axvline(run.trace.start + run.warm_up, color="0.25", linewidth=1, linestyle=(0, (4, 3)))
-        share = 100 * run.skips / run.iterations
+        share = 100 * run.skips / run.iterations_run
         panel.set_title(f"{run.policy}, seed {run.seed}: {share:.0f} % skipped", loc="left", fontsize=11)
         panel.set_xlabel("iteration (dashed: end of warm-up)")
         panel.grid(visible=False)
@@ -156,8 +163,9 @@ def visit_map(trace: Trace, n_views: int) -> np.ndarray:
     first = trace.start // n_views
     last = (trace.start + len(trace.view) - 1) // n_views
     grid = np.full((n_views, last - first + 1), NOT_VISITED)
-    for i, (view, skipped) in enumerate(zip(trace.view, trace.skipped, strict=True)):
-        grid[view, (trace.start + i) // n_views - first] = SKIPPED if skipped else RUN
+    for i, (view, ran, skipped) in enumerate(zip(trace.view, trace.ran, trace.skipped, strict=True)):
+        if ran:
+            grid[view, (trace.start + i) // n_views - first] = SKIPPED if skipped else RUN
     return grid
 
 
@@ -166,8 +174,9 @@ def loss_and_mean(run: RunRecord, view_names: Sequence[str]) -> Figure:
     trace = run.trace
     assert trace is not None
     by_view: dict[int, list[int]] = {}
-    for i, view in enumerate(trace.view):
-        by_view.setdefault(view, []).append(i)
+    for i, (view, ran) in enumerate(zip(trace.view, trace.ran, strict=True)):
+        if ran:
+            by_view.setdefault(view, []).append(i)
     skipped = trace.skipped
     ranked = sorted(by_view, key=lambda view: (-sum(skipped[i] for i in by_view[view]) / len(by_view[view]), view))
     picked = sorted({0, len(ranked) // 2, len(ranked) - 1})[:EXAMPLES]

@@ -1,12 +1,62 @@
-"""What is compared: the gate in three settings, an ungated run, and the controls."""
+"""What is compared: an ungated run, the gate in three settings, and the controls.
+
+A new policy is one entry of POLICIES. It makes its gate and its number of iterations itself, from a trainer that
+stands at the end of densification and from the finished runs of the same seed, of which it may copy rate or time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+from skipgs_plug import SkipGate
+from skipgs_plug.bench.controls import PlannedSkipping, periodic_skipping, random_skipping
+from skipgs_plug.bench.record import RunRecord
+from skipgs_plug.trainer import Trainer
 from skipgs_plug.trainer.errors import InputError
+
+REFERENCE = "ungated"  # what the others are compared with
+Earlier = Mapping[str, RunRecord]
+GateMaker = Callable[[Trainer, Earlier], SkipGate | None]
+Plan = Callable[[int, int, int, int], PlannedSkipping]  # of first, end, number of skips, seed
+
+
+def gate_with(**settings: Any) -> GateMaker:
+    """Return what attaches a gate: `settings` are arguments of SkipGate that differ from the default."""
+    # A loss that is not finite ends the run: a bench must not average over it.
+    return lambda trainer, earlier: SkipGate(trainer, record_trace=True, on_nonfinite="raise", **settings)
+
+
+def planned_as(name: str, plan: Plan) -> GateMaker:
+    """Return what attaches a control: as many skips as policy `name`, after the same warm-up."""
+
+    def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
+        copied = earlier[name]
+        first, end = trainer.refine_stop_iter + copied.warm_up, trainer.max_steps
+        return gate_with(policy=plan(first, end, copied.skips, trainer.config.seed))(trainer, earlier)  # type: ignore[return-value]
+
+    return make
+
+
+def as_long_as(name: str) -> Callable[[Trainer, Earlier], int]:
+    """Return what tells how many ungated iterations take as long as policy `name` did."""
+
+    def iterations(trainer: Trainer, earlier: Earlier) -> int:
+        share = earlier[name].t_post / earlier[REFERENCE].t_post
+        full = all_iterations(trainer, earlier)
+        return min(full, max(1, round(full * share)))
+
+    return iterations
+
+
+def no_gate(trainer: Trainer, earlier: Earlier) -> None:
+    """Attach nothing."""
+
+
+def all_iterations(trainer: Trainer, earlier: Earlier) -> int:
+    """Return the number of iterations from the end of densification to the end of the schedule."""
+    return trainer.max_steps - trainer.refine_stop_iter
 
 
 @dataclass(frozen=True)
@@ -14,30 +64,44 @@ class PolicySpec:
     """One row of the comparison.
 
     Attributes:
+        name: as given to --policies.
         meaning: one line for people.
+        gate: attaches the gate of this policy to a trainer and returns it; None for a run without.
+        iterations: number of iterations; fewer than are left run through the same schedule, compressed.
         needs: policies of the same seed that must have run before, because it copies their rate or time.
-        gate_settings: fields of SkipConfig that differ from the default; None for a run without SkipPolicy.
     """
 
     name: str
     meaning: str
+    gate: GateMaker = no_gate
+    iterations: Callable[[Trainer, Earlier], int] = all_iterations
     needs: tuple[str, ...] = ()
-    gate_settings: dict[str, Any] | None = field(default=None)
 
 
 POLICIES = {
     spec.name: spec
     for spec in (
-        PolicySpec("ungated", "every backward runs"),
-        PolicySpec("gate", "the paper's gate, default settings", gate_settings={}),
-        PolicySpec("gate-no-floor", "the gate without a floor", gate_settings={"min_bwd_ratio": 0.0}),
-        PolicySpec("gate-accumulate", "the gate, gradients accumulated", gate_settings={"step_mode": "adaptive_norm"}),
-        PolicySpec("random", "control: as many skips as the gate, drawn by chance", needs=("gate",)),
-        PolicySpec("periodic", "control: as many skips as the gate, evenly spread", needs=("gate",)),
+        PolicySpec(REFERENCE, "every backward runs"),
+        PolicySpec("gate", "the paper's gate, default settings", gate_with()),
+        PolicySpec("gate-no-floor", "the gate without a floor", gate_with(min_bwd_ratio=0.0)),
+        PolicySpec("gate-accumulate", "the gate, gradients accumulated", gate_with(step_mode="adaptive_norm")),
+        PolicySpec(
+            "random",
+            "control: as many skips as the gate, drawn by chance",
+            planned_as("gate", random_skipping),
+            needs=("gate",),
+        ),
+        PolicySpec(
+            "periodic",
+            "control: as many skips as the gate, evenly spread",
+            planned_as("gate", lambda first, end, n_skips, seed: periodic_skipping(first, end, n_skips)),
+            needs=("gate",),
+        ),
         PolicySpec(
             "shortened",
             "control: no skips, fewer iterations, schedule compressed to the gate's time",
-            needs=("ungated", "gate"),
+            iterations=as_long_as("gate"),
+            needs=(REFERENCE, "gate"),
         ),
     )
 }
@@ -55,17 +119,18 @@ def check_policies(names: Sequence[str]) -> None:
             raise InputError(f"Policy {name!r} copies what {missing[0]!r} measured; add {missing[0]} to --policies.")
 
 
-def running_order(names: Sequence[str], position: int) -> list[PolicySpec]:
-    """Return the order for the seed at `position`: rotated, so that a machine that slows down hits all alike.
+def rounds(names: Sequence[str], position: int) -> list[list[PolicySpec]]:
+    """Return what may run in turns: policies that copy nothing, then those that copy from them, and so on.
 
-    Controls that copy a measured rate or time come after the policies they copy, rotated among themselves.
+    The order within a round is rotated by `position`, that of the seed.
     """
-    specs = [POLICIES[name] for name in names]
-    free = [spec for spec in specs if not spec.needs]
-    controls = [spec for spec in specs if spec.needs]
-    return rotated(free, position) + rotated(controls, position)
-
-
-def rotated(specs: list[PolicySpec], by: int) -> list[PolicySpec]:
-    shift = by % len(specs) if specs else 0
-    return specs[shift:] + specs[:shift]
+    waiting = [POLICIES[name] for name in names]
+    done: set[str] = set()
+    found = []
+    while waiting:
+        ready = [spec for spec in waiting if done.issuperset(spec.needs)]
+        waiting = [spec for spec in waiting if spec not in ready]
+        done.update(spec.name for spec in ready)
+        shift = position % len(ready)
+        found.append(ready[shift:] + ready[:shift])
+    return found

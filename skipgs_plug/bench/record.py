@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -16,48 +17,80 @@ REASON_CODES = {
     "pause": "p",
     "forced": "f",
     "planned": "c",
+    "inactive": "i",
+    "non-finite": "x",
+    "other rank": "o",
 }
+OTHER_REASON = "u"  # a reason of a policy that is not in the table
+LEFT_OUT = "."  # the whole iteration was left out, forward too
 DIGITS = 5  # significant digits of losses and means in a trace
 
 
 @dataclass
 class Trace:
-    """Every decision of one refinement, one entry per iteration.
+    """Every decision of one refinement, one entry per iteration number.
 
     Attributes:
         start: iteration of the first entry.
         view: index into the list of training views.
-        loss: loss that was decided on.
+        loss: loss that was decided on; None for an iteration that was left out.
         mean: the view's running mean before this loss; None without one.
-        codes: reason letters, see REASON_CODES.
+        codes: reason letters, see REASON_CODES, or LEFT_OUT.
     """
 
     start: int
     view: list[int] = field(default_factory=list)
-    loss: list[float] = field(default_factory=list)
+    loss: list[float | None] = field(default_factory=list)
     mean: list[float | None] = field(default_factory=list)
     codes: str = ""
 
     def add(self, view: int, loss: float, mean: float | None, reason: str, skip: bool) -> None:
-        code = REASON_CODES[reason]
-        self.view.append(view)
-        self.loss.append(rounded(loss))
-        self.mean.append(None if mean is None else rounded(mean))
-        self.codes += code.upper() if skip else code
+        """Append an iteration that ran its forward."""
+        code = REASON_CODES.get(reason, OTHER_REASON)
+        self._append(view, rounded(loss), None if mean is None else rounded(mean), code.upper() if skip else code)
+
+    def fill(self, end: int, view_at: Callable[[int], int]) -> None:
+        """Append the iterations before `end` that are missing: they were left out. `view_at` tells their views."""
+        for step in range(self.end, end):
+            self._append(view_at(step), None, None, LEFT_OUT)
+
+    @property
+    def end(self) -> int:
+        """Iteration after the last entry."""
+        return self.start + len(self.codes)
+
+    @property
+    def ran(self) -> list[bool]:
+        """Whether the iteration ran, if only its forward."""
+        return [code != LEFT_OUT for code in self.codes]
 
     @property
     def skipped(self) -> list[bool]:
+        """Whether the iteration ran its forward and skipped its backward."""
         return [code.isupper() for code in self.codes]
+
+    def _append(self, view: int, loss: float | None, mean: float | None, code: str) -> None:
+        self.view.append(view)
+        self.loss.append(loss)
+        self.mean.append(mean)
+        self.codes += code
 
 
 @dataclass
 class Point:
-    """One evaluation during refinement, outside the clock."""
+    """One evaluation on held-out views during refinement, outside the clock."""
 
     step: int
     seconds: float  # of refinement so far
-    psnr: float
-    ssim: float
+    metrics: dict[str, float]  # by the names of trainer.metrics.METRICS
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"step": self.step, "seconds": self.seconds, **self.metrics}
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any]) -> Point:
+        metrics = dict(content)
+        return cls(metrics.pop("step"), metrics.pop("seconds"), metrics)
 
 
 @dataclass
@@ -67,15 +100,18 @@ class RunRecord:
     Attributes:
         status: "done"; "diverged" (its loss stopped being finite); "not run" (what it copies diverged).
         note: one sentence for a run that is not done.
-        iterations: of refinement.
+        iterations: of refinement, by number: those that were left out too.
+        iterations_run: those that ran, if only their forward.
         backwards: of refinement.
         warm_up: refinement iterations that the gate kept from skipping; 0 without a gate.
         floor: least share of backwards in force at the end; None without a gate.
         reasons: gated decisions by reason; empty without a gate.
         t_post, t_total: seconds of training, of refinement and in all.
         phases: seconds of refinement in forward, loss, backward, optimizer, strategy.
-        metrics: held-out psnr, ssim, and LPIPS by flavour where available; num_GS.
-        peak_memory: bytes on the GPU during refinement; None on the CPU.
+        metrics: held-out, by the names of trainer.metrics.METRICS; num_GS.
+        train_metrics: the same on the training views, without LPIPS.
+        points: evaluations on held-out views: before, on the way, at the end.
+        peak_memory: bytes on the GPU during refinement, of other runs in turns excluded; None on the CPU.
         commit: of this package, when it ran.
     """
 
@@ -84,6 +120,7 @@ class RunRecord:
     status: Literal["done", "diverged", "not run"] = "done"
     note: str = ""
     iterations: int = 0
+    iterations_run: int = 0
     backwards: int = 0
     warm_up: int = 0
     floor: float | None = None
@@ -92,6 +129,7 @@ class RunRecord:
     t_total: float = 0.0
     phases: dict[str, float] = field(default_factory=dict)
     metrics: dict[str, float] = field(default_factory=dict)
+    train_metrics: dict[str, float] = field(default_factory=dict)
     points: list[Point] = field(default_factory=list)
     trace: Trace | None = None
     peak_memory: int | None = None
@@ -99,21 +137,29 @@ class RunRecord:
 
     @property
     def skips(self) -> int:
-        return self.iterations - self.backwards
+        """Backwards skipped in iterations that ran."""
+        return self.iterations_run - self.backwards
 
     def as_dict(self, with_trace: bool = True) -> dict[str, Any]:
         content = dataclasses.asdict(self)
+        content["points"] = [point.as_dict() for point in self.points]
         if not with_trace:
             del content["trace"]
         return content
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> RunRecord:
-        content = dict(content)
-        content["points"] = [Point(**point) for point in content["points"]]
-        if content["trace"] is not None:
-            content["trace"] = Trace(**content["trace"])
-        return cls(**content)
+        """Undo `as_dict`.
+
+        Raises:
+            KeyError, TypeError: a field is missing, or one is of another version.
+        """
+        record = cls(**content)
+        for name in (known.name for known in dataclasses.fields(cls)):
+            content[name]  # a run of an older version lacks what has a default here
+        record.points = [Point.from_dict(point) for point in content["points"]]
+        record.trace = None if content["trace"] is None else Trace(**content["trace"])
+        return record
 
 
 def rounded(value: float) -> float:

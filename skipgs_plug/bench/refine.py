@@ -1,24 +1,26 @@
-"""One run: refine the snapshot of a seed under one policy, evaluating outside the clock."""
+"""One run: refine a densified model under one policy, evaluating outside the clock."""
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from skipgs_plug import SkipGate
-from skipgs_plug.bench.controls import PlannedSkipping, periodic_skipping, random_skipping
-from skipgs_plug.bench.policies import PolicySpec
+from skipgs_plug.bench.policies import Earlier, PolicySpec
 from skipgs_plug.bench.record import Point, RunRecord, Trace
 from skipgs_plug.trainer import Trainer
 from skipgs_plug.trainer.loop import Iteration
+from skipgs_plug.trainer.metrics import METRICS, chosen
+from skipgs_plug.trainer.order import ViewOrder
 from skipgs_plug.trainer.scalars import ScalarLog
 
-EVALUATIONS = 5  # after this many equal parts of refinement, and once before
+PARTS = 10  # of refinement, each followed by an evaluation; one more comes before the first
 
 
 class DivergedError(Exception):
@@ -39,90 +41,88 @@ def densify(trainer: Trainer, progress: bool = True, scalars: Path | None = None
 
 def refine(
     trainer: Trainer,
-    snapshot: dict[str, Any],
     spec: PolicySpec,
-    earlier: dict[str, RunRecord],
+    earlier: Earlier,
     lpips_net: str | None = None,
     scalars: Path | None = None,
-) -> RunRecord:
-    """Refine `snapshot` to the end of the schedule under one policy.
+) -> Generator[None, None, RunRecord]:
+    """Refine to the end of the schedule under one policy, in PARTS equal parts with a pause after each but the last.
 
     Args:
-        earlier: runs of the same seed by policy, of which a control copies rate or time.
+        trainer: one of its own, at the end of densification.
+        earlier: finished runs of the same seed by policy, of which a control copies rate or time.
         lpips_net: also measure LPIPS with this backbone.
         scalars: folder for TensorBoard scalars.
+
+    Returns:
+        The record, as the generator's value.
 
     Raises:
         DivergedError: a loss or a metric is not finite.
     """
-    trainer.restore(snapshot)
-    start = trainer.refine_stop_iter
-    iterations = trainer.max_steps - start
-    if spec.name == "shortened":
-        iterations = shortened_iterations(iterations, earlier["gate"].t_post, earlier["ungated"].t_post)
+    start, iterations = trainer.refine_stop_iter, spec.iterations(trainer, earlier)
     phases_before = dict(trainer.phase_seconds)
-    record = RunRecord(trainer.config.seed, spec.name, iterations=iterations, trace=Trace(start))
-    if trainer.backend.device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(trainer.backend.device)
+    trace = Trace(start)
+    record = RunRecord(trainer.config.seed, spec.name, iterations=iterations, trace=trace)
+    gate = spec.gate(trainer, earlier)
     with (
+        gate or contextlib.nullcontext(),
         compressed(trainer, start, iterations),
-        gated(trainer, spec, earlier) as gate,
         finite_losses(trainer),
         logged(trainer, scalars, gate) as log,
+        recorded(trainer, trace, gate, log),
     ):
-        record_losses(trainer, record, gate, log)
-        record.points.append(evaluate(trainer, log))
-        for part in range(1, EVALUATIONS + 1):
-            trainer.train(until=start + round(part * iterations / EVALUATIONS), progress=False)
-            if part < EVALUATIONS:
-                record.points.append(evaluate(trainer, log))
-        trainer.on_step = None
-        if trainer.backend.device.type == "cuda":
-            record.peak_memory = torch.cuda.max_memory_allocated(trainer.backend.device)
+        record.points.append(point(trainer, trainer.evaluate("test"), log))
+        for part in range(1, PARTS + 1):
+            with peak_memory(trainer, record):
+                trainer.train(until=start + round(part * iterations / PARTS), progress=False)
+            if part < PARTS:
+                record.points.append(point(trainer, trainer.evaluate("test"), log))
+                yield
         stats = trainer.evaluate("test", lpips_net)
         record.points.append(point(trainer, stats, log))
-    names = ["psnr", "ssim", "num_GS"] + [name for name in stats if name.startswith("lpips")]
-    record.metrics = {name: stats[name] for name in names}
+        record.metrics = measured(stats)
+        record.train_metrics = measured(trainer.evaluate("train"))
+        if gate is not None:
+            gate.verify()
+    trace.fill(start + iterations, views_of(trainer))
     record.t_post, record.t_total = trainer.t_post, trainer.t_total
     record.phases = {name: seconds - phases_before[name] for name, seconds in trainer.phase_seconds.items()}
-    record.backwards = iterations
+    record.iterations_run = record.backwards = sum(trace.ran)
     if gate is not None:
         report = gate.report()
-        record.backwards = report["backwards_run"]
+        record.backwards -= report["backwards_skipped"]
         record.warm_up = sum(row.reason == "warm-up" for row in gate.trace)
         record.floor = report["min_bwd_ratio_effective"]
         record.reasons = report["reasons"]
     return record
 
 
-def shortened_iterations(iterations: int, gate_seconds: float, ungated_seconds: float) -> int:
-    """Return how many ungated iterations take as long as the gated refinement did."""
-    return min(iterations, max(1, round(iterations * gate_seconds / ungated_seconds)))
+def measured(stats: dict[str, Any]) -> dict[str, float]:
+    """Return the metrics and the model's size in an evaluation."""
+    return {name: stats[name] for name in (*METRICS, "num_GS") if name in stats}
+
+
+def views_of(trainer: Trainer) -> Callable[[int], int]:
+    """Return what tells the index of the training view of an iteration."""
+    return ViewOrder(len(trainer.view_names), trainer.config.seed).at
 
 
 @contextlib.contextmanager
-def gated(trainer: Trainer, spec: PolicySpec, earlier: dict[str, RunRecord]) -> Iterator[SkipGate | None]:
-    """Attach the gate that `spec` asks for; None for runs without."""
-    # A loss that is not finite ends the run: a bench must not average over it.
-    if spec.gate_settings is not None:
-        gate = SkipGate(trainer, record_trace=True, on_nonfinite="raise", **spec.gate_settings)
-    elif spec.name in ("random", "periodic"):
-        policy = control(spec.name, trainer, earlier["gate"])
-        gate = SkipGate(trainer, policy=policy, record_trace=True, on_nonfinite="raise")
-    else:
-        yield None
+def peak_memory(trainer: Trainer, record: RunRecord) -> Iterator[None]:
+    """Raise `record.peak_memory` to what this part used on the GPU; other runs in turns stay out of it."""
+    device = trainer.backend.device
+    if device.type != "cuda":
+        yield
         return
-    with gate:
-        yield gate
-        gate.verify()
-
-
-def control(name: str, trainer: Trainer, gate: RunRecord) -> PlannedSkipping:
-    """Return the control that skips as often as `gate` did, after the same warm-up."""
-    first, end = trainer.refine_stop_iter + gate.warm_up, trainer.max_steps
-    if name == "random":
-        return random_skipping(first, end, gate.skips, trainer.config.seed)
-    return periodic_skipping(first, end, gate.skips)
+    torch.cuda.reset_peak_memory_stats(device)
+    before = torch.cuda.memory_allocated(device)
+    moments = (state.values() for optimizer in trainer.optimizers.values() for state in optimizer.state.values())
+    held = [*trainer.splats.values(), *itertools.chain(*moments)]
+    own = sum(tensor.nbytes for tensor in held if torch.is_tensor(tensor))
+    yield
+    peak = torch.cuda.max_memory_allocated(device) - before + own
+    record.peak_memory = max(record.peak_memory or 0, peak)
 
 
 @contextlib.contextmanager
@@ -176,31 +176,35 @@ def logged(trainer: Trainer, scalars: Path | None, gate: SkipGate | None = None)
         yield log
 
 
-def record_losses(trainer: Trainer, record: RunRecord, gate: SkipGate | None, log: ScalarLog | None) -> None:
-    """Fill the trace of `record`, and the log, after every iteration, outside the clock."""
+@contextlib.contextmanager
+def recorded(trainer: Trainer, trace: Trace, gate: SkipGate | None, log: ScalarLog | None) -> Iterator[None]:
+    """Fill the trace, and the log, after every iteration, outside the clock."""
     index = {name: i for i, name in enumerate(trainer.view_names)}
-    trace = record.trace
-    assert trace is not None
+    view_at = views_of(trainer)
 
     def on_step(iteration: Iteration) -> None:
-        if gate is None:
+        trace.fill(iteration.step, view_at)
+        row = gate.trace[-1] if gate is not None and gate.trace else None
+        if row is None or row.step != iteration.step:  # nothing was there to decide
             trace.add(index[iteration.view], iteration.loss, None, "ungated", False)
         else:
-            row = gate.trace[-1]
             trace.add(index[row.view], row.loss, row.mean, row.reason, row.skip)
         if log is not None:
             log.iteration(iteration)
 
     trainer.on_step = on_step
-
-
-def evaluate(trainer: Trainer, log: ScalarLog | None) -> Point:
-    return point(trainer, trainer.evaluate("test"), log)
+    try:
+        yield
+    finally:
+        trainer.on_step = None
 
 
 def point(trainer: Trainer, stats: dict[str, Any], log: ScalarLog | None) -> Point:
+    """Return an evaluation, written to the log too."""
     if log is not None:
         log.evaluation(stats)
-    if not (math.isfinite(stats["psnr"]) and math.isfinite(stats["ssim"])):
-        raise DivergedError(f"held-out PSNR {stats['psnr']}, SSIM {stats['ssim']} after iteration {trainer.step - 1}")
-    return Point(trainer.step, trainer.t_post, stats["psnr"], stats["ssim"])
+    metrics = {metric.name: stats[metric.name] for metric in chosen()}
+    for name, value in metrics.items():
+        if not math.isfinite(value):
+            raise DivergedError(f"held-out {name} {value} after iteration {trainer.step - 1}")
+    return Point(trainer.step, trainer.t_post, metrics)

@@ -1,14 +1,15 @@
-"""All runs of a bench: per seed densify once, then refine under each policy."""
+"""All runs of a bench: per seed densify once, then refine under each policy, in turns."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from skipgs_plug.bench import provenance
-from skipgs_plug.bench.policies import PolicySpec, check_policies, running_order
+from skipgs_plug.bench.policies import PolicySpec, check_policies, rounds
 from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.bench.refine import DivergedError, densify, refine
 from skipgs_plug.bench.store import BenchFolder
@@ -75,30 +76,61 @@ class Bench:
         """Return one record per seed and policy, by seed, in the order of `policies`."""
         records = []
         for position, seed in enumerate(self.seeds):
-            found = self._run_seed(seed, running_order(self.policies, position))
+            found = self._run_seed(seed, rounds(self.policies, position))
             records += [found[name] for name in self.policies]
         return records
 
-    def _run_seed(self, seed: int, order: list[PolicySpec]) -> dict[str, RunRecord]:
+    def _run_seed(self, seed: int, order: list[list[PolicySpec]]) -> dict[str, RunRecord]:
         found: dict[str, RunRecord] = {}
-        for spec in order:
+        for spec in itertools.chain(*order):
             stored = self.folder.load(seed, spec.name)
             if stored is not None:
                 found[spec.name] = stored
-        missing = [spec for spec in order if spec.name not in found]
-        if not missing:
+        if len(found) == len(self.policies):
             return found
-        trainer = Trainer(dataclasses.replace(self.config, seed=seed), self.scene, self.backend)
         try:
-            snapshot = self._densified(trainer)
+            snapshot = self._densified(self._trainer(seed))
         except DivergedError as error:
-            for spec in missing:
-                note = f"{error}, during densification"
-                found[spec.name] = self._store(RunRecord(seed, spec.name, "diverged", note))
+            for spec in itertools.chain(*order):
+                if spec.name not in found:
+                    note = f"{error}, during densification"
+                    found[spec.name] = self._store(RunRecord(seed, spec.name, "diverged", note))
             return found
-        for spec in missing:
-            found[spec.name] = self._store(self._run_policy(trainer, snapshot, spec, found))
+        for group in order:
+            for record in self._in_turns(seed, [spec for spec in group if spec.name not in found], snapshot, found):
+                found[record.policy] = self._store(record)
         return found
+
+    def _in_turns(
+        self, seed: int, specs: list[PolicySpec], snapshot: dict[str, Any], earlier: dict[str, RunRecord]
+    ) -> Iterator[RunRecord]:
+        """Refine `snapshot` under each policy, a part of one after a part of the other; yields what has finished.
+
+        A machine that slows down hits all alike. Each run has a trainer of its own.
+        """
+        runs = {}
+        for spec in specs:
+            lost = [name for name in spec.needs if earlier[name].status != "done"]
+            if lost:
+                note = f"{lost[0]} of this seed, which it copies, did not finish"
+                yield RunRecord(seed, spec.name, "not run", note)
+                continue
+            trainer = self._trainer(seed)
+            trainer.restore(snapshot)
+            runs[spec.name] = refine(trainer, spec, earlier, self.lpips_net, self._scalars(seed, spec.name))
+        while runs:
+            for name in list(runs):
+                try:
+                    next(runs[name])
+                except StopIteration as finished:
+                    del runs[name]
+                    yield finished.value
+                except DivergedError as error:
+                    del runs[name]
+                    yield RunRecord(seed, name, "diverged", str(error))
+
+    def _trainer(self, seed: int) -> Trainer:
+        return Trainer(dataclasses.replace(self.config, seed=seed), self.scene, self.backend)
 
     def _densified(self, trainer: Trainer) -> dict[str, Any]:
         seed, path = trainer.config.seed, self.folder.snapshot(trainer.config.seed)
@@ -111,18 +143,6 @@ class Bench:
             count = len(trainer.splats["means"])
             self.say(f"seed {seed}: densified to {count:,} Gaussians in {trainer.t_total:.1f} s of training")
         return trainer.snapshot()
-
-    def _run_policy(
-        self, trainer: Trainer, snapshot: dict[str, Any], spec: PolicySpec, earlier: dict[str, RunRecord]
-    ) -> RunRecord:
-        seed = trainer.config.seed
-        lost = [name for name in spec.needs if earlier[name].status != "done"]
-        if lost:
-            return RunRecord(seed, spec.name, "not run", f"{lost[0]} of this seed, which it copies, did not finish")
-        try:
-            return refine(trainer, snapshot, spec, earlier, self.lpips_net, self._scalars(seed, spec.name))
-        except DivergedError as error:
-            return RunRecord(seed, spec.name, "diverged", str(error))
 
     def _scalars(self, seed: int, name: str) -> Path | None:
         return self.folder.scalars(seed, name) if self.tensorboard else None

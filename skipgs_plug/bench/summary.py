@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import dataclasses
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from skipgs_plug.bench.record import RunRecord
+from skipgs_plug.bench.policies import REFERENCE
+from skipgs_plug.bench.record import Point, RunRecord
 from skipgs_plug.trainer.clock import PHASES
+from skipgs_plug.trainer.metrics import METRICS
+
+HEADLINE = "psnr"  # the metric that "time to reach" is about
 
 
 @dataclass
 class Quantity:
-    """Mean and spread (sample standard deviation over seeds; None with one seed)."""
+    """Mean and spread (sample standard deviation over seeds; None with one seed).
+
+    Attributes:
+        seeds: how many have a value, where that is not all of them.
+    """
 
     mean: float
     spread: float | None
+    seeds: int | None = None
 
 
 @dataclass
@@ -27,10 +37,12 @@ class Row:
         seeds: those that the means are over.
         excluded: the others, with the reason.
         values: by name: `t_post t_total` (s), `t_post_saved t_total_saved` (% less than ungated, same seed),
-            `iterations`, `backwards_share` (% of the refinement iterations of the full schedule),
-            `share_forward ...` (% of t_post), `psnr ssim lpips_*`, `psnr_gain` (dB above ungated, same seed),
-            `num_GS`, `peak_memory_gib`; `wanted` and `held_back`: backwards after warm-up that a gate's rule asked
-            for, and skips that its floor forbade (% of the iterations after warm-up).
+            `time_to_ungated` (s of refinement until the final PSNR of ungated, same seed, missing where it is not
+            reached), `iterations_run`, `backwards_share` (% of the refinement iterations of the full schedule),
+            `share_forward ...` (% of t_post), every metric by its own name, `train_` before it on training views,
+            `_gain` after it above ungated, same seed; `num_GS`, `peak_memory_gib`; `wanted` and `held_back`:
+            backwards after warm-up that a gate's rule asked for, and skips that its floor forbade (% of the
+            iterations after warm-up).
     """
 
     policy: str
@@ -41,7 +53,7 @@ class Row:
 
 def summarise(records: Sequence[RunRecord], policies: Sequence[str], full_iterations: int) -> list[Row]:
     """Return one row per policy; runs that did not finish are named in it and enter no mean."""
-    ungated = {r.seed: r for r in records if r.policy == "ungated" and r.status == "done"}
+    ungated = {r.seed: r for r in records if r.policy == REFERENCE and r.status == "done"}
     rows = []
     for policy in policies:
         mine = [record for record in records if record.policy == policy]
@@ -49,7 +61,7 @@ def summarise(records: Sequence[RunRecord], policies: Sequence[str], full_iterat
         row = Row(policy, [r.seed for r in done], {r.seed: f"{r.status}: {r.note}" for r in mine if r not in done})
         samples = [measured(record, ungated.get(record.seed), full_iterations) for record in done]
         for name in dict.fromkeys(name for sample in samples for name in sample):
-            row.values[name] = quantity([sample[name] for sample in samples if name in sample])
+            row.values[name] = quantity([sample[name] for sample in samples if name in sample], len(samples))
         rows.append(row)
     return rows
 
@@ -60,15 +72,20 @@ def measured(record: RunRecord, ungated: RunRecord | None, full_iterations: int)
     if ungated is not None:
         values["t_post_saved"] = 100 * (1 - record.t_post / ungated.t_post)
         values["t_total_saved"] = 100 * (1 - record.t_total / ungated.t_total)
-    values["iterations"] = record.iterations
+        reached = time_to_reach(record.points, ungated.metrics[HEADLINE])
+        if reached is not None:
+            values["time_to_ungated"] = reached
+    values["iterations_run"] = record.iterations_run
     values["backwards_share"] = 100 * record.backwards / full_iterations
     for phase in PHASES:
         if phase != "strategy":  # nothing is left of it after densification
             values[f"share_{phase}"] = 100 * record.phases[phase] / sum(record.phases.values())
     values.update(record.metrics)
+    values.update({f"train_{name}": value for name, value in record.train_metrics.items() if name in METRICS})
     if ungated is not None:
-        values["psnr_gain"] = record.metrics["psnr"] - ungated.metrics["psnr"]
-    after_warm_up = record.iterations - record.warm_up
+        shared = [name for name in METRICS if name in record.metrics and name in ungated.metrics]
+        values.update({f"{name}_gain": record.metrics[name] - ungated.metrics[name] for name in shared})
+    after_warm_up = record.iterations_run - record.warm_up
     if "deviation" in record.reasons and after_warm_up > 0:
         held_back = record.reasons.get("budget", 0)
         values["wanted"] = 100 * (record.backwards - record.warm_up - held_back) / after_warm_up
@@ -78,8 +95,25 @@ def measured(record: RunRecord, ungated: RunRecord | None, full_iterations: int)
     return values
 
 
-def quantity(sample: Sequence[float]) -> Quantity:
-    return Quantity(statistics.fmean(sample), statistics.stdev(sample) if len(sample) > 1 else None)
+def time_to_reach(points: Sequence[Point], target: float) -> float | None:
+    """Return the seconds of refinement after which the held-out PSNR first was `target` dB, None if it never was.
+
+    Between two evaluations it is taken to change evenly with time.
+    """
+    before = points[0]
+    for after in points:
+        if after.metrics[HEADLINE] >= target:
+            rise = after.metrics[HEADLINE] - before.metrics[HEADLINE]
+            share = (target - before.metrics[HEADLINE]) / rise if rise > 0 else 1.0
+            return before.seconds + share * (after.seconds - before.seconds)
+        before = after
+    return None
+
+
+def quantity(sample: Sequence[float], total: int) -> Quantity:
+    """Return mean and spread of a sample from so many of `total` seeds."""
+    spread = statistics.stdev(sample) if len(sample) > 1 else None
+    return Quantity(statistics.fmean(sample), spread, len(sample) if len(sample) < total else None)
 
 
 def ceiling(rows: Sequence[Row]) -> dict[str, float] | None:
@@ -93,9 +127,9 @@ def ceiling(rows: Sequence[Row]) -> dict[str, float] | None:
         product, %), `measured` (% saved); None without an ungated and a gate row.
     """
     by_name = {row.policy: row.values for row in rows if row.seeds}
-    if "gate" not in by_name or "ungated" not in by_name or "t_post_saved" not in by_name["gate"]:
+    if "gate" not in by_name or REFERENCE not in by_name or "t_post_saved" not in by_name["gate"]:
         return None
-    share = by_name["ungated"]["share_backward"].mean + by_name["ungated"]["share_optimizer"].mean
+    share = by_name[REFERENCE]["share_backward"].mean + by_name[REFERENCE]["share_optimizer"].mean
     skipped = 100 - by_name["gate"]["backwards_share"].mean
     return {
         "share": share,
@@ -112,7 +146,7 @@ def timing_noise(records: Sequence[RunRecord]) -> float | None:
     """
     worst = None
     for seed in {record.seed for record in records}:
-        rates = [r.phases["forward"] / r.iterations for r in records if r.seed == seed and r.status == "done"]
+        rates = [r.phases["forward"] / r.iterations_run for r in records if r.seed == seed and r.status == "done"]
         if len(rates) > 1:
             worst = max(worst or 0.0, 100 * (max(rates) / min(rates) - 1))
     return worst
@@ -123,7 +157,7 @@ def row_as_dict(row: Row) -> dict[str, Any]:
         "policy": row.policy,
         "seeds": row.seeds,
         "excluded": row.excluded,
-        "values": {name: {"mean": q.mean, "spread": q.spread} for name, q in row.values.items()},
+        "values": {name: dataclasses.asdict(quantity) for name, quantity in row.values.items()},
     }
 
 

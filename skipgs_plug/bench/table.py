@@ -1,54 +1,70 @@
-"""The one table, and the sentences that belong under it."""
+"""The tables, and the sentences that belong under them."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from skipgs_plug.bench.policies import POLICIES
-from skipgs_plug.bench.summary import Quantity, Row
-from skipgs_plug.trainer.metrics import SSIM_FLAVOUR
+from skipgs_plug.bench.summary import Row
+from skipgs_plug.trainer.clock import PHASES
+from skipgs_plug.trainer.metrics import METRICS, Metric
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column: heading, name in `Row.values`, digits after the point, sign shown or not."""
+    """A column: heading, name in `Row.values`, digits after the point, sign shown or not, text without a value."""
 
     heading: str
     name: str
     digits: int
     signed: bool = False
+    absent: str = "-"
+
+
+def metric_columns(metric: Metric) -> tuple[Column, Column]:
+    """Return the held-out value and its difference to ungated."""
+    gain = Column(f"vs ungated {metric.unit}".strip(), f"{metric.name}_gain", metric.digits, signed=True)
+    return Column(metric.heading, metric.name, metric.digits), gain
 
 
 RESULTS = (
     Column("T_post s", "t_post", 1),
     Column("saved %", "t_post_saved", 1),
+    Column("s to ungated's PSNR", "time_to_ungated", 1, absent="not reached"),
     Column("T_total s", "t_total", 1),
     Column("saved %", "t_total_saved", 1),
-    Column("iterations", "iterations", 0),
+    Column("iterations", "iterations_run", 0),
     Column("backwards %", "backwards_share", 1),
-    Column("PSNR dB", "psnr", 2),
-    Column("vs ungated dB", "psnr_gain", 2, signed=True),
-    Column("SSIM", "ssim", 4),
-    Column("LPIPS alex", "lpips_alex", 4),
-    Column("LPIPS vgg", "lpips_vgg", 4),
+    *itertools.chain(*map(metric_columns, METRICS.values())),
     Column("peak GiB", "peak_memory_gib", 2),
 )
-SHARES = (
-    Column("forward", "share_forward", 1),
-    Column("loss", "share_loss", 1),
-    Column("backward", "share_backward", 1),
-    Column("optimizer", "share_optimizer", 1),
-)
+TRAINING = tuple(Column(metric.heading, f"train_{metric.name}", metric.digits) for metric in METRICS.values())
+SHARES = tuple(Column(phase, f"share_{phase}", 1) for phase in PHASES)
+TABLES = {
+    "Time and quality, mean ± spread over seeds": RESULTS,
+    "Quality on the training views, to see overfitting": TRAINING,
+    "Share of refinement time, %": SHARES,
+}
 
 
-def cell(value: Quantity | None, column: Column) -> str:
-    """Return "mean ± spread", "mean" with one seed, or a dash."""
+def tables(rows: Sequence[Row]) -> list[tuple[str, list[list[str]]]]:
+    """Return (caption, lines) of every table that some row has values for."""
+    found = [(caption, cells(rows, columns)) for caption, columns in TABLES.items()]
+    return [(caption, lines) for caption, lines in found if len(lines[0]) > 2]
+
+
+def cell(row: Row, column: Column) -> str:
+    """Return "mean ± spread", "mean" with one seed, how many seeds have a value if not all, or the text without one."""
+    value = row.values.get(column.name)
     if value is None:
-        return "-"
-    mean = f"{value.mean:{'+' if column.signed else ''}.{column.digits}f}"
-    return mean if value.spread is None else f"{mean} ± {value.spread:.{column.digits}f}"
+        return column.absent if row.seeds else "-"
+    text = f"{value.mean:{'+' if column.signed else ''}.{column.digits}f}"
+    if value.spread is not None:
+        text += f" ± {value.spread:.{column.digits}f}"
+    return text if value.seeds is None else f"{text} ({value.seeds} of {len(row.seeds)})"
 
 
 def cells(rows: Sequence[Row], columns: Sequence[Column]) -> list[list[str]]:
@@ -61,7 +77,7 @@ def cells(rows: Sequence[Row], columns: Sequence[Column]) -> list[list[str]]:
     for row in rows:
         total = len(row.seeds) + len(row.excluded)
         seeds = f"{len(row.seeds)} of {total} !" if row.excluded else str(total)
-        lines.append([row.policy, seeds, *(cell(row.values.get(column.name), column) for column in columns)])
+        lines.append([row.policy, seeds, *(cell(row, column) for column in columns)])
     return lines
 
 
@@ -102,6 +118,7 @@ def notes(rows: Sequence[Row], bench: dict[str, Any]) -> list[str]:
             "The forward pass is nearly the same work under every policy; within a seed its time per iteration "
             f"differed by up to {bench['timing_noise']:.0f} %. Differences in time below that are noise of the machine."
         )
+    shown = [metric for metric in METRICS.values() if any(metric.name in row.values for row in rows)]
     scene, machine = bench["settings"]["scene"], bench["settings"]["machine"]
     first, last = bench["refinement"]
     sentences += [
@@ -110,14 +127,11 @@ def notes(rows: Sequence[Row], bench: dict[str, Any]) -> list[str]:
         f"after one densification per seed, backend {machine['backend']} on {machine['gpu'] or machine['cpu']}, "
         f"{machine['threads']} threads.",
         "Mean ± sample standard deviation over seeds; saved % and vs ungated within each seed. T_post: seconds of "
-        "refinement, T_total: densification too; evaluation and compilation are in neither. Backwards % of the "
-        "ungated number. PSNR: mean of per-image values, float render.",
-        f"SSIM: {SSIM_FLAVOUR}. "
-        + (
-            f"LPIPS: {bench['settings']['lpips']}, inputs normalised."
-            if bench["settings"]["lpips"]
-            else "LPIPS is left out: no backbone weights on this machine."
-        ),
+        "refinement, T_total: densification too; evaluation and compilation are in neither. S to ungated's PSNR: of "
+        "refinement until the final held-out PSNR of the same seed's ungated run, interpolated between evaluations. "
+        "Backwards % of the iterations of the ungated run.",
+        " ".join(f"{metric.label}: {metric.flavour}." for metric in shown)
+        + ("" if any(metric.net for metric in shown) else " LPIPS is left out: no backbone weights on this machine."),
     ]
     if len(bench["commits"]) > 1:
         sentences.append(f"The runs were made at different commits: {', '.join(bench['commits'])}.")
@@ -126,4 +140,5 @@ def notes(rows: Sequence[Row], bench: dict[str, Any]) -> list[str]:
 
 def legend(rows: Sequence[Row]) -> list[tuple[str, str]]:
     """Return (policy, meaning) of every row."""
-    return [(row.policy, POLICIES[row.policy].meaning) for row in rows]
+    unknown = "a policy of another version"
+    return [(row.policy, POLICIES[row.policy].meaning if row.policy in POLICIES else unknown) for row in rows]

@@ -17,7 +17,7 @@ from skipgs_plug.bench.result import build_result
 from skipgs_plug.bench.runner import Bench
 from skipgs_plug.bench.store import BenchFolder
 from skipgs_plug.bench.summary import Row, row_from_dict
-from skipgs_plug.bench.table import RESULTS, SHARES, cells, legend, markdown, notes
+from skipgs_plug.bench.table import legend, markdown, notes, tables
 from skipgs_plug.trainer import TrainConfig, load_scene
 from skipgs_plug.trainer.files import write_aside, write_json
 
@@ -78,9 +78,7 @@ def run(args: Args, command: str) -> list[Row]:
     result = build_result(bench, records, command)
     rows = [row_from_dict(row) for row in result["rows"]]
     parts = [
-        markdown(cells(rows, RESULTS)),
-        "Share of refinement time, %:",
-        markdown(cells(rows, SHARES)),
+        *(f"{caption}:\n\n{markdown(lines)}" for caption, lines in tables(rows)),
         "\n\n".join(notes(rows, result)),
         "\n".join(f"- {name}: {meaning}" for name, meaning in legend(rows)),
     ]

@@ -13,13 +13,14 @@ import tyro
 
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.adapters.base import AbstractAdapter
-from skipgs_plug.adapters.registry import get_adapter
+from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster.compat import FAMILIES, serve
-from skipgs_plug.scripts.checkpoints import Checkpoints
+from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
+from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED
 from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu, exclusive_cores
-from skipgs_plug.scripts.launch import run_script
+from skipgs_plug.scripts.launch import run_script, source_of
 
 # Stand-ins are named after the extension modules, which not every adapter has to itself.
 FAMILY_OF = {"step_trainer": "pip_gaussian_splatting"}
@@ -34,7 +35,7 @@ class Args:
     """
 
     adapter: tyro.conf.Positional[str]
-    """Name of the trainer: inria, fastgs, taming, ..."""
+    """Name of the trainer: inria, fastgs, taming, ...; or auto, to recognise it by its script."""
     gate: tyro.conf.OmitArgPrefixes[GateOptions] = dataclasses.field(default_factory=GateOptions)
     resume_gate: str = "auto"
     """State the gate goes on from: auto (the one beside the checkpoint the script loads), off (afresh), or a path."""
@@ -65,10 +66,14 @@ def run(args: Args, command: list[str]) -> int:
         The script's exit code.
 
     Raises:
-        SkipGSError: The script cannot be run or gated, or did not train.
+        SkipGSError: The script cannot be run or gated.
     """
+    if args.adapter == "auto":
+        args = dataclasses.replace(args, adapter=find_script_adapter(source_of(command)).name)
+        say(f"{script_name(command)} is run as {args.adapter}.")
     adapter = get_adapter(args.adapter)()
     checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
+    adapter.replaced = (*REPLACED, *(f"torch.cuda.{name}" for name in CUDA_REPLACED if args.cpu))
     settings = args.gate.given() | ({"enabled": False} if args.no_gate else {})
     gates: list[SkipGate] = []
 
@@ -86,9 +91,15 @@ def run(args: Args, command: list[str]) -> int:
             for gate in gates:
                 gate.detach()
                 report(gate, adapter)
-    if code == 0:
+    if code == 0 and gates and gates[0].trained:
         gates[0].verify()
+    elif code == 0:
+        say(f"{script_name(command)} ended without a training iteration; nothing was gated.")
     return code
+
+
+def say(sentence: str) -> None:
+    print(f"skipgs-plug: {sentence}", file=sys.stderr)
 
 
 def script_name(command: Sequence[str]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping
 
 from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.views import forget_oldest
 
 
 class ViewMeans:
@@ -12,7 +13,7 @@ class ViewMeans:
 
     Attributes:
         values: mean by view key. A restored state has string keys; `update` gives each back to the key
-            that the loop uses when that view comes along.
+            that the loop uses when that view comes along. Bounded by MAX_VIEWS.
     """
 
     __slots__ = ("_decay", "_gain", "values")
@@ -28,6 +29,7 @@ class ViewMeans:
         mean = values.get(view)
         if mean is None and (type(view) is str or (mean := values.pop(str(view), None)) is None):
             values[view] = loss
+            forget_oldest(values)
             return None
         values[view] = self._decay * mean + self._gain * loss
         return mean

@@ -23,7 +23,7 @@ from skipgs_plug.core.scene_check import SceneCheck
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.core.trace import TraceRow
-from skipgs_plug.core.views import require_unique
+from skipgs_plug.core.views import require_unique, warn_unless_recurring
 
 log = logging.getLogger(__name__)
 
@@ -170,7 +170,8 @@ class Engine:
         loss = float(signal.detach() if isinstance(signal, Tensor) else signal)
         mean = None if self.trace is None else self.mean(view)
         answer = now.decision = self._agreed(view, loss, now.step)
-        self.stats.record(answer, view, loss)
+        if self.stats.record(answer, view, loss) and self._view_names is None:
+            warn_unless_recurring(self.stats.n_views, self.stats.gated)
         if self.trace is not None:
             self.trace.append(TraceRow(now.step, view, loss, mean, answer.reason, answer.skip))
         return answer

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, Protocol
 
@@ -24,6 +24,7 @@ class Adapter(Protocol):
     checked: ClassVar[str]
     saved_state: Callable[[int], dict[str, Any] | None] | None
     output_folder: str | None
+    replaced: Sequence[str]
 
     def attach(self, hooks: Hooks) -> None: ...
 
@@ -174,6 +175,11 @@ class Hooks:
     def patched(self) -> list[str]:
         """Every name that is replaced at present."""
         return self._patches.names
+
+    @property
+    def trained(self) -> bool:
+        """Whether an iteration was seen, or a training backward that was in none."""
+        return self._iterations + self._backwards > 0
 
     def restore(self) -> None:
         """Put back every replaced name."""

@@ -29,6 +29,8 @@ class Iteration:
     __slots__ = ("backwards", "decision", "due", "ended", "keys", "ran", "signal", "step", "stepped", "view")
 
     def __init__(self) -> None:
+        self.keys: set[str] = set()
+        self.stepped: set[int] = set()
         self.begin(None)
 
     def begin(self, step: int | None) -> None:
@@ -40,8 +42,8 @@ class Iteration:
         self.view: Any = None
         self.signal: Any = None
         self.backwards = 0
-        self.keys: set[str] = set()
-        self.stepped: set[int] = set()
+        self.keys.clear()
+        self.stepped.clear()
         self.ended = False
 
     @property

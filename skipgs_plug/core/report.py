@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any, Protocol
 
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.stats import GateStats
+from skipgs_plug.files import write_aside
 
 SCHEMA_VERSION = 1
 
@@ -67,18 +67,9 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
 
 def write_report(gate: Reporting, path: str | Path) -> None:
     """Write `gate.report()` as JSON."""
-    write_aside(Path(path), json.dumps(_finite(gate.report()), indent=2, allow_nan=False) + "\n")
-
-
-def write_aside(path: Path, text: str) -> None:
-    """Write a file aside first, then rename it, so that no half a file is ever seen."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        aside.write_text(text)
-        os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
+    text = json.dumps(_finite(gate.report()), indent=2, allow_nan=False) + "\n"
+    with write_aside(path) as temporary:
+        temporary.write_text(text)
 
 
 def _finite(value: Any) -> Any:

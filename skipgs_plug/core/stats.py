@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from skipgs_plug.core.decision import Decision
+from skipgs_plug.core.views import forget_oldest
 
 
 class GateStats:
@@ -27,12 +28,14 @@ class GateStats:
         self.events: dict[str, int] = {}
         self._views: dict[str, list[Any]] = {}  # visits, backwards, skips, last loss
 
-    def record(self, decision: Decision, view: str, loss: float) -> None:
-        """Count one gated decision."""
+    def record(self, decision: Decision, view: str, loss: float) -> bool:
+        """Count one gated decision; True for a view that was not counted before."""
         self.reasons[decision.reason] = self.reasons.get(decision.reason, 0) + 1
         row = self._views.get(view)
+        new = row is None
         if row is None:
             row = self._views[view] = [0, 0, 0, loss]
+            forget_oldest(self._views)
         row[0] += 1
         row[3] = loss
         if decision.skip:
@@ -41,6 +44,7 @@ class GateStats:
         else:
             self.backwards += 1
             row[1] += 1
+        return new
 
     @property
     def gated(self) -> int:
@@ -54,7 +58,7 @@ class GateStats:
 
     @property
     def n_views(self) -> int:
-        """Number of different views seen from `start_iter` on."""
+        """Number of different views seen from `start_iter` on, as far as they are kept (MAX_VIEWS)."""
         return len(self._views)
 
     def view_table(self, mean_of: Callable[[str], float | None]) -> list[dict[str, Any]]:

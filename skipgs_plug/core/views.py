@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import numbers
 import os
+import warnings
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import PurePath
 from typing import Any
 
 from skipgs_plug.core.errors import SkipGSError
+
+CHECKED_KEYS = 5_000  # when as many have come, some must have come again
+RECURRING = 0.01  # least share of decisions on views that were seen before
+MAX_VIEWS = 200_000  # kept per table, some 60 MB in all; more than any scene has
 
 
 def view_key(view: Any) -> str:
@@ -52,3 +58,22 @@ def require_unique(names: Iterable[str]) -> list[str]:
             f"View key {name!r} names {count} training views; use keys that differ, such as relative paths."
         )
     return names
+
+
+def warn_unless_recurring(keys: int, decisions: int) -> None:
+    """Warn when the keys of so many decisions hardly ever came twice; to be called at each new key."""
+    if keys == CHECKED_KEYS and decisions - keys < RECURRING * decisions:
+        warnings.warn(
+            f"{keys:,} different view keys came in {decisions:,} gated decisions, and a view that does not come again "
+            "is never skipped: unless there are that many training views, name the image in view=, not a counter or "
+            "the id of an object.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+
+
+def forget_oldest(table: dict[Any, Any]) -> None:
+    """Take the half of a table of views that came first out of it, once it holds more than MAX_VIEWS."""
+    if len(table) > MAX_VIEWS:
+        for view in list(itertools.islice(table, len(table) // 2)):
+            del table[view]

@@ -8,7 +8,7 @@ from typing import Any
 
 from skipgs_plug.bench.store import flat
 from skipgs_plug.bench.summary import row_from_dict
-from skipgs_plug.bench.table import RESULTS, SHARES, cells, legend, notes
+from skipgs_plug.bench.table import legend, notes, tables
 from skipgs_plug.report import html, plots
 from skipgs_plug.report.source import BenchSource, RunSource
 
@@ -63,12 +63,9 @@ def run_section(run: RunSource) -> list[str]:
 def bench_section(bench: BenchSource) -> list[str]:
     data = bench.data
     rows = [row_from_dict(row) for row in data["rows"]]
-    heading, *lines = cells(rows, RESULTS)
-    share_heading, *shares = cells(rows, SHARES)
     parts = [
         f"<h2>Bench: {escape(data['settings']['scene']['name'])}</h2>",
-        html.table("Time and quality, mean ± spread over seeds", heading, lines),
-        html.table("Share of refinement time, %", share_heading, shares),
+        *(html.table(caption, lines[0], lines[1:]) for caption, lines in tables(rows)),
         html.paragraphs(notes(rows, data)),
     ]
     parts += [html.picture(plots.inline_png(path), text) for path, text in bench.pictures]

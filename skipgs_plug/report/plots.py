@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skipgs_plug.bench.plots import SMALL, STYLE, new_figure
+from skipgs_plug.bench.plots import SMALL, new_figure, style
 from skipgs_plug.bench.record import Trace
 
 if TYPE_CHECKING:
@@ -31,14 +31,15 @@ REASON_COLOURS = {
 def skips_over_time(traces: Mapping[tuple[int, str], Trace], parts: int = 25) -> Figure:
     """Share of skipped backwards in equal parts of refinement, mean over seeds, for policies that skip."""
     figure, axes = new_figure(9.0, 3.2)
-    for i, (policy, (colour, _)) in enumerate(STYLE.items()):
+    for i, policy in enumerate(dict.fromkeys(policy for _, policy in traces)):
+        colour, _ = style(policy)
         runs = [np.array(trace.skipped) for (_, name), trace in traces.items() if name == policy]
         if not any(run.any() for run in runs):
             continue
         start = next(trace.start for (_, name), trace in traces.items() if name == policy)
         edges = np.linspace(0, len(runs[0]), min(parts, len(runs[0])) + 1).round().astype(int)
         shares = [[100 * part.mean() for part in np.split(run, edges[1:-1])] for run in runs]
-        width = 4.0 - 0.5 * i  # policies may agree: then the earlier one shows behind the later
+        width = max(1.0, 4.0 - 0.5 * i)  # policies may agree: then the earlier one shows behind the later
         axes.stairs(np.mean(shares, axis=0), start + edges, baseline=None, color=colour, linewidth=width, label=policy)
     axes.set_ylim(-2, 102)
     axes.set_xlabel("iteration")

@@ -14,9 +14,10 @@ from typing import Any
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.report import write_aside
+from skipgs_plug.files import write_aside
 from skipgs_plug.gate import SkipGate
 
+REPLACED = ("torch.save", "torch.load")  # by `watch`; `torch.load` by `run_script` too
 SUFFIX = ".skipgs.json"  # behind the name of the checkpoint
 
 
@@ -102,7 +103,8 @@ class Checkpoints:
         for state in checkpoint.parent.glob(f"*{SUFFIX}"):  # some scripts keep the last few checkpoints only
             if not state.with_name(state.name.removesuffix(SUFFIX)).exists():
                 state.unlink(missing_ok=True)
-        write_aside(_beside(checkpoint), json.dumps({**self._run, "gate": gate.state_dict()}) + "\n")
+        with write_aside(_beside(checkpoint)) as temporary:
+            temporary.write_text(json.dumps({**self._run, "gate": gate.state_dict()}) + "\n")
 
 
 def _beside(checkpoint: Path) -> Path:

@@ -8,6 +8,7 @@ import importlib.util
 import runpy
 import sys
 import traceback
+import types
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,11 @@ from typing import Any, NamedTuple
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
+
+# For advice: parts of every checkout of the Inria family, CUDA extensions, packages not called as their module.
+OF_CHECKOUTS = frozenset({"arguments", "gaussian_renderer", "scene", "utils"})
+EXTENSIONS = ("diff_", "simple_knn", "fused_ssim")
+PACKAGES = {"cv2": "opencv-python", "PIL": "pillow", "skimage": "scikit-image", "yaml": "pyyaml"}
 
 
 def run_script(command: Sequence[str], attach: Callable[[], None] | None = None) -> int:
@@ -35,18 +41,42 @@ def run_script(command: Sequence[str], attach: Callable[[], None] | None = None)
     """
     program = _resolve(command)
     with _as_main_program(program), _whole_checkpoints():
-        if attach is not None:
-            attach()
         try:
+            if attach is not None:
+                attach()
             program.run()
         except SystemExit as stop:
             return _exit_code(stop.code)
         except SkipGSError:
             raise
         except BaseException as error:
-            _print_traceback(error, program.source)
+            _print_traceback(error, program)
+            if isinstance(error, ModuleNotFoundError) and error.name:
+                print(f"skipgs-plug: {what_brings(error.name, program.source)}", file=sys.stderr)
             return 130 if isinstance(error, KeyboardInterrupt) else 1
     return 0
+
+
+def source_of(command: Sequence[str]) -> Path:
+    """The file that `run_script` would run for this command.
+
+    Raises:
+        SkipGSError: There is none.
+    """
+    return _resolve(command).source
+
+
+def what_brings(module: str, script: Path) -> str:
+    """A sentence for a module that a script asks for and that is not there."""
+    top = module.partition(".")[0]
+    if top in OF_CHECKOUTS:
+        return f"{script.name} is not in its checkout: there is no {top} beside it; run the one in a whole checkout."
+    if top.startswith(EXTENSIONS):
+        return (
+            f"{top} is a CUDA extension that comes with the trainer: build it as the trainer's README says, or run on "
+            "the CPU with --cpu before '--'."
+        )
+    return f"{script.name} needs the module {module}: pip install {PACKAGES.get(top, top)}."
 
 
 class _Program(NamedTuple):
@@ -99,10 +129,15 @@ def _exit_code(code: Any) -> int:
     return 1
 
 
-def _print_traceback(error: BaseException, source: Path) -> None:
-    """As the interpreter prints it: from the script's own first frame on."""
+def _print_traceback(error: BaseException, program: _Program) -> None:
+    """As the interpreter prints it: from the first frame on that is the script's or lies in its checkout."""
+
+    def is_ours(trace: types.TracebackType) -> bool:
+        file = trace.tb_frame.f_code.co_filename
+        return file != str(program.source) and program.folder not in Path(file).parents
+
     trace = error.__traceback__
-    while trace is not None and trace.tb_frame.f_code.co_filename != str(source):
+    while trace is not None and is_ours(trace):
         trace = trace.tb_next
     traceback.print_exception(type(error), error, trace or error.__traceback__)
 

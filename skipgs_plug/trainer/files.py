@@ -1,26 +1,12 @@
-"""Files are written aside, then renamed: a reader never sees half of one."""
+"""Writing JSON files aside; `write_aside` itself belongs to all parts of the package."""
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-
-@contextlib.contextmanager
-def write_aside(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; renamed onto it on success, removed on failure."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+from skipgs_plug.files import write_aside
 
 
 def write_json(path: str | Path, content: Any) -> None:

@@ -173,12 +173,13 @@ class Trainer:
         return colors[0]
 
     def evaluate(self, split: str = "test", lpips_net: str | None = None) -> dict[str, Any]:
-        """Return mean `psnr` and `ssim` over the views of "test" or "train", `num_GS`, and the flavours."""
+        """Return the means of the chosen metrics over the views of "test" or "train", `num_GS`, and the flavours."""
         views = {"test": self.scene.test, "train": self.scene.train}[split]
         if not views:
             raise InputError(f"Scene {self.scene.name} has no {split} views; lower test_every to hold some out.")
+        wanted = metrics.chosen(lpips_net)
         with self.backend.exclusive_cores():
-            rows = [self._measure(view, lpips_net) for view in views]
+            rows = [metrics.measure(wanted, self.render(view), self._target(view)) for view in views]
         means = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
         return {
             **means,
@@ -186,16 +187,8 @@ class Trainer:
             "step": self.step,
             "split": split,
             "views": len(views),
-            "psnr_flavour": "mean of per-image PSNR, float render clamped to [0, 1]",
-            "ssim_flavour": metrics.SSIM_FLAVOUR,
+            **{f"{metric.name}_flavour": metric.flavour for metric in wanted},
         }
-
-    def _measure(self, view: View, lpips_net: str | None) -> dict[str, float]:
-        image, target = self.render(view), self._target(view)
-        row = {"psnr": metrics.psnr(image, target), "ssim": metrics.ssim(image, target)}
-        if lpips_net is not None:
-            row[f"lpips_{lpips_net}"] = metrics.lpips(image, target, lpips_net)
-        return row
 
     def export_ply(self, path: str | Path) -> None:
         """Write the 62-property INRIA PLY, in the coordinates of the dataset."""

@@ -1,9 +1,12 @@
-"""PSNR, SSIM and LPIPS of rendered images; each names its flavour."""
+"""PSNR, SSIM and LPIPS of rendered images; each names its flavour. A new metric is one entry of METRICS."""
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -13,6 +16,36 @@ from skipgs_plug.trainer.errors import InputError
 
 SSIM_FLAVOUR = "torchmetrics: 11x11 Gaussian window, reflect padding, border cropped"
 LPIPS_WEIGHTS = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
+
+
+@dataclass(frozen=True)
+class Metric:
+    """What evaluations, tables and logs need to know of one metric.
+
+    Attributes:
+        name: key in stats and results.
+        label: name for people.
+        digits: shown after the point.
+        flavour: what tells it from others of that name; a clause.
+        measure: function of render and target, images [H, W, 3], the target in [0, 1].
+        unit: shown after the label.
+        tag: name in TensorBoard, where gsplat names no flavour; the key itself if empty.
+        net: LPIPS backbone, which must be asked for; None for a metric of every evaluation.
+    """
+
+    name: str
+    label: str
+    digits: int
+    flavour: str
+    measure: Callable[[Tensor, Tensor], float]
+    unit: str = ""
+    tag: str = ""
+    net: str | None = None
+
+    @property
+    def heading(self) -> str:
+        """Label and unit."""
+        return f"{self.label} {self.unit}".strip()
 
 
 def psnr(render: Tensor, target: Tensor) -> float:
@@ -53,3 +86,29 @@ def lpips(render: Tensor, target: Tensor, net: str) -> float:
 def batch(image: Tensor) -> Tensor:
     """Return [H, W, 3] as [1, 3, H, W]."""
     return image.permute(2, 0, 1)[None]
+
+
+METRICS = {
+    metric.name: metric
+    for metric in (
+        Metric("psnr", "PSNR", 2, "mean of per-image PSNR, float render clamped to [0, 1]", psnr, unit="dB"),
+        Metric("ssim", "SSIM", 4, SSIM_FLAVOUR, ssim),
+        *(
+            Metric(
+                f"lpips_{net}", f"LPIPS {net}", 4, f"torchmetrics, backbone {net}, inputs normalised to [-1, 1]",
+                functools.partial(lpips, net=net), tag="lpips", net=net,
+            )
+            for net in LPIPS_WEIGHTS
+        ),
+    )
+}  # fmt: skip
+
+
+def chosen(lpips_net: str | None = None) -> list[Metric]:
+    """Return the metrics of every evaluation, and LPIPS with a backbone if one is named."""
+    return [metric for metric in METRICS.values() if metric.net in (None, lpips_net)]
+
+
+def measure(metrics: Sequence[Metric], render: Tensor, target: Tensor) -> dict[str, float]:
+    """Return the metrics of a render against its target, images [H, W, 3], by name."""
+    return {metric.name: metric.measure(render, target) for metric in metrics}

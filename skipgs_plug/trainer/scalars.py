@@ -11,9 +11,9 @@ from typing import Any
 import torch
 
 from skipgs_plug.trainer.loop import Iteration, Trainer
+from skipgs_plug.trainer.metrics import METRICS
 
 EVERY = 10  # iterations between two points of a curve
-METRICS = ("psnr", "ssim", "lpips", "num_GS")
 
 
 class ScalarLog:
@@ -46,9 +46,9 @@ class ScalarLog:
         self._write({f"train/{name}": value for name, value in scalars.items()} | dict(self._more()), iteration.step)
 
     def evaluation(self, stats: Mapping[str, Any], split: str = "val") -> None:
-        """Write `val/psnr ssim lpips num_GS` of an evaluation; gsplat's tags do not name the flavour of LPIPS."""
-        tags = {name: "lpips" if name.startswith("lpips_") else name for name in stats}
-        shown = {f"{split}/{tag}": stats[name] for name, tag in tags.items() if tag in METRICS}
+        """Write `val/psnr ssim lpips num_GS` of an evaluation: all metrics under their tags, and the model's size."""
+        tags = {metric.name: metric.tag or metric.name for metric in METRICS.values()} | {"num_GS": "num_GS"}
+        shown = {f"{split}/{tag}": stats[name] for name, tag in tags.items() if name in stats}
         self._write(shown, self._trainer.step - 1)
 
     def _write(self, scalars: Mapping[str, float], step: int) -> None:

@@ -10,6 +10,8 @@ from lookalikes import fastgs, inria, speedy_splat
 from lookalikes.splats import NAMES, Scene, SplatModel, dataset, draw, make_cameras, new_log, photo_loss, pick
 
 from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError, UnknownTrainerError
+from skipgs_plug.adapters import register_adapter, registry
+from skipgs_plug.adapters.inria import InriaFamily
 from skipgs_plug.adapters.registry import adapter_names
 
 
@@ -176,29 +178,39 @@ def test_early_start_is_refused_where_gradients_are_read():
     run(script("inria", inria), start_iter=20)
 
 
-def test_user_adapter_of_a_fork_is_asked_first():
-    from skipgs_plug import register_adapter
-    from skipgs_plug.adapters import registry
-    from skipgs_plug.adapters.inria import InriaFamily
+class Marked(InriaFamily):
+    """A fork that is known by a name."""
 
-    class Mine(InriaFamily):
-        name, checked = "mine", "my fork of Inria 3DGS"
+    name, checked, mark = "mine", "my fork of Inria 3DGS", "MY_FORK"
 
-        @classmethod
-        def recognises(cls, names):
-            return "MY_FORK" in names
+    def start_iter(self, opt, loop):
+        return 30
 
-        def start_iter(self, opt, loop):
-            return 30
+
+class Recognised(Marked):
+    """A fork that is known by something else."""
+
+    mark = ""
+
+    @classmethod
+    def recognises(cls, names):
+        return "MY_FORK" in names
+
+
+@pytest.mark.parametrize("mine", [Marked, Recognised])
+def test_user_adapter_of_a_fork_is_asked_first(mine):
 
     module = copied(inria)
     module.MY_FORK = True
     try:
-        register_adapter(Mine)
+        register_adapter(mine)
         with SkipGate(module) as gate:
             assert gate.adapter.name == "mine"
         with SkipGate(inria) as gate:
             assert gate.adapter.name == "inria"
+        with pytest.raises(AdapterMismatchError, match=r"'mine' is for my fork .* training script of 'inria'"):
+            SkipGate(inria, adapter="mine")
+        SkipGate(module, adapter="inria").detach()  # by name, an adapter takes what it can
     finally:
         registry._registered.pop("mine", None)
     assert copy.copy(adapter_names())[0] == "reference"

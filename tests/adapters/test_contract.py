@@ -10,6 +10,7 @@ from cases import CASES, PAUSE, RULE, SCRIPTS, SkipAlways, run
 from lookalikes.splats import Log, log, new_log
 
 from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.adapters.registry import get_adapter
 
 each = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 resumable = [case for case in CASES if case.resume]
@@ -173,6 +174,28 @@ def test_two_gates_on_one_trainer_are_refused(case):
             SkipGate(trainer)
         assert gate.patched == names and replaced_names(trainer)
     assert not replaced_names(trainer) and torch.Tensor.backward is REAL_BACKWARD
+
+
+@pytest.mark.parametrize("case", SCRIPTS, ids=lambda case: case.name)
+def test_answers_about_a_run_change_nothing(case, monkeypatch):
+    adapter, answers = get_adapter(case.module.ADAPTER), []
+
+    def twice(ask):
+        def asked(self, opt, loop):
+            before = dict(vars(self))
+            answers.append((ask(self, opt, loop), ask(self, opt, loop)))
+            assert vars(self) == before
+            return answers[-1][0]
+
+        return asked
+
+    monkeypatch.setattr(adapter, "start_iter", twice(adapter.start_iter))
+    monkeypatch.setattr(adapter, "gradients_read_until", twice(adapter.gradients_read_until))
+    new_log()
+    trainer, train = case.make()
+    with SkipGate(trainer):
+        train(last=case.module.FIRST)
+    assert len(answers) == 2 and all(one == other for one, other in answers)
 
 
 @pytest.mark.parametrize("case", SCRIPTS, ids=lambda case: case.name)

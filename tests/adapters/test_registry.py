@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 
 import pytest
 
@@ -77,5 +78,5 @@ def test_every_built_in_adapter_loads_under_its_name(name: str) -> None:
     module, _, attribute = registry.BUILTIN[name].partition(":")
     adapter = getattr(importlib.import_module(module), attribute)
     assert adapter.name == name
-    assert adapter.checked
+    assert re.fullmatch(r".*\w \([^()]*\w\)", adapter.checked)  # with what, and in brackets how
     assert not adapter.matches(object())

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from skipgs_plug.bench.policies import POLICIES, check_policies, running_order
-from skipgs_plug.trainer import InputError
+from skipgs_plug.bench.policies import POLICIES, check_policies, rounds
+from skipgs_plug.bench.record import RunRecord
+from skipgs_plug.trainer import InputError, TrainConfig, Trainer
 
 
 @pytest.mark.parametrize(
@@ -20,14 +21,23 @@ def test_unusable_policies_are_refused_by_name(names, named):
         check_policies(names)
 
 
-def test_order_rotates_and_controls_follow_what_they_copy():
-    firsts, last = set(), set()
+def test_policies_run_in_turns_with_those_that_copy_from_the_same_rounds():
+    firsts = set()
     for position in range(12):
-        order = [spec.name for spec in running_order(tuple(POLICIES), position)]
-        assert sorted(order) == sorted(POLICIES)
-        for name in order:
-            assert all(order.index(other) < order.index(name) for other in POLICIES[name].needs)
-        firsts.add(order[0])
-        last.add(order[-1])
-    assert firsts == {"ungated", "gate", "gate-no-floor", "gate-accumulate"}
-    assert last == {"random", "periodic", "shortened"}
+        free, controls = ([spec.name for spec in group] for group in rounds(tuple(POLICIES), position))
+        assert sorted([*free, *controls]) == sorted(POLICIES)
+        assert set(free) == {"ungated", "gate", "gate-no-floor", "gate-accumulate"}
+        firsts.add((free[0], controls[0]))
+    assert len(firsts) == 12  # every order of four and three
+
+
+def test_shortened_takes_the_time_of_the_gate(scene):
+    trainer = Trainer(TrainConfig(max_steps=2000), scene)
+
+    def shortened(gate_seconds: float) -> int:
+        earlier = {name: RunRecord(0, name, t_post=t) for name, t in {"gate": gate_seconds, "ungated": 100.0}.items()}
+        return POLICIES["shortened"].iterations(trainer, earlier)
+
+    assert shortened(60.0) == 600
+    assert shortened(110.0) == 1000
+    assert shortened(0.001) == 1

@@ -7,8 +7,8 @@ import pytest
 import torch
 from bench_fixtures import MAX_STEPS, SEEDS, early_floor, make_bench
 
-from skipgs_plug.bench.policies import POLICIES
-from skipgs_plug.bench.refine import compressed, densify, shortened_iterations
+from skipgs_plug.bench.policies import POLICIES, PolicySpec
+from skipgs_plug.bench.refine import PARTS, compressed, densify
 from skipgs_plug.bench.summary import summarise
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.backend import resolve_backend
@@ -18,7 +18,7 @@ START = MAX_STEPS // 2
 
 def test_every_policy_ran_from_the_same_point(finished):
     for seed in SEEDS:
-        starts = {finished.run(policy, seed).points[0].psnr for policy in POLICIES}
+        starts = {finished.run(policy, seed).points[0].metrics["psnr"] for policy in POLICIES}
         assert len(starts) == 1
         densified = {finished.run(policy, seed).t_total - finished.run(policy, seed).t_post for policy in POLICIES}
         assert max(densified) - min(densified) < 1e-9
@@ -59,7 +59,7 @@ def test_what_the_rule_asked_for_is_told_from_what_the_floor_forbade(finished):
 
 def test_ungated_runs_every_backward(finished):
     record = finished.run("ungated")
-    assert record.backwards == record.iterations == MAX_STEPS - START
+    assert record.backwards == record.iterations_run == record.iterations == MAX_STEPS - START
     assert set(record.trace.codes) == {"-"}
 
 
@@ -79,13 +79,52 @@ def test_time_is_split_into_phases_and_evaluated_on_the_way(finished):
         assert steps[0] == START and steps[-1] == START + record.iterations
         seconds = [point.seconds for point in record.points]
         assert seconds == sorted(seconds) and seconds[0] == 0.0
-        assert record.points[-1].psnr == record.metrics["psnr"]
+        assert record.points[-1].metrics["psnr"] == record.metrics["psnr"]
+        assert len(record.points) == 1 + PARTS and "num_GS" not in record.points[0].metrics
+        assert record.train_metrics["psnr"] != record.metrics["psnr"]
 
 
-def test_shortened_takes_the_time_of_the_gate():
-    assert shortened_iterations(1000, gate_seconds=60.0, ungated_seconds=100.0) == 600
-    assert shortened_iterations(1000, gate_seconds=110.0, ungated_seconds=100.0) == 1000
-    assert shortened_iterations(10, gate_seconds=0.1, ungated_seconds=100.0) == 1
+def test_policies_take_turns(scene, tmp_path, monkeypatch):
+    seen = []
+    train = Trainer.train
+
+    def noted(trainer, until=None, progress=True):
+        seen.append((id(trainer), until))
+        train(trainer, until, progress)
+
+    monkeypatch.setattr(Trainer, "train", noted)
+    make_bench(scene, tmp_path, seeds=(0,), policies=("ungated", "gate")).run()
+    parts = seen[1:]  # after densification
+    assert [until for _, until in parts] == [START + 4 * part for part in range(1, PARTS + 1) for _ in range(2)]
+    assert [owner for owner, _ in parts] == [parts[0][0], parts[1][0]] * PARTS and parts[0][0] != parts[1][0]
+
+
+def test_a_run_in_turns_equals_one_alone(scene, finished, tmp_path):
+    with early_floor():
+        (alone,) = make_bench(scene, tmp_path, seeds=(0,), policies=("gate-accumulate",)).run()
+    together = finished.run("gate-accumulate")
+    assert alone.trace == together.trace and alone.metrics == together.metrics
+
+
+def test_a_policy_that_leaves_out_whole_iterations_is_one_entry(scene, tmp_path, monkeypatch):
+    def every_second(trainer, earlier):
+        train_step = trainer.train_step
+
+        def thinned():
+            loss = train_step()
+            trainer.step += 1
+            return loss
+
+        trainer.train_step = thinned
+
+    monkeypatch.setitem(POLICIES, "thinned", PolicySpec("thinned", "every second iteration", every_second))
+    full, record = make_bench(scene, tmp_path, seeds=(0,), policies=("ungated", "thinned")).run()
+    assert (record.iterations, record.iterations_run, record.backwards, record.skips) == (40, 20, 20, 0)
+    assert record.trace.codes == "-." * 20 and record.trace.view == full.trace.view
+    assert record.trace.loss[1] is None
+    assert 0.0 < record.t_post < full.t_post
+    row = summarise([full, record], ("ungated", "thinned"), 40)[1]
+    assert row.values["iterations_run"].mean == 20 and row.values["backwards_share"].mean == 50.0
 
 
 def test_shortened_runs_through_the_whole_schedule(scene):
@@ -139,11 +178,12 @@ def test_a_killed_bench_continues_where_it_stopped(scene, finished, tmp_path):
 
 def test_a_run_that_diverges_is_named_and_its_copies_are_not_run(scene, tmp_path):
     bench = make_bench(scene, tmp_path, seeds=(5,))
-    bench.backend = failing_backend(START + 1 + (MAX_STEPS - START) + 20)  # warm-up, densification, ungated, then
+    turn = 1 + (MAX_STEPS - START) // PARTS  # compilation, and the iterations of a part
+    bench.backend = failing_backend(1 + START + turn + 1 + 3)  # densification, ungated's turn, the gate's third loss
     found = {record.policy: record for record in bench.run()}
     assert found["ungated"].status == "done"
     assert found["gate"].status == "diverged"
-    assert f"loss nan at iteration {START + 19} on view" in found["gate"].note
+    assert f"loss nan at iteration {START + 2} on view" in found["gate"].note
     assert found["gate-no-floor"].status == "done"
     for policy in ("random", "periodic", "shortened"):
         assert found[policy].status == "not run" and "gate" in found[policy].note

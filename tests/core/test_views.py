@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from skipgs_plug import SkipGate
+from skipgs_plug.adapters import TrainerFacts
+from skipgs_plug.core import views
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.views import require_unique, view_key
 
@@ -40,3 +43,31 @@ def test_shared_names_are_found() -> None:
     assert require_unique([]) == []
     with pytest.raises(SkipGSError, match="'a' names 2"):
         require_unique(["a", "b", "a"])
+
+
+def train(gate: SkipGate, keys) -> None:
+    for step, key in enumerate(keys, start=gate.stats()["iterations"]):
+        gate.backward(torch.tensor(1.0, requires_grad=True), view=key, step=step)
+
+
+def test_keys_that_do_not_recur_are_warned_about_once_and_forgotten(monkeypatch) -> None:
+    monkeypatch.setattr(views, "CHECKED_KEYS", 100)
+    monkeypatch.setattr(views, "MAX_VIEWS", 150)
+    gate = SkipGate(start_iter=0, warmup=0)
+    train(gate, range(99))
+    with pytest.warns(RuntimeWarning, match="100 different view keys came in 100 gated decisions") as caught:
+        train(gate, range(99, 1000))
+    assert len(caught) == 1
+    state = gate.state_dict()
+    assert 75 <= len(state["policy"]["means"]) == len(state["stats"]["views"]) <= 150
+    assert gate.stats()["reasons"] == {"new view": 1000}
+    train(gate, [999])  # the latest are the ones kept
+    assert gate.skipped
+
+
+def test_keys_that_recur_or_are_known_are_not_warned_about(monkeypatch) -> None:
+    monkeypatch.setattr(views, "CHECKED_KEYS", 100)
+    train(SkipGate(start_iter=0), [*range(98), 0, 1, 98, 99, 100])
+    known = SkipGate(start_iter=0)
+    known._engine.configure(TrainerFacts(0, view_names=[str(i) for i in range(200)]))
+    train(known, range(200))

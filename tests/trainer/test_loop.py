@@ -128,8 +128,21 @@ def test_options_train(tiny_scene: Scene, tiny_config: TrainConfig, field: str) 
     for trainer in (plain, varied):
         trainer.train(until=6, progress=False)
     assert all(torch.isfinite(p).all() for p in varied.splats.values())
-    changed = not torch.equal(plain.splats["means"], varied.splats["means"])
-    assert changed or field == "absgrad"  # which acts at the first densification only
+    assert not torch.equal(plain.splats["means"], varied.splats["means"])
+
+
+def test_absolute_gradients_decide_about_densification_only(tiny_scene: Scene, tiny_config: TrainConfig) -> None:
+    # The threshold lies between the mean gradients and the larger means of their absolute values.
+    config = dataclasses.replace(tiny_config, grow_grad2d=0.001)
+    plain, absolute = (Trainer(dataclasses.replace(config, absgrad=absgrad), tiny_scene) for absgrad in (False, True))
+    for trainer in (plain, absolute):
+        trainer.train(until=4, progress=False)
+    assert all(torch.equal(plain.splats[name], absolute.splats[name]) for name in plain.splats)
+    sums = [trainer.strategy_state["grad2d"] for trainer in (plain, absolute)]
+    assert (sums[1] >= sums[0]).all() and (sums[1] > sums[0]).any()
+    for trainer in (plain, absolute):
+        trainer.train(until=5, progress=False)
+    assert len(tiny_scene.points) < len(plain.splats["means"]) < len(absolute.splats["means"])
 
 
 def test_callers_random_state_is_left_alone(trainer: Trainer) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from torch import Tensor
 from .. import rasterization
 from ..install import install_as_gsplat
 from ..torch_reference_projection import rotation_matrices
+from .packages import usable
 from .relocation import compute_relocation
 
 
@@ -35,7 +35,7 @@ def gsplat_on_cpu() -> Iterator[None]:
         (gsplat.strategy.ops, "compute_relocation", compute_relocation),
         (gsplat.strategy.ops, "quat_scale_to_covar_preci", quat_scale_to_covar_preci),
     ]
-    if importlib.util.find_spec("torchvision") is None:
+    if not usable("torchvision"):
         replaced.append((torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", AbsentLpips))
     if tuple(map(int, gsplat.__version__.split(".")[:2])) < (1, 5):
         replaced += [(module, "rasterization", rasterization_1_4) for module in (gsplat, gsplat.rendering)]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import ModuleType
+
+from .packages import usable
 
 _CLASSES = ("GaussianRasterizationSettings", "GaussianRasterizer")
 _ACCELERATED = (*_CLASSES, "SparseGaussianAdam")
@@ -58,7 +59,7 @@ _ON_GSPLAT = ("gsplat", "nerfstudio")
 def serve(family: str) -> Iterator[None]:
     """Serve the extension modules of one family of trainers from the CPU rasterizer.
 
-    Where torchvision is not installed, the few functions of it that these trainers call come along.
+    Where torchvision cannot be imported, the few functions of it that these trainers call come along.
     Modules of the same names that were imported before are set aside and come back at the end.
 
     Raises:
@@ -68,7 +69,7 @@ def serve(family: str) -> Iterator[None]:
         raise ValueError(f"No stand-ins for {family!r}; there are some for: {', '.join(sorted(FAMILIES))}.")
     served = {name: _module(name, *source) for name, source in FAMILIES[family].items()}
     # gsplat's script has no use for torchvision.
-    if family != "gsplat" and importlib.util.find_spec("torchvision") is None:
+    if family != "gsplat" and not usable("torchvision"):
         served |= importlib.import_module(".vision", __package__).modules()
     before = {name: sys.modules.get(name) for name in served}
     try:

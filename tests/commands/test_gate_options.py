@@ -1,0 +1,40 @@
+"""Every command that attaches a gate takes its settings by the same names."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import tyro
+
+from skipgs_plug import SkipConfig
+from skipgs_plug.commands import run, train
+from skipgs_plug.commands.gate_options import GateOptions
+
+GIVEN = {
+    "start_iter": 7,
+    "threshold": 0.1,
+    "ema_decay": 0.5,
+    "warmup": 3,
+    "min_bwd_ratio": 0.25,
+    "on_nonfinite": "raise",
+    "pause_iters": 9,
+    "step_mode": "adaptive_norm",
+    "step_trigger": "ref_k",
+}
+COMMANDS = pytest.mark.parametrize(
+    ("args", "own"), [(run.Args, ["inria"]), (train.Args, ["scene", "--out", "folder"])], ids=["run", "train"]
+)
+
+
+def test_there_is_one_for_every_setting() -> None:
+    assert set(GIVEN) == {field.name for field in dataclasses.fields(GateOptions)}
+    assert set(GIVEN) | {"enabled"} == {field.name for field in dataclasses.fields(SkipConfig)}
+
+
+@COMMANDS
+def test_what_is_given_reaches_the_gate(args, own) -> None:
+    options = [word for name, value in GIVEN.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    config = (tyro.conf.FlagCreatePairsOff,)
+    assert tyro.cli(args, args=[*own, *options], config=config).gate.given() == GIVEN
+    assert tyro.cli(args, args=own, config=config).gate.given() == {}

@@ -1,0 +1,73 @@
+"""Who imports whom, read from the source: the parts know only those below them, and no two modules each other."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import skipgs_plug
+
+ROOT = Path(skipgs_plug.__path__[0])
+# What each part may import besides itself and modules that import nothing of the package.
+MAY_IMPORT = {
+    "core": set(),
+    "adapters": {"core"},
+    "gate": {"core", "adapters"},
+    "scripts": {"core", "gate"},
+    "fallback_raster": set(),
+    "trainer": {"fallback_raster"},
+}
+CIRCLES_OF_TRAINER = "skipgs_plug.trainer."  # its state and its loop know each other
+
+
+def imports() -> dict[str, set[str]]:
+    """Modules of the package that each of them imports, in functions and for types too."""
+    files = {}
+    for path in ROOT.rglob("*.py"):
+        name = ".".join(("skipgs_plug", *path.relative_to(ROOT).with_suffix("").parts))
+        files[name.removesuffix(".__init__")] = path
+    found = {}
+    for name, path in files.items():
+        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        wanted = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                wanted |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+                base = ".".join([*above, *([node.module] if node.module else [])])
+                wanted |= {f"{base}.{alias.name}" if f"{base}.{alias.name}" in files else base for alias in node.names}
+        found[name] = (wanted & set(files)) - {name}
+    return found
+
+
+IMPORTS = imports()
+
+
+def part(module: str) -> str:
+    return module.split(".")[1] if "." in module else ""
+
+
+@pytest.mark.parametrize("name", MAY_IMPORT)
+def test_a_part_knows_only_those_below_it(name: str) -> None:
+    own = {module for module in IMPORTS if part(module) == name}
+    assert own
+    others = {wanted for module in own for wanted in IMPORTS[module] if part(wanted) != name and IMPORTS[wanted]}
+    assert {part(wanted) for wanted in others} <= MAY_IMPORT[name]
+
+
+def reachable(module: str) -> set[str]:
+    seen: set[str] = set()
+    waiting = [module]
+    while waiting:
+        new = IMPORTS[waiting.pop()] - seen
+        seen |= new
+        waiting += new
+    return seen
+
+
+def test_no_two_modules_import_each_other() -> None:
+    circles = {module for module in IMPORTS if module in reachable(module)}
+    assert {module for module in circles if not module.startswith(CIRCLES_OF_TRAINER)} == set()
