@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import functools
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from .. import rasterization
 from ..install import install_as_gsplat
 from ..torch_reference_projection import rotation_matrices
+from .lpips import AbsentLpips
 from .packages import usable
 from .relocation import compute_relocation
 
@@ -75,15 +74,3 @@ def quat_scale_to_covar_preci(
     roots = (rotation * scales[:, None, :], rotation / scales[:, None, :])
     covariance, precision = (root @ root.transpose(-1, -2) for root in roots)
     return covariance if compute_covar else None, precision if compute_preci else None
-
-
-class AbsentLpips(torch.nn.Module):
-    """LPIPS where its network cannot be had: a warning when first asked, and nan for a value."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__()
-
-    def forward(self, image: Tensor, target: Tensor) -> Tensor:
-        """Not a number. Shapes are not checked."""
-        warnings.warn("LPIPS needs torchvision, which is not installed: reporting nan.", stacklevel=2)
-        return torch.tensor(torch.nan)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import ModuleType
 
+from .nvidia_smi import one_free_gpu
 from .packages import usable
 
 _CLASSES = ("GaussianRasterizationSettings", "GaussianRasterizer")
@@ -52,7 +53,8 @@ FAMILIES: dict[str, _Source] = {
     "gsplat": _SSIM,
     "nerfstudio": {},  # all of CUDA that splatfacto needs is in gsplat
 }
-_ON_GSPLAT = ("gsplat", "nerfstudio")
+# What is served besides where torchvision cannot be imported.
+_WITHOUT_TORCHVISION: dict[str, _Source] = {"scaffold_gs": {"lpips": (".lpips", ("LPIPS",))}}
 
 
 @contextmanager
@@ -71,6 +73,7 @@ def serve(family: str) -> Iterator[None]:
     # gsplat's script has no use for torchvision.
     if family != "gsplat" and not usable("torchvision"):
         served |= importlib.import_module(".vision", __package__).modules()
+        served |= {name: _module(name, *source) for name, source in _WITHOUT_TORCHVISION.get(family, {}).items()}
     before = {name: sys.modules.get(name) for name in served}
     try:
         # First what torchmetrics is imported for: it must not find a part of torchvision.
@@ -86,12 +89,12 @@ def serve(family: str) -> Iterator[None]:
 
 
 def _extras(family: str) -> AbstractContextManager[None]:
-    """gsplat's functions are replaced inside gsplat, which is a real package here."""
-    if family not in _ON_GSPLAT:
-        return nullcontext()
-    from .gsplat_script import gsplat_on_cpu
+    """What cannot be had by serving modules."""
+    if family in ("gsplat", "nerfstudio"):  # functions are replaced inside gsplat, which is a real package here
+        from .gsplat_script import gsplat_on_cpu
 
-    return gsplat_on_cpu()
+        return gsplat_on_cpu()
+    return one_free_gpu() if family == "scaffold_gs" else nullcontext()
 
 
 def _module(name: str, source: str, offered: tuple[str, ...]) -> ModuleType:
