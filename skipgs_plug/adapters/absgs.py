@@ -16,6 +16,11 @@ class AbsGS(InriaFamily):
 
     name = "absgs"
     checked = "TY424/AbsGS 87d7a5aa (its script, run on the CPU)"
+    project = "[AbsGS](https://github.com/TY424/AbsGS)"
+    gated = (
+        "From `densify_until_iter` on. With `--use_prune_weight` every prune until `prune_until_iter` pauses the gate."
+    )
+    left_alone = "Blend weights are gathered in skipped iterations too: they come from the forward."
     mark = "use_prune_weight"
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:

@@ -27,6 +27,9 @@ class AbstractAdapter(ABC):
 
     Attributes:
         name: how users call it.
+        project: its name and home, in Markdown, for docs/adapters.md; as are the next two.
+        gated: from when on the gate decides, and what pauses it.
+        left_alone: what else is done or left alone in skipped iterations, beyond what holds for every trainer.
         checked: upstream version or commit that it was checked with, and in brackets how; part of error messages.
         saved_state: gives the state of the gate that belongs to the checkpoint which the trainer goes on from,
             if any; called once, with the first iteration. Set before the gate is made.
@@ -37,6 +40,9 @@ class AbstractAdapter(ABC):
 
     name: ClassVar[str]
     checked: ClassVar[str]
+    project: ClassVar[str] = ""
+    gated: ClassVar[str] = ""
+    left_alone: ClassVar[str] = ""
     saved_state: Callable[[int], dict[str, Any] | None] | None = None
     output_folder: str | None = None
     replaced: Sequence[str] = ()

@@ -16,6 +16,12 @@ class ImprovedGS(InriaFamily):
 
     name = "improved_gs"
     checked = "XiaoBin2001/Improved-GS d008d118 (its script, run on the CPU)"
+    project = "[Improved-GS](https://github.com/XiaoBin2001/Improved-GS)"
+    gated = "From `densify_until_iter` on."
+    left_alone = (
+        "Both optimizers step every 5th and later every 20th iteration on what the backwards since then have left, in "
+        "skipped iterations too."
+    )
     mark = "compute_edge_score"
     structural = (*InriaFamily.structural, "only_prune")
 

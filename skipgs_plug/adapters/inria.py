@@ -240,6 +240,14 @@ class Inria(InriaFamily):
 
     name = "inria"
     checked = "graphdeco-inria/gaussian-splatting 8a70a8cd and 54c035f (their scripts, run on the CPU)"
+    project = "[Inria 3DGS](https://github.com/graphdeco-inria/gaussian-splatting)"
+    gated = "From `densify_until_iter` on: that iteration does not densify any more."
+    left_alone = (
+        "Both optimizers of the current version, sparse Adam too. Renders of the viewer and of evaluations are not "
+        "taken for training. When two images have the same name in different folders (older versions keep the name "
+        "only), the gate warns and tells views apart by their position. A fork that no adapter knows is refused when "
+        "its loop draws noise or writes into tensors, and otherwise gated with a list of what was not recognised."
+    )
 
     @classmethod
     def recognises(cls, names: Container[str]) -> bool:

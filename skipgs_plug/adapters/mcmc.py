@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -25,6 +26,15 @@ class MCMC(InriaFamily):
 
     name = "mcmc"
     checked = "ubc-vision/3dgs-mcmc 7b4fc9f7 (its script, run on the CPU)"
+    project = "[3DGS-MCMC](https://github.com/ubc-vision/3dgs-mcmc)"
+    gated = (
+        "From `densify_until_iter` (25,000) on, where relocation ends. A gate that you start earlier runs the "
+        "iterations that relocate."
+    )
+    left_alone = (
+        "The position noise between the lines of the loop is zero where the gradient step is left out; its random "
+        "numbers are drawn as ever."
+    )
     mark = NOISE
 
     def __init__(self, trainer: Any = None) -> None:
@@ -54,4 +64,6 @@ class MCMC(InriaFamily):
             in_loop = sys._getframe(2).f_code.co_name == LOOP
             return torch.zeros_like(factor) if in_loop and hooks.state.skipped else factor
 
-        hooks.wrap(names if NOISE in names else vars(sys.modules[model.__module__]), NOISE, covariance)
+        # A script takes it from this module when it imports it.
+        owner = vars(importlib.import_module("scene.gaussian_model")) if self.trainer is None else names
+        hooks.wrap(owner, NOISE, covariance)

@@ -16,6 +16,12 @@ class MipSplatting(InriaFamily):
 
     name = "mip_splatting"
     checked = "autonomousvision/mip-splatting dda02ab5 (its script, run on the CPU)"
+    project = "[Mip-Splatting](https://github.com/autonomousvision/mip-splatting)"
+    gated = "From `densify_until_iter` on."
+    left_alone = (
+        "The 3D filter is computed anew every hundredth iteration, skipped or not: where nothing moved it is what it "
+        "was, so it does not pause the gate."
+    )
     mark = "create_offset_gt"
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:

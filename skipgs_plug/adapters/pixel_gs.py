@@ -13,6 +13,9 @@ class PixelGS(InriaFamily):
 
     name = "pixel_gs"
     checked = "zhengzhang01/Pixel-GS 05c9d557 (its script, run on the CPU)"
+    project = "[Pixel-GS](https://github.com/zhengzhang01/Pixel-GS)"
+    gated = "From `densify_until_iter` on."
+    left_alone = "Pixel counts and the gradients they weight are read by densification alone."
     mark = "depth_threshold"
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:

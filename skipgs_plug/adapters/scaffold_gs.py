@@ -13,6 +13,9 @@ class ScaffoldGS(InriaFamily):
 
     name = "scaffold_gs"
     checked = "city-super/Scaffold-GS 59c833b5 (its script, run on the CPU)"
+    project = "[Scaffold-GS](https://github.com/city-super/Scaffold-GS)"
+    gated = "From `update_until` on, where anchors are neither grown nor pruned any more."
+    left_alone = "Networks and anchors have one optimizer, which is left alone."
     mark = "prefilter_voxel"
     structural = ("prune_anchor", "training_setup")
 

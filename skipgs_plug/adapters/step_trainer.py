@@ -31,6 +31,15 @@ class StepTrainer(AbstractAdapter):
 
     name = "step_trainer"
     checked = "gaussian-splatting 2.11.0 of PyPI (its script, run on the CPU)"
+    project = "[pip gaussian-splatting](https://pypi.org/project/gaussian-splatting/)"
+    gated = (
+        "From the latest of its inclusive bounds + 1 on, after a pause for the opacity reset that falls on that "
+        "bound. Modes without densification need `--start-iter`."
+    )
+    left_alone = (
+        "`before_optim_hook`, which reads gradients, is left out with the backward. Attach to the outermost trainer; "
+        "wrappers added later are fine."
+    )
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:

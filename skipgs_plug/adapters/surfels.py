@@ -17,6 +17,9 @@ class Surfels(InriaFamily):
 
     name = "2dgs"
     checked = "hbb1/2d-gaussian-splatting 1920a239 (look-alike only: its rasterizer has no stand-in)"
+    project = "[2D Gaussian Splatting](https://github.com/hbb1/2d-gaussian-splatting)"
+    gated = "From `densify_until_iter` on; decided on the whole loss, with normal consistency and depth distortion."
+    left_alone = "Needs CUDA: `--cpu` has no stand-in for its surfel rasterizer."
     mark = "render_net_image"
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
