@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -15,13 +16,15 @@ from ..torch_reference_projection import rotation_matrices
 from .lpips import AbsentLpips
 from .packages import usable
 from .relocation import compute_relocation
+from .scene_manager import SceneManager
 
 
 @contextmanager
 def gsplat_on_cpu() -> Iterator[None]:
     """Replace gsplat's rasterizer and the two CUDA functions its MCMC strategy calls.
 
-    Where torchvision is missing, torchmetrics' LPIPS is replaced too: the script builds it at the start.
+    Where torchvision is missing, torchmetrics' LPIPS is replaced too: the script builds it at the start. The pycolmap
+    that is installed gets the `SceneManager` of the one that gsplat's script wants up to 1.5.3.
 
     Raises:
         ImportError: gsplat is not installed.
@@ -38,15 +41,20 @@ def gsplat_on_cpu() -> Iterator[None]:
         replaced.append((torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", AbsentLpips))
     if tuple(map(int, gsplat.__version__.split(".")[:2])) < (1, 5):
         replaced += [(module, "rasterization", rasterization_1_4) for module in (gsplat, gsplat.rendering)]
+    if usable("pycolmap") and not hasattr(pycolmap := importlib.import_module("pycolmap"), "SceneManager"):
+        replaced.append((pycolmap, "SceneManager", SceneManager))
     with install_as_gsplat():
-        before = [(owner, name, getattr(owner, name)) for owner, name, _ in replaced]
+        before = [(owner, name, getattr(owner, name, None)) for owner, name, _ in replaced]
         for owner, name, stand_in in replaced:
             setattr(owner, name, stand_in)
         try:
             yield
         finally:
             for owner, name, original in before:
-                setattr(owner, name, original)
+                if original is None:
+                    delattr(owner, name)
+                else:
+                    setattr(owner, name, original)
 
 
 @functools.wraps(rasterization)
