@@ -105,7 +105,10 @@ def make_package(folder, **files):
 def test_gsplat_script_is_run_gated(run_example, tmp_path, monkeypatch):
     make_package(
         tmp_path / "checkout",
-        gsplat__distributed="def cli(fn, args, verbose=False):\n    return fn(0, 0, 1, args)\n",
+        gsplat__distributed=(
+            "def _distributed_worker(world_rank, world_size, fn, args):\n    return fn(0, 0, 1, args)\n"
+            "def cli(fn, args, verbose=False):\n    return _distributed_worker(0, 1, fn=fn, args=args)\n"
+        ),
         examples__simple_trainer=(
             "from gsplat.distributed import cli\nfrom lookalikes import gsplat_runner\n"
             "class Runner(gsplat_runner.Runner):\n    pass\n"

@@ -98,6 +98,10 @@ class AbstractAdapter(ABC):
         return None
 
 
+# Marks a `torch.multiprocessing.spawn` that attaches a gate in each process.
+GATES_CHILDREN = "__skipgs_gates_children__"
+
+
 def refuse_other_processes(hooks: Hooks) -> None:
     """Let a script fail that is about to spread training over several processes, where no gate is attached."""
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
+from skipgs_plug.adapters.base import GATES_CHILDREN, AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
@@ -32,7 +32,8 @@ class GsplatRunner(AbstractAdapter):
     gated = "From `strategy.refine_stop_iter` on (15,000, for MCMC 25,000)."
     left_alone = (
         "MCMC's position noise is left out where the gradient step is: alone it is a random walk. Batches of several "
-        "images have one joint loss and so one mean."
+        "images have one joint loss and so one mean. Where the script spawns a process for each GPU, `skipgs-plug run` "
+        "attaches a gate in each: a backward is left out when all of them would (checked with gloo on the CPU, not on GPUs)."
     )
 
     def __init__(self, trainer: Any = None) -> None:
@@ -49,12 +50,16 @@ class GsplatRunner(AbstractAdapter):
         return "Runner" in code.names and any(name.startswith("gsplat.") for name in code.names)
 
     def attach_script(self, hooks: Hooks) -> None:
-        def launched(original: Callable[..., Any], main: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            self.attach_on_call(hooks, main.__globals__["Runner"], "train")
-            return original(main, *args, **kwargs)
+        def started(
+            original: Callable[..., Any], rank: int, size: int, fn: Callable[..., Any], *args: Any, **kwargs: Any
+        ) -> Any:
+            self.attach_on_call(hooks, fn.__globals__["Runner"], "train")
+            return original(rank, size, fn, *args, **kwargs)
 
-        refuse_other_processes(hooks)
-        hooks.wrap(importlib.import_module("gsplat.distributed"), "cli", launched)
+        # The launcher attaches in each process that is spawned; nobody else does.
+        if not getattr(torch.multiprocessing.spawn, GATES_CHILDREN, False):
+            refuse_other_processes(hooks)
+        hooks.wrap(importlib.import_module("gsplat.distributed"), "_distributed_worker", started)
 
     def attach(self, hooks: Hooks) -> None:
         runner = self.trainer

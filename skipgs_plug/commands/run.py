@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster.compat import FAMILIES, serve
+from skipgs_plug.scripts import children
 from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
 from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED
 from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu, exclusive_cores
@@ -71,6 +73,28 @@ def run(args: Args, command: list[str]) -> int:
     if args.adapter == "auto":
         args = dataclasses.replace(args, adapter=find_script_adapter(source_of(command)).name)
         say(f"{script_name(command)} is run as {args.adapter}.")
+    with children.gated_when_spawned(functools.partial(run_spawned, args, command)) as spawned:
+        code, gate = run_gated(args, command, functools.partial(run_script, command))
+    if code == 0 and gate is not None and gate.trained:
+        gate.verify()
+    elif code == 0 and not spawned:
+        say(f"{script_name(command)} ended without a training iteration; nothing was gated.")
+    return code
+
+
+def run_spawned(args: Args, command: list[str], rank: int, call: bytes) -> None:
+    """What a process does that the script spawns: all of `run`, with the script's call at the end."""
+    code, gate = run_gated(args, command, lambda attach: children.run_call(command, attach, rank, call), rank)
+    if code:
+        sys.exit(code)
+    if gate is not None and gate.trained:
+        gate.verify()
+
+
+def run_gated(
+    args: Args, command: list[str], execute: Callable[[Callable[[], None]], int], rank: int = 0
+) -> tuple[int, SkipGate | None]:
+    """Attach a gate to what `execute(attach)` runs, and write skipgs.json where `rank` is 0."""
     adapter = get_adapter(args.adapter)()
     checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
     adapter.replaced = (*REPLACED, *(f"torch.cuda.{name}" for name in CUDA_REPLACED if args.cpu))
@@ -86,16 +110,13 @@ def run(args: Args, command: list[str]) -> int:
     with cpu_instead_of_cuda(args, command) if args.cpu else contextlib.nullcontext():
         try:
             with checkpoints.watch():
-                code = run_script(command, attach)
+                code = execute(attach)
         finally:
             for gate in gates:
                 gate.detach()
-                report(gate, adapter)
-    if code == 0 and gates and gates[0].trained:
-        gates[0].verify()
-    elif code == 0:
-        say(f"{script_name(command)} ended without a training iteration; nothing was gated.")
-    return code
+                if rank == 0:
+                    report(gate, adapter)
+    return code, gates[0] if gates else None
 
 
 def say(sentence: str) -> None:

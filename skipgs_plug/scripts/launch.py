@@ -39,12 +39,23 @@ def run_script(command: Sequence[str], attach: Callable[[], None] | None = None)
         SkipGSError: There is no such script or module, or a module of the script's checkout was imported
             before from somewhere else.
     """
-    program = _resolve(command)
+    return _run(_resolve(command), attach, None)
+
+
+def run_in_script(command: Sequence[str], attach: Callable[[], None], run: Callable[[str], None]) -> int:
+    """As `run_script`, with `run(file of the script)` in place of running it."""
+    return _run(_resolve(command), attach, run)
+
+
+def _run(program: _Program, attach: Callable[[], None] | None, instead: Callable[[str], None] | None) -> int:
     with _as_main_program(program), _whole_checkpoints():
         try:
             if attach is not None:
                 attach()
-            program.run()
+            if instead is None:
+                program.run()
+            else:
+                instead(str(program.source))
         except SystemExit as stop:
             return _exit_code(stop.code)
         except SkipGSError:
