@@ -33,7 +33,8 @@ class GsplatRunner(AbstractAdapter):
     left_alone = (
         "MCMC's position noise is left out where the gradient step is: alone it is a random walk. Batches of several "
         "images have one joint loss and so one mean. Where the script spawns a process for each GPU, `skipgs-plug run` "
-        "attaches a gate in each: a backward is left out when all of them would (checked with gloo on the CPU, not on GPUs)."
+        "attaches a gate in each: a backward is left out when all of them would (checked with gloo on the CPU, not on "
+        "GPUs)."
     )
 
     def __init__(self, trainer: Any = None) -> None:
