@@ -21,7 +21,13 @@ from skipgs_plug.core.errors import SkipGSError
 # For advice: parts of every checkout of the Inria family, CUDA extensions, packages not called as their module.
 OF_CHECKOUTS = frozenset({"arguments", "gaussian_renderer", "scene", "utils"})
 EXTENSIONS = ("diff_", "simple_knn", "fused_ssim")
-PACKAGES = {"cv2": "opencv-python", "PIL": "pillow", "skimage": "scikit-image", "yaml": "pyyaml"}
+PACKAGES = {
+    "cv2": "opencv-python",
+    "PIL": "pillow",
+    "skimage": "scikit-image",
+    "sklearn": "scikit-learn",
+    "yaml": "pyyaml",
+}
 
 
 def run_script(command: Sequence[str], attach: Callable[[], None] | None = None) -> int:

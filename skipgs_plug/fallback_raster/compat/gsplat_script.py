@@ -29,8 +29,9 @@ def gsplat_on_cpu() -> Iterator[None]:
     Raises:
         ImportError: gsplat is not installed.
     """
-    import gsplat.rendering
-    import gsplat.strategy.ops
+    with _no_cuda_toolkit():
+        import gsplat.rendering
+        import gsplat.strategy.ops
     import torchmetrics.image.lpip
 
     replaced: list[tuple[Any, str, Any]] = [
@@ -55,6 +56,18 @@ def gsplat_on_cpu() -> Iterator[None]:
                     delattr(owner, name)
                 else:
                     setattr(owner, name, original)
+
+
+@contextmanager
+def _no_cuda_toolkit() -> Iterator[None]:
+    """Keep gsplat from compiling its extension when it is imported, which it does since 1.6 where it finds `nvcc`."""
+    places: Any = importlib.import_module("torch.utils.cpp_extension")
+    find = places._find_cuda_home
+    places._find_cuda_home = lambda: None
+    try:
+        yield
+    finally:
+        places._find_cuda_home = find
 
 
 @functools.wraps(rasterization)
