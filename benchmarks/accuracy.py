@@ -162,7 +162,7 @@ def main(repeats: int = 5) -> None:
     Args:
         repeats: Timed passes of each case.
     """
-    about = provenance("gsplat") | {"threads": cores()}
+    about = provenance() | {"threads": cores()}
     small = {degree: frustum(2000, 128, 96, degree) for degree in (None, 0, 1, 2, 3)}
     cases: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
         ("plain colors", small[None], {}),

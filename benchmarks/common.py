@@ -3,15 +3,12 @@
 import functools
 import json
 import os
-import platform
 import shlex
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skipgs_plug.bench.provenance import commit, cpu_name, versions
 from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
 from skipgs_plug.fallback_raster.launch import FloatArray, Worker, worker
 from skipgs_plug.trainer.files import write_aside
@@ -186,22 +184,15 @@ def relative_difference(value: Tensor, truth: Tensor) -> float:
     return ((value.double() - truth.double()).norm() / truth.double().norm().clamp(min=1e-300)).item()
 
 
-def provenance(*packages: str) -> dict[str, Any]:
-    """What a reader needs to repeat or to doubt the figures; packages are named with their versions."""
-    describe = ["git", "describe", "--always", "--dirty"]
-    commit = subprocess.run(describe, capture_output=True, text=True, cwd=Path(__file__).parent)
-    cpu = platform.processor() or platform.machine()
-    if Path("/proc/cpuinfo").exists():
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), cpu)
+def provenance() -> dict[str, Any]:
+    """What a reader needs to repeat or to doubt the figures."""
     return {
         "command": shlex.join(["python", *sys.argv]),
-        "commit": commit.stdout.strip(),
-        "cpu": cpu,
+        "commit": commit(),
+        "cpu": cpu_name(),
         "cores": cores(),
         "load_before": os.getloadavg()[0],  # above 0.5 something else was running: do not trust the times
-        "python": platform.python_version(),
-        "versions": {name: version(name) for name in ("torch", "warp-lang", *packages)},
+        "versions": versions(),
     }
 
 

@@ -1,12 +1,12 @@
 """decisions.json: every decision of every run, small enough to be kept beside the results.
 
     {"kind": "skipgs-decisions", "schema_version": 1, "start": 1500,
-     "views": {"0": "12 3 15 ..."},                          by seed: index of the view of each iteration
+     "views": {"0": "12 3 15 ..."},                          by seed: index of the view of each iteration that ran
      "runs": {"0": {"ungated": "-1500", "gate": "w34dD3b"}}}  by seed and policy: letters, each with its repetitions
 
 The letters are those of REASON_CODES; upper case means that the backward was skipped, a point that the whole iteration
-was left out. All policies of a seed have the same views in the same order, a shortened run only the first of them. What
-is missing here of a trace are losses and means.
+was left out. All policies of a seed see the same views in the same order, one that runs fewer iterations only the first
+of them. What is missing here of a trace are losses and means.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from skipgs_plug.bench.record import RunRecord, Trace
+from skipgs_plug.bench.record import LEFT_OUT, RunRecord, Trace
 from skipgs_plug.trainer import InputError
 from skipgs_plug.trainer.files import write_json
 
@@ -35,7 +35,8 @@ def write_decisions(path: Path, records: Sequence[RunRecord]) -> None:
     for record in records:
         if record.status == "done" and record.trace is not None:
             start = record.trace.start
-            views[record.seed] = max(views.get(record.seed, []), record.trace.view, key=len)
+            seen = [view for view in record.trace.view if view is not None]
+            views[record.seed] = max(views.get(record.seed, []), seen, key=len)
             runs.setdefault(record.seed, {})[record.policy] = packed(record.trace.codes)
     orders = {seed: " ".join(map(str, order)) for seed, order in views.items()}
     content = {"kind": KIND, "schema_version": SCHEMA_VERSION, "start": start, "views": orders, "runs": runs}
@@ -56,9 +57,10 @@ def read_decisions(path: Path) -> dict[tuple[int, str], Trace]:
         for seed, runs in content["runs"].items():
             order = [int(index) for index in content["views"][seed].split()]
             for policy, letters in runs.items():
-                codes = unpacked(letters)
-                traces[int(seed), policy] = Trace(content["start"], order[: len(codes)], codes=codes)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+                codes, following = unpacked(letters), iter(order)
+                seen = [None if code == LEFT_OUT else next(following) for code in codes]
+                traces[int(seed), policy] = Trace(content["start"], seen, codes=codes)
+    except (ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
         raise InputError(f"{path} holds no decisions that can be read ({error}); repeat its bench.") from error
     return traces
 

@@ -163,8 +163,8 @@ def visit_map(trace: Trace, n_views: int) -> np.ndarray:
     first = trace.start // n_views
     last = (trace.start + len(trace.view) - 1) // n_views
     grid = np.full((n_views, last - first + 1), NOT_VISITED)
-    for i, (view, ran, skipped) in enumerate(zip(trace.view, trace.ran, trace.skipped, strict=True)):
-        if ran:
+    for i, (view, skipped) in enumerate(zip(trace.view, trace.skipped, strict=True)):
+        if view is not None:
             grid[view, (trace.start + i) // n_views - first] = SKIPPED if skipped else RUN
     return grid
 
@@ -174,8 +174,8 @@ def loss_and_mean(run: RunRecord, view_names: Sequence[str]) -> Figure:
     trace = run.trace
     assert trace is not None
     by_view: dict[int, list[int]] = {}
-    for i, (view, ran) in enumerate(zip(trace.view, trace.ran, strict=True)):
-        if ran:
+    for i, view in enumerate(trace.view):
+        if view is not None:
             by_view.setdefault(view, []).append(i)
     skipped = trace.skipped
     ranked = sorted(by_view, key=lambda view: (-sum(skipped[i] for i in by_view[view]) / len(by_view[view]), view))
@@ -193,7 +193,7 @@ def loss_and_mean(run: RunRecord, view_names: Sequence[str]) -> Figure:
         panel.plot(steps[out], loss[out], linestyle="none", marker="o", markersize=3.6, color="#D55E00",
                    markerfacecolor="white", label="loss, backward skipped")  # fmt: skip
         share = f"{out.sum()} of {len(out)} visits skipped"
-        panel.set_title(f"{view_names[view]}: {share}", loc="left", fontsize=SMALL + 1)
+        panel.set_title(f"{view_names[view]}: {share}", loc="left", fontsize=SMALL + 1, parse_math=False)
         panel.set_ylabel("loss")
     panels[-1].set_xlabel("iteration")
     handles, labels = panels[0].get_legend_handles_labels()

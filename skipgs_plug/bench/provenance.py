@@ -15,6 +15,7 @@ import skipgs_plug
 from skipgs_plug.trainer import Scene, TrainConfig
 from skipgs_plug.trainer.backend import Backend
 
+MEASURING = ("skipgs_plug", "benchmarks/*.py")  # the code that figures come from
 PACKAGES = ("torch", "warp-lang", "gsplat", "numpy", "torchmetrics")
 
 
@@ -54,13 +55,13 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """Return the commit of this package's own checkout, "+" added when files differ; None outside of one."""
+    """Return the commit of this package's own checkout, "+" added when its code differs; None outside of one."""
     root = Path(skipgs_plug.__file__).parents[1]
     if not (root / ".git").exists():
         return None
     try:
         head = git(root, "rev-parse", "--short=12", "HEAD")
-        changed = git(root, "status", "--porcelain", "--untracked-files=no", "--", "skipgs_plug")
+        changed = git(root, "status", "--porcelain", "--untracked-files=no", "--", *MEASURING)
     except (OSError, subprocess.CalledProcessError):
         return None
     return head + ("+" if changed else "")

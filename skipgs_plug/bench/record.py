@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -32,14 +31,14 @@ class Trace:
 
     Attributes:
         start: iteration of the first entry.
-        view: index into the list of training views.
+        view: index into the list of training views; None for an iteration that was left out.
         loss: loss that was decided on; None for an iteration that was left out.
         mean: the view's running mean before this loss; None without one.
         codes: reason letters, see REASON_CODES, or LEFT_OUT.
     """
 
     start: int
-    view: list[int] = field(default_factory=list)
+    view: list[int | None] = field(default_factory=list)
     loss: list[float | None] = field(default_factory=list)
     mean: list[float | None] = field(default_factory=list)
     codes: str = ""
@@ -49,10 +48,10 @@ class Trace:
         code = REASON_CODES.get(reason, OTHER_REASON)
         self._append(view, rounded(loss), None if mean is None else rounded(mean), code.upper() if skip else code)
 
-    def fill(self, end: int, view_at: Callable[[int], int]) -> None:
-        """Append the iterations before `end` that are missing: they were left out. `view_at` tells their views."""
-        for step in range(self.end, end):
-            self._append(view_at(step), None, None, LEFT_OUT)
+    def fill(self, end: int) -> None:
+        """Append the iterations before `end` that are missing: they were left out."""
+        for _ in range(self.end, end):
+            self._append(None, None, None, LEFT_OUT)
 
     @property
     def end(self) -> int:
@@ -69,7 +68,7 @@ class Trace:
         """Whether the iteration ran its forward and skipped its backward."""
         return [code.isupper() for code in self.codes]
 
-    def _append(self, view: int, loss: float | None, mean: float | None, code: str) -> None:
+    def _append(self, view: int | None, loss: float | None, mean: float | None, code: str) -> None:
         self.view.append(view)
         self.loss.append(loss)
         self.mean.append(mean)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from skipgs_plug.bench.record import Point, RunRecord, Trace
 from skipgs_plug.trainer import Trainer
 from skipgs_plug.trainer.loop import Iteration
 from skipgs_plug.trainer.metrics import METRICS, chosen
-from skipgs_plug.trainer.order import ViewOrder
 from skipgs_plug.trainer.scalars import ScalarLog
 
 PARTS = 10  # of refinement, each followed by an evaluation; one more comes before the first
@@ -85,7 +84,7 @@ def refine(
         record.train_metrics = measured(trainer.evaluate("train"))
         if gate is not None:
             gate.verify()
-    trace.fill(start + iterations, views_of(trainer))
+    trace.fill(start + iterations)
     record.t_post, record.t_total = trainer.t_post, trainer.t_total
     record.phases = {name: seconds - phases_before[name] for name, seconds in trainer.phase_seconds.items()}
     record.iterations_run = record.backwards = sum(trace.ran)
@@ -101,11 +100,6 @@ def refine(
 def measured(stats: dict[str, Any]) -> dict[str, float]:
     """Return the metrics and the model's size in an evaluation."""
     return {name: stats[name] for name in (*METRICS, "num_GS") if name in stats}
-
-
-def views_of(trainer: Trainer) -> Callable[[int], int]:
-    """Return what tells the index of the training view of an iteration."""
-    return ViewOrder(len(trainer.view_names), trainer.config.seed).at
 
 
 @contextlib.contextmanager
@@ -180,10 +174,9 @@ def logged(trainer: Trainer, scalars: Path | None, gate: SkipGate | None = None)
 def recorded(trainer: Trainer, trace: Trace, gate: SkipGate | None, log: ScalarLog | None) -> Iterator[None]:
     """Fill the trace, and the log, after every iteration, outside the clock."""
     index = {name: i for i, name in enumerate(trainer.view_names)}
-    view_at = views_of(trainer)
 
     def on_step(iteration: Iteration) -> None:
-        trace.fill(iteration.step, view_at)
+        trace.fill(iteration.step)
         row = gate.trace[-1] if gate is not None and gate.trace else None
         if row is None or row.step != iteration.step:  # nothing was there to decide
             trace.add(index[iteration.view], iteration.loss, None, "ungated", False)

@@ -1,6 +1,8 @@
-"""A CPU rasterizer for 3D Gaussians with gsplat's signature, written with NVIDIA Warp.
+"""A CPU rasterizer for 3D Gaussians with gsplat's signature.
 
-Warp is imported, and kernels are compiled (seconds, cached on disk), when something is first rendered.
+Its kernels are C++ with vector types (`kernels/*.h`), compiled by NVIDIA Warp's own Clang and launched by Warp on all
+cores; none is written in Warp's Python dialect, and no compiler has to be installed. Warp is imported, and kernels are
+compiled (seconds, cached on disk), when something is first rendered.
 """
 
 from .install import install_as_gsplat as install_as_gsplat

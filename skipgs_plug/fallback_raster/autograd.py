@@ -11,16 +11,31 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .binning import MAX_CHANNELS, TILE, Bins, bin_gaussians, pack_colors
-from .blend import PAIR, backward_worker, forward_worker, reduce_pairs
-from .launch import scratch
-from .project import BLOCK, list_visible, project_backward, project_forward
+from .binning import Bins, bin_gaussians, pack_colors
+from .blend import backward_worker, forward_worker, reduce_pairs
+from .constants import BLOCK, MAX_CHANNELS, PAIR, blocks, tiles
+from .launch import floats, ints, scratch, zeros
+from .project import list_visible, project_backward, project_forward
 from .sh import sh_backward, sh_forward
-from .shortcuts import VISIBLE_ONLY, active_shortcuts
+from .shortcuts import SHORTCUTS, active_shortcuts
 
 
-def _blocks(n: int) -> int:
-    return (n + BLOCK - 1) // BLOCK
+def _saved(ctx: Any, **shapes: torch.Size) -> tuple[Tensor, ...]:
+    """The saved tensors, if those that came from outside still have the sizes that the forward pass saw.
+
+    Torch notices what is changed in place, but not that `.data` was replaced, as code that densifies does.
+
+    Raises:
+        RuntimeError: A tensor has another size now.
+    """
+    tensors = ctx.saved_tensors
+    for tensor, (name, shape) in zip(tensors, shapes.items(), strict=False):
+        if tensor.shape != shape:
+            raise RuntimeError(
+                f"{name} had shape {list(shape)} when it was rendered and has {list(tensor.shape)} now: call "
+                "backward() before the number of Gaussians changes."
+            )
+    return tensors  # type: ignore[no-any-return]
 
 
 class Project(torch.autograd.Function):
@@ -49,18 +64,17 @@ class Project(torch.autograd.Function):
         antialiased: bool,
     ) -> tuple[Tensor, ...]:
         n = len(means)
-        means2d, sigmas = torch.empty(n, 2), torch.empty(n, 2)
-        depths, conics = torch.empty(n), torch.empty(n, 3)
-        compensations = torch.empty(n if antialiased else 0)
-        radii = torch.empty(n, 2, dtype=torch.int32)
+        means2d, sigmas, depths, conics = floats(n, 2), floats(n, 2), floats(n), floats(n, 3)
+        compensations, radii = floats(n if antialiased else 0), ints(n, 2)
         project_forward(
             means, quats, scales, opacities, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
             n, float(width), float(height), near_plane, far_plane, eps2d, radius_clip, int(antialiased),
         )  # fmt: skip
-        visible, block_start = torch.empty(n, dtype=torch.int32), torch.empty(_blocks(n) + 1, dtype=torch.int32)
+        visible, block_start = ints(n), ints(blocks(n) + 1)
         list_visible(radii, visible, block_start, n)
         visible = visible[: int(block_start[-1])]
         ctx.save_for_backward(means, quats, scales, viewmat, K, visible, block_start)
+        ctx.shapes = {"means": means.shape, "quats": quats.shape, "scales": scales.shape, "viewmats": viewmat.shape}
         ctx.size = (width, height, eps2d)
         ctx.mark_non_differentiable(radii, sigmas, visible, block_start)
         ctx.set_materialize_grads(False)  # depths rarely have a gradient: no zeros for them
@@ -76,25 +90,25 @@ class Project(torch.autograd.Function):
         v_compensations: Tensor | None,
         *_: Any,
     ) -> Any:
-        means, quats, scales, viewmat, K, visible, block_start = ctx.saved_tensors
+        means, quats, scales, viewmat, K, visible, block_start = _saved(ctx, **ctx.shapes)
         width, height, eps2d = ctx.size
         with_pose = ctx.needs_input_grad[4]
-        v_means, v_quats, v_scales = torch.empty(means.shape), torch.empty(quats.shape), torch.empty(scales.shape)
-        v_poses = torch.zeros(_blocks(len(means)) if with_pose else 0, 3, 4)
+        v_means, v_quats, v_scales = (floats(*t.shape) for t in (means, quats, scales))
+        v_poses = zeros(blocks(len(means)) if with_pose else 0, 3, 4)
         n = len(means)
-        v_means2d = torch.zeros(n, 2) if v_means2d is None else v_means2d.contiguous()
-        v_conics = torch.zeros(n, 3) if v_conics is None else v_conics.contiguous()
+        v_means2d = zeros(n, 2) if v_means2d is None else v_means2d.contiguous()
+        v_conics = zeros(n, 3) if v_conics is None else v_conics.contiguous()
         v_depths, v_compensations = (
-            torch.empty(0) if v is None else v.contiguous() for v in (v_depths, v_compensations)
+            floats(0) if v is None else v.contiguous() for v in (v_depths, v_compensations)
         )  # fmt: skip
         project_backward(
             means, quats, scales, viewmat, K, visible, block_start, v_means2d, v_depths, v_conics, v_compensations,
             v_means, v_quats, v_scales, v_poses, n, float(width), float(height), eps2d,
-            v_depths.numel(), v_compensations.numel(), int(with_pose), active_shortcuts(),
+            int(v_depths.numel() > 0), int(v_compensations.numel() > 0), int(with_pose), active_shortcuts(),
         )  # fmt: skip
         v_viewmat = None
         if with_pose:
-            v_viewmat = torch.zeros(4, 4)
+            v_viewmat = zeros(4, 4)
             v_viewmat[:3] = v_poses.sum(0)
         return v_means, v_quats, v_scales, None, v_viewmat, *[None] * 8
 
@@ -117,25 +131,26 @@ class SphericalHarmonics(torch.autograd.Function):
         degree: int,
     ) -> Tensor:
         n = len(means)
-        colors = torch.empty(n, 3)
-        if not active_shortcuts() & VISIBLE_ONLY:
-            visible = torch.arange(n, dtype=torch.int32)
-            block_start = torch.arange(0, BLOCK * (_blocks(n) + 1), BLOCK, dtype=torch.int32).clamp(max=n)
+        colors = floats(n, 3)
+        if not active_shortcuts() & SHORTCUTS["visible_only"]:
+            visible = torch.arange(n, dtype=torch.int32, device="cpu")
+            block_start = torch.arange(0, BLOCK * (blocks(n) + 1), BLOCK, dtype=torch.int32, device="cpu").clamp(max=n)
         ctx.layout = (3 * base.shape[1], 3 * base.shape[1], 3) if rest is None else (3, 3 * rest.shape[1], 0)
         ctx.degree = degree
         ctx.joined = rest is None
         rest = base if rest is None else rest
         sh_forward(means, camera, base, rest, visible, block_start, colors, n, *ctx.layout, degree)
-        ctx.save_for_backward(means, camera, base, rest, colors, visible, block_start)
+        ctx.save_for_backward(means, base, rest, camera, colors, visible, block_start)
+        ctx.shapes = {"means": means.shape, "colors": base.shape, "the higher bands of colors": rest.shape}
         return colors
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> Any:  # type: ignore[override]
-        means, camera, base, rest, colors, visible, block_start = ctx.saved_tensors
-        v_means, v_base = torch.empty(means.shape), torch.empty(base.shape)
-        v_rest = v_base if ctx.joined else torch.empty(rest.shape)
-        v_cameras = torch.zeros(_blocks(len(means)), 3)
+        means, base, rest, camera, colors, visible, block_start = _saved(ctx, **ctx.shapes)
+        v_means, v_base = floats(*means.shape), floats(*base.shape)
+        v_rest = v_base if ctx.joined else floats(*rest.shape)
+        v_cameras = zeros(blocks(len(means)), 3)
         sh_backward(
             means, camera, base, rest, visible, block_start, colors, v_colors.contiguous(), v_means, v_base, v_rest,
             v_cameras, len(means), *ctx.layout, ctx.degree, active_shortcuts(),
@@ -166,12 +181,10 @@ class Blend(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         bins = bin_gaussians(visible, means2d, depths, conics, opacities, sigmas, colors, width, height)
         channels = colors.shape[1]
-        tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-        image = torch.empty(height, width, channels)
-        transmittance = torch.empty(height, width)
-        pixel_stop = torch.empty(height, width, dtype=torch.int32)
-        tile_stop = torch.empty(tiles_x * tiles_y, dtype=torch.int32)
-        pair_blocks = torch.empty(len(bins.tile_list), dtype=torch.int32)
+        tiles_x, tiles_y = tiles(width, height)
+        image, transmittance = floats(height, width, channels), floats(height, width)
+        pixel_stop, tile_stop = ints(height, width), ints(tiles_x * tiles_y)
+        pair_blocks = ints(len(bins.tile_list))
         for channel in range(0, channels, MAX_CHANNELS):
             some = min(MAX_CHANNELS, channels - channel)
             if channel > 0:
@@ -181,6 +194,13 @@ class Blend(torch.autograd.Function):
                 pair_blocks, width, height, tiles_x, tiles_y, channels, channel, some, active_shortcuts(),
             )  # fmt: skip
         ctx.save_for_backward(means2d, conics, opacities, colors, transmittance, pixel_stop, tile_stop, pair_blocks)
+        ctx.shapes = {
+            "means2d": means2d.shape,
+            "conics": conics.shape,
+            "opacities": opacities.shape,
+            "colors": colors.shape,
+            "alphas": transmittance.shape,
+        }
         ctx.bins, ctx.absolute = bins, absolute
         ctx.mark_non_differentiable(bins.tiles_per_gauss)
         return image, transmittance, bins.tiles_per_gauss
@@ -188,15 +208,16 @@ class Blend(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor, _: Any) -> Any:  # type: ignore[override]
-        means2d, conics, opacities, colors, transmittance, pixel_stop, tile_stop, pair_blocks = ctx.saved_tensors
+        means2d, conics, opacities, colors, transmittance, pixel_stop, tile_stop, pair_blocks = _saved(
+            ctx, **ctx.shapes
+        )
         bins: Bins = ctx.bins
         height, width, channels = v_image.shape
-        tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+        tiles_x, tiles_y = tiles(width, height)
         v_image, v_transmittance = v_image.contiguous(), v_transmittance.contiguous()
-        v_means2d, v_conics = torch.empty(means2d.shape), torch.empty(conics.shape)
-        v_opacities, v_colors = torch.empty(opacities.shape), torch.empty(colors.shape)
+        v_means2d, v_conics, v_opacities, v_colors = (floats(*t.shape) for t in (means2d, conics, opacities, colors))
         with_absolute = ctx.absolute is not None
-        absolute = ctx.absolute if with_absolute else torch.empty(0)
+        absolute = ctx.absolute if with_absolute else floats(0)
         v_pairs = scratch("v_pairs", len(bins.tile_list), PAIR)
         for channel in range(0, channels, MAX_CHANNELS):
             some = min(MAX_CHANNELS, channels - channel)

@@ -1,15 +1,17 @@
 """Kernels that run on all cores.
 
+They are C++ (`kernels/*.h`), written with the vector types of Clang. Warp compiles them with its own Clang on first
+use (up to a few seconds each), caches them on disk and launches them; no compiler has to be installed. Nothing of
+them is written in Warp's Python dialect, whose scalar code does not vectorise across pixels.
+
 Warp executes a CPU launch on the calling thread, but it releases the interpreter lock while the kernel runs.
 Every kernel here is therefore a worker: it takes the next block of items from a shared atomic counter until
 none is left, and calling it starts one worker per thread. Blocks are handed out dynamically, so a busy core or
 an expensive tile delays nobody, and since no two blocks write to one location the result does not depend on
 the number of threads.
-
-The bodies are C++ with vector types (see `simd.py`), compiled by Warp's own Clang on first use (up to a few
-seconds each) and cached on disk; no compiler has to be installed.
 """
 
+import ctypes
 import functools
 import importlib
 import inspect
@@ -18,23 +20,31 @@ import math
 import os
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, get_args, get_origin
 
 import torch
 from torch import Tensor
 
-from .simd import PRELUDE
-
-# A counter fills a cache line, so that nothing else is slowed down by it.
-_COUNTER_SIZE = 16
+from . import guard
+from .cache import load_or_rebuild
+from .guard import Sizes
+from .source import PRELUDE, SHARED, declare
 
 _lock = threading.RLock()
 _scratch = threading.local()
 _num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _pool: ThreadPoolExecutor | None = None
+_busy = False  # threads of the pool may still be at work
+_forked = False  # this process inherited torch's OpenMP without its threads, and has not been told so
+
+# The counter has a cache line of its own, so that nothing else is slowed down by it.
+_Counter = ctypes.c_int32 * 32
+_COUNTER_OFFSET = 64
 
 
 def get_num_threads() -> int:
@@ -61,6 +71,21 @@ def set_num_threads(n: int) -> None:
             _pool = None
 
 
+def floats(*shape: int) -> Tensor:
+    """A float32 tensor with undefined content, whatever the default dtype and device of the process."""
+    return guard.poison(torch.empty(shape, dtype=torch.float32, device="cpu"))
+
+
+def ints(*shape: int) -> Tensor:
+    """An int32 tensor with undefined content."""
+    return guard.poison(torch.empty(shape, dtype=torch.int32, device="cpu"))
+
+
+def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """A tensor of zeros."""
+    return torch.zeros(shape, dtype=dtype, device="cpu")
+
+
 def scratch(name: str, *shape: int) -> Tensor:
     """A float buffer with undefined content that this thread reuses whenever it asks for the same name again.
 
@@ -70,8 +95,8 @@ def scratch(name: str, *shape: int) -> Tensor:
     buffers: dict[str, Tensor] = _scratch.__dict__
     size = math.prod(shape)
     if name not in buffers or buffers[name].numel() < size:
-        buffers[name] = torch.empty(size)
-    return buffers[name][:size].view(shape)
+        buffers[name] = floats(size)
+    return guard.poison(buffers[name][:size].view(shape))
 
 
 class FloatArray:
@@ -82,39 +107,116 @@ class IntArray:
     """Marks a worker's parameter as a contiguous int32 tensor, passed flat."""
 
 
+class LongArray:
+    """Marks a worker's parameter as a contiguous int64 tensor, passed flat."""
+
+
+class _Kind(NamedTuple):
+    """What a parameter is in Python, in Warp and in C++."""
+
+    dtype: torch.dtype | None  # of a tensor
+    warp: str
+    pointer: str
+
+
 # Arrays travel as addresses: describing them to Warp takes longer than some kernels run.
-_WARP_TYPE = {FloatArray: "wp.uint64", IntArray: "wp.uint64", int: "wp.int32", float: "wp.float32"}
-_POINTER = {FloatArray: "float", IntArray: "int"}
+_KINDS: dict[type, _Kind] = {
+    FloatArray: _Kind(torch.float32, "wp.uint64", "float"),
+    IntArray: _Kind(torch.int32, "wp.uint64", "int"),
+    LongArray: _Kind(torch.int64, "wp.uint64", "long long"),
+    int: _Kind(None, "wp.int32", ""),
+    float: _Kind(None, "wp.float32", ""),
+}
 
 
 class Worker:
-    """A kernel made of C++; call it with its parameters to run it on every thread. See `worker`."""
+    """A kernel made of C++; call it with its parameters to run it on every thread. See `worker`.
 
-    def __init__(self, name: str, kinds: dict[str, type], code: str):
+    A call checks the number of arguments and the type, layout, dtype and device of each; what Warp and the kernel get
+    are bare addresses. Sizes are checked where `guard.py` is on.
+
+    Raises:
+        TypeError: Arguments are missing, too many, or not of the declared kind.
+    """
+
+    def __init__(self, name: str, kinds: dict[str, type], shapes: dict[str, str], code: str):
         self._name = name
         self._kinds = kinds
+        self._sizes = Sizes(name, shapes)
         self._code = code
         self._command: Any = None
+        self._checks = [(parameter, kind, _KINDS[kind].dtype) for parameter, kind in kinds.items()]
 
     def __call__(self, *arguments: Tensor | int | float) -> None:
+        values = self._values(arguments)
+        if guard.level() == guard.OFF:
+            self._run(values, arguments)
+            return
+        named = dict(zip(self._kinds, arguments, strict=True))
+        self._sizes.check(named)
+        if guard.level() == guard.SIZES:
+            self._run(values, arguments)
+        else:
+            guard.run_between_zones(self._name, named, lambda inside: self._run(self._values(inside), inside))
+
+    def _values(self, arguments: tuple[Any, ...]) -> list[int | float]:
+        """Addresses of tensors, and numbers, in the order of the parameters."""
+        values: list[int | float] = []
+        try:
+            checks: Any = zip(self._checks, arguments, strict=True)
+            for (parameter, kind, dtype), argument in checks:
+                if dtype is None:
+                    if type(argument) is not kind:
+                        raise TypeError(self._wrong(parameter, argument))
+                    if kind is int and not -0x80000000 <= argument <= 0x7FFFFFFF:
+                        raise OverflowError(f"{self._name}: {parameter} = {argument} does not fit into 32 bits.")
+                    values.append(argument)
+                else:
+                    if argument.dtype is not dtype or not argument.is_cpu or not argument.is_contiguous():
+                        raise TypeError(self._wrong(parameter, argument))
+                    values.append(argument.data_ptr())
+        except ValueError:
+            raise TypeError(f"{self._name} takes {len(self._checks)} arguments, got {len(arguments)}.") from None
+        except AttributeError:
+            raise TypeError(self._wrong(parameter, argument)) from None
+        return values
+
+    def _wrong(self, parameter: str, argument: Any) -> str:
+        kind = self._kinds[parameter]
+        dtype = _KINDS[kind].dtype
+        wanted = kind.__name__ if dtype is None else f"contiguous tensor of {dtype} on the CPU"
+        if not isinstance(argument, Tensor):
+            return f"{self._name}: {parameter} must be a {wanted}, got {type(argument).__name__} {argument!r:.40}."
+        layout = "contiguous" if argument.is_contiguous() else f"strides {argument.stride()}"
+        return f"{self._name}: {parameter} must be a {wanted}, got {argument.dtype} on {argument.device}, {layout}."
+
+    def _run(self, values: list[int | float], arguments: tuple[Any, ...]) -> None:
         with _lock:
             if self._command is None:
                 self._command = self._record()
-            # Named, because an address does not keep a tensor alive.
-            counter = torch.zeros(_COUNTER_SIZE, dtype=torch.int32)
-            self._command.set_params_from_ctypes([_parameter(a) for a in (counter, *arguments)])
-            _on_all_threads(self._command.launch)
+            if _forked:
+                _warn_after_fork()
+            command, bounds, parameters = self._command
+            counter = _Counter()
+            block = parameters(ctypes.addressof(counter) + _COUNTER_OFFSET, *values)
+
+            # What a thread needs lives as long as its work: an exception may end this call before they do.
+            def work(owned: Any = (counter, arguments)) -> None:
+                command.hooks.forward(bounds, ctypes.byref(block))
+
+            _on_all_threads(work)
 
     def _record(self) -> Any:
         wp = _warp()
-        declared = {"counter_address": _WARP_TYPE[IntArray]}
+        declared = {"counter_address": "wp.uint64"}
         pointers = "int* counter = (int*)counter_address;\n"
         for name, kind in self._kinds.items():
-            if kind in _POINTER:
-                declared[f"{name}_address"] = _WARP_TYPE[kind]
-                pointers += f"{_POINTER[kind]}* __restrict {name} = ({_POINTER[kind]}*){name}_address;\n"
+            _, type_in_warp, pointer = _KINDS[kind]
+            if pointer:
+                declared[f"{name}_address"] = type_in_warp
+                pointers += f"{pointer}* __restrict {name} = ({pointer}*){name}_address;\n"
             else:
-                declared[name] = _WARP_TYPE[kind]
+                declared[name] = type_in_warp
         signature = ", ".join(f"{name}: {kind}" for name, kind in declared.items())
         source = f"def {self._name}_body({signature}): ...\n"
         source += f"def {self._name}({signature}):\n    {self._name}_body({', '.join(declared)})\n"
@@ -127,32 +229,58 @@ class Worker:
         namespace[f"{self._name}_body"] = wp.func_native(PRELUDE + pointers + self._code)(body)
         kernel = wp.kernel(enable_backward=False)(namespace[self._name])
         inputs = [0] * len(declared)
-        return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
+        # Warp compiles for blocks of one thread on the CPU.
+        folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(1)
+        command = load_or_rebuild(
+            folder,
+            lambda: wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False),
+            kernel.module.unload,
+        )
+        # Every call fills a block of parameters of its own, which the threads share.
+        bounds, *parameters = command.params
+        fields = [(name, type(parameter)) for name, parameter in zip(declared, parameters, strict=True)]
+        block = type(f"{self._name}_parameters", (ctypes.Structure,), {"_fields_": fields})
+        return command, ctypes.byref(bounds), block
 
 
-def worker(code: str, *, items: str, grain: int, name: str | None = None) -> Callable[[Callable[..., None]], Worker]:
+def worker(
+    code: str,
+    *,
+    items: str,
+    grain: str | int,
+    name: str | None = None,
+    constants: dict[str, int | float] | None = None,
+) -> Callable[[Callable[..., None]], Worker]:
     """Turns a stub function into a `Worker`.
 
+    The stub's parameters are annotated `FloatArray`, `IntArray`, `LongArray`, `int` or `float`; arrays also
+    `Annotated[FloatArray, "n, 3"]` with the sizes that `guard.Sizes` checks.
+
     Args:
-        code: C++ that handles items `[first, last)`; array parameters of the stub are pointers of their name.
+        code: C++ that handles items `[first, last)`; array parameters of the stub are pointers of their name. It knows
+            what `simd.h` defines, the constants of `constants.py` and the shortcuts by name.
         items: C++ expression for the number of items, in terms of the stub's parameters.
-        grain: Items taken from the counter at a time.
+        grain: Items taken from the counter at a time, a number or the name of a constant.
         name: Name of the kernel where the stub's own is not unique.
+        constants: More of them, of this kernel alone.
     """
-    loop = f"""
+    loop = f"""{declare(SHARED | (constants or {}))}
 for (;;) {{
     const int first = __atomic_fetch_add(counter, {grain}, __ATOMIC_RELAXED);
     if (first >= ({items})) break;
-    const int last = first + {grain} < ({items}) ? first + {grain} : ({items});
-    {code}
+    const int last = smaller(first + {grain}, {items});
+{code}
 }}
 """
 
     def build(stub: Callable[..., None]) -> Worker:
-        kinds = {
-            name: parameter.annotation for name, parameter in inspect.signature(stub, eval_str=True).parameters.items()
-        }
-        return Worker(name or stub.__name__, kinds, loop)
+        kinds, shapes = {}, {}
+        for parameter in inspect.signature(stub, eval_str=True).parameters.values():
+            kind = parameter.annotation
+            if get_origin(kind) is Annotated:
+                kind, shapes[parameter.name] = get_args(kind)
+            kinds[parameter.name] = kind
+        return Worker(name or stub.__name__, kinds, shapes, loop)
 
     return build
 
@@ -187,23 +315,54 @@ def _quiet_stderr() -> Iterator[None]:
         os.close(nowhere)
 
 
-def _parameter(value: Tensor | int | float) -> int | float:
-    if isinstance(value, Tensor):
-        assert value.is_contiguous(), "kernels read and write contiguous tensors only"
-        return value.data_ptr()
-    return value
-
-
 def _on_all_threads(work: Callable[[], None]) -> None:
-    global _pool
+    """Runs `work` on every thread and returns when all are done, also when an exception arrives meanwhile.
+
+    KeyboardInterrupt and what signal handlers raise may come between any two steps, and another one while the threads
+    are awaited. So the pool counts as busy until all is known to be done, and the next call waits for it.
+    """
+    global _pool, _busy
     if _num_threads == 1:
         work()
         return
+    if _busy and _pool is not None:
+        _pool.shutdown()
+        _pool = None
     if _pool is None:
         _pool = ThreadPoolExecutor(_num_threads - 1, thread_name_prefix="skipgs-raster")
-    others = [_pool.submit(work) for _ in range(_num_threads - 1)]
-    work()
-    for other in others:
-        # A worker that has not started by now would find no item left.
-        if not other.cancel():
-            other.result()
+    others: list[Future[None]] = []
+    _busy = True
+    try:
+        for _ in range(_num_threads - 1):
+            others.append(_pool.submit(work))
+        work()
+    finally:
+        for other in others:
+            # A worker that has not started by now would find no item left.
+            if not other.cancel():
+                other.result()
+    _busy = False
+
+
+def _warn_after_fork() -> None:
+    global _forked
+    _forked = False
+    warnings.warn(
+        "This process was forked from one in which torch had several threads, which do not survive a fork: torch "
+        'may hang here. Start processes with multiprocessing\'s "spawn", or call torch.set_num_threads(1) first.',
+        RuntimeWarning,
+        stacklevel=4,
+    )
+
+
+def _after_fork_in_child() -> None:
+    """Threads do not survive a fork: a child starts its own."""
+    global _pool, _busy, _forked
+    _pool, _busy = None, False
+    _forked = torch.get_num_threads() > 1
+    _lock.release()
+
+
+# A child must not inherit the lock from a thread that renders; so a fork waits until it has finished.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_after_fork_in_child)

@@ -1,13 +1,14 @@
 """`rasterization` with gsplat's signature, on the CPU."""
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
+from .arguments import check_tensors, refuse_unsupported
 from .autograd import Blend, Project, SphericalHarmonics
-from .binning import TILE
+from .constants import TILE, tiles
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
@@ -102,36 +103,31 @@ def rasterization(
         ValueError: A shape, dtype, device or mode does not fit, or a camera is not finite.
         NotImplementedError: An option is not supported on the CPU.
     """
-    unsupported = {
-        "sparse_grad": sparse_grad,
-        "distributed": distributed,
-        "covars": covars is not None,
-        "with_ut": with_ut,
-        "with_eval3d": with_eval3d,
-        "radial_coeffs": radial_coeffs is not None,
-        "tangential_coeffs": tangential_coeffs is not None,
-        "thin_prism_coeffs": thin_prism_coeffs is not None,
-        "ftheta_coeffs": ftheta_coeffs is not None,
-        "viewmats_rs": viewmats_rs is not None,
-        "rolling_shutter": rolling_shutter is not None and getattr(rolling_shutter, "name", "GLOBAL") != "GLOBAL",
-    }
-    for name, used in unsupported.items():
-        if used:
-            raise NotImplementedError(f"The CPU rasterizer does not support {name}; leave it at its default.")
+    refuse_unsupported(
+        sparse_grad=sparse_grad,
+        distributed=distributed,
+        covars=covars is not None,
+        with_ut=with_ut,
+        with_eval3d=with_eval3d,
+        radial_coeffs=radial_coeffs is not None,
+        tangential_coeffs=tangential_coeffs is not None,
+        thin_prism_coeffs=thin_prism_coeffs is not None,
+        ftheta_coeffs=ftheta_coeffs is not None,
+        viewmats_rs=viewmats_rs is not None,
+        rolling_shutter=rolling_shutter is not None and getattr(rolling_shutter, "name", "GLOBAL") != "GLOBAL",
+    )
     if camera_model != "pinhole":
         raise NotImplementedError(f"The CPU rasterizer only knows camera_model='pinhole', not {camera_model!r}.")
-    if render_mode not in ("RGB", "D", "ED", "RGB+D", "RGB+ED"):
+    if render_mode not in get_args(RenderMode):
         raise ValueError(f"render_mode must be RGB, D, ED, RGB+D or RGB+ED, not {render_mode!r}.")
-    if rasterize_mode not in ("classic", "antialiased"):
+    if rasterize_mode not in get_args(RasterizeMode):
         raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', not {rasterize_mode!r}.")
     sh_rest = None
     if isinstance(colors, tuple):
         if sh_degree is None or len(colors) != 2:
             raise ValueError("colors as a tuple must be a pair (sh0 [N, 1, 3], shN [N, K - 1, 3]) with sh_degree set.")
         colors, sh_rest = colors
-    _check_tensors(
-        means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, sh_rest, backgrounds, width, height
-    )
+    check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, sh_rest, backgrounds, width, height)
 
     dtype, n_cameras, n = means.dtype, len(viewmats), len(means)
     means, quats, scales, opacities, colors, viewmats, Ks = (
@@ -165,7 +161,6 @@ def rasterization(
                     means, centre, of_camera, sh_rest, visible[camera], block_starts[camera], sh_degree
                 )
             features.append(of_camera)
-    with_depth = render_mode != "RGB"
 
     camera_ids = gaussian_ids = counts = None
     if packed:
@@ -175,36 +170,29 @@ def rasterization(
             t[camera_ids, gaussian_ids] for t in (means2d, depths, conics, opacities, radii, sigmas)
         )
         counts = torch.bincount(camera_ids, minlength=n_cameras).tolist()
-        visible = [torch.arange(count, dtype=torch.int32) for count in counts]
+        visible = [torch.arange(count, dtype=torch.int32, device="cpu") for count in counts]
     absolute = None
     if absgrad:
         absolute = torch.zeros_like(means2d)
         means2d.absgrad = absolute  # type: ignore[attr-defined]
 
-    images, alphas, tiles_per_gauss = [], [], []
-    absolutes = [None] * n_cameras if absolute is None else _unstack(absolute, counts)
-    of_cameras = zip(*(_unstack(t, counts) for t in (means2d, conics, opacities, depths, sigmas)), strict=True)
-    for camera, (centres, shapes, strengths, distances, extents) in enumerate(of_cameras):
-        channels = [features[camera]] if features else []
-        if with_depth:
-            channels.append(distances.unsqueeze(1))
-        image, transmittance, tiles = Blend.apply(
-            centres, shapes, strengths, torch.cat(channels, 1) if len(channels) > 1 else channels[0],
-            distances, extents, visible[camera], width, height, absolutes[camera],
-        )  # fmt: skip
-        alpha = (1.0 - transmittance).unsqueeze(-1)
-        if backgrounds is not None and features:
-            behind = backgrounds[camera].to(torch.float32)
-            if with_depth:
-                behind = torch.cat([behind, behind.new_zeros(1)])
-            image = image + transmittance.unsqueeze(-1) * behind
-        if render_mode.endswith("ED"):
-            expected = image[..., -1:] / alpha.clamp(min=1e-10)
-            image = torch.cat([image[..., :-1], expected], -1) if features else expected
-        images.append(image)
-        alphas.append(alpha)
-        tiles_per_gauss.append(tiles)
-
+    absolutes = None if absolute is None else _unstack(absolute, counts)
+    projections = zip(*(_unstack(t, counts) for t in (means2d, conics, opacities, depths, sigmas)), strict=True)
+    rendered = [
+        _render_camera(
+            projection,
+            visible[camera],
+            features[camera] if features else None,
+            None if absolutes is None else absolutes[camera],
+            None if backgrounds is None else backgrounds[camera],
+            width,
+            height,
+            render_mode,
+        )
+        for camera, projection in enumerate(projections)
+    ]
+    images, alphas, tiles_per_gauss = zip(*rendered, strict=True)
+    tile_width, tile_height = tiles(width, height)
     info = {
         "batch_ids": None if camera_ids is None else torch.zeros_like(camera_ids),
         "camera_ids": camera_ids,
@@ -214,8 +202,8 @@ def rasterization(
         "depths": depths,
         "conics": conics,
         "opacities": opacities,
-        "tile_width": (width + TILE - 1) // TILE,
-        "tile_height": (height + TILE - 1) // TILE,
+        "tile_width": tile_width,
+        "tile_height": tile_height,
         "tiles_per_gauss": torch.cat(tiles_per_gauss) if packed else _stack(tiles_per_gauss),
         "width": width,
         "height": height,
@@ -224,6 +212,38 @@ def rasterization(
         "n_cameras": n_cameras,
     }
     return _stack(images).to(dtype), _stack(alphas).to(dtype), info
+
+
+def _render_camera(
+    projection: tuple[Tensor, ...],  # means2d [R, 2], conics [R, 3], opacities [R], depths [R], sigmas [R, 2]
+    visible: Tensor,  # [M]
+    features: Tensor | None,  # [R, D], None where only depth is wanted
+    absolute: Tensor | None,  # [R, 2]
+    background: Tensor | None,  # [D]
+    width: int,
+    height: int,
+    render_mode: RenderMode,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Image [H, W, X], alpha [H, W, 1] and tiles_per_gauss [R] of projected Gaussians."""
+    means2d, conics, opacities, depths, sigmas = projection
+    with_depth = render_mode != "RGB"
+    channels = [] if features is None else [features]
+    if with_depth:
+        channels.append(depths.unsqueeze(1))
+    image, transmittance, tiles_per_gauss = Blend.apply(
+        means2d, conics, opacities, torch.cat(channels, 1) if len(channels) > 1 else channels[0],
+        depths, sigmas, visible, width, height, absolute,
+    )  # fmt: skip
+    alpha = (1.0 - transmittance).unsqueeze(-1)
+    if background is not None and features is not None:
+        behind = background.to(torch.float32)
+        if with_depth:
+            behind = torch.cat([behind, behind.new_zeros(1)])
+        image = image + transmittance.unsqueeze(-1) * behind
+    if render_mode.endswith("ED"):
+        expected = image[..., -1:] / alpha.clamp(min=1e-10)
+        image = expected if features is None else torch.cat([image[..., :-1], expected], -1)
+    return image, alpha, tiles_per_gauss
 
 
 # One camera is the rule in training: views, whose gradients are views too, spare copies of everything.
@@ -236,83 +256,3 @@ def _unstack(tensor: Tensor, counts: list[int] | None) -> Sequence[Tensor]:
     if counts is not None:
         return [tensor] if len(counts) == 1 else tensor.split(counts)
     return [tensor.squeeze(0)] if len(tensor) == 1 else tensor.unbind()
-
-
-def _check_tensors(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    sh_degree: int | None,
-    sh_rest: Tensor | None,
-    backgrounds: Tensor | None,
-    width: int,
-    height: int,
-) -> None:
-    tensors = {
-        "means": means,
-        "quats": quats,
-        "scales": scales,
-        "opacities": opacities,
-        "colors": colors,
-        "viewmats": viewmats,
-        "Ks": Ks,
-    }
-    if backgrounds is not None:
-        tensors["backgrounds"] = backgrounds
-    if sh_rest is not None:
-        tensors["colors[1]"] = sh_rest
-    for name, tensor in tensors.items():
-        if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
-            kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
-            raise ValueError(f"{name} must be a floating point tensor, got {kind}.")
-        if tensor.device.type != "cpu":
-            raise ValueError(f"{name} is on {tensor.device}, but this rasterizer runs on the CPU: use {name}.cpu().")
-    if means.dim() != 2 or means.shape[1] != 3:
-        raise ValueError(f"means must have shape [N, 3] (no batch dimensions), got {list(means.shape)}.")
-    n = len(means)
-    n_cameras = len(viewmats) if viewmats.dim() else 0
-    expected = {
-        "quats": [n, 4],
-        "scales": [n, 3],
-        "opacities": [n],
-        "viewmats": [n_cameras, 4, 4],
-        "Ks": [n_cameras, 3, 3],
-    }
-    for name, shape in expected.items():
-        if list(tensors[name].shape) != shape:
-            raise ValueError(f"{name} must have shape {shape}, got {list(tensors[name].shape)}.")
-    if n_cameras == 0:
-        raise ValueError("viewmats must hold at least one camera, got none.")
-    shape = list(colors.shape)
-    if sh_degree is None:
-        if shape[:-1] not in ([n], [n_cameras, n]) or shape[-1] == 0:
-            raise ValueError(f"colors must have shape [{n}, D] or [{n_cameras}, {n}, D], got {shape}.")
-        channels = shape[-1]
-    else:
-        if sh_degree not in (0, 1, 2, 3):
-            raise ValueError(f"sh_degree must be 0 to 3 on the CPU, got {sh_degree!r}.")
-        terms = (sh_degree + 1) ** 2
-        if sh_rest is not None:
-            rest = list(sh_rest.shape)
-            if shape != [n, 1, 3] or len(rest) != 3 or rest[0] != n or rest[2] != 3:
-                raise ValueError(
-                    f"colors as a pair must have shapes [{n}, 1, 3], [{n}, K - 1, 3], got {shape}, {rest}."
-                )
-            shape = [n, 1 + rest[1], 3]
-        if shape[-1:] != [3] or shape[:-2] not in ([n], [n_cameras, n]) or shape[-2] < terms:
-            raise ValueError(
-                f"colors must have shape [{n}, K, 3] or [{n_cameras}, {n}, K, 3] with K >= {terms} for "
-                f"sh_degree={sh_degree}, got {shape}."
-            )
-        channels = 3
-    if backgrounds is not None and list(backgrounds.shape) != [n_cameras, channels]:
-        raise ValueError(f"backgrounds must have shape [{n_cameras}, {channels}], got {list(backgrounds.shape)}.")
-    if not (isinstance(width, int) and isinstance(height, int) and width > 0 and height > 0):
-        raise ValueError(f"width and height must be whole numbers of at least 1, got {width!r} and {height!r}.")
-    for name in ("viewmats", "Ks"):
-        if not torch.isfinite(tensors[name]).all():
-            raise ValueError(f"{name} holds NaN or infinity: a camera must be finite.")

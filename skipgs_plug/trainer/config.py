@@ -13,6 +13,39 @@ REFERENCE_STEPS = 30_000  # the schedule that all milestone defaults describe
 MIN_REFINE_EVERY = 100  # below, gradients are averaged over too few views and the count explodes
 MIN_RESET_EVERY = 3000  # a reset takes thousands of updates to recover from, whatever the length of the run
 
+TINY = 1e-6
+MANY = 1 << 31
+INTEGERS = {  # least and greatest value
+    "data_factor": (1, 64),
+    "test_every": (0, MANY),
+    "init_num_pts": (4, 1 << 27),
+    "seed": (-(1 << 62), 1 << 62),
+    "max_steps": (1, MANY),
+    "sh_degree": (0, 3),
+    "sh_degree_interval": (1, MANY),
+    "refine_start_iter": (0, MANY),
+    "refine_stop_iter": (0, MANY),
+    "refine_every": (1, MANY),
+    "reset_every": (1, MANY),
+}
+NUMBERS = {
+    "ssim_lambda": (0.0, 1.0),
+    "init_opa": (TINY, 1 - TINY),  # stored as a logit
+    "init_scale": (TINY, 1e6),  # stored as a logarithm
+    "means_lr": (0.0, 10.0),
+    "scales_lr": (0.0, 10.0),
+    "opacities_lr": (0.0, 10.0),
+    "quats_lr": (0.0, 10.0),
+    "sh0_lr": (0.0, 10.0),
+    "shN_lr": (0.0, 10.0),
+    "near_plane": (TINY, 1e30),
+    "far_plane": (TINY, 1e30),
+    "grow_grad2d": (0.0, 1e6),
+    "grow_scale3d": (0.0, 1e6),
+    "prune_opa": (0.0, 1.0),
+    "prune_scale3d": (0.0, 1e6),
+}
+
 
 @dataclass
 class TrainConfig:
@@ -97,23 +130,20 @@ class TrainConfig:
     """Densify by absolute gradients (AbsGS); wants grow_grad2d of about 0.0008."""
 
     def __post_init__(self) -> None:
-        for name, least in (
-            ("max_steps", 1),
-            ("data_factor", 1),
-            ("test_every", 0),
-            ("refine_every", 1),
-        ):
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < least:
-                raise InputError(f"{name}={value!r} is not an integer of at least {least}.")
-        if not 0 <= self.sh_degree <= 3:
-            raise InputError(f"sh_degree={self.sh_degree} is outside 0..3.")
-        if not 0.0 <= self.ssim_lambda <= 1.0:
-            raise InputError(f"ssim_lambda={self.ssim_lambda} is outside 0..1.")
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, float) and not math.isfinite(value):
                 raise InputError(f"{field.name}={value} is not a finite number.")
+        for name, (low, high) in INTEGERS.items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+                raise InputError(f"{name}={value!r} is not an integer in {low}..{high:,}.")
+        for name, (least, greatest) in NUMBERS.items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value <= greatest:
+                raise InputError(f"{name}={value!r} is outside {least:g}..{greatest:g}.")
+        if self.near_plane >= self.far_plane:
+            raise InputError(f"near_plane={self.near_plane:g} is not below far_plane={self.far_plane:g}.")
 
     def scaled(self, milestone: int) -> int:
         """Return a milestone of the 30,000-iteration schedule in iterations of this run, at least 1."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -15,6 +15,7 @@ from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.mask import leave_out
 from skipgs_plug.trainer.model import create_optimizers, create_splats
 from skipgs_plug.trainer.order import ViewOrder, derive_seed
 from skipgs_plug.trainer.ply import write_ply
@@ -179,7 +180,7 @@ class Trainer:
             raise InputError(f"Scene {self.scene.name} has no {split} views; lower test_every to hold some out.")
         wanted = metrics.chosen(lpips_net)
         with self.backend.exclusive_cores():
-            rows = [metrics.measure(wanted, self.render(view), self._target(view)) for view in views]
+            rows = [self._measure(wanted, view) for view in views]
         means = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
         return {
             **means,
@@ -189,6 +190,10 @@ class Trainer:
             "views": len(views),
             **{f"{metric.name}_flavour": metric.flavour for metric in wanted},
         }
+
+    def _measure(self, wanted: Sequence[metrics.Metric], view: View) -> dict[str, float]:
+        image, target = leave_out(self.render(view), self._target(view), view.mask)
+        return metrics.measure(wanted, image, target, view.mask)
 
     def export_ply(self, path: str | Path) -> None:
         """Write the 62-property INRIA PLY, in the coordinates of the dataset."""
@@ -220,7 +225,7 @@ class Trainer:
             generator = torch.Generator().manual_seed(derive_seed(self.config.seed, step))
             background = torch.rand(1, 3, generator=generator).to(self.backend.device)
         colors, _, info = self._rasterize(view, degree, background)
-        return colors[0], self._target(view), info
+        return (*leave_out(colors[0], self._target(view), view.mask), info)
 
     def _rasterize(self, view: View, degree: int, background: Tensor | None) -> tuple[Tensor, Tensor, dict[str, Any]]:
         device = self.backend.device

@@ -27,7 +27,7 @@ class Metric:
         label: name for people.
         digits: shown after the point.
         flavour: what tells it from others of that name; a clause.
-        measure: function of render and target, images [H, W, 3], the target in [0, 1].
+        measure: function of render and target, images [H, W, 3], the target in [0, 1], and mask [H, W] or None.
         unit: shown after the label.
         tag: name in TensorBoard, where gsplat names no flavour; the key itself if empty.
         net: LPIPS backbone, which must be asked for; None for a metric of every evaluation.
@@ -37,7 +37,7 @@ class Metric:
     label: str
     digits: int
     flavour: str
-    measure: Callable[[Tensor, Tensor], float]
+    measure: Callable[[Tensor, Tensor, Tensor | None], float]
     unit: str = ""
     tag: str = ""
     net: str | None = None
@@ -48,17 +48,25 @@ class Metric:
         return f"{self.label} {self.unit}".strip()
 
 
-def psnr(render: Tensor, target: Tensor) -> float:
-    """Return PSNR in dB of images [H, W, 3] clamped to [0, 1]; infinite for equal images."""
-    error = float(((render.clamp(0, 1) - target) ** 2).mean())
+def psnr(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Return PSNR in dB of images [H, W, 3] clamped to [0, 1], over the pixels of `mask`; infinite for equal images."""
+    squares = (render.clamp(0, 1) - target) ** 2
+    error = float((squares if mask is None else squares[mask.to(squares.device)]).mean())
     return -10.0 * math.log10(error) if error > 0.0 else math.inf
 
 
-def ssim(render: Tensor, target: Tensor) -> float:
-    """Return SSIM of images [H, W, 3] in [0, 1], as torchmetrics pads (see SSIM_FLAVOUR)."""
+def ssim(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Return SSIM of images [H, W, 3] in [0, 1], as torchmetrics pads (see SSIM_FLAVOUR).
+
+    With a mask [H, W]: the mean over windows whose centre counts. Both images should be black outside it.
+    """
     from torchmetrics.functional.image import structural_similarity_index_measure
 
-    return float(structural_similarity_index_measure(batch(render.clamp(0, 1)), batch(target), data_range=1.0))  # type: ignore[arg-type]
+    images = batch(render.clamp(0, 1)), batch(target)
+    if mask is None:
+        return float(structural_similarity_index_measure(*images, data_range=1.0))  # type: ignore[arg-type]
+    _, windows = structural_similarity_index_measure(*images, data_range=1.0, return_full_image=True)
+    return float(windows[0].permute(1, 2, 0)[mask.to(windows.device)].mean())
 
 
 def require_lpips(net: str) -> None:
@@ -74,8 +82,11 @@ def require_lpips(net: str) -> None:
         raise InputError(f"LPIPS needs the backbone weights {weights}; put them there, or leave out --lpips-net.")
 
 
-def lpips(render: Tensor, target: Tensor, net: str) -> float:
-    """Return LPIPS (`net` alex or vgg, inputs normalised to [-1, 1]) of images [H, W, 3] in [0, 1]."""
+def lpips(render: Tensor, target: Tensor, mask: Tensor | None = None, *, net: str) -> float:
+    """Return LPIPS (`net` alex or vgg, inputs normalised to [-1, 1]) of images [H, W, 3] in [0, 1].
+
+    It has no mask of its own: both images should be black outside one.
+    """
     from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
 
     require_lpips(net)
@@ -109,6 +120,10 @@ def chosen(lpips_net: str | None = None) -> list[Metric]:
     return [metric for metric in METRICS.values() if metric.net in (None, lpips_net)]
 
 
-def measure(metrics: Sequence[Metric], render: Tensor, target: Tensor) -> dict[str, float]:
-    """Return the metrics of a render against its target, images [H, W, 3], by name."""
-    return {metric.name: metric.measure(render, target) for metric in metrics}
+def measure(metrics: Sequence[Metric], render: Tensor, target: Tensor, mask: Tensor | None = None) -> dict[str, float]:
+    """Return the metrics of a render against its target, images [H, W, 3], by name.
+
+    Args:
+        mask: Pixels that count  # [H, W]
+    """
+    return {metric.name: metric.measure(render, target, mask) for metric in metrics}

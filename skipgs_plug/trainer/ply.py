@@ -1,7 +1,8 @@
-"""The 62-property INRIA PLY, in the coordinates of the dataset."""
+"""3DGS models as the 62-property INRIA PLY, in the coordinates of the dataset, and point clouds."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.files import write_aside
 
 REST = 15  # coefficients of SH degrees 1 to 3
+REST_COUNTS = (0, 9, 24, 45)  # f_rest properties of SH degrees 0 to 3
+MAX_LOG_SCALE = 80.0  # float32 overflows at e^88
+MAX_HEADER = 1 << 16
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
     *(f"f_rest_{i}" for i in range(3 * REST)),
@@ -49,31 +53,105 @@ def write_ply(splats: Mapping[str, Tensor], path: str | Path) -> None:
 
 
 def read_ply(path: str | Path) -> dict[str, Tensor]:
-    """Return `means scales quats opacities sh0 shN` of a 62- or 59-property PLY, raw values.
+    """Read a 3DGS model of SH degree 0 to 3, raw values; normals are optional and ignored.
+
+    Returns:
+        `means [N, 3]`, `scales [N, 3]` (log), `quats [N, 4]` (wxyz, any length but 0), `opacities [N]` (logit),
+        `sh0 [N, 1, 3]` and `shN [N, K - 1, 3]`, float32 on the CPU.
 
     Raises:
         MissingFileError: no such file.
-        InputError: not a PLY, truncated, not a Gaussian PLY, or with NaN or infinite values.
+        InputError: not a PLY, truncated, not a Gaussian PLY, empty, or with values that cannot be rendered.
     """
+    path = Path(path)
+    vertices = read_vertices(path)
+    count = sum(name.startswith("f_rest_") for name in vertices)
+    if count not in REST_COUNTS:
+        raise InputError(f"PLY {path} has {count} f_rest properties, expected one of {REST_COUNTS}; export it again.")
+    names = [n for n in PROPERTIES if n[0] != "n" and (not n.startswith("f_rest") or int(n[7:]) < count)]
+    lacking = [name for name in names if name not in vertices]
+    if lacking:
+        raise InputError(f"PLY {path} is not a 3DGS model: it lacks {', '.join(lacking[:4])}; export it again.")
+    table = columns(path, vertices, names)
+    means, sh0, rest, opacity, scales, quats = torch.from_numpy(table).split([3, 3, count, 1, 3, 4], dim=1)
+    if (quats == 0).all(dim=1).any():
+        raise InputError(f"PLY {path} holds rotations of length 0; export it again from a sound checkpoint.")
+    if len(scales) and float(scales.max()) > MAX_LOG_SCALE:
+        raise InputError(f"PLY {path} holds scales above e^{MAX_LOG_SCALE:g}: they must be logarithms.")
+    return {
+        "means": means.contiguous(),
+        "scales": scales.contiguous(),
+        "quats": quats.contiguous(),
+        "opacities": opacity[:, 0].contiguous(),
+        "sh0": sh0[:, None, :].contiguous(),
+        "shN": rest.reshape(-1, 3, count // 3).transpose(1, 2).contiguous(),
+    }
+
+
+def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read a point cloud: positions [M, 3] float32 and colours [M, 3] uint8, grey where the file has none.
+
+    Raises:
+        MissingFileError: no such file.
+        InputError: not a PLY, truncated, without x, y and z, or with values that are not finite.
+    """
+    path = Path(path)
+    vertices = read_vertices(path)
+    if not {"x", "y", "z"} <= set(vertices):
+        raise InputError(f"PLY {path} has no vertices with x, y and z; give a point cloud.")
+    positions = columns(path, vertices, ["x", "y", "z"])
+    names = ["red", "green", "blue"]
+    if not set(names) <= set(vertices):
+        return positions, np.full(positions.shape, 128, dtype=np.uint8)
+    colours = columns(path, vertices, names)
+    if vertices["red"].dtype.kind == "f":  # in [0, 1] by convention
+        colours = colours * 255
+    return positions, np.rint(colours.clip(0, 255)).astype(np.uint8)
+
+
+def read_vertices(path: Path) -> dict[str, np.ndarray]:
+    """Return the vertices' properties [N] by name; what the header claims is checked before anything is allocated."""
     from plyfile import PlyData, PlyParseError
 
-    path = Path(path)
-    if not path.is_file():
-        raise MissingFileError(f"PLY {path} does not exist; give the path of a point_cloud_*.ply.")
+    check_header(path)
     try:
         vertices = PlyData.read(str(path), mmap=False)["vertex"]
-        needed = [name for name in PROPERTIES if name not in ("nx", "ny", "nz")]
-        table = np.stack([np.asarray(vertices[name], dtype=np.float32) for name in needed], axis=1)
-    except (PlyParseError, KeyError, ValueError, EOFError, UnicodeDecodeError) as error:
-        raise InputError(f"PLY {path} is damaged or not a 3DGS model ({error}); export it again.") from error
+        return {prop.name: np.asarray(vertices[prop.name]) for prop in vertices.properties}
+    except (PlyParseError, KeyError, ValueError, TypeError, EOFError, MemoryError, OSError) as error:
+        raise InputError(f"PLY {path} is damaged or not a PLY ({error}); export it again.") from error
+
+
+def check_header(path: Path) -> None:
+    """Refuse counts that the file cannot hold: each value takes a byte at least, and vertices have no lists."""
+    if not os.path.isfile(path):
+        raise MissingFileError(f"PLY {path} does not exist; give the path of a point_cloud_*.ply.")
+    try:
+        with open(path, "rb") as stream:
+            size, head = os.fstat(stream.fileno()).st_size, stream.read(MAX_HEADER)
+    except OSError as error:
+        raise InputError(f"PLY {path} cannot be read ({error}).") from error
+    header, found, _ = head.partition(b"end_header")
+    if not header.startswith(b"ply") or not found:
+        raise InputError(f"PLY {path} is damaged or not a PLY (no header); export it again.")
+    element, count, needed = b"", 0, len(header)
+    for line in header.splitlines():
+        words = line.split()
+        if words[:1] == [b"element"]:
+            if len(words) != 3 or not words[2].isdigit() or len(words[2]) > 19:
+                raise InputError(f"PLY {path} is damaged: {line[:80]!r} in its header; export it again.")
+            element, count = words[1], int(words[2])
+        elif words[:1] == [b"property"]:
+            needed += count
+            if element == b"vertex" and words[1:2] == [b"list"]:
+                raise InputError(f"PLY {path} has lists in its vertices, so it is neither a model nor a point cloud.")
+    if needed > size:
+        raise InputError(f"PLY {path} is damaged: it claims {needed:,} bytes at least, has {size:,}; export it again.")
+
+
+def columns(path: Path, vertices: Mapping[str, np.ndarray], names: list[str]) -> np.ndarray:
+    """Return the named properties as a finite table [N, len(names)] float32."""
+    with np.errstate(over="ignore"):
+        table = np.stack([vertices[name].astype(np.float32) for name in names], axis=1)
     if not np.isfinite(table).all():
         raise InputError(f"PLY {path} holds NaN or infinite values; export it again from a sound checkpoint.")
-    means, sh0, rest, opacity, scales, quats = torch.from_numpy(table).split([3, 3, 3 * REST, 1, 3, 4], dim=1)
-    return {
-        "means": means,
-        "scales": scales,
-        "quats": quats,
-        "opacities": opacity[:, 0],
-        "sh0": sh0[:, None, :],
-        "shN": rest.reshape(-1, 3, REST).transpose(1, 2).contiguous(),
-    }
+    return table

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.errors import InputError
 
 BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
+MIN_SIDE = 11  # window of SSIM
+MAX_COORDINATE = 1e15  # squares of distances stay finite in float32
 
 
 @dataclass
@@ -27,6 +29,7 @@ class View:
     image: Tensor  # [H, W, 3] uint8
     K: Tensor  # [3, 3] float32, pixels of `image`
     viewmat: Tensor  # [4, 4] float32, world to camera
+    mask: Tensor | None = None  # [H, W] bool, False where a pixel does not count; None: all count
 
     @property
     def width(self) -> int:
@@ -41,9 +44,8 @@ class View:
 class Scene:
     """Training views, held-out views and the points that training starts from.
 
-    Positions stay in the coordinates of the dataset, so an exported PLY lies where its cameras do:
-    `transform` (dataset frame to training frame) is the identity for all loaders of this package.
-    Everything in the recipe that has a length is multiplied by `scene_scale` instead.
+    Positions stay in the coordinates of the dataset, so an exported PLY lies where its cameras do; everything
+    in the recipe that has a length is multiplied by `scene_scale` instead.
     """
 
     name: str
@@ -52,45 +54,7 @@ class Scene:
     points: Tensor  # [M, 3] float32
     points_rgb: Tensor  # [M, 3] uint8
     scene_scale: float  # 1.1 x largest distance of a training camera from their centre
-    transform: Tensor = field(default_factory=lambda: torch.eye(4))  # [4, 4]
     background: tuple[float, float, float] = BLACK  # colour in [0, 1] behind the scene
-
-
-def load_scene(path: str | Path, data_factor: int = 1, test_every: int = 8, init_num_pts: int = 100_000) -> Scene:
-    """Load a COLMAP folder, a Blender folder or a packed .npz. Writes nothing.
-
-    Args:
-        path: folder with `sparse/0` or `sparse`, folder with `transforms_train.json`, or .npz file.
-        data_factor: use `images_{data_factor}`; resized in memory when that folder is missing.
-        test_every: views sorted by name, index % test_every == 0 held out; 0 holds out none. Blender scenes
-            with `transforms_test.json` and packed files bring their own split.
-        init_num_pts: random points for a Blender scene, which has no point cloud.
-
-    Raises:
-        MissingFileError: a folder or image is not there.
-        InputError: the content cannot be used (camera model, empty or non-finite points, damaged image...).
-    """
-    path = Path(path).expanduser()
-    if not path.exists():
-        raise MissingFileError(f"Scene {path} does not exist; give a COLMAP folder, Blender folder or packed .npz.")
-    if path.is_file():
-        from skipgs_plug.trainer.packed import load_packed
-
-        if path.suffix != ".npz":
-            raise InputError(f"Scene {path} is a file but not a packed .npz; give the folder that holds it.")
-        return load_packed(path)
-    if (path / "sparse").is_dir():
-        from skipgs_plug.trainer.colmap import load_colmap
-
-        return load_colmap(path, data_factor, test_every)
-    if (path / "transforms_train.json").is_file():
-        from skipgs_plug.trainer.blender import load_blender
-
-        return load_blender(path, data_factor, test_every, init_num_pts)
-    raise MissingFileError(
-        f"Scene {path} holds neither {path / 'sparse' / '0'} (COLMAP) nor "
-        f"{path / 'transforms_train.json'} (Blender); run COLMAP on it or give another folder."
-    )
 
 
 def split_views(views: list[View], test_every: int) -> tuple[list[View], list[View]]:
@@ -119,13 +83,12 @@ def assemble_scene(
         if view.name in seen:
             raise InputError(f"{source} names two views {view.name!r}; image paths must be unique.")
         seen.add(view.name)
-        if not (torch.isfinite(view.viewmat).all() and torch.isfinite(view.K).all()):
-            raise InputError(f"{source}: camera of {view.name!r} holds NaN or infinity; reconstruct it again.")
+        check_view(view, source)
     if len(points) < 4:
         raise InputError(f"{source} has {len(points)} points, at least 4 are needed; run the reconstruction again.")
-    bad = int((~np.isfinite(points).all(axis=1)).sum())
+    bad = int((~(np.abs(points) < MAX_COORDINATE).all(axis=1)).sum())
     if bad:
-        raise InputError(f"{source} has {bad} points with NaN or infinite coordinates; remove them.")
+        raise InputError(f"{source} has {bad} points with NaN, infinite or huge coordinates; remove them.")
     return Scene(
         name=name,
         train=train,
@@ -135,6 +98,30 @@ def assemble_scene(
         scene_scale=camera_extent(train),
         background=background,
     )
+
+
+def check_view(view: View, source: Path) -> None:
+    """Refuse what cannot be trained on, before training begins."""
+    if not is_text(view.name):
+        raise InputError(f"{source}: view name {view.name[:80]!r} holds control characters or no UTF-8; rename it.")
+    if not (torch.isfinite(view.viewmat).all() and torch.isfinite(view.K).all()):
+        raise InputError(f"{source}: camera of {view.name!r} holds NaN or infinity; reconstruct it again.")
+    if view.K[0, 0] <= 0 or view.K[1, 1] <= 0:
+        raise InputError(f"{source}: camera of {view.name!r} has a focal length of 0 or less; reconstruct it again.")
+    if abs(float(torch.linalg.det(view.viewmat[:3, :3].double()))) < 1e-6:
+        raise InputError(f"{source}: the pose of {view.name!r} cannot be inverted; reconstruct it again.")
+    if min(view.width, view.height) < MIN_SIDE:
+        raise InputError(
+            f"{source}: {view.name!r} is {view.width}x{view.height}, SSIM needs {MIN_SIDE} pixels on each side; "
+            "use larger images or a smaller data_factor."
+        )
+    if view.mask is not None and not view.mask.any():
+        raise InputError(f"{source}: the mask of {view.name!r} leaves no pixel; white is what counts.")
+
+
+def is_text(name: str) -> bool:
+    """Whether a name can be printed and written: no control characters, none of the surrogates of other encodings."""
+    return not any(ord(c) < 32 or 0xD800 <= ord(c) <= 0xDFFF for c in name)
 
 
 def camera_extent(views: list[View]) -> float:

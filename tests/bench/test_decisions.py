@@ -33,6 +33,16 @@ def test_runs_that_did_not_finish_are_left_out(finished, tmp_path):
     assert read_decisions(path) == {}
 
 
+def test_iterations_that_were_left_out_have_no_view(tmp_path):
+    records = [
+        RunRecord(0, "ungated", trace=Trace(10, [3, 1, 2, 0], codes="----")),
+        RunRecord(0, "thinned", trace=Trace(10, [3, None, None, 1], codes="-..-")),
+    ]
+    write_decisions(tmp_path / "decisions.json", records)
+    traces = read_decisions(tmp_path / "decisions.json")
+    assert [traces[0, record.policy] for record in records] == [record.trace for record in records]
+
+
 def test_a_long_bench_stays_small(tmp_path):
     """Seven policies, three seeds, 1,500 iterations of 255 views, no two decisions in a row alike."""
     codes = "dDbD" * 375
@@ -57,7 +67,9 @@ def test_packed_letters_are_as_documented():
     "content",
     ["", "[]", "{}", '{"kind": "skipgs-decisions", "schema_version": 2, "runs": {}}',
      json.dumps({"kind": "skipgs-decisions", "schema_version": 1, "start": 0, "views": {"0": "0 1"},
-                 "runs": {"0": {"gate": "3w"}}})],
+                 "runs": {"0": {"gate": "3w"}}}),
+     json.dumps({"kind": "skipgs-decisions", "schema_version": 1, "start": 0, "views": {"0": "0 1"},
+                 "runs": {"0": {"gate": "w3"}}})],
 )  # fmt: skip
 def test_unusable_files_are_named(tmp_path, content):
     path = tmp_path / "decisions.json"

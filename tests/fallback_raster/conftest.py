@@ -7,6 +7,8 @@ from collections.abc import Iterator
 import pytest
 import torch
 
+from skipgs_plug.fallback_raster import guard
+
 
 @pytest.fixture(autouse=True)
 def one_torch_thread() -> Iterator[None]:
@@ -15,6 +17,13 @@ def one_torch_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(autouse=True)
+def sizes_checked() -> Iterator[None]:
+    """Every kernel call compares the sizes of its tensors with what it declares; SKIPGS_PLUG_GUARD=1 does more."""
+    with guard.at_least(guard.SIZES):
+        yield
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 import torch
-from raster_scenes import errors_against_reference, leaves, random_scene
+from raster_scenes import errors_against_reference, leaves, random_scene, relative_error
 
 from skipgs_plug.fallback_raster import rasterization
+from skipgs_plug.fallback_raster.shortcuts import SHORTCUTS, without_shortcuts
 from skipgs_plug.fallback_raster.torch_reference import rasterization_reference
 
 IMAGE_ERROR = 1e-5
@@ -49,6 +50,29 @@ def test_image_and_gradients(case: str) -> None:
         if not error < (IMAGE_ERROR if name in ("image", "alpha") else GRADIENT_ERROR)
     }
     assert not wrong, errors
+
+
+@pytest.mark.parametrize("case", ["SH 3", "background, depth", "absgrad, packed", "5 features", "many Gaussians"])
+def test_shortcuts_change_nothing(case: str) -> None:
+    """Without any of them the rasterizer is a second oracle: nothing is left out but by the definition of alpha."""
+    scene, options = CASES[case]
+    results = []
+    for left_out in ((), tuple(SHORTCUTS)):
+        inputs = leaves(random_scene(**scene), torch.float32)
+        with without_shortcuts(*left_out):
+            image, alpha, info = rasterization(**inputs, **{"packed": False, **options})
+            generator = torch.Generator().manual_seed(1)
+            upstream = torch.randn(image.shape, generator=generator)
+            upstream[:, : image.shape[1] // 2] = 0.0  # for the shortcuts of the adjoint
+            torch.autograd.backward([image, alpha], [upstream, upstream[..., :1]])
+        gradients = [t.grad for t in inputs.values() if torch.is_tensor(t) and t.grad is not None]
+        results.append(([image.detach(), alpha.detach()], gradients, info["tiles_per_gauss"].sum()))
+    (images, gradients, tiles), (plain_images, plain_gradients, plain_tiles) = results
+    assert all(torch.equal(a, b) for a, b in zip(images, plain_images, strict=True))
+    assert len(gradients) >= 5
+    for fast, plain in zip(gradients, plain_gradients, strict=True):
+        assert relative_error(fast, plain) < 1e-6
+    assert tiles < plain_tiles  # some were left out
 
 
 @pytest.mark.parametrize("case", ["SH 3", "antialiased", "RGB+ED", "three cameras", "packed", "near and far"])

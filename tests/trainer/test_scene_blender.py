@@ -40,7 +40,13 @@ def test_factor_and_own_split(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda c: c.pop("camera_angle_x"), r"lacks or garbles .*camera_angle_x"),
+        (lambda c: c.pop("camera_angle_x"), r"camera_angle_x is None, not a finite number"),
+        (lambda c: c.update(camera_angle_x=10**400), r"camera_angle_x is 1000.*\.\.\., not a finite number"),
+        (lambda c: c.update(camera_angle_x=0.0), r"camera_angle_x is 0, not between 0 and pi"),
+        (lambda c: c.update(frames=[1]), r"lists no frames"),
+        (lambda c: c["frames"][0].update(file_path=3), r"file_path of a frame is 3, not a string"),
+        (lambda c: c["frames"][0].update(transform_matrix=[[10**400] * 4] * 4), r"is not 4x4 numbers"),
+        (lambda c: c["frames"][0].update(transform_matrix=[[0.0] * 4] * 4), r"not a finite pose"),
         (lambda c: c["frames"].clear(), r"lists no frames"),
         (lambda c: c["frames"][0].update(transform_matrix=[[1.0]]), r"is not 4x4"),
         (lambda c: c["frames"][0]["transform_matrix"][0].__setitem__(0, float("nan")), r"not a finite pose"),
@@ -59,6 +65,31 @@ def test_invalid_json_and_missing_image(folder: Path) -> None:
     (folder / "train/view_001.png").unlink()
     with pytest.raises(MissingFileError, match=r"view_001\.png does not exist"):
         load_scene(folder)
-    (folder / "transforms_train.json").write_text("{")
-    with pytest.raises(InputError, match="is not valid JSON"):
+    for content in (b"{", b"[" * 100_000, b'{"a": ' + b"9" * 5000 + b"}", b"\xff\xfe", b""):
+        (folder / "transforms_train.json").write_bytes(content)
+        with pytest.raises(InputError, match=r"transforms_train\.json is not valid JSON"):
+            load_scene(folder)
+    (folder / "transforms_train.json").write_text("[]")
+    with pytest.raises(InputError, match="holds no JSON object"):
+        load_scene(folder)
+
+
+@pytest.mark.parametrize("name", ["../secret.png", "/etc/x.png", "a/../../x.png", "C:\\x.png", "..\\x.png"])
+def test_names_that_leave_the_scene(folder: Path, name: str) -> None:
+    (folder.parent / "secret.png").write_bytes((folder / "train/view_001.png").read_bytes())
+    path = folder / "transforms_train.json"
+    content = json.loads(path.read_text())
+    content["frames"][0]["file_path"] = name
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"leaves the scene"):
+        load_scene(folder)
+
+
+@pytest.mark.parametrize("name", ["a\0b.png", "a\udc80.png", "x" * 5000 + ".png"])
+def test_names_that_no_file_has(folder: Path, name: str) -> None:
+    path = folder / "transforms_train.json"
+    content = json.loads(path.read_text())
+    content["frames"][0]["file_path"] = name
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"control characters or no UTF-8|does not exist"):
         load_scene(folder)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -10,7 +9,9 @@ import numpy as np
 import torch
 
 from skipgs_plug.trainer.errors import InputError
-from skipgs_plug.trainer.images import find_image, read_image
+from skipgs_plug.trainer.loaders.images import read_image
+from skipgs_plug.trainer.loaders.json_file import read_number, read_object, read_pose, read_string
+from skipgs_plug.trainer.loaders.paths import find_image
 from skipgs_plug.trainer.scene import BLACK, WHITE, Scene, View, assemble_scene, split_views
 
 BOX = 1.3  # half edge of the cube of initial points, as in 3DGS
@@ -34,31 +35,28 @@ def load_blender(path: Path, data_factor: int, test_every: int, init_num_pts: in
 def read_transforms(path: Path, file_name: str, data_factor: int) -> tuple[list[View], bool]:
     """Return the views of one transforms file and whether any image has transparency."""
     source = path / file_name
-    try:
-        content = json.loads(source.read_text())
-        angle = float(content["camera_angle_x"])
-        frames = [(str(f["file_path"]), np.array(f["transform_matrix"], dtype=np.float64)) for f in content["frames"]]
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{source} is not valid JSON ({error}); restore the file.") from error
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{source} lacks or garbles camera_angle_x, file_path or transform_matrix ({error}); restore the file."
-        ) from error
+    content = read_object(source)
+    angle = read_number(content.get("camera_angle_x"), "camera_angle_x", source)
+    frames = content.get("frames")
+    if not 0.0 < angle < math.pi:
+        raise InputError(f"{source}: camera_angle_x is {angle:g}, not between 0 and pi; restore the file.")
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames) or not frames:
+        raise InputError(f"{source} lists no frames; restore the file.")
     views, any_alpha = [], False
-    for file_path, camera_to_world in frames:
-        if camera_to_world.shape != (4, 4):
-            raise InputError(f"{source}: transform_matrix of {file_path!r} is not 4x4; restore the file.")
-        if not np.isfinite(camera_to_world).all() or abs(np.linalg.det(camera_to_world[:3, :3])) < 1e-6:
-            raise InputError(f"{source}: transform_matrix of {file_path!r} is not a finite pose; restore the file.")
+    for frame in frames:
+        file_path = read_string(frame.get("file_path"), "file_path of a frame", source)
+        pose = read_pose(frame.get("transform_matrix"), file_path, source)
         image_path = find_image(path, file_path if Path(file_path).suffix else file_path + ".png")
-        pixels, has_alpha = read_image(image_path, image_path, WHITE, data_factor)
-        any_alpha |= has_alpha
+        pixels, alpha = read_image(image_path, image_path, WHITE, data_factor)
+        any_alpha |= alpha is not None
         height, width = pixels.shape[:2]
         focal = 0.5 * width / math.tan(0.5 * angle)
         K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-        opencv = camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along -z, y up
-        viewmat = torch.from_numpy(np.linalg.inv(opencv)).float()
+        viewmat = torch.from_numpy(opencv_viewmat(pose)).float()
         views.append(View(image_path.relative_to(path).as_posix(), pixels, K, viewmat))
-    if not views:
-        raise InputError(f"{source} lists no frames; restore the file.")
     return views, any_alpha
+
+
+def opencv_viewmat(camera_to_world: np.ndarray) -> np.ndarray:
+    """Return world to camera [4, 4] of an OpenGL pose, which looks along -z with y up."""
+    return np.linalg.inv(camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0]))

@@ -1,0 +1,112 @@
+"""What `rasterization` refuses, in one sentence that names the argument."""
+
+import torch
+from torch import Tensor
+
+# Kernels count rows, channels of rows and pixels in 32 bits, and place pixel centres in float32.
+MAX_NUMBERS = 2**31 - 1
+MAX_SIDE = 2**23
+
+
+def refuse_unsupported(**used: bool) -> None:
+    """Names the first option of gsplat's that is used and not supported here.
+
+    Raises:
+        NotImplementedError: One is used.
+    """
+    for name, in_use in used.items():
+        if in_use:
+            raise NotImplementedError(f"The CPU rasterizer does not support {name}; leave it at its default.")
+
+
+def check_tensors(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    sh_degree: int | None,
+    sh_rest: Tensor | None,
+    backgrounds: Tensor | None,
+    width: int,
+    height: int,
+) -> None:
+    """Compares kinds, devices and shapes with what `rasterization` documents, and sizes with what kernels can count.
+
+    Raises:
+        ValueError: Something does not fit.
+    """
+    tensors = {
+        "means": means,
+        "quats": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "colors": colors,
+        "viewmats": viewmats,
+        "Ks": Ks,
+    }
+    if backgrounds is not None:
+        tensors["backgrounds"] = backgrounds
+    if sh_rest is not None:
+        tensors["colors[1]"] = sh_rest
+    for name, tensor in tensors.items():
+        if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+            kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
+            raise ValueError(f"{name} must be a floating point tensor, got {kind}.")
+        if tensor.device.type != "cpu":
+            raise ValueError(f"{name} is on {tensor.device}, but this rasterizer runs on the CPU: use {name}.cpu().")
+    if means.dim() != 2 or means.shape[1] != 3:
+        raise ValueError(f"means must have shape [N, 3] (no batch dimensions), got {list(means.shape)}.")
+    n = len(means)
+    n_cameras = len(viewmats) if viewmats.dim() else 0
+    expected = {
+        "quats": [n, 4],
+        "scales": [n, 3],
+        "opacities": [n],
+        "viewmats": [n_cameras, 4, 4],
+        "Ks": [n_cameras, 3, 3],
+    }
+    for name, shape in expected.items():
+        if list(tensors[name].shape) != shape:
+            raise ValueError(f"{name} must have shape {shape}, got {list(tensors[name].shape)}.")
+    if n_cameras == 0:
+        raise ValueError("viewmats must hold at least one camera, got none.")
+    shape = list(colors.shape)
+    if sh_degree is None:
+        if shape[:-1] not in ([n], [n_cameras, n]) or shape[-1] == 0:
+            raise ValueError(f"colors must have shape [{n}, D] or [{n_cameras}, {n}, D], got {shape}.")
+        channels = shape[-1]
+    else:
+        if sh_degree not in (0, 1, 2, 3):
+            raise ValueError(f"sh_degree must be 0 to 3 on the CPU, got {sh_degree!r}.")
+        terms = (sh_degree + 1) ** 2
+        if sh_rest is not None:
+            rest = list(sh_rest.shape)
+            if shape != [n, 1, 3] or len(rest) != 3 or rest[0] != n or rest[2] != 3:
+                raise ValueError(
+                    f"colors as a pair must have shapes [{n}, 1, 3], [{n}, K - 1, 3], got {shape}, {rest}."
+                )
+            shape = [n, 1 + rest[1], 3]
+        if shape[-1:] != [3] or shape[:-2] not in ([n], [n_cameras, n]) or shape[-2] < terms:
+            raise ValueError(
+                f"colors must have shape [{n}, K, 3] or [{n_cameras}, {n}, K, 3] with K >= {terms} for "
+                f"sh_degree={sh_degree}, got {shape}."
+            )
+        channels = 3
+    if backgrounds is not None and list(backgrounds.shape) != [n_cameras, channels]:
+        raise ValueError(f"backgrounds must have shape [{n_cameras}, {channels}], got {list(backgrounds.shape)}.")
+    if not (isinstance(width, int) and isinstance(height, int) and width > 0 and height > 0):
+        raise ValueError(f"width and height must be whole numbers of at least 1, got {width!r} and {height!r}.")
+    if max(width, height) > MAX_SIDE or width * height > MAX_NUMBERS:
+        raise ValueError(
+            f"An image may have at most {MAX_SIDE:,} pixels along a side and {MAX_NUMBERS:,} in all, "
+            f"got {width}x{height}."
+        )
+    widest = max(4, channels if sh_degree is None else 3) + 1  # quaternions, or colours and depth
+    if n * widest > MAX_NUMBERS:
+        raise ValueError(f"{n:,} Gaussians with {widest} numbers each are more than {MAX_NUMBERS:,} numbers.")
+    for name in ("viewmats", "Ks"):
+        if not torch.isfinite(tensors[name]).all():
+            raise ValueError(f"{name} holds NaN or infinity: a camera must be finite.")

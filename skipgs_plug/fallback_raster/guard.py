@@ -1,0 +1,140 @@
+"""Debug modes that prove that kernels stay inside their buffers: `SKIPGS_PLUG_GUARD=1`.
+
+Kernels get bare addresses. In this mode every call first compares the size of each tensor with the one that the
+stub declares, and then runs twice on copies that lie between guard zones, filled with two different patterns. A kernel
+that writes beyond a buffer changes a zone; one that reads beyond it and lets that show in a result gives two results.
+Calls take several times as long.
+"""
+
+import ast
+import math
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import CodeType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from . import constants
+from .constants import blocks
+
+OFF, SIZES, ZONES = range(3)
+
+_level = ZONES if os.environ.get("SKIPGS_PLUG_GUARD", "0") not in ("", "0") else OFF
+
+# Two patterns of four bytes: no number as a float, and no index as an int.
+_PATTERNS = (-1, -0x00400002)
+_ZONE = 1024  # of four bytes each, on either side
+
+
+def level() -> int:
+    """OFF, SIZES or ZONES, which includes SIZES."""
+    return _level
+
+
+@contextmanager
+def at_least(wanted: int) -> Iterator[None]:
+    """Checks this much, or more where the environment asks for more, inside a `with` block."""
+    global _level
+    before = _level
+    _level = max(_level, wanted)
+    try:
+        yield
+    finally:
+        _level = before
+
+
+class Sizes:
+    """Sizes of a kernel's tensors, as its stub declares them.
+
+    A shape is a list of expressions of the kernel's numbers, of `constants.py` and of `blocks`. A name that is none of
+    these stands for one size throughout the call: the first tensor that has it decides.
+    """
+
+    def __init__(self, kernel: str, shapes: dict[str, str]):
+        self._kernel = kernel
+        self._shapes = shapes
+        self._parsed: dict[str, list[tuple[str | None, CodeType]]] = {}
+        for name, shape in shapes.items():
+            expressions = ast.parse(f"({shape},)", mode="eval").body
+            assert isinstance(expressions, ast.Tuple)
+            self._parsed[name] = [
+                (e.id if isinstance(e, ast.Name) else None, compile(ast.Expression(e), shape, "eval"))
+                for e in expressions.elts
+            ]
+
+    def check(self, arguments: dict[str, Any]) -> None:
+        """Compares the tensors of a call with what is declared.
+
+        Raises:
+            ValueError: A tensor has another size.
+        """
+        known: dict[str, Any] = {"blocks": blocks, **vars(constants)}
+        known |= {name: value for name, value in arguments.items() if not isinstance(value, Tensor)}
+        for name, dimensions in self._parsed.items():
+            size = arguments[name].numel()
+            unknown = {symbol for symbol, _ in dimensions if symbol is not None and symbol not in known}
+            rest = math.prod(eval(code, known) for symbol, code in dimensions if symbol not in unknown)
+            if len(unknown) == 1 and rest and size % rest == 0:
+                known[unknown.pop()] = size // rest
+            elif unknown or size != rest:
+                raise ValueError(
+                    f"{self._kernel}: {name} holds {size} numbers, but [{self._shapes[name]}] makes {rest}."
+                )
+
+
+def run_between_zones(kernel: str, arguments: dict[str, Any], run: Callable[[tuple[Any, ...]], None]) -> None:
+    """Runs a kernel on copies of its tensors that lie between guard zones, twice, and copies the results back.
+
+    Raises:
+        AssertionError: The kernel wrote into a zone, or what it read there changed a result.
+    """
+    results = []
+    for pattern in _PATTERNS:
+        # A tensor that is passed twice stays one tensor.
+        buffers: dict[tuple[int, int], Tensor] = {}
+        inside = []
+        for value in arguments.values():
+            if isinstance(value, Tensor):
+                key = value.data_ptr(), value.numel()
+                if key not in buffers:
+                    buffers[key] = _surrounded(value, pattern)
+                value = _middle(buffers[key], value)
+            inside.append(value)
+        run(tuple(inside))
+        for name, value in arguments.items():
+            if isinstance(value, Tensor):
+                _check_zones(kernel, name, buffers[value.data_ptr(), value.numel()], pattern)
+        results.append(inside)
+    for name, value, first, second in zip(arguments, arguments.values(), *results, strict=True):
+        if isinstance(value, Tensor):
+            if not torch.equal(first.view(torch.uint8), second.view(torch.uint8)):
+                raise AssertionError(f"{kernel}: {name} depends on memory outside of the buffers.")
+            value.data.copy_(first)  # past the version that torch counts: kernels write past it too
+
+
+def poison(fresh: Tensor) -> Tensor:
+    """Fills a tensor of undefined content with what shows wherever it is read before it is written."""
+    if _level == ZONES:
+        fresh.view(torch.int32).fill_(_PATTERNS[0])
+    return fresh
+
+
+def _surrounded(value: Tensor, pattern: int) -> Tensor:
+    words = value.numel() * value.element_size() // 4
+    buffer = torch.full((words + 2 * _ZONE,), pattern, dtype=torch.int32, device="cpu")
+    _middle(buffer, value).copy_(value.detach())
+    return buffer
+
+
+def _middle(buffer: Tensor, like: Tensor) -> Tensor:
+    return buffer[_ZONE : len(buffer) - _ZONE].view(like.dtype).view(like.shape)
+
+
+def _check_zones(kernel: str, name: str, buffer: Tensor, pattern: int) -> None:
+    for side, zone in (("before", buffer[:_ZONE]), ("behind", buffer[len(buffer) - _ZONE :])):
+        changed = int((zone != pattern).sum())
+        if changed:
+            raise AssertionError(f"{kernel} wrote {4 * changed} bytes {side} {name}.")

@@ -1,0 +1,86 @@
+// Front-to-back compositing, one tile at a time.
+#include "blend_tile.h"
+for (int t = first; t < last; ++t) {
+    const Tile tile(t, tile_start, tiles_x, width, height);
+    const int x0 = tile.x0, y0 = tile.y0, begin = tile.begin, end = tile.end;
+
+    v16 T[16], C[16][D];
+    i16 stop[16];
+    unsigned open = 0;  // blocks with an unfinished pixel
+    for (int b = 0; b < 16; ++b) {
+        const i16 inside = (lane_x + 4 * (b & 3) < (float)tile.columns) & (lane_y + 4 * (b >> 2) < (float)tile.rows);
+        // The sign of T marks pixels that take no more: finished ones and those outside the image.
+        T[b] = inside ? (v16)1.0f : (v16)-1.0f;
+        for (int c = 0; c < D; ++c) C[b][c] = (v16)0.0f;
+        stop[b] = inside ? (i16)end : (i16)begin;
+        if (any(inside)) open |= 1u << b;
+    }
+    // First pixel of each block.
+    const v16 corner_x = 4.0f * lane_x + (x0 + 0.5f), corner_y = 4.0f * lane_y + (y0 + 0.5f);
+    for (int base = begin; base < end && open; base += 64) {
+        unsigned long long live[16] = {};  // by block, the Gaussians of these 64 that reach it
+        const int count = smaller(64, end - base);
+        for (int j = 0; j < count; j += 16) {
+            int reached[16] = {};
+            for (int i = 0; i < 16 && j + i < count; ++i) {
+                __builtin_prefetch(records + (long long)RECORD * tile_list[smaller(base + j + i + 16, end - 1)]);
+                const float* r = records + (long long)RECORD * tile_list[base + j + i];
+                const v16 left = corner_x - r[0], right = left + 3.0f, top = corner_y - r[1], bottom = top + 3.0f;
+                // A convex function is least at the point nearest to the centre or on an edge that faces it.
+                const v16 near_x = vmax(left, vmin(right, (v16)0.0f)), near_y = vmax(top, vmin(bottom, (v16)0.0f));
+                const v16 at_y = vmax(top, vmin(bottom, r[13] * near_x));
+                const v16 at_x = vmax(left, vmin(right, r[12] * near_y));
+                const v16 p = r[2] * near_x + r[3] * at_y, w = r[4] * at_y;
+                const v16 q = r[2] * at_x + r[3] * near_y, u = r[4] * near_y;
+                // A little more than exact: every pixel is tested again.
+                const i16 near = vmin(p * p + w * w, q * q + u * u) <= r[14] + 0.01f;
+                reached[i] = shortcuts & BLOCK_BOUNDS ? bits(near) : 65535;
+                pair_blocks[base + j + i] = reached[i];
+            }
+            const i16 of_gaussian = *(const i16*)reached;
+            for (int b = 0; b < 16; ++b) live[b] |= (unsigned long long)bits(of_gaussian & (1 << b)) << j;
+        }
+        for (unsigned todo = open; todo; todo &= todo - 1) {
+            const int b = __builtin_ctz(todo);
+            // Exponent that a Gaussian needs to count; none suffices in a finished pixel.
+            v16 transmitted = T[b], color[D], least = transmitted > 0.0f ? (v16)LOG2_ALPHA_MIN : (v16)1e30f;
+            for (int c = 0; c < D; ++c) color[c] = C[b][c];
+            for (unsigned long long rest = live[b]; rest; rest &= rest - 1) {
+                const int k = base + __builtin_ctzll(rest);
+                const float* r = records + (long long)RECORD * tile_list[k];
+                const Falloff seen(tile, b, r);
+
+                const v16 alpha = vmin((v16)ALPHA_MAX, exp2(seen.log2_alpha));
+                const v16 next = transmitted - alpha * transmitted;
+                const i16 taken = seen.log2_alpha >= least, finished = taken & (next <= TRANSMITTANCE_MIN);
+                const i16 hit = taken & ~finished;
+                // Selected, not multiplied by zero: a NaN colour stays in the pixels that it touches.
+                const v16 weight = alpha * transmitted;
+                for (int c = 0; c < D; ++c) color[c] = hit ? color[c] + weight * r[8 + c] : color[c];
+                transmitted = hit ? next : transmitted;
+                if (any(finished)) {
+                    transmitted = finished ? -transmitted : transmitted;
+                    least = finished ? (v16)1e30f : least;
+                    stop[b] = finished ? (i16)k : stop[b];
+                    if ((shortcuts & SATURATION) && !any(transmitted > 0.0f)) {
+                        open &= ~(1u << b);
+                        break;
+                    }
+                }
+            }
+            T[b] = transmitted;
+            for (int c = 0; c < D; ++c) C[b][c] = color[c];
+        }
+    }
+    int tile_end = begin;
+    for (int b = 0; b < 16; ++b) tile_end = larger(tile_end, __builtin_reduce_max(stop[b]));
+    tile_stop[t] = tile_end;
+    for (int y = 0; y < tile.rows; ++y)
+        for (int x = 0; x < tile.columns; ++x) {
+            const long long at = (long long)(y0 + y) * width + x0 + x;
+            const int b = y / 4 * 4 + x / 4, l = y % 4 * 4 + x % 4;
+            transmittance[at] = fabsf(T[b][l]);
+            pixel_stop[at] = stop[b][l];
+            for (int c = 0; c < channels; ++c) image[at * stride + channel + c] = C[b][c][l];
+        }
+}

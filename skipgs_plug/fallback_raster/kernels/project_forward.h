@@ -1,0 +1,46 @@
+// Centre, depth, inverse covariance and extent on the image plane of rows [first, last).
+#include "geometry.h"
+for (int base = first; base < last; base += 16) {
+    const int lanes = last - base < 16 ? last - base : 16;
+    int row[16];
+    for (int l = 0; l < 16; ++l) row[l] = base + (l < lanes ? l : lanes - 1);
+    v16 world[3], x, y, z, qw, qx, qy, qz, q_scale, q_norm, R[3][3];
+    v16 iz, ux, uy, J00, J02, J11, J12, WM[3][3], T0[3], T1[3];
+    v16 sharp_xx, sharp_yy, cov_xx, cov_yy, sharp_det, det, slope, conic_a, conic_b, conic_c;
+    const v16 S[3] = {gather(scales, row, 3, 0), gather(scales, row, 3, 1), gather(scales, row, 3, 2)};
+    centres(viewmat, means, row, world, x, y, z);
+    rotations(quats, row, qw, qx, qy, qz, q_scale, q_norm, R);
+    splat_axes(viewmat, K, width, height, x, y, z, R, S, iz, ux, uy, J00, J02, J11, J12, WM, T0, T1);
+    covariances(T0, T1, eps2d, sharp_xx, sharp_yy, cov_xx, cov_yy, sharp_det, det, slope, conic_a, conic_b, conic_c);
+
+    v16 compensation = vsqrt(sharp_det / det);
+    v16 opacity = gather(opacities, row, 1, 0) * (antialiased ? compensation : (v16)1.0f);
+    // Written so that a NaN anywhere fails the test and the Gaussian is left out.
+    i16 visible = (z >= near_plane) & (z <= far_plane) & (det > 0.0f) & (opacity >= ALPHA_MIN);
+    v16 reach = vmin((v16)3.33f, vsqrt(LN_4 * log2(255.0f * vmax(opacity, (v16)1e-3f))));
+    v16 u = K[0] * x * iz + K[2], v = K[4] * y * iz + K[5];
+    v16 sigma_x = vsqrt(cov_xx), sigma_y = vsqrt(cov_yy);
+    v16 radius_x = vmin((v16)1e9f, __builtin_elementwise_ceil(reach * sigma_x));
+    v16 radius_y = vmin((v16)1e9f, __builtin_elementwise_ceil(reach * sigma_y));
+    // Thinner than a millionth of a pixel (only without eps2d): it meets no pixel centre, but overflows gradients.
+    visible &= (conic_a < 1e12f) & (conic_c < 1e12f);
+    visible &= (radius_x > radius_clip) | (radius_y > radius_clip);
+    visible &= (u + radius_x > 0.0f) & (u - radius_x < width) & (v + radius_y > 0.0f) & (v - radius_y < height);
+
+    const v16 none = (v16)0.0f;
+    i16 rx = __builtin_convertvector(visible ? radius_x : none, i16);
+    i16 ry = __builtin_convertvector(visible ? radius_y : none, i16);
+    for (int l = 0; l < lanes; ++l) {
+        radii[2 * row[l]] = rx[l];
+        radii[2 * row[l] + 1] = ry[l];
+    }
+    scatter(means2d, row, 2, 0, visible ? u : none, lanes);
+    scatter(means2d, row, 2, 1, visible ? v : none, lanes);
+    scatter(depths, row, 1, 0, visible ? z : none, lanes);
+    scatter(conics, row, 3, 0, visible ? conic_a : none, lanes);
+    scatter(conics, row, 3, 1, visible ? conic_b : none, lanes);
+    scatter(conics, row, 3, 2, visible ? conic_c : none, lanes);
+    scatter(sigmas, row, 2, 0, visible ? sigma_x : none, lanes);
+    scatter(sigmas, row, 2, 1, visible ? sigma_y : none, lanes);
+    if (antialiased) scatter(compensations, row, 1, 0, visible ? compensation : none, lanes);
+}

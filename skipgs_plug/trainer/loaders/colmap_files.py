@@ -1,0 +1,105 @@
+"""Lengths in COLMAP's binary files: its reader takes counts at their word, whatever the size of the file."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from skipgs_plug.trainer.errors import InputError
+
+POINT_2D = 24  # x, y, id of the 3D point
+TRACK_ELEMENT = 8  # image id, index of the 2D point
+POSE = 56  # quaternion, translation
+
+
+def check_lengths(model: Path, camera_models: dict[int, int]) -> None:
+    """Walk through every binary file of a model and see that its counts fill it exactly.
+
+    Args:
+        model: folder with cameras.bin, images.bin, points3D.bin and, of newer versions, rigs.bin and frames.bin.
+        camera_models: number of parameters by id of the camera model.
+
+    Raises:
+        InputError: a file is shorter or longer than its counts say, or has an unknown camera model.
+    """
+    for name, walk in WALKS.items():
+        path = model / name
+        if not path.is_file():
+            continue
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path} cannot be read ({error}).") from error
+        at = 0
+        try:
+            for at in walk(data, camera_models):
+                if at > len(data):
+                    break
+        except (struct.error, ValueError):
+            at = len(data) + 1
+        except KeyError as error:
+            raise InputError(f"{path} has a camera of unknown model {error}; export the model again.") from error
+        if at != len(data):
+            what = "ends early" if at > len(data) else f"has {len(data) - at:,} bytes too many"
+            raise InputError(f"{path} {what}: its counts do not fit its {len(data):,} bytes; export the model again.")
+
+
+def walk_cameras(data: bytes, camera_models: dict[int, int]) -> Iterator[int]:
+    """Yield the position after the count and after every record."""
+    at = 8
+    yield at
+    for _ in range(unpack("<Q", data, 0)):
+        at += 24 + 8 * camera_models[unpack("<i", data, at + 4)]
+        yield at
+
+
+def walk_images(data: bytes, _: Any) -> Iterator[int]:
+    at = 8
+    yield at
+    for _ in range(unpack("<Q", data, 0)):
+        at = data.index(b"\0", at + 4 + POSE + 4) + 1
+        at += 8 + POINT_2D * unpack("<Q", data, at)
+        yield at
+
+
+def walk_points(data: bytes, _: Any) -> Iterator[int]:
+    at = 8
+    yield at
+    for _ in range(unpack("<Q", data, 0)):
+        at += 51 + TRACK_ELEMENT * unpack("<Q", data, at + 43)
+        yield at
+
+
+def walk_rigs(data: bytes, _: Any) -> Iterator[int]:
+    at = 8
+    yield at
+    for _ in range(unpack("<Q", data, 0)):
+        sensors = unpack("<I", data, at + 4)
+        at += 8 + (8 if sensors else 0)  # the reference sensor has no pose
+        for _ in range(sensors - 1):
+            at += 9 + (POSE if data[at + 8 : at + 9] != b"\0" else 0)
+            yield at
+        yield at
+
+
+def walk_frames(data: bytes, _: Any) -> Iterator[int]:
+    at = 8
+    yield at
+    for _ in range(unpack("<Q", data, 0)):
+        at += 12 + POSE + 16 * unpack("<I", data, at + 8 + POSE)
+        yield at
+
+
+def unpack(kind: str, data: bytes, at: int) -> int:
+    return struct.unpack_from(kind, data, at)[0]
+
+
+WALKS = {
+    "cameras.bin": walk_cameras,
+    "images.bin": walk_images,
+    "points3D.bin": walk_points,
+    "rigs.bin": walk_rigs,
+    "frames.bin": walk_frames,
+}

@@ -1,0 +1,67 @@
+"""JSON files of a scene: every way in which one can be broken is one sentence."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skipgs_plug.trainer.errors import InputError
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file, which is UTF-8 whatever the locale.
+
+    Raises:
+        InputError: the file cannot be read, is not JSON, nested too deeply, or not an object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError, MemoryError) as error:
+        raise InputError(f"{path} is not valid JSON ({error}); restore the file.") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path} holds no JSON object; restore the file.")
+    return content
+
+
+def read_number(value: Any, name: str, source: Path) -> float:
+    """Return a finite number, or name what is not one."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if isinstance(value, (str, bool)) or not math.isfinite(number):
+        raise InputError(f"{source}: {name} is {short(value)}, not a finite number; restore the file.")
+    return number
+
+
+def read_string(value: Any, name: str, source: Path) -> str:
+    if not isinstance(value, str):
+        raise InputError(f"{source}: {name} is {short(value)}, not a string; restore the file.")
+    return value
+
+
+def read_pose(value: Any, name: str, source: Path) -> np.ndarray:
+    """Return a camera-to-world matrix [4, 4] that can be inverted."""
+    try:
+        pose = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{source}: transform_matrix of {name!r} is not 4x4 numbers; restore the file.") from error
+    if pose.shape != (4, 4):
+        raise InputError(f"{source}: transform_matrix of {name!r} is not 4x4; restore the file.")
+    sound = np.isfinite(pose).all() and np.abs(pose).max() < 1e12 and np.allclose(pose[3], (0, 0, 0, 1))
+    if not sound or abs(np.linalg.det(pose[:3, :3])) < 1e-6:
+        raise InputError(f"{source}: transform_matrix of {name!r} is not a finite pose; restore the file.")
+    return pose
+
+
+def short(value: Any) -> str:
+    """Return what is wrong in at most 60 characters; numbers of thousands of digits have no text."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        return "too long"
+    return text if len(text) <= 60 else text[:57] + "..."

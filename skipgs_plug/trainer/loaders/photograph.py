@@ -1,0 +1,101 @@
+"""One View of a photograph, its mask and its calibrated camera; lens distortion is removed in memory."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.loaders.images import read_image, read_mask
+from skipgs_plug.trainer.loaders.native import import_pycolmap
+from skipgs_plug.trainer.loaders.paths import inside
+from skipgs_plug.trainer.scene import View
+
+PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
+MAX_SIDE = 1 << 20
+
+
+def load_photograph(
+    name: str, image_path: Path, camera: Any, viewmat: np.ndarray, factor: int = 1, mask_path: Path | None = None
+) -> View:
+    """Read a photograph; alpha below one half and black pixels of the mask do not count in the loss.
+
+    Args:
+        name: of the view.
+        image_path: at any scale of the size that the camera was calibrated for.
+        camera: pycolmap.Camera of any model that pycolmap can undistort.
+        viewmat: world to camera [4, 4].
+        factor: shrink by this in memory.
+        mask_path: picture of the same shape, black where pixels are left out.
+    """
+    check_camera(camera, image_path)
+    size = (camera.width, camera.height)
+    pixels, alpha = read_image(image_path, image_path, None, factor, size)
+    mask = None if alpha is None else alpha >= 128
+    if mask_path is not None:
+        drawn = read_mask(mask_path, pixels, size)
+        mask = drawn if mask is None else mask & drawn
+    if model_name(camera) in PINHOLE_MODELS:
+        K = np.array(camera.calibration_matrix(), dtype=np.float64)
+        # The downscaled image has a rounded size: scale by what was really loaded, not by the factor.
+        K[0] *= pixels.shape[1] / camera.width
+        K[1] *= pixels.shape[0] / camera.height
+    else:
+        pixels, mask, K = undistort(pixels, mask, camera, image_path)
+    return View(name, pixels, torch.from_numpy(K).float(), torch.from_numpy(viewmat).float(), mask)
+
+
+def undistort(
+    pixels: Tensor, mask: Tensor | None, camera: Any, image_path: Path
+) -> tuple[Tensor, Tensor | None, np.ndarray]:
+    """Resample image and mask as a pinhole camera sees them, cut so that no pixel is without a source; returns K."""
+    pycolmap = import_pycolmap()
+    try:
+        fitted = pycolmap.Camera(camera.todict())
+        fitted.rescale(pixels.shape[1], pixels.shape[0])
+        options = pycolmap.UndistortCameraOptions()
+        bitmap, pinhole = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(pixels.numpy()), fitted)
+        straight = torch.from_numpy(np.array(bitmap.to_array()))
+        if mask is not None:
+            drawn = pycolmap.Bitmap.from_array(mask.byte().numpy() * 255)
+            cut, _ = pycolmap.undistort_image(options, drawn, fitted)
+            mask = torch.from_numpy(np.array(cut.to_array())).reshape(straight.shape[:2]) >= 128
+    except Exception as error:  # pycolmap raises bare RuntimeError or ValueError
+        raise InputError(
+            f"Image {image_path}: its camera, a {model_name(camera)}, cannot be undistorted ({error}); "
+            "run: colmap image_undistorter."
+        ) from error
+    return straight, mask, np.array(pinhole.calibration_matrix(), dtype=np.float64)
+
+
+def check_camera(camera: Any, source: Path) -> None:
+    """Refuse sizes, focal lengths and distortions that no camera has."""
+    parameters = np.array(camera.params, dtype=np.float64)
+    focal = parameters[list(camera.focal_length_idxs())]
+    if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE):
+        problem = f"a size of {camera.width}x{camera.height}"
+    elif not np.isfinite(parameters).all() or np.abs(parameters).max(initial=0.0) > 1e9:
+        problem = f"parameters {parameters.tolist()}"
+    elif (focal <= 0).any():
+        problem = f"a focal length of {focal.min():g}"
+    else:
+        return
+    raise InputError(f"{source}: its camera ({model_name(camera)}) has {problem}; run the reconstruction again.")
+
+
+def model_name(camera: Any) -> str:
+    return getattr(camera.model, "name", str(camera.model))
+
+
+def find_mask(folder: Path, name: str) -> Path | None:
+    """Return the mask of an image: its name with .png added (COLMAP's way) or in place of its suffix, or its name."""
+    path = inside(folder, name)
+    for candidate in (path.with_name(path.name + ".png"), path.with_suffix(".png"), path):
+        if os.path.isfile(candidate):
+            return candidate
+    return None
