@@ -8,7 +8,7 @@ from torch import Tensor
 
 from .inria import GaussianRasterizationSettings, RasterizerModule
 from .rendering import render, splats
-from .statistics import sum_per_gaussian
+from .statistics import gather
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
@@ -21,4 +21,4 @@ class GaussianRasterizer(RasterizerModule):
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
         result = render(self.raster_settings, splats(means3D, means2D, opacities, **gaussians))
-        return result.color, result.radii, sum_per_gaussian(result.footprint, lambda pairs: pairs.weight)
+        return result.color, result.radii, gather(result.footprint).weight

@@ -10,7 +10,7 @@ from torch import Tensor
 from .inria import RasterizerModule
 from .rendering import render, splats
 from .sparse_adam import SparseGaussianAdam
-from .statistics import sum_per_gaussian
+from .statistics import gather
 from .taming import GaussianRasterizationSettings
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam"]
@@ -29,8 +29,7 @@ class GaussianRasterizer(RasterizerModule):
         empty = torch.empty(0)
         sums = empty
         if weights is not None and len(weights):
-            flat = weights.detach().reshape(-1)
-            sums = sum_per_gaussian(f, lambda pairs: flat[pairs.pixel] * pairs.weight)
+            sums = gather(f, weights).weighted_value
         centers = f.means2d - 0.5  # the CUDA code has the first pixel centre at 0
         unread = (empty,) * 3
         return result.color, result.radii, empty, *unread, centers, f.depths, result.radii, sums, *unread

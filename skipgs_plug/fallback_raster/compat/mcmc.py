@@ -10,20 +10,17 @@ from torch import Tensor
 from . import relocation
 from .inria import GaussianRasterizationSettings, RasterizerModule
 from .rendering import render, splats
+from .statistics import gather
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "compute_relocation"]
 
 
 class GaussianRasterizer(RasterizerModule):
-    """Returns (color [3, H, W], radii [N], is_used [N] int32).
-
-    The CUDA module marks in `is_used` what reached a pixel; here it is what has a radius, which no trainer tells
-    apart.
-    """
+    """Returns (color [3, H, W], radii [N], is_used [N] int32, 1 where a Gaussian contributes to a pixel)."""
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
         result = render(self.raster_settings, splats(means3D, means2D, opacities, **gaussians))
-        return result.color, result.radii, (result.radii > 0).to(torch.int32)
+        return result.color, result.radii, (gather(result.footprint).pixels > 0).to(torch.int32)
 
 
 def compute_relocation(

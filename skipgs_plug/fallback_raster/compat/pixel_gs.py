@@ -8,7 +8,7 @@ from torch import Tensor
 
 from .inria import RasterizerModule
 from .rendering import render, splats
-from .statistics import count_per_gaussian
+from .statistics import gather
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
@@ -45,4 +45,4 @@ class GaussianRasterizer(RasterizerModule):
             means2D = means2D.clone()
             means2D.register_hook(lambda gradient: gradient * fading)
         result = render(settings, splats(means3D, means2D, opacities, **gaussians))
-        return result.color, result.radii, count_per_gaussian(result.footprint).float()[:, None]
+        return result.color, result.radii, gather(result.footprint).pixels.float()[:, None]

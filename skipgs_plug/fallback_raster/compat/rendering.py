@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .statistics import Footprint, squared_gradients
+from .pairs import squared_gradients
+from .statistics import Footprint
 
 NEAR_PLANE = 0.2  # `in_frustum` of the CUDA code
 EPS2D = 0.3  # its low-pass filter, added to the 2D covariance
