@@ -15,7 +15,7 @@ from skipgs_plug.adapters.registry import get_adapter
 each = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 resumable = [case for case in CASES if case.resume]
 REAL_BACKWARD = torch.Tensor.backward
-NOT_EVENTS = ("frozen", "relocate")  # change nothing about the losses, or belong to every iteration
+NOT_EVENTS = ("frozen", "relocate", "filter")  # change nothing about the losses, or belong to every iteration
 
 
 @pytest.fixture(scope="module")
