@@ -61,6 +61,9 @@ def gsplat_on_cpu() -> Iterator[None]:
 @contextmanager
 def _no_cuda_toolkit() -> Iterator[None]:
     """Keep gsplat from compiling its extension when it is imported, which it does since 1.6 where it finds `nvcc`."""
+    if not usable("torch.utils.cpp_extension"):  # it needs setuptools, and gsplat needs it to compile
+        yield
+        return
     places: Any = importlib.import_module("torch.utils.cpp_extension")
     find = places._find_cuda_home
     places._find_cuda_home = lambda: None
