@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -17,6 +19,7 @@ from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Adapter, Hooks
 from skipgs_plug.core.optimizers import listed
 from skipgs_plug.core.policy import Policy
+from skipgs_plug.core.refinement.loop_range import EVERY, LoopRange
 from skipgs_plug.core.report import build_report, counters, summarise
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.views import view_key
@@ -39,6 +42,12 @@ class SkipGate:
             if gate.backward(loss, view=camera.image_name, step=step):
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)
+
+    With `refine_share` whole iterations are left out after densification, and all learning rates are larger for
+    it and shrink (see `skipgs_plug.core.refinement`); a loop of your own is then written as
+
+        gate = SkipGate(start_iter=15_000, refine_share=0.4)
+        for step in gate.iterations(range(1, 30_001)):
 
     Learning-rate and SH schedules, logging and checkpoints count iterations, not updates: let them run on
     skipped iterations too. From `start_iter` on the loss is read on the host before the backward, one
@@ -89,6 +98,43 @@ class SkipGate:
         self._iteration = self._engine.iteration
 
     # Verbs for a loop of your own.
+
+    def iterations(
+        self, numbers: range, *, always: Iterable[int] | None = None, views: Iterable[Any] | None = None
+    ) -> LoopRange:
+        """Return the iterations of your loop that run: `for step in gate.iterations(range(30_000))`.
+
+        Also for a loop of yours around a trainer that the gate is attached to.
+
+        Iterations that something hangs on always run: those for which the loop's own conditions on the number
+        hold (`if step % 1000 == 0`), read from its source, and the last one. What advances per call, such as a
+        scheduler, is yours to advance by number.
+
+        Args:
+            numbers: All iterations, one by one.
+            always: Iterations that must run, instead of those read from the loop.
+            views: Keys of all training views; `refine_share="auto"` must know them.
+
+        Raises:
+            SkipGSError: The numbers do not go up by one, or a condition of the loop cannot be foreseen.
+        """
+        if not isinstance(numbers, range) or numbers.step != 1:
+            raise SkipGSError("iterations() takes a range that goes up by one, such as range(30_000).")
+        engine = self._engine
+        if numbers:
+            engine.compensate_until(numbers[-1])
+        if engine.refinement is None:
+            return LoopRange(numbers, EVERY)
+        source = None
+        if always is None:
+            frame = sys._getframe(1)
+            source = (frame.f_code, {**frame.f_globals, **frame.f_locals})
+        else:
+            chosen = set(always)
+            engine.refinement.describe(lambda left: chosen)
+        if views is not None:
+            engine.refinement.know_views([view_key(view) for view in views])
+        return engine.refinement.follow(LoopRange(numbers, engine.refinement, source))
 
     def backward(self, loss: Any, view: Any, step: int, *, signal: Any = None) -> bool:
         """Run `loss.backward()` unless this view can do without; True when gradients were computed.
@@ -211,6 +257,11 @@ class SkipGate:
         return self._engine.trace
 
     @property
+    def script_globals(self) -> dict[str, Any]:
+        """Names that a script which is about to run must find among its globals."""
+        return {} if self._hooks is None else self._hooks.script_globals
+
+    @property
     def patched(self) -> list[str]:
         """Every name replaced in the trainer and in PyTorch, as "owner.name"; empty once detached.
 
@@ -225,7 +276,7 @@ class SkipGate:
         own = None if self.adapter is None else self.adapter.timing()
         clock = self._engine.clock
         t_total, t_post = (clock.t_total, clock.t_post) if own is None else own
-        return counters(self._engine.stats, self._floor, t_total, t_post)
+        return counters(self._engine.stats, self._floor, t_total, t_post, self._engine.refinement)
 
     def report(self) -> dict[str, Any]:
         """The content of skipgs.json: settings, counters, seconds, per-view table."""
@@ -289,6 +340,7 @@ class SkipGate:
         """Put back everything that was replaced; counts and summary stay readable."""
         if self._hooks is not None:
             self._hooks.restore()
+        self._engine.release()
 
     def __enter__(self) -> SkipGate:
         return self

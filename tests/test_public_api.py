@@ -25,6 +25,10 @@ NAMES = {
 }
 
 GATE = {
+    "iterations": (
+        "(self, numbers: 'range', *, always: 'Iterable[int] | None' = None, "
+        "views: 'Iterable[Any] | None' = None) -> 'LoopRange'"
+    ),
     "backward": "(self, loss: 'Any', view: 'Any', step: 'int', *, signal: 'Any' = None) -> 'bool'",
     "detach": "(self) -> 'None'",
     "load_state_dict": "(self, state: 'dict[str, Any]') -> 'None'",
@@ -40,7 +44,7 @@ GATE = {
     "view_table": "(self) -> 'list[dict[str, Any]]'",
     "visible": "(self, mask: 'Tensor') -> 'Tensor'",
 }
-GATE_PROPERTIES = {"adapter", "config", "patched", "policy", "skipped", "trace", "trained"}
+GATE_PROPERTIES = {"script_globals", "adapter", "config", "patched", "policy", "skipped", "trace", "trained"}
 
 ADAPTER = {
     "attach": "(self, hooks: 'Hooks') -> 'None'",
@@ -53,13 +57,21 @@ ADAPTER = {
     "timing": "(self) -> 'tuple[float, float] | None'",
 }
 HOOKS = {
+    "always": "(self, always: 'Always') -> 'None'",
     "backward": "(self, loss: 'torch.Tensor', run: 'Callable[[], Any]', view: 'Any' = None) -> 'Any'",
     "before": "(self, owner: 'Any', name: 'str', call: 'Callable[..., Any]') -> 'None'",
+    "catch_up": "(self, owner: 'Any', name: 'str', caller: 'str') -> 'None'",
     "event": "(self, kind: 'str') -> 'None'",
     "events": "(self, owner: 'Any', *names: 'str') -> 'None'",
     "gate_tensor_backward": "(self, *callers: 'str') -> 'None'",
     "iteration": "(self, step: 'int') -> 'None'",
+    "loop": (
+        "(self, names: 'dict[str, Any]', *functions: 'str', always: 'Always | None' = None, "
+        "pure: 'Iterable[str]' = ()) -> 'None'"
+    ),
+    "number": "(self, counted: 'int') -> 'int'",
     "on_detach": "(self, label: 'str', undo: 'Callable[[], None]') -> 'None'",
+    "own_loop": "(self, owner: 'Any', name: 'str') -> 'None'",
     "ready": "(self, facts: 'TrainerFacts') -> 'None'",
     "restore": "(self) -> 'None'",
     "signal": "(self, value: 'float | torch.Tensor') -> 'None'",
@@ -71,7 +83,7 @@ HOOKS = {
 FACTS = (
     "(start_iter: 'int | None', *, view_names: 'Iterable[str] | None' = None, max_steps: 'int | None' = None, "
     "world_size: 'int | None' = None, gradients_read_until: 'int | None' = None, "
-    "defaults: 'Mapping[str, Any]' = <factory>) -> None"
+    "accumulates: 'bool' = False, defaults: 'Mapping[str, Any]' = <factory>) -> None"
 )
 POLICY = {
     "decide": "(self, view: 'Hashable', loss: 'float', step: 'int') -> 'Decision'",
@@ -93,6 +105,10 @@ DEFAULTS = {
     "pause_iters": None,
     "step_mode": "off",
     "step_trigger": "snr",
+    "refine_share": None,
+    "tolerance": 0.05,
+    "compensate": None,
+    "rate_peak": None,
 }
 
 
@@ -137,7 +153,7 @@ def test_what_adapters_are_written_with() -> None:
         "replaced",
     }
     assert signatures(Hooks) == HOOKS
-    assert properties(Hooks) == {"patched", "state", "trained"}
+    assert properties(Hooks) == {"gap", "patched", "state", "trained"}
     assert str(inspect.signature(TrainerFacts)) == FACTS
     assert str(inspect.signature(adapters.register_adapter)) == (
         "(adapter: 'type[AbstractAdapter]') -> 'type[AbstractAdapter]'"
@@ -172,7 +188,8 @@ def test_state_keys() -> None:
     gate = SkipGate(start_iter=0)
     gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
     state = gate.state_dict()
-    assert set(state) == {"version", "policy", "stats", "accumulator", "non_finite_in_a_row", "clock", "step"}
+    gate = {"version", "policy", "stats", "accumulator", "non_finite_in_a_row", "clock", "step", "refinement"}
+    assert set(state) == gate
     assert set(state["policy"]) == {"version", "means", "budget", "warmup_end", "pause_until", "events"}
     assert set(state["stats"]) == {"iterations", "backwards", "skips", "reasons", "events", "views"}
     assert state["version"] == state["policy"]["version"] == 2

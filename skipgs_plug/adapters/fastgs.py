@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from skipgs_plug.adapters.inria import InriaFamily
+
+ACCUMULATES_FROM = 15_000  # `optimizer_step` has these numbers in it
+SLOWER_FROM = 20_000
 
 
 class FastGS(InriaFamily):
@@ -28,3 +31,18 @@ class FastGS(InriaFamily):
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter)
+
+    def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
+        default = getattr(opt, "optimizer_type", "default") == "default"
+        return default and self.start_iter(opt, loop) >= ACCUMULATES_FROM
+
+    def always_run(self, numbers: range) -> Iterable[int]:
+        """Those in which `optimizer_step` steps an optimizer on what gathered over several."""
+        return (n for n in numbers if n % interval(n) == 0)
+
+
+def interval(iteration: int) -> int:
+    """Iterations between two of the rarer steps."""
+    if iteration <= ACCUMULATES_FROM:
+        return 16
+    return 32 if iteration <= SLOWER_FROM else 64

@@ -11,6 +11,7 @@ import torch
 from skipgs_plug.adapters.base import GATES_CHILDREN, AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
 from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
@@ -90,6 +91,8 @@ class GsplatRunner(AbstractAdapter):
         hooks.before(*((runner, "rasterize_splats") if stage is None else (stage, "render")), remember)
         hooks.before(type(strategy), "step_pre_backward", forwarded)
         hooks.gate_tensor_backward("train")
+        hooks.loop(function_names(type(runner).train), "train")
+        catch_up_schedulers(hooks, "train")
         self._relocations = leave_out_noise(hooks, strategy, type(strategy))
         self.output_folder = runner.cfg.result_dir
         hooks.ready(

@@ -7,6 +7,8 @@ from typing import Any
 
 from skipgs_plug.adapters.inria import InriaFamily
 
+ACCUMULATES_FROM = 15_000  # the loop has this number in it
+
 
 class ImprovedGS(InriaFamily):
     """Both optimizers step every 5th iteration from 15,001 on and every 20th from 22,501 on, as upstream.
@@ -27,3 +29,6 @@ class ImprovedGS(InriaFamily):
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter)
+
+    def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
+        return opt.optimizer_type == "default" and self.start_iter(opt, loop) >= ACCUMULATES_FROM

@@ -14,7 +14,7 @@ import warnings
 import weakref
 from abc import abstractmethod
 from collections import ChainMap
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -102,6 +102,10 @@ class InriaFamily(AbstractAdapter):
         """First iteration whose gradients only the optimizers read; arguments as for `start_iter`."""
         return int(opt.densify_until_iter)
 
+    def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
+        """Whether optimizers step by the iteration's number, on gradients gathered since; as for `start_iter`."""
+        return False
+
     def attach(self, hooks: Hooks) -> None:
         names = namespace_of(self.trainer)
         if names is None or LOOP not in names or "GaussianModel" not in names:
@@ -112,7 +116,7 @@ class InriaFamily(AbstractAdapter):
         code = LoopCode.of_module(names)
         self._refuse_fork(code)
         self.examine(code, names, names["GaussianModel"])
-        self._attach_to(hooks, names, names["GaussianModel"])
+        self._attach_to(hooks, names, names["GaussianModel"], names)
 
     def attach_script(self, hooks: Hooks) -> None:
         code = LoopCode.of_script(Path(sys.argv[0]))
@@ -126,9 +130,9 @@ class InriaFamily(AbstractAdapter):
         renderer = importlib.import_module("gaussian_renderer")
         model = importlib.import_module("scene.gaussian_model").GaussianModel
         self.examine(code, vars(renderer), model)
-        self._attach_to(hooks, vars(renderer), model)
+        self._attach_to(hooks, vars(renderer), model, hooks.script_globals)
 
-    def _attach_to(self, hooks: Hooks, names: dict[str, Any], model: type) -> None:
+    def _attach_to(self, hooks: Hooks, names: dict[str, Any], model: type, script: dict[str, Any]) -> None:
         present = [name for name in self.renders if name in names]
         if not present:
             raise AdapterMismatchError(
@@ -146,7 +150,7 @@ class InriaFamily(AbstractAdapter):
                 self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
                 self._model = weakref.ref(args[0])
             else:
-                self._step += 1
+                self._step = hooks.number(self._step + 1)
                 own = [one for one in vars(args[0]).values() if isinstance(one, torch.optim.Optimizer)]
                 if moved := stillness.moved(own):
                     self._give_up(hooks, moved)
@@ -165,6 +169,11 @@ class InriaFamily(AbstractAdapter):
             hooks.wrap(names, name, rendered)
         hooks.events(model, *(name for name in self.structural if hasattr(model, name)))
         hooks.gate_tensor_backward(LOOP)
+        hooks.loop(script, LOOP, always=self.always_run)
+
+    def always_run(self, numbers: range) -> Iterable[int]:
+        """Those of these iterations on whose number something hangs that the loop itself does not say."""
+        return ()
 
     def is_training_render(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bool:
         """Whether a render with these arguments after the camera can be the training one."""
@@ -227,6 +236,7 @@ class InriaFamily(AbstractAdapter):
                 view_names=[view_key(key) for key in self.view_keys(cameras)],
                 max_steps=opt.iterations,
                 gradients_read_until=self.gradients_read_until(opt, loop),
+                accumulates=self.accumulates(opt, loop),
             )
         )
 

@@ -55,8 +55,8 @@ class MCMC(InriaFamily):
     def must_run(self, step: int) -> bool:
         return step in self._relocations
 
-    def _attach_to(self, hooks: Hooks, names: dict[str, Any], model: type) -> None:
-        super()._attach_to(hooks, names, model)
+    def _attach_to(self, hooks: Hooks, names: dict[str, Any], model: type, script: dict[str, Any]) -> None:
+        super()._attach_to(hooks, names, model, script)
 
         def covariance(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             factor = original(*args, **kwargs)

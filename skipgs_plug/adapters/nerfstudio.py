@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.loss_scaler import guard_scaler
+from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
@@ -77,6 +78,8 @@ class Nerfstudio(AbstractAdapter):
         hooks.wrap(pipeline, "get_train_loss_dict", forwarded)
         hooks.wrap(pipeline.datamanager, "next_train", batch_made)
         hooks.gate_tensor_backward(LOOP)
+        hooks.loop(function_names(type(trainer).train), "train", always=self.always_run, pure=("step_check",))
+        catch_up_schedulers(hooks, "scheduler_step_all")
         guard_scaler(hooks, trainer.grad_scaler)
         strategy = getattr(pipeline.model, "strategy", None)
         self._relocations = leave_out_noise(hooks, strategy, strategy)
@@ -93,6 +96,16 @@ class Nerfstudio(AbstractAdapter):
 
     def must_run(self, step: int) -> bool:
         return step in self._relocations
+
+    def always_run(self, numbers: range) -> Iterable[int]:
+        """Evaluations, and the first and last of several whose gradients are gathered: other functions decide there."""
+        config = self.trainer.config
+        every = (config.steps_per_eval_batch, config.steps_per_eval_image, config.steps_per_eval_all_images)
+        gathered = [steps for steps in config.gradient_accumulation_steps.values() if steps > 1]
+        for n in numbers:
+            evaluates = any(interval and n % interval == 0 for interval in every)
+            if evaluates or any(n % steps in (0, steps - 1) for steps in gathered):
+                yield n
 
 
 def view_names(files: list[Path]) -> list[str]:

@@ -40,6 +40,7 @@ class ReferenceTrainer(AbstractAdapter):
             hooks.backward(loss, lambda: original(loss, view, step), view)
 
         hooks.wrap(trainer, "backward", gated)
+        hooks.own_loop(trainer, "iterations")
         n_views = len(trainer.view_names)
         scale = trainer.max_steps / FULL_SCHEDULE
         hooks.ready(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import torch
@@ -19,6 +19,7 @@ from skipgs_plug.core.hooks import Hooks
 EXPECTED = ("step", "curr_step", "optimizer", "update_learning_rate", "preprocess", "before_optim_hook", "optim_step")
 # Last iteration of each kind of densification, inclusive.
 BOUNDS = ("densify_until_iter", "prune_until_iter", "opacity_reset_until_iter")
+RAISES = "sh_degree_up_interval"  # of the wrapper that raises the SH degree
 
 
 class StepTrainer(AbstractAdapter):
@@ -61,6 +62,7 @@ class StepTrainer(AbstractAdapter):
             return self.trainer
 
         hooks.wrap(prepare, "prepare_trainer", prepared)
+        hooks.loop(hooks.script_globals, "training")
 
     def attach(self, hooks: Hooks) -> None:
         trainer = self.trainer
@@ -86,13 +88,25 @@ class StepTrainer(AbstractAdapter):
         def hooked(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             return None if hooks.state.skipped else watched(original, *args, **kwargs)
 
+        def advanced(original: Callable[[], None]) -> None:
+            for _ in range(hooks.gap):  # the trainer counts its calls
+                original()
+            hooks.iteration(trainer.curr_step + 1)
+            original()
+
         # Other wrappers may be put around this trainer later: they call all of these, but not its `step`.
-        hooks.before(trainer, "update_learning_rate", lambda: hooks.iteration(trainer.curr_step + 1))
+        hooks.wrap(trainer, "update_learning_rate", advanced)
+        hooks.always(self.always_run)
         hooks.before(trainer, "preprocess", lambda camera: hooks.view(camera.ground_truth_image_path))
         hooks.wrap(trainer, "before_optim_hook", hooked)
         hooks.wrap(trainer, "optim_step", watched)
         hooks.gate_tensor_backward("step")
         hooks.ready(TrainerFacts(end, gradients_read_until=end))
+
+    def always_run(self, numbers: range) -> Iterable[int]:
+        """Those in which a wrapper raises the SH degree."""
+        intervals = [part.sh_degree_up_interval for part in layers(self.trainer) if hasattr(part, RAISES)]
+        return (n for n in numbers if any(n % interval == 0 for interval in intervals))
 
 
 def layers(part: Any) -> Iterator[Any]:

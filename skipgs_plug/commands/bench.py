@@ -66,7 +66,7 @@ def run(args: Args, command: str) -> list[Row]:
     """Run what is missing, print the table, write bench.json, decisions.json, table.md and plots; returns the rows."""
     check_policies(args.policies)
     config = dataclasses.replace(args.train, data_dir=args.scene, result_dir=args.out)
-    scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts)
+    scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
     folder = BenchFolder(args.out)
     progress, tensorboard = not args.no_progress, args.tensorboard
     bench = Bench(scene, config, folder, args.seeds, args.policies, progress=progress, tensorboard=tensorboard)

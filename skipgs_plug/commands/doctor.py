@@ -14,8 +14,8 @@ FULL = "pip install 'skipgs_plug[full]'"
 EXTRAS = (
     ("warp", "warp-lang", "rasterizer on the CPU"),
     ("gsplat", "gsplat", "densification, rasterizer on CUDA"),
-    ("pycolmap", "pycolmap", "COLMAP scenes"),
-    ("PIL", "pillow", "images"),
+    ("PIL.Image", "pillow", "images"),  # before pycolmap, or writing a PNG crashes: see trainer/loaders/native.py
+    ("pycolmap", "pycolmap", "COLMAP scenes; in your own code import PIL.Image before it"),
     ("plyfile", "plyfile", "PLY"),
     ("scipy", "scipy", "initial scales"),
     ("tyro", "tyro", "command line"),

@@ -30,6 +30,15 @@ class GateOptions:
     step_trigger: Literal["snr", "ref_k"] | None = None
     """When an accumulated step is taken; default snr."""
 
+    refine_share: float | Literal["auto"] | None = None
+    """Leave out whole iterations: the share of refinement that runs (0.4), or auto; default: the paper's gate."""
+    tolerance: float | None = None
+    """Decibels that the rest of refinement may be worth when auto ends it; default 0.05."""
+    compensate: bool | None = None
+    """Larger, shrinking steps for what is left out; default: with --refine-share only."""
+    rate_peak: float | None = None
+    """Factor on learning rates when refinement begins, falling to 0; default: twice the inverse of the share."""
+
     def given(self) -> dict[str, Any]:
         """The settings that the user gave, by name."""
         return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}

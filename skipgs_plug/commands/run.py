@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -22,7 +23,7 @@ from skipgs_plug.scripts import children
 from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
 from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED
 from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu, exclusive_cores
-from skipgs_plug.scripts.launch import run_script, source_of
+from skipgs_plug.scripts.launch import Attach, run_script, source_of
 
 # Stand-ins are named after the extension modules, which not every adapter has to itself.
 FAMILY_OF = {"step_trainer": "pip_gaussian_splatting"}
@@ -92,7 +93,7 @@ def run_spawned(args: Args, command: list[str], rank: int, call: bytes) -> None:
 
 
 def run_gated(
-    args: Args, command: list[str], execute: Callable[[Callable[[], None]], int], rank: int = 0
+    args: Args, command: list[str], execute: Callable[[Attach], int], rank: int = 0
 ) -> tuple[int, SkipGate | None]:
     """Attach a gate to what `execute(attach)` runs, and write skipgs.json where `rank` is 0."""
     adapter = get_adapter(args.adapter)()
@@ -101,11 +102,12 @@ def run_gated(
     settings = args.gate.given() | ({"enabled": False} if args.no_gate else {})
     gates: list[SkipGate] = []
 
-    def attach() -> None:
+    def attach() -> dict[str, Any]:
         if not args.no_gate:
             adapter.saved_state = checkpoints.state_for
         gates.append(SkipGate(adapter=adapter, **settings))
         checkpoints.gate = gates[0]
+        return gates[0].script_globals
 
     with cpu_instead_of_cuda(args, command) if args.cpu else contextlib.nullcontext():
         try:

@@ -32,10 +32,10 @@ class Options(TrainConfig):
 
 @dataclass
 class Args:
-    """Train a COLMAP folder, a Blender folder or a packed .npz."""
+    """Train a COLMAP, nerfstudio or Blender folder or a packed .npz."""
 
     scene: tyro.conf.Positional[str]
-    """Folder with sparse/0 or transforms_train.json, or packed .npz."""
+    """Folder with sparse/0, transforms.json or transforms_train.json, or packed .npz."""
     out: str
     """Run folder to write."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
@@ -66,7 +66,7 @@ def run(args: Args) -> int:
     if not args.resume and folder.has_checkpoints():
         raise InputError(f"{args.out} already holds a run; add --resume to continue it or give another --out.")
     checkpoint = folder.latest_checkpoint() if args.resume else None
-    scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts)
+    scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
     trainer = Trainer(config, scene)
     gate = None if args.no_gate else SkipGate(trainer, **args.gate.given())
     if checkpoint is not None:

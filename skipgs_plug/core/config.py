@@ -33,6 +33,13 @@ class SkipConfig:
             step is taken; "off" steps as the trainer does.
         step_trigger: "snr" (accumulated energy is twice the noise floor) or "ref_k" (accumulated norm
             reaches that of 16 single gradients).
+        refine_share: Leave out whole iterations from `start_iter` on instead of single backwards: the share of
+            them that runs, or "auto" for what the scene needs. None for the paper's gate.
+        tolerance: Decibels that the rest of refinement may be worth when "auto" ends it.
+        compensate: Make up for what is left out with larger, shrinking steps. None: with `refine_share`, not
+            with the paper's gate.
+        rate_peak: Factor on all learning rates when refinement begins, falling linearly to 0. None for twice
+            the inverse of the share that runs.
 
     Raises:
         SkipGSError: A value is out of its range; names the field and the range.
@@ -48,6 +55,10 @@ class SkipConfig:
     pause_iters: int | None = None
     step_mode: str = "off"
     step_trigger: str = "snr"
+    refine_share: float | str | None = None
+    tolerance: float = 0.05
+    compensate: bool | None = None
+    rate_peak: float | None = None
 
     def __post_init__(self) -> None:
         if self.start_iter is not None:
@@ -65,6 +76,22 @@ class SkipConfig:
         _check_choice("on_nonfinite", self.on_nonfinite, ON_NONFINITE)
         _check_choice("step_mode", self.step_mode, STEP_MODES)
         _check_choice("step_trigger", self.step_trigger, STEP_TRIGGERS)
+        share = self.refine_share
+        if share is not None and share != "auto" and not (_is_number(share) and 0.0 < float(share) <= 1.0):
+            raise SkipGSError(f'refine_share must be "auto" or in (0, 1], not {share!r}.')
+        if not (_is_number(self.tolerance) and self.tolerance >= 0.0):
+            raise SkipGSError(f"tolerance must be a number of decibels >= 0, not {self.tolerance!r}.")
+        if self.rate_peak is not None and not (_is_number(self.rate_peak) and self.rate_peak > 0.0):
+            raise SkipGSError(f"rate_peak must be a factor above 0, not {self.rate_peak!r}.")
+        if share is not None and self.step_mode != "off":
+            raise SkipGSError("refine_share leaves out iterations whole; leave step_mode at 'off'.")
+
+    @property
+    def compensates(self) -> bool:
+        """Whether learning rates are scaled."""
+        if not self.enabled:
+            return False
+        return self.refine_share is not None if self.compensate is None else self.compensate
 
     def as_dict(self) -> dict[str, Any]:
         """The settings as plain values, as written to skipgs.json."""

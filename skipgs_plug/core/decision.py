@@ -12,7 +12,9 @@ class Decision(NamedTuple):
         skip: True when the backward is to be left out.
         reason: what decided: "warm-up", "new view", "deviation" (loss against the view's mean), "budget"
             (a skip that the floor forbids), "pause", "non-finite", "inactive", "forced" (the adapter rules
-            skipping out in this iteration) or "other rank" (a process of the group needs the backward).
+            skipping out in this iteration), "other rank" (a process of the group needs the backward), "full" (an
+            iteration that was not left out runs whole), "watched" (the view is not trained on for a while) or
+            "over" (refinement has ended).
     """
 
     skip: bool
@@ -31,3 +33,6 @@ NON_FINITE = Decision(True, "non-finite")
 NON_FINITE_PASSED = Decision(False, "non-finite")
 FORCED = Decision(False, "forced")
 OTHER_RANK = Decision(False, "other rank")
+FULL = Decision(False, "full")
+WATCHED = Decision(True, "watched")
+OVER = Decision(True, "over")

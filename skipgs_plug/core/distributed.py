@@ -32,6 +32,12 @@ def refuse_unreachable_ranks(world_size: int | None = None) -> None:
         )
 
 
+def refuse_several(because: str) -> None:
+    """Raise SkipGSError when several processes train together, for a reason given as half a sentence."""
+    if group_size() > 1:
+        raise SkipGSError(f"{because}, but {group_size()} train together; give a share, such as 0.4.")
+
+
 def agree(own: Decision) -> Decision:
     """Reduce this rank's decision with those of all others: skip only when every rank would.
 

@@ -19,6 +19,9 @@ from skipgs_plug.core.iteration import Iteration
 from skipgs_plug.core.nonfinite import NonFiniteGuard
 from skipgs_plug.core.optimizers import OptimizerSteps
 from skipgs_plug.core.policy import Policy, SkipPolicy
+from skipgs_plug.core.refinement.compensation import Compensation
+from skipgs_plug.core.refinement.policy import RefinementPolicy
+from skipgs_plug.core.refinement.refinement import Refinement
 from skipgs_plug.core.scene_check import SceneCheck
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state
 from skipgs_plug.core.stats import GateStats
@@ -45,6 +48,8 @@ class Engine:
         start: first iteration that may be skipped.
         iteration: what is known of the present iteration.
         stats, clock, steps: counts, seconds, optimizer steps.
+        refinement: leaves out whole iterations; None without `refine_share`.
+        compensation: scales learning rates for skipped backwards; None unless asked for.
         trace: rows of gated decisions; None when they are not recorded.
     """
 
@@ -63,6 +68,10 @@ class Engine:
         self.stats = GateStats()
         self.clock = GateClock()
         self.steps = OptimizerSteps(config, self.iteration)
+        self.refinement: Refinement | None = None
+        if config.enabled and config.refine_share is not None:
+            self.refinement = Refinement(config, self._go_on_from_saved)
+        self.compensation: Compensation | None = None
         self.trace: list[TraceRow] | None = [] if record_trace else None
         self._guard = NonFiniteGuard(config.on_nonfinite)
         self._must_run = must_run
@@ -102,10 +111,30 @@ class Engine:
             self._view_names = require_unique(facts.view_names)
         if config.enabled and facts.max_steps is not None and self.start > facts.max_steps:
             log.warning("The gate starts at %d, after the last iteration %d.", self.start, facts.max_steps)
+        if self.refinement is not None:
+            if config.refine_share == "auto":
+                distributed.refuse_several("refine_share='auto' decides by the losses of one process")
+            self.refinement.configure(self.start, facts.max_steps, self._view_names, facts.accumulates)
         if self.policy is None:
-            self.policy = SkipPolicy.from_config(config)
+            if self.refinement is None:
+                self.policy = SkipPolicy.from_config(config)
+            else:
+                self.policy = RefinementPolicy(config, self.refinement)
+        if facts.max_steps is not None:
+            self.compensate_until(facts.max_steps)
         if self._pending_state is not None:
             self.load_state_dict(self._pending_state)
+
+    def compensate_until(self, last: int) -> None:
+        """Scale learning rates for the paper's gate, if that was asked for; `last` is the run's last iteration."""
+        if self.config.compensates and self.refinement is None and self.compensation is None:
+            self.compensation = Compensation(self.config, self.start, last)
+
+    def release(self) -> None:
+        """Let go of loops and optimizers; counts stay readable."""
+        for holder in (self.refinement, self.compensation):
+            if holder is not None:
+                holder.remove()
 
     @property
     def active(self) -> bool:
@@ -133,17 +162,22 @@ class Engine:
         Raises:
             GateOrderError: It lies before the previous one.
         """
-        if self.iteration.step is None and self._saved_state is not None:
-            ask, self._saved_state = self._saved_state, None
-            state = ask(step)
-            if state is not None:
-                self.load_state_dict(state)
+        if self.iteration.step is None:
+            self._go_on_from_saved(step)
+            self._saved_state = None
         before = self.iteration.step
         if before is not None and step < before:
             raise GateOrderError(
                 f"Iterations went back from {before} to {step}: load the gate state that belongs to "
                 "the checkpoint, or attach a new gate."
             )
+        if self.config.compensates and self.refinement is None:
+            if self.compensation is None:
+                raise SkipGSError(
+                    "compensate=True must know the last iteration: write the loop as "
+                    "for step in gate.iterations(range(...))."
+                )
+            self.compensation.heartbeat(step, None if self.policy is None else self.policy.floor)
         self.iteration.begin(step)
         self.clock.open(post=step >= self.start)
 
@@ -199,6 +233,7 @@ class Engine:
             "non_finite_in_a_row": self._guard.in_a_row,
             "clock": self.clock.state_dict(),
             "step": self.iteration.step,
+            "refinement": None if self.refinement is None else self.refinement.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -207,8 +242,10 @@ class Engine:
             raise SkipGSError("The gate state is empty: it was saved before training began; start afresh.")
         if self.policy is None:
             self._pending_state = dict(state)
+            # The loop asks about its first number before the trainer says anything else.
+            self._load_refinement(state.get("refinement"))
             return
-        self._pending_state = None
+        pending, self._pending_state = self._pending_state is not None, None
         accumulator = self.steps.accumulator
         if is_release_state(state):
             self._refuse_other_scene(state.get("view_loss_ema", ()))
@@ -218,6 +255,8 @@ class Engine:
             step = None
         else:
             state = gate_state(state)
+            if not pending:
+                self._load_refinement(state.get("refinement"))
             self._refuse_other_scene(state["stats"]["views"])
             self.policy.load_state_dict(state["policy"])
             self.stats.load_state_dict(state["stats"])
@@ -227,6 +266,23 @@ class Engine:
             step = state["step"]
         self._scene_check.start()
         self.iteration.begin(step)
+
+    def _go_on_from_saved(self, step: int) -> None:
+        """Load the state that belongs to what training goes on from with iteration `step`, if there is one."""
+        state = None if self._saved_state is None else self._saved_state(step)
+        if state is not None:
+            self._saved_state = None
+            self.load_state_dict(state)
+
+    def _load_refinement(self, state: dict[str, Any] | None) -> None:
+        if (state is None) != (self.refinement is None):
+            saved = None if state is None else state["asked"]
+            raise SkipGSError(
+                f"The gate state was saved with refine_share={saved!r}, not {self.config.refine_share!r}; "
+                "go on with its setting, or start the gate afresh."
+            )
+        if state is not None and self.refinement is not None:
+            self.refinement.load_state_dict(state)
 
     def _agreed(self, view: str, loss: float, step: int) -> Decision:
         if distributed.group_size() == 1:

@@ -20,6 +20,8 @@ class TrainerFacts:
         world_size: Number of processes, when the trainer knows better than WORLD_SIZE.
         gradients_read_until: Before this iteration more than the optimizers reads gradients, densification
             say, so that a gate which the user starts earlier is refused.
+        accumulates: Optimizers step every so many iterations on what gathered in between, however many of
+            these ran: nothing is to be made up for.
         defaults: Settings that suit this trainer, used where the user gave none.
     """
 
@@ -29,4 +31,5 @@ class TrainerFacts:
     max_steps: int | None = None
     world_size: int | None = None
     gradients_read_until: int | None = None
+    accumulates: bool = False
     defaults: Mapping[str, Any] = dataclasses.field(default_factory=dict)

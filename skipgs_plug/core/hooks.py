@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, Protocol
@@ -12,6 +13,8 @@ from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.intercept import Around, Patches, intercept_tensor_backward
+from skipgs_plug.core.refinement.loop_range import LoopRange, replace_range
+from skipgs_plug.core.refinement.refinement import Always, nothing_always
 from skipgs_plug.core.views import view_key
 
 CHECKED_ITERATIONS = 10  # after these, exactly one training backward each must have been seen
@@ -52,6 +55,7 @@ class Hooks:
         self._expectation = f"Adapter {adapter.name!r} was checked with {adapter.checked}."
         self._patches = Patches(self._expectation)
         self._ready = False
+        self.script_globals: dict[str, Any] = {}
         self._iteration = engine.iteration
         self._iterations = 0
         self._backwards = 0
@@ -66,6 +70,8 @@ class Hooks:
             SkipGSError: As `Engine.configure`.
         """
         self._engine.configure(facts, self._given)
+        if self._engine.config.compensates:
+            self.on_detach("torch.optim.Optimizer.step (hooks)", self._engine.release)
         self._ready = True
 
     # What the trainer does.
@@ -77,6 +83,8 @@ class Hooks:
                 raise self._mismatch("the trainer iterates before it said when densification ends")
             if self._iterations == CHECKED_ITERATIONS:
                 self._require_one_backward_each()
+            if self._engine.refinement is not None:
+                self._engine.refinement.heartbeat(step)
             self._iterations += 1
             self._odd_iterations += 1  # until its backward is seen
             self._engine.open_iteration(step)
@@ -155,6 +163,76 @@ class Hooks:
 
         for name in names:
             self.wrap(owner, name, around)
+
+    def loop(
+        self,
+        names: dict[str, Any],
+        *functions: str,
+        always: Always | None = None,
+        pure: Iterable[str] = (),
+    ) -> None:
+        """The training loop counts with `range` in one of these functions: iterations can be left out there.
+
+        Iterations that the loop's own conditions name (`if iteration % 1000 == 0`) always run.
+
+        Args:
+            names: Global names of the functions' module; `script_globals` for a script that is about to run.
+            functions: Names of the functions.
+            always: Gives further iterations, of a range of them, that must run: what depends on their numbers
+                in functions that the loop calls.
+            pure: Functions that only look at numbers, and may stand in the loop's conditions.
+        """
+        if self._engine.refinement is not None:
+            self._engine.refinement.describe(always or nothing_always, pure)
+            replace_range(self._patches, names, functions, self._engine.refinement)
+
+    def always(self, always: Always) -> None:
+        """Iterations that must run, as for `loop`, where the loop is the user's own."""
+        if self._engine.refinement is not None:
+            self._engine.refinement.describe(always)
+
+    def own_loop(self, owner: Any, name: str) -> None:
+        """`owner.name(...)` gives the range that the training loop counts with, and nothing hangs on its numbers."""
+        if self._engine.refinement is None:
+            return
+        refinement = self._engine.refinement
+
+        def counted(original: Callable[..., range], *args: Any, **kwargs: Any) -> LoopRange:
+            return refinement.follow(LoopRange(original(*args, **kwargs), refinement))
+
+        self.wrap(owner, name, counted)
+
+    def number(self, counted: int) -> int:
+        """Number of the present iteration, for trainers whose iterations are only counted: `counted` if all ran."""
+        refinement = self._engine.refinement
+        number = None if refinement is None else refinement.number
+        return counted if number is None else number
+
+    @property
+    def gap(self) -> int:
+        """Iterations that were left out right before the present one."""
+        refinement = self._engine.refinement
+        return 0 if refinement is None else refinement.gap
+
+    def catch_up(self, owner: Any, name: str, caller: str) -> None:
+        """Call `owner.name` once more for every iteration that was left out before the present one.
+
+        For what advances per call instead of by the iteration's number.
+
+        Args:
+            owner, name: As for `wrap`.
+            caller: Name of the function whose calls count.
+        """
+        if self._engine.refinement is None:
+            return
+
+        def repeated(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            if sys._getframe(2).f_code.co_name == caller:  # 0 is this function, 1 the wrapper
+                for _ in range(self.gap):
+                    original(*args, **kwargs)
+            return original(*args, **kwargs)
+
+        self.wrap(owner, name, repeated)
 
     def gate_tensor_backward(self, *callers: str) -> None:
         """Gate the scalar `Tensor.backward` that functions of these names call themselves."""

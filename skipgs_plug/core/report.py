@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.refinement.refinement import Refinement
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.files import write_aside
 
 SCHEMA_VERSION = 1
+NO_REFINEMENT: dict[str, Any] = {"refine_share": None, "iterations_skipped": 0, "always_run": {}, "foresight": None}
 
 
 class Reporting(Protocol):
@@ -19,7 +21,9 @@ class Reporting(Protocol):
     def report(self) -> dict[str, Any]: ...
 
 
-def counters(stats: GateStats, floor: float | None, t_total: float, t_post: float) -> dict[str, Any]:
+def counters(
+    stats: GateStats, floor: float | None, t_total: float, t_post: float, refinement: Refinement | None = None
+) -> dict[str, Any]:
     """Return what was counted and timed.
 
     Returns:
@@ -27,8 +31,10 @@ def counters(stats: GateStats, floor: float | None, t_total: float, t_post: floa
         `backwards_run` + `backwards_skipped`); `min_bwd_ratio_effective` (floor in force, None for a policy
         without); `paused`, `non_finite` (gated iterations with that reason); `reasons` (all of them);
         `events` (structural changes by kind); `t_total`, `t_post` (seconds of training, and of its part from
-        start_iter on).
+        start_iter on); `refine_share` (share of the iterations from start_iter on that run or may run, None when
+        none is left out), `iterations_run`, `iterations_skipped`, `always_run`, `foresight` (see `Refinement.report`).
     """
+    left_out = None if refinement is None else refinement.report()
     return {
         "iterations": stats.iterations,
         "gated_iterations": stats.gated,
@@ -41,6 +47,7 @@ def counters(stats: GateStats, floor: float | None, t_total: float, t_post: floa
         "events": dict(stats.events),
         "t_total": t_total,
         "t_post": t_post,
+        **(left_out or {**NO_REFINEMENT, "iterations_run": stats.gated}),
     }
 
 
@@ -53,6 +60,8 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
     """Return the counters as a few lines for people."""
     if not config.enabled:
         return f"SkipGS: off, {counted['iterations']:,} backwards seen."
+    if counted["refine_share"] is not None:
+        return _summarise_refinement(config, counted)
     gated, skipped, reasons = counted["gated_iterations"], counted["backwards_skipped"], counted["reasons"]
     floor = counted["min_bwd_ratio_effective"]
     share = 100 * skipped / gated if gated else 0.0
@@ -63,6 +72,26 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
         f"held back by the floor {reasons.get('budget', 0):,}, paused {counted['paused']:,} "
         f"(events {sum(counted['events'].values()):,}), non-finite {counted['non_finite']:,}"
     )
+
+
+def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
+    run, skipped = counted["iterations_run"], counted["iterations_skipped"]
+    share = 100 * run / (run + skipped) if run + skipped else 0.0
+    lines = [
+        f"SkipGS: {run:,} of {run + skipped:,} iterations run ({share:.1f} %) since iteration "
+        f"{config.start_iter or 0:,}, {skipped:,} left out whole."
+    ]
+    foresight = counted["foresight"]
+    if foresight is not None:
+        worth = foresight["rest_worth_db"]
+        judged = "not judged" if worth is None else f"worth at most {worth:.2f} dB when last judged"
+        lines.append(
+            f"  {'ended early' if foresight['ended'] else 'not ended'}, cycle {foresight['cycle'] + 1}; the rest was "
+            f"{judged} (tolerance {config.tolerance} dB), {len(foresight['watched'])} views watched"
+        )
+    elif config.refine_share == "auto":
+        lines.append("  each view comes up too seldom in this schedule to leave out iterations: all of them run")
+    return "\n".join(lines)
 
 
 def write_report(gate: Reporting, path: str | Path) -> None:

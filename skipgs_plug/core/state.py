@@ -12,6 +12,7 @@ GATE_VERSION = 2
 POLICY_KEYS = ("means", "budget", "warmup_end", "pause_until", "events")
 GATE_KEYS = ("policy", "stats", "accumulator", "non_finite_in_a_row", "clock", "step")
 STATS_KEYS = ("iterations", "backwards", "skips", "reasons", "events", "views")
+REFINEMENT_KEYS = ("asked", "share", "first", "next", "thinning", "recovery", "foresight")
 BUDGET_KEYS = ("floor", "backwards", "skips", "calibrating", "would_skip", "would_total")
 
 
@@ -47,6 +48,8 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
     require_version(state, GATE_VERSION)
     require(state, GATE_KEYS, "Gate state")
     require(state["stats"], STATS_KEYS, "Gate state's stats")
+    if state.get("refinement") is not None:
+        require(state["refinement"], REFINEMENT_KEYS, "Gate state's refinement")
     return dict(state)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from skipgs_plug.adapters.base import GATES_CHILDREN
-from skipgs_plug.scripts.launch import run_in_script
+from skipgs_plug.scripts.launch import Attach, run_in_script
 
 Enter = Callable[[int, bytes], None]
 
@@ -53,7 +53,7 @@ def gated_when_spawned(enter: Enter) -> Iterator[list[int]]:
         torch.multiprocessing.spawn = spawn
 
 
-def run_call(command: Sequence[str], attach: Callable[[], None], rank: int, call: bytes) -> int:
+def run_call(command: Sequence[str], attach: Attach, rank: int, call: bytes) -> int:
     """In a spawned process: import the script as Python would there, and call what the script had spawned.
 
     Args:
@@ -63,10 +63,10 @@ def run_call(command: Sequence[str], attach: Callable[[], None], rank: int, call
         call: What `gated_when_spawned` gave to `enter`.
     """
 
-    def run(script: str) -> None:
+    def run(script: str, names: dict[str, Any]) -> None:
         main = types.ModuleType("__mp_main__")
         sys.modules["__main__"] = sys.modules["__mp_main__"] = main
-        vars(main).update(runpy.run_path(script, run_name="__mp_main__"))
+        vars(main).update(runpy.run_path(script, init_globals=names, run_name="__mp_main__"))
         fn, args = pickle.loads(call)
         fn(rank, *args)
 

@@ -18,6 +18,8 @@ import torch
 
 from skipgs_plug.core.errors import SkipGSError
 
+Attach = Callable[[], dict[str, Any]]  # see `run_script`
+
 # For advice: parts of every checkout of the Inria family, CUDA extensions, packages not called as their module.
 OF_CHECKOUTS = frozenset({"arguments", "gaussian_renderer", "scene", "utils"})
 EXTENSIONS = ("diff_", "simple_knn", "fused_ssim")
@@ -30,7 +32,7 @@ PACKAGES = {
 }
 
 
-def run_script(command: Sequence[str], attach: Callable[[], None] | None = None) -> int:
+def run_script(command: Sequence[str], attach: Attach | None = None) -> int:
     """Execute an unmodified script in its own checkout and give its exit code.
 
     The script sees its own folder first on `sys.path`, its own `sys.argv`, and `__name__ == "__main__"`.
@@ -39,7 +41,8 @@ def run_script(command: Sequence[str], attach: Callable[[], None] | None = None)
     Args:
         command: What would follow `python`: a script and its arguments, or `-m`, a module and its arguments.
             Or the name of a command that an installed package brings, such as `ns-train`, and its arguments.
-        attach: Called where the script would be: its folder is on `sys.path`, nothing of it is imported.
+        attach: Called where the script would be: its folder is on `sys.path`, nothing of it is imported. Gives
+            names that the script is to find among its globals.
 
     Raises:
         SkipGSError: There is no such script or module, or a module of the script's checkout was imported
@@ -48,20 +51,19 @@ def run_script(command: Sequence[str], attach: Callable[[], None] | None = None)
     return _run(_resolve(command), attach, None)
 
 
-def run_in_script(command: Sequence[str], attach: Callable[[], None], run: Callable[[str], None]) -> int:
-    """As `run_script`, with `run(file of the script)` in place of running it."""
+def run_in_script(command: Sequence[str], attach: Attach, run: Callable[[str, dict[str, Any]], None]) -> int:
+    """As `run_script`, with `run(file of the script, names for its globals)` in place of running it."""
     return _run(_resolve(command), attach, run)
 
 
-def _run(program: _Program, attach: Callable[[], None] | None, instead: Callable[[str], None] | None) -> int:
+def _run(program: _Program, attach: Attach | None, instead: Callable[[str, dict[str, Any]], None] | None) -> int:
     with _as_main_program(program), _whole_checkpoints():
         try:
-            if attach is not None:
-                attach()
+            names = {} if attach is None else attach()
             if instead is None:
-                program.run()
+                program.run(names)
             else:
-                instead(str(program.source))
+                instead(str(program.source), names)
         except SystemExit as stop:
             return _exit_code(stop.code)
         except SkipGSError:
@@ -100,7 +102,7 @@ class _Program(NamedTuple):
     argv: list[str]
     folder: Path  # first on sys.path
     source: Path  # whose frames the traceback begins with
-    run: Callable[[], Any]
+    run: Callable[[dict[str, Any]], Any]  # takes global names of the script
 
 
 def _resolve(command: Sequence[str]) -> _Program:
@@ -112,12 +114,12 @@ def _resolve(command: Sequence[str]) -> _Program:
         source = _source_of(name)
         if source is None:
             raise SkipGSError(f"There is no module {name}: install it, or name a training script after '--'.")
-        run = functools.partial(runpy.run_module, name, run_name="__main__")
+        run = functools.partial(_run_module, name)
         return _Program([str(source), *arguments], Path.cwd(), source, run)
     script = Path(name).resolve()
     if script.is_file():
         _refuse_shadowed_modules(script.parent)
-        run = functools.partial(runpy.run_path, str(script), run_name="__main__")
+        run = functools.partial(_run_path, str(script))
         return _Program([str(script), *arguments], script.parent, script, run)
     for installed in importlib.metadata.entry_points(group="console_scripts", name=name):
         folder = Path(sys.executable).parent
@@ -126,7 +128,15 @@ def _resolve(command: Sequence[str]) -> _Program:
     raise SkipGSError(f"There is no script {script}: name the training script after '--'.")
 
 
-def _call(installed: importlib.metadata.EntryPoint) -> None:
+def _run_module(name: str, names: dict[str, Any]) -> None:
+    runpy.run_module(name, init_globals=names, run_name="__main__")
+
+
+def _run_path(script: str, names: dict[str, Any]) -> None:
+    runpy.run_path(script, init_globals=names, run_name="__main__")
+
+
+def _call(installed: importlib.metadata.EntryPoint, names: dict[str, Any]) -> None:
     sys.exit(installed.load()())
 
 

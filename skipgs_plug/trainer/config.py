@@ -59,7 +59,7 @@ class TrainConfig:
     """
 
     data_dir: str = ""
-    """Scene: COLMAP folder, Blender folder or packed .npz."""
+    """Scene: COLMAP, nerfstudio or Blender folder or packed .npz."""
     result_dir: str = ""
     """Run folder to write."""
     data_factor: int = 1
@@ -68,6 +68,8 @@ class TrainConfig:
     """Hold out every n-th view by name (index % n == 0); 0 holds out none."""
     init_num_pts: int = 100_000
     """Random initial points for scenes that bring no point cloud (Blender)."""
+    init_ply: str = ""
+    """Point cloud or 3DGS model (PLY, in the coordinates of the scene) to start from instead of the scene's points."""
     backend: Literal["auto", "gsplat", "warp"] = "auto"
     """Rasterizer: gsplat on CUDA, warp on CPU; auto takes gsplat where CUDA works."""
     seed: int = 42

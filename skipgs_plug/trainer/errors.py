@@ -9,3 +9,9 @@ class InputError(ValueError):
 
 class MissingFileError(InputError, FileNotFoundError):
     """A file or folder that should exist and does not."""
+
+
+def reason(error: BaseException) -> str:
+    """Return what a library complains of as part of a sentence: its first line, or its type, in 200 characters."""
+    text = str(error).strip().partition("\n")[0] or type(error).__name__
+    return text if len(text) <= 200 else text[:197] + "..."

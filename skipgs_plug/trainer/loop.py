@@ -48,6 +48,7 @@ class Trainer:
 
     Attributes:
         step: next iteration, 0-based.
+        ran: iterations that ran, which is fewer where a gate leaves some out; every view has its turn among these.
         splats: raw parameters `means scales quats opacities sh0 shN`.
         optimizers: one per parameter, by the same names.
         refine_stop_iter: end of densification in iterations of this run.
@@ -60,7 +61,7 @@ class Trainer:
         self.scene = scene
         self.backend = backend or resolve_backend(config.backend)
         self.max_steps = config.max_steps
-        self.step = 0
+        self.step = self.ran = 0
         self.splats = create_splats(scene, config, self.backend.device)
         self.optimizers = create_optimizers(self.splats, config, scene.scene_scale)
         self.strategy = create_strategy(config)
@@ -99,11 +100,21 @@ class Trainer:
         self.stop_requested = False
         bar = tqdm(total=until, initial=self.step, desc="Training", disable=not progress, mininterval=0.5)
         with bar:
-            while self.step < until and not self.stop_requested:
+            for step in self.iterations(until):
+                bar.update(step - self.step)
+                self.step = step
                 loss = self.train_step()
                 bar.update()
-                if self.step % 10 == 0:
+                if self.ran % 10 == 0:
                     bar.set_postfix_str(f"loss={loss:.3f} | GS={len(self.splats['means'])}", refresh=False)
+                if self.stop_requested:
+                    break
+            else:
+                self.step = max(self.step, until)
+
+    def iterations(self, until: int) -> range:
+        """Numbers of the iterations up to `until` (exclusive): the seam where a gate leaves some out."""
+        return range(self.step, until)
 
     def train_step(self) -> float:
         """Run one iteration and return its loss."""
@@ -112,7 +123,7 @@ class Trainer:
 
     def _train_step(self) -> float:
         step = self.step
-        view = self.scene.train[self._order.at(step)]
+        view = self.scene.train[self._order.at(self.ran)]
         if not self._warm:
             self._warm_up(view)
         densifying = step < self.refine_stop_iter
@@ -137,6 +148,7 @@ class Trainer:
         self.clock.stop(after_densification=not densifying)
 
         self.step += 1
+        self.ran += 1
         if self.on_step is not None:
             self.on_step(Iteration(step, view.name, value, image.detach(), target))
         return value

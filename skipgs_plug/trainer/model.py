@@ -16,10 +16,22 @@ ADAM_EPS = 1e-15
 
 def create_splats(scene: Scene, config: TrainConfig, device: torch.device) -> nn.ParameterDict:
     """Return `means [N, 3]`, `scales [N, 3]` (log), `quats [N, 4]` (wxyz), `opacities [N]` (logit),
-    `sh0 [N, 1, 3]` and `shN [N, K - 1, 3]` for one isotropic Gaussian per point."""
+    `sh0 [N, 1, 3]` and `shN [N, K - 1, 3]`: the Gaussians of the scene, else an isotropic one per point."""
+    if scene.gaussians is not None:
+        tensors = {name: tensor.clone() for name, tensor in scene.gaussians.items()}
+        higher = torch.zeros(len(tensors["means"]), (config.sh_degree + 1) ** 2 - 1, 3)
+        known = min(higher.shape[1], tensors["shN"].shape[1])
+        higher[:, :known] = tensors["shN"][:, :known]
+        tensors["shN"] = higher
+    else:
+        tensors = one_per_point(scene, config)
+    return nn.ParameterDict({name: nn.Parameter(t.to(device)) for name, t in tensors.items()})
+
+
+def one_per_point(scene: Scene, config: TrainConfig) -> dict[str, Tensor]:
     n = len(scene.points)
     rgb = scene.points_rgb.float() / 255.0
-    tensors = {
+    return {
         "means": scene.points.clone(),
         "scales": torch.log(neighbour_distance(scene.points) * config.init_scale)[:, None].repeat(1, 3),
         "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
@@ -27,7 +39,6 @@ def create_splats(scene: Scene, config: TrainConfig, device: torch.device) -> nn
         "sh0": ((rgb - 0.5) / SH_C0)[:, None, :],
         "shN": torch.zeros(n, (config.sh_degree + 1) ** 2 - 1, 3),
     }
-    return nn.ParameterDict({name: nn.Parameter(t.to(device)) for name, t in tensors.items()})
 
 
 def neighbour_distance(points: Tensor) -> Tensor:

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.files import write_aside
+from skipgs_plug.trainer.scene import check_points
 
 REST = 15  # coefficients of SH degrees 1 to 3
 REST_COUNTS = (0, 9, 24, 45)  # f_rest properties of SH degrees 0 to 3
@@ -63,8 +64,35 @@ def read_ply(path: str | Path) -> dict[str, Tensor]:
         MissingFileError: no such file.
         InputError: not a PLY, truncated, not a Gaussian PLY, empty, or with values that cannot be rendered.
     """
-    path = Path(path)
+    return model_of(Path(path), read_vertices(Path(path)))
+
+
+def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read a point cloud: positions [M, 3] float32 and colours [M, 3] uint8, grey where the file has none.
+
+    Raises:
+        MissingFileError: no such file.
+        InputError: not a PLY, truncated, without x, y and z, or with values that are not finite.
+    """
+    return points_of(Path(path), read_vertices(Path(path)))
+
+
+def read_start(path: str | Path) -> tuple[tuple[np.ndarray, np.ndarray], dict[str, Tensor] | None]:
+    """Read what training may start from: positions and colours as `read_points`, and, of a 3DGS model, its Gaussians.
+
+    Raises:
+        MissingFileError: no such file.
+        InputError: neither a point cloud nor a model, or of fewer than four points.
+    """
+    path = Path(path).expanduser()
     vertices = read_vertices(path)
+    cloud = points_of(path, vertices)
+    check_points(cloud[0], path)
+    return cloud, model_of(path, vertices) if "f_dc_0" in vertices else None
+
+
+def model_of(path: Path, vertices: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
+    """Return the Gaussians of `read_ply`."""
     count = sum(name.startswith("f_rest_") for name in vertices)
     if count not in REST_COUNTS:
         raise InputError(f"PLY {path} has {count} f_rest properties, expected one of {REST_COUNTS}; export it again.")
@@ -88,15 +116,8 @@ def read_ply(path: str | Path) -> dict[str, Tensor]:
     }
 
 
-def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a point cloud: positions [M, 3] float32 and colours [M, 3] uint8, grey where the file has none.
-
-    Raises:
-        MissingFileError: no such file.
-        InputError: not a PLY, truncated, without x, y and z, or with values that are not finite.
-    """
-    path = Path(path)
-    vertices = read_vertices(path)
+def points_of(path: Path, vertices: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions and colours of `read_points`."""
     if not {"x", "y", "z"} <= set(vertices):
         raise InputError(f"PLY {path} has no vertices with x, y and z; give a point cloud.")
     positions = columns(path, vertices, ["x", "y", "z"])
@@ -118,18 +139,18 @@ def read_vertices(path: Path) -> dict[str, np.ndarray]:
         vertices = PlyData.read(str(path), mmap=False)["vertex"]
         return {prop.name: np.asarray(vertices[prop.name]) for prop in vertices.properties}
     except (PlyParseError, KeyError, ValueError, TypeError, EOFError, MemoryError, OSError) as error:
-        raise InputError(f"PLY {path} is damaged or not a PLY ({error}); export it again.") from error
+        raise InputError(f"PLY {path} is damaged or not a PLY ({reason(error)}); export it again.") from error
 
 
 def check_header(path: Path) -> None:
     """Refuse counts that the file cannot hold: each value takes a byte at least, and vertices have no lists."""
     if not os.path.isfile(path):
-        raise MissingFileError(f"PLY {path} does not exist; give the path of a point_cloud_*.ply.")
+        raise MissingFileError(f"PLY {path} does not exist; give the path of a PLY file.")
     try:
         with open(path, "rb") as stream:
             size, head = os.fstat(stream.fileno()).st_size, stream.read(MAX_HEADER)
     except OSError as error:
-        raise InputError(f"PLY {path} cannot be read ({error}).") from error
+        raise InputError(f"PLY {path} cannot be read ({reason(error)}).") from error
     header, found, _ = head.partition(b"end_header")
     if not header.startswith(b"ply") or not found:
         raise InputError(f"PLY {path} is damaged or not a PLY (no header); export it again.")

@@ -13,6 +13,7 @@ from skipgs_plug.trainer.errors import InputError
 
 BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
+MIN_POINTS = 4  # each has three neighbours
 MIN_SIDE = 11  # window of SSIM
 MAX_COORDINATE = 1e15  # squares of distances stay finite in float32
 
@@ -55,6 +56,7 @@ class Scene:
     points_rgb: Tensor  # [M, 3] uint8
     scene_scale: float  # 1.1 x largest distance of a training camera from their centre
     background: tuple[float, float, float] = BLACK  # colour in [0, 1] behind the scene
+    gaussians: dict[str, Tensor] | None = None  # as of `read_ply`, to start from instead of one per point
 
 
 def split_views(views: list[View], test_every: int) -> tuple[list[View], list[View]]:
@@ -84,11 +86,7 @@ def assemble_scene(
             raise InputError(f"{source} names two views {view.name!r}; image paths must be unique.")
         seen.add(view.name)
         check_view(view, source)
-    if len(points) < 4:
-        raise InputError(f"{source} has {len(points)} points, at least 4 are needed; run the reconstruction again.")
-    bad = int((~(np.abs(points) < MAX_COORDINATE).all(axis=1)).sum())
-    if bad:
-        raise InputError(f"{source} has {bad} points with NaN, infinite or huge coordinates; remove them.")
+    check_points(points, source)
     return Scene(
         name=name,
         train=train,
@@ -117,6 +115,15 @@ def check_view(view: View, source: Path) -> None:
         )
     if view.mask is not None and not view.mask.any():
         raise InputError(f"{source}: the mask of {view.name!r} leaves no pixel; white is what counts.")
+
+
+def check_points(points: np.ndarray, source: Path) -> None:
+    """Refuse point clouds that training cannot start from."""
+    if len(points) < MIN_POINTS:
+        raise InputError(f"{source} has {len(points)} points, at least {MIN_POINTS} are needed; get a larger cloud.")
+    bad = int((~(np.abs(points) < MAX_COORDINATE).all(axis=1)).sum())
+    if bad:
+        raise InputError(f"{source} has {bad} points with NaN, infinite or huge coordinates; remove them.")
 
 
 def is_text(name: str) -> bool:

@@ -37,6 +37,7 @@ def capture(trainer: Trainer) -> dict[str, Any]:
     state = {
         "version": VERSION,
         "step": trainer.step,
+        "ran": trainer.ran,
         "splats": {name: param.detach() for name, param in trainer.splats.items()},
         "optimizers": moments,
         "strategy": dict(trainer.strategy_state),
@@ -53,6 +54,7 @@ def apply(trainer: Trainer, state: dict[str, Any]) -> None:
     """
     state = copy.deepcopy(state)
     trainer.step = state["step"]
+    trainer.ran = state.get("ran", trainer.step)  # before iterations could be left out, all had run
     for name, tensor in state["splats"].items():
         param = nn.Parameter(tensor.to(trainer.backend.device))
         trainer.splats[name] = param

@@ -62,8 +62,16 @@ def test_bad_input_is_one_sentence(packed, tmp_path, capsys, more, sentence):
 def test_plots_are_drawn_from_whatever_finished(finished, tmp_path):
     records = [finished.run("ungated", 0)]
     rows = summarise(records, ("ungated",), 40)
-    write_plots(tmp_path, records, rows, finished.bench.scene.train)
+    names = [view.name for view in finished.bench.scene.train]
+    write_plots(tmp_path, records, rows, names)
     assert {path.stem for path in tmp_path.iterdir()} == {"psnr_over_time", "time_against_error", "phases"}
+
+
+def test_names_of_views_are_no_formulas(finished, tmp_path):
+    records = [finished.run("gate", 0)]
+    names = [rf"$\frac$ {view.name}" for view in finished.bench.scene.train]
+    write_plots(tmp_path, records, summarise(records, ("gate",), 40), names)
+    assert (tmp_path / "loss_and_mean.png").is_file()
 
 
 def test_visit_map_has_a_column_for_each_epoch():

@@ -25,6 +25,11 @@ KEYS = {
     "events",
     "t_total",
     "t_post",
+    "refine_share",
+    "iterations_run",
+    "iterations_skipped",
+    "always_run",
+    "foresight",
     "views",
 }
 

@@ -64,7 +64,7 @@ def test_transparent_grey_level_of_16_bits(tmp_path: Path) -> None:
     np.testing.assert_array_equal(alpha, np.where(GREY[0, 0] == GREY, 0, 255))
 
 
-@pytest.mark.parametrize("side", [30_000, 10_000])
+@pytest.mark.parametrize("side", [16_000, 10_000])
 def test_bomb(tmp_path: Path, side: int) -> None:
     path = tmp_path / "bomb.png"
     Image.new("1", (side, side)).save(path)

@@ -16,3 +16,12 @@ def test_png_after_pycolmap(tmp_path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_order_that_crashes_is_refused_at_import() -> None:
+    code = "import pycolmap\nimport skipgs_plug.trainer\n"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    if sys.platform == "linux":
+        assert "ImportError: pycolmap was imported before Pillow" in done.stderr and done.returncode == 1
+    else:
+        assert done.returncode == 0, done.stderr

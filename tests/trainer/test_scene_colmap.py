@@ -60,7 +60,7 @@ def test_holding_out_none(folder: Path) -> None:
 
 
 def test_missing_scene(tmp_path: Path) -> None:
-    with pytest.raises(MissingFileError, match=r"nowhere does not exist; give a COLMAP folder"):
+    with pytest.raises(MissingFileError, match=r"nowhere does not exist; give a COLMAP, nerfstudio"):
         load_scene(tmp_path / "nowhere")
     with pytest.raises(MissingFileError, match=r"holds neither .*sparse/0 \(COLMAP\) nor .*transforms_train"):
         load_scene(tmp_path)

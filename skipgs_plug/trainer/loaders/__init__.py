@@ -2,41 +2,64 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+
+import numpy as np
+import torch
 
 from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.loaders.blender import load_blender
 from skipgs_plug.trainer.loaders.colmap import load_colmap
+from skipgs_plug.trainer.loaders.nerfstudio import load_nerfstudio
 from skipgs_plug.trainer.loaders.packed import load_packed
+from skipgs_plug.trainer.ply import read_start
 from skipgs_plug.trainer.scene import Scene
 
 
-def load_scene(path: str | Path, data_factor: int = 1, test_every: int = 8, init_num_pts: int = 100_000) -> Scene:
-    """Load a COLMAP folder, a Blender folder or a packed .npz. Writes nothing.
+def load_scene(
+    path: str | Path,
+    data_factor: int = 1,
+    test_every: int = 8,
+    init_num_pts: int = 100_000,
+    init_ply: str | Path | None = None,
+) -> Scene:
+    """Load a COLMAP, nerfstudio or Blender folder or a packed .npz. Writes nothing.
 
     Args:
-        path: folder with `sparse/0` or `sparse`, folder with `transforms_train.json`, or .npz file.
+        path: folder with `sparse/0` or `sparse`, with `transforms_train.json`, with `transforms.json`, or .npz file.
         data_factor: use `images_{data_factor}`; resized in memory when that folder is missing.
         test_every: views sorted by name, index % test_every == 0 held out; 0 holds out none. Blender scenes
-            with `transforms_test.json` and packed files bring their own split.
+            with `transforms_test.json`, nerfstudio files with `train_filenames` and packed files bring their own split.
         init_num_pts: random points for a Blender scene, which has no point cloud.
+        init_ply: point cloud, or 3DGS model, to start from instead of the scene's points; in its coordinates.
 
     Raises:
         MissingFileError: a folder or image is not there.
         InputError: the content cannot be used (camera model, empty or non-finite points, damaged image...).
     """
     path = Path(path).expanduser()
+    cloud, gaussians = read_start(init_ply) if init_ply else (None, None)
     if not path.exists():
-        raise MissingFileError(f"Scene {path} does not exist; give a COLMAP folder, Blender folder or packed .npz.")
+        raise MissingFileError(
+            f"Scene {path} does not exist; give a COLMAP, nerfstudio or Blender folder or a packed .npz."
+        )
     if path.is_file():
         if path.suffix != ".npz":
             raise InputError(f"Scene {path} is a file but not a packed .npz; give the folder that holds it.")
-        return load_packed(path)
-    if (path / "sparse").is_dir():
-        return load_colmap(path, data_factor, test_every)
-    if (path / "transforms_train.json").is_file():
-        return load_blender(path, data_factor, test_every, init_num_pts)
-    raise MissingFileError(
-        f"Scene {path} holds neither {path / 'sparse' / '0'} (COLMAP) nor "
-        f"{path / 'transforms_train.json'} (Blender); run COLMAP on it or give another folder."
-    )
+        scene = load_packed(path)
+    elif (path / "sparse").is_dir():
+        scene = load_colmap(path, data_factor, test_every)
+    elif (path / "transforms_train.json").is_file():
+        scene = load_blender(path, data_factor, test_every, init_num_pts)
+    elif (path / "transforms.json").is_file():
+        scene = load_nerfstudio(path, data_factor, test_every, cloud)
+    else:
+        raise MissingFileError(
+            f"Scene {path} holds neither {path / 'sparse' / '0'} (COLMAP) nor {path / 'transforms_train.json'} "
+            "(Blender) nor transforms.json (nerfstudio); run COLMAP on it or give another folder."
+        )
+    if cloud is None:
+        return scene
+    points, colours = (torch.from_numpy(np.ascontiguousarray(part)) for part in cloud)
+    return dataclasses.replace(scene, points=points, points_rgb=colours, gaussians=gaussians)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.loaders.colmap_files import check_lengths
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.paths import find_image
@@ -71,7 +71,7 @@ def read_model(model: Path) -> Any:
     try:
         return pycolmap.Reconstruction(str(model))
     except Exception as error:  # pycolmap raises bare RuntimeError, ValueError or IndexError by kind of damage
-        raise InputError(f"COLMAP model {model} cannot be read ({error}); export it again.") from error
+        raise InputError(f"COLMAP model {model} cannot be read ({reason(error)}); export it again.") from error
 
 
 def camera_models(pycolmap: Any) -> dict[int, int]:

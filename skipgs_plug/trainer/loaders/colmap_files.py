@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import mmap
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.errors import InputError, reason
 
 POINT_2D = 24  # x, y, id of the 3D point
 TRACK_ELEMENT = 8  # image id, index of the 2D point
@@ -29,24 +31,26 @@ def check_lengths(model: Path, camera_models: dict[int, int]) -> None:
         if not path.is_file():
             continue
         try:
-            data = path.read_bytes()
+            with open(path, "rb") as stream:
+                size = os.fstat(stream.fileno()).st_size
+                data: Any = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
         except OSError as error:
-            raise InputError(f"{path} cannot be read ({error}).") from error
+            raise InputError(f"{path} cannot be read ({reason(error)}).") from error
         at = 0
         try:
             for at in walk(data, camera_models):
-                if at > len(data):
+                if at > size:
                     break
-        except (struct.error, ValueError):
-            at = len(data) + 1
+        except struct.error:  # a count or a name would lie behind the end
+            at = size + 1
         except KeyError as error:
             raise InputError(f"{path} has a camera of unknown model {error}; export the model again.") from error
-        if at != len(data):
-            what = "ends early" if at > len(data) else f"has {len(data) - at:,} bytes too many"
-            raise InputError(f"{path} {what}: its counts do not fit its {len(data):,} bytes; export the model again.")
+        if at != size:
+            what = "ends early" if at > size else f"has {size - at:,} bytes too many"
+            raise InputError(f"{path} {what}: its counts do not fit its {size:,} bytes; export the model again.")
 
 
-def walk_cameras(data: bytes, camera_models: dict[int, int]) -> Iterator[int]:
+def walk_cameras(data: Any, camera_models: dict[int, int]) -> Iterator[int]:
     """Yield the position after the count and after every record."""
     at = 8
     yield at
@@ -55,16 +59,17 @@ def walk_cameras(data: bytes, camera_models: dict[int, int]) -> Iterator[int]:
         yield at
 
 
-def walk_images(data: bytes, _: Any) -> Iterator[int]:
+def walk_images(data: Any, _: Any) -> Iterator[int]:
     at = 8
     yield at
     for _ in range(unpack("<Q", data, 0)):
-        at = data.index(b"\0", at + 4 + POSE + 4) + 1
+        end = data.find(b"\0", at + 4 + POSE + 4)
+        at = end + 1 if end >= 0 else len(data)
         at += 8 + POINT_2D * unpack("<Q", data, at)
         yield at
 
 
-def walk_points(data: bytes, _: Any) -> Iterator[int]:
+def walk_points(data: Any, _: Any) -> Iterator[int]:
     at = 8
     yield at
     for _ in range(unpack("<Q", data, 0)):
@@ -72,7 +77,7 @@ def walk_points(data: bytes, _: Any) -> Iterator[int]:
         yield at
 
 
-def walk_rigs(data: bytes, _: Any) -> Iterator[int]:
+def walk_rigs(data: Any, _: Any) -> Iterator[int]:
     at = 8
     yield at
     for _ in range(unpack("<Q", data, 0)):
@@ -84,7 +89,7 @@ def walk_rigs(data: bytes, _: Any) -> Iterator[int]:
         yield at
 
 
-def walk_frames(data: bytes, _: Any) -> Iterator[int]:
+def walk_frames(data: Any, _: Any) -> Iterator[int]:
     at = 8
     yield at
     for _ in range(unpack("<Q", data, 0)):
@@ -92,7 +97,7 @@ def walk_frames(data: bytes, _: Any) -> Iterator[int]:
         yield at
 
 
-def unpack(kind: str, data: bytes, at: int) -> int:
+def unpack(kind: str, data: Any, at: int) -> int:
     return struct.unpack_from(kind, data, at)[0]
 
 

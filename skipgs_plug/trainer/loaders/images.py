@@ -12,7 +12,7 @@ import torch
 from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
-from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 
 ORIENTATION = 0x0112  # EXIF tag; 5 to 8 exchange width and height
 
@@ -55,7 +55,7 @@ def read_image(
     if factor > 1:
         reduced = (max(1, round(picture.width / factor)), max(1, round(picture.height / factor)))
         picture = picture.resize(reduced, Image.Resampling.BICUBIC)
-        alpha = alpha and alpha.resize(reduced, Image.Resampling.BICUBIC)
+        alpha = None if alpha is None else alpha.resize(reduced, Image.Resampling.BICUBIC)
     return torch.from_numpy(np.array(picture)), None if alpha is None else torch.from_numpy(np.array(alpha))
 
 
@@ -84,7 +84,7 @@ def decode(source: Path | IO[bytes], label: Path | str) -> Image.Image:
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError, KeyError, IndexError, TypeError,
             OverflowError, AttributeError, NotImplementedError, RuntimeError, ZeroDivisionError) as error:  # fmt: skip
         # Pillow's plugins raise whatever their parser stumbles over.
-        raise InputError(f"Image {label} cannot be decoded ({error}); replace the file.") from error
+        raise InputError(f"Image {label} cannot be decoded ({reason(error)}); replace the file.") from error
     if picture.mode.startswith("I;16") or (picture.mode == "I" and opened.format == "PNG"):
         values = np.asarray(picture).astype(np.uint16)
         info = picture.info

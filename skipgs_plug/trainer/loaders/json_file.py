@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.errors import InputError, reason
 
 
 def read_object(path: Path) -> dict[str, Any]:
@@ -21,7 +21,7 @@ def read_object(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError, MemoryError) as error:
-        raise InputError(f"{path} is not valid JSON ({error}); restore the file.") from error
+        raise InputError(f"{path} is not valid JSON ({reason(error)}); restore the file.") from error
     if not isinstance(content, dict):
         raise InputError(f"{path} holds no JSON object; restore the file.")
     return content

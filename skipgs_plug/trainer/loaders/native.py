@@ -1,23 +1,31 @@
-"""The one place that imports pycolmap, whose codecs clash with Pillow's when they come first."""
+"""The one place that decides the order in which pycolmap and Pillow are loaded.
+
+On Linux pycolmap brings a zlib whose functions Pillow's own are then bound to, some of them: after `import pycolmap`
+the first PNG that Pillow writes ends the process (deflateEnd frees what another deflateInit allocated). With Pillow
+loaded first, both work.
+"""
 
 from __future__ import annotations
 
+import sys
 from typing import Any
+
+import PIL.Image  # noqa: F401
 
 from skipgs_plug.trainer.errors import InputError
 
+# sys.modules keeps the order in which modules were loaded.
+if sys.platform == "linux" and next(m for m in sys.modules if m in ("pycolmap", "PIL._imaging")) == "pycolmap":
+    raise ImportError("pycolmap was imported before Pillow, which crashes Python later: import PIL.Image before it.")
+
 
 def import_pycolmap() -> Any:
-    """Return the module, with Pillow loaded before it.
-
-    Both bring their own libpng. With pycolmap's loaded first, Pillow's first PNG written ends in a double free.
+    """Return the module, which is loaded on first use.
 
     Raises:
         InputError: pycolmap is not installed.
     """
     try:
-        import PIL.Image
-        import PIL.PngImagePlugin  # noqa: F401
         import pycolmap
     except ImportError as error:
         raise InputError(

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.errors import InputError, reason
 from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene
@@ -91,7 +91,7 @@ def read_archive(path: Path) -> dict[str, Any]:
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in SHAPES}
     except Exception as error:  # zipfile, zlib and numpy raise whatever their parser stumbles over
-        raise InputError(f"Packed scene {path} is damaged or not one ({error}); pack it again.") from error
+        raise InputError(f"Packed scene {path} is damaged or not one ({reason(error)}); pack it again.") from error
 
 
 def check_header(archive: zipfile.ZipFile, name: str, expected: tuple[int | None, ...]) -> None:

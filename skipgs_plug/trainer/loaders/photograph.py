@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.errors import InputError, reason
 from skipgs_plug.trainer.loaders.images import read_image, read_mask
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.paths import inside
@@ -60,6 +60,7 @@ def undistort(
         fitted.rescale(pixels.shape[1], pixels.shape[0])
         options = pycolmap.UndistortCameraOptions()
         bitmap, pinhole = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(pixels.numpy()), fitted)
+        K = np.array(pinhole.calibration_matrix(), dtype=np.float64)  # not of a camera that sees a sphere
         straight = torch.from_numpy(np.array(bitmap.to_array()))
         if mask is not None:
             drawn = pycolmap.Bitmap.from_array(mask.byte().numpy() * 255)
@@ -67,10 +68,10 @@ def undistort(
             mask = torch.from_numpy(np.array(cut.to_array())).reshape(straight.shape[:2]) >= 128
     except Exception as error:  # pycolmap raises bare RuntimeError or ValueError
         raise InputError(
-            f"Image {image_path}: its camera, a {model_name(camera)}, cannot be undistorted ({error}); "
+            f"Image {image_path}: its camera, a {model_name(camera)}, cannot be undistorted ({reason(error)}); "
             "run: colmap image_undistorter."
         ) from error
-    return straight, mask, np.array(pinhole.calibration_matrix(), dtype=np.float64)
+    return straight, mask, K
 
 
 def check_camera(camera: Any, source: Path) -> None:

@@ -68,6 +68,6 @@ def training(dataset, opt, pipe, checkpoint, args):
 
 
 def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20)
+    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20, optimizer_type="default")
     opt.__dict__.update(options)
     return training(dataset(order), opt, None, checkpoint, SimpleNamespace(cams=2))

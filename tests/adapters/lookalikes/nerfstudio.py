@@ -47,7 +47,13 @@ class Pipeline:
 class Trainer:
     def __init__(self, strategy=None, max_norm=None, accumulate=1, scaled=False, world_size=1):
         self.strategy = strategy or DefaultStrategy()
-        self.config = SimpleNamespace(max_num_iterations=LAST + 1)
+        self.config = SimpleNamespace(
+            max_num_iterations=LAST + 1,
+            steps_per_eval_batch=25,
+            steps_per_eval_image=50,
+            steps_per_eval_all_images=0,
+            gradient_accumulation_steps={"xyz": accumulate},
+        )
         self.world_size, self.max_norm, self.accumulate = world_size, max_norm, accumulate
         self.grad_scaler = torch.amp.GradScaler("cpu", enabled=scaled)
         self.base_dir = Path("output")
@@ -86,8 +92,11 @@ class Trainer:
                     self.grad_scaler.step(optimizer)
         self.grad_scaler.update()
         if step >= self.accumulate:
-            for scheduler in self.schedulers:
-                scheduler.step()
+            self.scheduler_step_all()
+
+    def scheduler_step_all(self):
+        for scheduler in self.schedulers:
+            scheduler.step()
 
 
 MCMC = MCMCStrategy

@@ -121,9 +121,10 @@ class OpacityResetter(TrainerWrapper):
 
 class SHLifter(TrainerWrapper):
     raised = 0
+    sh_degree_up_interval = 10
 
     def loss(self, out, camera):
-        self.raised += self.curr_step % 10 == 0
+        self.raised += self.curr_step % self.sh_degree_up_interval == 0
         return super().loss(out, camera)
 
 

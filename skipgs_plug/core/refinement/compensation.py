@@ -1,0 +1,34 @@
+"""Larger, shrinking steps for the paper's gate: they make up for the backwards that it skips."""
+
+from __future__ import annotations
+
+from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.refinement.rates import ScaledRates, path_factor
+
+
+class Compensation:
+    """Scales the learning rates of gated iterations by what the floor leaves of the backwards.
+
+    Args:
+        config: With `compensate`.
+        start: First gated iteration.
+        last: Last iteration of the run.
+    """
+
+    def __init__(self, config: SkipConfig, start: int, last: int) -> None:
+        self._peak = config.rate_peak
+        self._start, self._end = start, last + 1
+        self._rates = ScaledRates()
+
+    def heartbeat(self, step: int, floor: float | None) -> None:
+        """Iteration `step` begins; `floor` is the least share of real backwards in force."""
+        self._rates.follow_thread()
+        if step < self._start:
+            self._rates.factor = 1.0
+            return
+        progress = (step - self._start) / max(self._end - self._start, 1)
+        self._rates.factor = path_factor(1.0 if floor is None else floor, progress, self._peak)
+
+    def remove(self) -> None:
+        """Let go of the optimizers."""
+        self._rates.remove()

@@ -1,0 +1,124 @@
+"""How much of refinement a scene needs, foreseen from views that are watched but not trained on for a while.
+
+Refinement runs in cycles of steps that shrink to nothing, so that a cycle leaves a finished model behind; they end at
+1/8, 1/4, 1/2 and all of what may run, each as long as all before it. Up to the last one, the losses of a few watched
+views at the end of a cycle say what it brought to views that are not trained on. What a doubling of the iterations
+brings hardly ever grows with the next doubling, so the last gain times the doublings that are left bounds what the
+rest would still bring; when that is less than the tolerance, refinement ends. In the last cycle all views are trained.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterable
+from typing import Any
+
+CYCLE_ENDS = (0.125, 0.25, 0.5, 1.0)
+LEAST_VISITS = 10  # of each view: with fewer, larger steps did not make up for what was left out
+LEAST_SHARE = 0.4
+WATCHED_SHARE = 1 / 12  # of the views
+LEAST_WATCHED, MOST_WATCHED = 3, 12
+
+
+def needed_share(iterations: int, n_views: int) -> float:
+    """Share of the refinement iterations that may be needed, known beforehand: each view ten times, at least 0.4."""
+    return min(1.0, max(LEAST_SHARE, LEAST_VISITS * n_views / max(iterations, 1)))
+
+
+def watched_views(names: Iterable[str], seed: int = 0) -> frozenset[str]:
+    """Draw the views to watch; the same for the same names."""
+    names = sorted(names)
+    count = min(MOST_WATCHED, max(LEAST_WATCHED, round(len(names) * WATCHED_SHARE)))
+    return frozenset(random.Random(seed).sample(names, min(count, len(names) // 4)))
+
+
+class Foresight:
+    """Follows the cycles, and says when the rest is not worth its time.
+
+    Args:
+        tolerance: Decibels that the rest may be worth when refinement ends.
+
+    Attributes:
+        cycle: index of the present cycle.
+        ended: refinement is over.
+        gains: decibels that each finished cycle brought to the watched views: (mean, standard error).
+        foreseen: decibels that the rest was worth when it was last judged, with two standard errors added.
+    """
+
+    def __init__(self, tolerance: float) -> None:
+        self._tolerance = tolerance
+        self.cycle = 0
+        self.ended = False
+        self.gains: list[tuple[float, float]] = []
+        self.foreseen: float | None = None
+        self._now: dict[str, float] = {}
+        self._before: dict[str, float] = {}
+
+    @property
+    def watching(self) -> bool:
+        """Whether watched views are left out of training at present."""
+        return not self.ended and self.cycle < len(CYCLE_ENDS) - 1
+
+    def see(self, view: str, loss: float) -> None:
+        """A watched view was rendered; its last loss in a cycle counts."""
+        if loss > 0.0:
+            self._now[view] = loss
+
+    def progress(self, share_done: float) -> float:
+        """Return the progress through the present cycle, having gone some share of the way; judges where one ends.
+
+        Args:
+            share_done: Iterations run, of those that may run, in [0, 1].
+        """
+        while not self.ended and share_done >= CYCLE_ENDS[self.cycle]:
+            self._end_cycle()
+        if self.ended:
+            return 1.0
+        begin = CYCLE_ENDS[self.cycle - 1] if self.cycle else 0.0
+        return (share_done - begin) / (CYCLE_ENDS[self.cycle] - begin)
+
+    def _end_cycle(self) -> None:
+        end = CYCLE_ENDS[self.cycle]
+        if end == 1.0:
+            self.ended = True
+            return
+        # The first cycle is not judged: views that are no longer trained on lose what only training gave them.
+        if self.cycle > 0:
+            gain = mean_gain(self._before, self._now)
+            if gain is not None:
+                self.gains.append(gain)
+                mean, error = gain
+                self.foreseen = (mean + 2.0 * error) * math.log2(1.0 / end)
+                self.ended = self.foreseen < self._tolerance
+        self._before = {**self._before, **self._now}
+        self._now = {}
+        self.cycle += 1
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "cycle": self.cycle,
+            "ended": self.ended,
+            "gains": [list(gain) for gain in self.gains],
+            "foreseen": self.foreseen,
+            "now": dict(self._now),
+            "before": dict(self._before),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.cycle, self.ended, self.foreseen = int(state["cycle"]), bool(state["ended"]), state["foreseen"]
+        self.gains = [(float(mean), float(error)) for mean, error in state["gains"]]
+        self._now, self._before = dict(state["now"]), dict(state["before"])
+
+
+def mean_gain(before: dict[str, float], after: dict[str, float]) -> tuple[float, float] | None:
+    """Return mean and standard error of the gain over the views seen both times, in decibels; None with less than two.
+
+    Losses of 3DGS are mean absolute differences for the most part, so 20 log10 of their ratio is about what PSNR gains.
+    """
+    gains = [20.0 * math.log10(before[view] / after[view]) for view in sorted(after) if view in before]
+    if len(gains) < 2:
+        return None
+    mean = math.fsum(gains) / len(gains)
+    variance = math.fsum((gain - mean) ** 2 for gain in gains) / (len(gains) - 1)
+    return mean, math.sqrt(variance / len(gains))

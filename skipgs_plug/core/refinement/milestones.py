@@ -1,0 +1,287 @@
+"""Iterations that something hangs on, read off the loop itself: its conditions on the iteration's number.
+
+A training loop saves, evaluates, prunes and reports by number: `if iteration % 1000 == 0`, `if iteration in
+saving_iterations`. Such conditions are read from the source of the function and evaluated ahead of time. Nothing of
+the source is changed.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+import inspect
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
+from types import CodeType
+from typing import Any, NamedTuple
+
+from skipgs_plug.core.errors import SkipGSError
+
+SAFE = frozenset({"abs", "bool", "int", "len", "max", "min", "round"})
+_POINT = (ast.Eq, ast.NotEq, ast.In, ast.NotIn, ast.Is, ast.IsNot)
+
+
+class _Leaf(NamedTuple):
+    """A part of a condition that is no `and`, `or` or `not`.
+
+    Attributes:
+        code: to be evaluated with the number; None when the part does not depend on it, or cannot be foreseen.
+        unforeseeable: it depends on the number and on what only happens in the loop.
+    """
+
+    code: CodeType | None
+    unforeseeable: bool
+
+
+class Condition:
+    """One condition of the loop on its number, with those it is nested in.
+
+    Attributes:
+        text: as it stands in the source.
+        line: where.
+    """
+
+    def __init__(self, test: ast.expr, path: list[ast.expr], loop: _Loop) -> None:
+        self.text, self.line = ast.unparse(test), loop.first_line + test.lineno - 1
+        self._loop = loop
+        self._test = test
+        self._path = path
+        self._leaves: dict[int, _Leaf] = {}
+
+    def numbers(self, numbers: range, names: Mapping[str, Any]) -> set[int]:
+        """Return those numbers for which the condition does the rarer of its two things, whatever else it depends on.
+
+        Raises:
+            SkipGSError: It depends on something that changes in the loop.
+        """
+        found: set[int] = set()
+        for assumed in (True, False):  # of parts that say nothing of the number
+            holds: set[int] = set()
+            rest: set[int] = set()
+            for number in numbers:
+                values = {**names, self._loop.target: number}
+                if all(self._value(outer, values, True) for outer in self._path):
+                    (holds if self._value(self._test, values, assumed) else rest).add(number)
+            found |= holds if len(holds) <= len(rest) else rest
+        return found
+
+    def _value(self, node: ast.expr, values: Mapping[str, Any], assumed: bool) -> bool:
+        if isinstance(node, ast.BoolOp):
+            combine = all if isinstance(node.op, ast.And) else any
+            return combine(self._value(part, values, assumed) for part in node.values)
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+            return not self._value(node.operand, values, not assumed)
+        leaf = self._leaf(node)
+        if leaf.unforeseeable and self._is_tested(node):
+            raise SkipGSError(
+                f"Line {self.line} of {self._loop.file} decides by the iteration's number in a way that cannot be "
+                f"foreseen ({self.text}), so leaving out iterations could lose what it does; gate without "
+                "refine_share, or name the iterations that must run (always=)."
+            )
+        if leaf.code is None:
+            return assumed
+        try:
+            return bool(eval(leaf.code, dict(values)))
+        except Exception:  # a name that is not bound yet, a number of another kind
+            return assumed
+
+    def _is_tested(self, node: ast.expr) -> bool:
+        """Whether a part is one of the condition itself, not of those around it, and picks single numbers."""
+        return _is_point(node) and any(leaf is node for leaf in _leaves(self._test))
+
+    def _leaf(self, node: ast.expr) -> _Leaf:
+        found = self._leaves.get(id(node))
+        if found is None:
+            found = self._leaves[id(node)] = self._loop.leaf(node)
+        return found
+
+
+class _Loop:
+    """One `for` statement of a function, whose target is the iteration's number."""
+
+    def __init__(self, statement: ast.For, file: str, first_line: int, pure: frozenset[str]) -> None:
+        assert isinstance(statement.target, ast.Name)
+        self.target = statement.target.id
+        self.file, self.first_line = file, first_line
+        self._pure = pure | SAFE
+        stored = [
+            node.id
+            for one in statement.body
+            for node in ast.walk(one)
+            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id != self.target
+        ]
+        self._changing = set(stored)
+        self.body = self._spelled_out(statement.body, stored)
+
+    def _spelled_out(self, body: list[ast.stmt], stored: list[str]) -> list[ast.stmt]:
+        """Replace names that stand for something of the number: `epoch_step = step % len(views)`."""
+        for statement in body:
+            if not (isinstance(statement, ast.Assign) and len(statement.targets) == 1):
+                continue
+            (name,), value = statement.targets, statement.value
+            if not isinstance(name, ast.Name) or stored.count(name.id) != 1:
+                continue
+            if self.mentions(value) and not self.leaf(value).unforeseeable:
+                body = [_Inline(name.id, value).visit(copy.deepcopy(one)) for one in body]
+        return body
+
+    def leaf(self, node: ast.expr) -> _Leaf:
+        if not self.mentions(node):
+            return _Leaf(None, False)
+        inner = {
+            name.id
+            for part in ast.walk(node)
+            if isinstance(part, ast.comprehension)
+            for name in ast.walk(part.target)
+            if isinstance(name, ast.Name)
+        }
+        names = {part.id for part in ast.walk(node) if isinstance(part, ast.Name)} - inner
+        calls = [part for part in ast.walk(node) if isinstance(part, ast.Call)]
+        impure = any(not isinstance(call.func, ast.Name) or call.func.id not in self._pure for call in calls)
+        if impure or names & self._changing:
+            return _Leaf(None, True)
+        return _Leaf(compile(ast.Expression(node), self.file, "eval"), False)
+
+    def mentions(self, node: ast.AST) -> bool:
+        """Whether the number stands in this part of the source."""
+        return any(isinstance(part, ast.Name) and part.id == self.target for part in ast.walk(node))
+
+    def conditions(self) -> Iterator[Condition]:
+        """All conditions that hold for single numbers, not for a stretch of them."""
+        for test, path in _tests(self.body, []):
+            if self.mentions(test) and any(_is_point(leaf) and self.mentions(leaf) for leaf in _leaves(test)):
+                yield Condition(test, path, self)
+
+    def lists(self) -> Iterator[ast.expr]:
+        """What is handed on together with the number, where it may be a list of iterations."""
+        for statement in self.body:
+            for call in ast.walk(statement):
+                if not isinstance(call, ast.Call):
+                    continue
+                given = [*call.args, *(keyword.value for keyword in call.keywords)]
+                if any(isinstance(value, ast.Name) and value.id == self.target for value in given):
+                    yield from (value for value in given if isinstance(value, (ast.Name, ast.Attribute)))
+
+
+class _Inline(ast.NodeTransformer):
+    """Puts an expression where a name is read."""
+
+    def __init__(self, name: str, value: ast.expr) -> None:
+        self._name, self._value = name, value
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        if node.id != self._name or not isinstance(node.ctx, ast.Load):
+            return node
+        return ast.copy_location(copy.deepcopy(self._value), node)
+
+
+def milestones(
+    code: CodeType, line: int, numbers: range, names: Mapping[str, Any], pure: Iterable[str] = ()
+) -> dict[str, set[int]]:
+    """Return the iterations that something hangs on, by what it is.
+
+    Args:
+        code: Of the function that holds the loop.
+        line: A line inside the loop.
+        numbers: Those that may be left out.
+        names: What the function had names for before its loop began.
+        pure: Functions that only look at numbers, and may stand in conditions.
+
+    Returns:
+        By "line N: condition", or "line N: list" of iterations that is handed to a function with the number.
+
+    Raises:
+        SkipGSError: The source cannot be read, no loop is there, or a condition cannot be foreseen.
+    """
+    loop = _loop_at(code, line, frozenset(pure))
+    found: dict[str, set[int]] = {}
+    for condition in loop.conditions():
+        hits = condition.numbers(numbers, names)
+        if hits:
+            found.setdefault(f"line {condition.line}: {condition.text}", set()).update(hits)
+    for node in loop.lists():
+        try:
+            value = eval(compile(ast.Expression(node), loop.file, "eval"), dict(names))
+        except Exception:
+            continue
+        if isinstance(value, (list, tuple, set, frozenset)) and all(type(entry) is int for entry in value):
+            hits = {entry for entry in value if entry in numbers}
+            if hits:
+                found[f"line {loop.first_line + node.lineno - 1}: {ast.unparse(node)}"] = hits
+    return found
+
+
+def _loop_at(code: CodeType, line: int, pure: frozenset[str]) -> _Loop:
+    try:
+        source = textwrap.dedent(inspect.getsource(code))
+        tree = ast.parse(source)
+    except (OSError, TypeError, SyntaxError) as error:
+        raise SkipGSError(
+            f"The source of {code.co_name}() in {code.co_filename} cannot be read ({error}), so it cannot be known "
+            "which iterations must run; gate without refine_share, or name them (always=)."
+        ) from error
+    first = code.co_firstlineno
+    for node in ast.walk(tree):  # breadth first: the outermost loop around the line
+        if (
+            isinstance(node, ast.For)
+            and isinstance(node.target, ast.Name)
+            and node.lineno <= line - first + 1 <= (node.end_lineno or node.lineno)
+        ):
+            return _Loop(node, code.co_filename, first, pure)
+    raise SkipGSError(
+        f"Line {line} of {code.co_filename} stands in no loop over a single number; "
+        "write the loop as: for step in gate.iterations(range(...))."
+    )
+
+
+def _tests(body: list[ast.stmt], path: list[ast.expr]) -> Iterator[tuple[ast.expr, list[ast.expr]]]:
+    """All conditions in these statements, each with those that must hold for it to be looked at."""
+    for statement in body:
+        if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            continue
+        if isinstance(statement, (ast.If, ast.While)):
+            yield statement.test, path
+            yield from _tests(statement.body, [*path, statement.test])
+            yield from _tests(statement.orelse, [*path, ast.UnaryOp(ast.Not(), statement.test)])
+            continue
+        inner = [part for part in ast.iter_child_nodes(statement) if isinstance(part, ast.stmt)]
+        for handler in getattr(statement, "handlers", ()):
+            inner += handler.body
+        yield from _tests(inner, path)
+        for part in ast.iter_child_nodes(statement):
+            if isinstance(part, ast.expr):
+                yield from ((test, path) for test in _values(part))
+
+
+def _values(node: ast.AST) -> Iterator[ast.expr]:
+    """Conditions inside an expression: `flag = iteration % 10 == 0`, `a if iteration in b else c`."""
+    if isinstance(node, (ast.BoolOp, ast.Compare)) or (isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not)):
+        yield node
+        return
+    if isinstance(node, ast.IfExp):
+        yield node.test
+        children: list[ast.AST] = [node.body, node.orelse]
+    else:
+        children = list(ast.iter_child_nodes(node))
+    for child in children:
+        yield from _values(child)
+
+
+def _leaves(node: ast.expr) -> Iterator[ast.expr]:
+    if isinstance(node, ast.BoolOp):
+        for part in node.values:
+            yield from _leaves(part)
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+        yield from _leaves(node.operand)
+    else:
+        yield node
+
+
+def _is_point(leaf: ast.expr) -> bool:
+    """Whether a part of a condition picks single numbers: equality, membership, a remainder, or a function's word."""
+    if isinstance(leaf, ast.Compare):
+        return any(isinstance(operator, _POINT) for operator in leaf.ops) or any(
+            isinstance(part, ast.Mod) for part in ast.walk(leaf)
+        )
+    # The training backward of a loop of one's own, which gets the number too, is no milestone.
+    return not (isinstance(leaf, ast.Call) and isinstance(leaf.func, ast.Attribute) and leaf.func.attr == "backward")

@@ -1,0 +1,60 @@
+"""What happens to the backward of an iteration that was not left out."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from typing import Any
+
+from skipgs_plug.core import decision
+from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.decision import Decision
+from skipgs_plug.core.ema import ViewMeans
+from skipgs_plug.core.policy import Policy
+from skipgs_plug.core.refinement.refinement import Refinement
+
+
+class RefinementPolicy(Policy):
+    """Every backward runs, except on views that are watched only, and after refinement has ended.
+
+    Structural changes need no pause: no mean decides.
+    """
+
+    def __init__(self, config: SkipConfig, refinement: Refinement) -> None:
+        self._config = config
+        self._refinement = refinement
+        self._means = ViewMeans(config.ema_decay)
+
+    @property
+    def start_iter(self) -> int:
+        """First iteration that may be left out."""
+        return self._config.start_iter or 0
+
+    def mean(self, view: Hashable) -> float | None:
+        """Running mean of a view's loss."""
+        return self._means.get(view)
+
+    def decide(self, view: Hashable, loss: float, step: int) -> Decision:
+        """Run the backward, unless the view is watched or refinement is over."""
+        if step < self.start_iter:
+            return decision.INACTIVE
+        if loss - loss != 0.0:  # NaN or infinite
+            return decision.NON_FINITE
+        self._means.update(view, loss)
+        refinement = self._refinement
+        if refinement.over:
+            return decision.OVER
+        if refinement.watching and view in refinement.watched:
+            assert refinement.foresight is not None
+            refinement.foresight.see(str(view), loss)
+            return decision.WATCHED
+        return decision.FULL
+
+    def notify_event(self, step: int, n_views: int) -> None:
+        """Tell the refinement, which may have ended."""
+        self._refinement.notify_event(n_views)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"means": self._means.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._means.load_state_dict(state["means"])

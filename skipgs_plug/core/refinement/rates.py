@@ -1,0 +1,85 @@
+"""Larger, shrinking steps: a factor on every learning rate, for the length of each optimizer step only."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import torch
+from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
+
+
+def path_factor(share: float, progress: float, peak: float | None = None) -> float:
+    """Factor on learning rates at some progress through refinement, when a share of the iterations runs.
+
+    Adam's steps are about as long as its learning rate, and refinement is limited by how far parameters travel: a
+    share of the steps goes as far as all of them when their mean length is 1 / share. The factor falls linearly from
+    twice that to 0, the shape that averages the noise of the last steps out (Defazio et al., arXiv 2310.07831).
+
+    Args:
+        share: Share of the iterations that run, in (0, 1].
+        progress: Share of refinement that is over, in [0, 1].
+        peak: Factor at the beginning, instead of 2 / share.
+    """
+    return (2.0 / share if peak is None else peak) * (1.0 - progress)
+
+
+class ScaledRates:
+    """Multiplies the learning rates of every optimizer that steps in this thread, and puts them back afterwards.
+
+    PyTorch's own hooks around `step` are used, so fused, sparse and selective optimizers are reached alike, the
+    trainer's schedule is never disturbed, and a checkpoint holds the trainer's rates.
+
+    Attributes:
+        factor: in force; 1 touches nothing.
+    """
+
+    def __init__(self) -> None:
+        self.factor = 1.0
+        self._thread = threading.get_ident()
+        self._depth: dict[int, int] = {}  # a step can call the step of its base class
+        self._before: dict[int, list[tuple[dict[str, Any], Any]]] = {}
+        self._handles = (
+            register_optimizer_step_pre_hook(self._scale),
+            register_optimizer_step_post_hook(self._put_back),
+        )
+
+    def follow_thread(self) -> None:
+        """Scale the steps of the thread that calls this, which is the one that trains."""
+        self._thread = threading.get_ident()
+        if self._before:  # a step that raised had no end
+            for saved in self._before.values():
+                _restore(saved)
+            self._before.clear()
+            self._depth.clear()
+
+    def remove(self) -> None:
+        """Take the hooks back."""
+        self.follow_thread()
+        for handle in self._handles:
+            handle.remove()
+
+    def _scale(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        if self.factor == 1.0 or threading.get_ident() != self._thread:
+            return
+        key = id(optimizer)
+        self._depth[key] = self._depth.get(key, 0) + 1
+        if self._depth[key] > 1:
+            return
+        self._before[key] = [(group, group["lr"]) for group in optimizer.param_groups]
+        for group in optimizer.param_groups:
+            group["lr"] = group["lr"] * self.factor
+
+    def _put_back(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        key = id(optimizer)
+        if key not in self._depth:
+            return
+        self._depth[key] -= 1
+        if self._depth[key] == 0:
+            del self._depth[key]
+            _restore(self._before.pop(key))
+
+
+def _restore(saved: list[tuple[dict[str, Any], Any]]) -> None:
+    for group, rate in saved:
+        group["lr"] = rate

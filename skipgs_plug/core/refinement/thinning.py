@@ -1,0 +1,56 @@
+"""Which iterations run: a share of them, evenly spread, and every one that something hangs on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class Thinning:
+    """Runs one iteration in each slot of 1 / share iterations, at a place in it that looks random.
+
+    Strictly even gaps would meet loops that take view `step % n` at the same views again and again. An iteration
+    that must run is paid for by those after it, so that the share stays what was asked for as long as fewer
+    iterations must run than may.
+
+    Args:
+        share: Share of iterations that run, in [0, 1].
+
+    Attributes:
+        run, left_out: iterations counted so far.
+    """
+
+    def __init__(self, share: float) -> None:
+        self.share = share
+        self.run = 0
+        self.left_out = 0
+        self._due = 0  # how many should have run by now
+
+    def runs(self, must: bool) -> bool:
+        """Whether the next iteration runs; `must` says that something hangs on it."""
+        if 0.0 < self.share < 1.0:
+            asked = self.run + self.left_out
+            while (self._due + _place(self._due)) / self.share < asked + 1:
+                self._due += 1
+            must = must or self.run < self._due
+        else:
+            must = must or self.share > 0.0
+        if must:
+            self.run += 1
+        else:
+            self.left_out += 1
+        return must
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"share": self.share, "run": self.run, "left_out": self.left_out, "due": self._due}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.share = float(state["share"])
+        self.run, self.left_out, self._due = int(state["run"]), int(state["left_out"]), int(state["due"])
+
+
+def _place(slot: int) -> float:
+    """Where in its slot an iteration runs, in [0, 1): always the same, with no period (SplitMix64's finaliser)."""
+    mixed = (slot * 0x9E3779B97F4A7C15 + 0x9E3779B97F4A7C15) % (1 << 64)
+    mixed = ((mixed ^ (mixed >> 30)) * 0xBF58476D1CE4E5B9) % (1 << 64)
+    mixed = ((mixed ^ (mixed >> 27)) * 0x94D049BB133111EB) % (1 << 64)
+    return (mixed ^ (mixed >> 31)) / (1 << 64)

@@ -1,0 +1,151 @@
+"""What holds for every adapter when whole iterations are left out, on look-alikes of the trainers."""
+
+import json
+
+import pytest
+import torch
+from cases import CASES, run
+from lookalikes import step_trainer
+from lookalikes.splats import Log, log, new_log
+
+from skipgs_plug import SkipGate
+from skipgs_plug.core.errors import AdapterMismatchError
+
+LOOPS = [case for case in CASES if case.name != "step_trainer"]  # its loop is the script's, not the trainer's
+each = pytest.mark.parametrize("case", LOOPS, ids=lambda case: case.name)
+resumable = [case for case in LOOPS if case.resume]
+SHARE = 0.4
+
+
+def same(one, other):
+    return len(one) == len(other) and all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+@pytest.fixture
+def begun(monkeypatch):
+    """Numbers of the iterations that began."""
+    numbers = []
+    original = Log.begins
+
+    def begins(self, iteration, parameters):
+        numbers.append(iteration)
+        return original(self, iteration, parameters)
+
+    monkeypatch.setattr(Log, "begins", begins)
+    return numbers
+
+
+@each
+def test_a_share_of_the_iterations_runs_and_nothing_that_hangs_on_numbers_is_lost(case, begun):
+    plain = run(case)[0]
+    begun.clear()
+    gated, gate = run(case, refine_share=SHARE)
+    start, last = case.module.START, case.module.LAST
+    assert begun[: start - case.module.FIRST] == list(range(case.module.FIRST, start))
+    refined = [n for n in begun if n >= start]
+    report = gate.report()
+    assert refined == sorted(set(refined)) and refined[-1] == last and len(refined) == report["iterations_run"]
+    assert report["iterations_run"] + report["iterations_skipped"] == last + 1 - start
+    always = sum(report["always_run"].values())
+    assert len(refined) <= max(SHARE * (last + 1 - start), always) + 2
+    assert gated.structure == plain.structure  # prunes, resets, relocations: same iterations, same counts
+    assert gated.other_backwards == plain.other_backwards
+    assert gated.backwards == begun
+
+
+@pytest.mark.parametrize(
+    "settings", [{"refine_share": 1.0}, {"refine_share": 0.4, "enabled": False}], ids=["all", "off"]
+)
+@each
+def test_leaving_out_nothing_leaves_training_bit_identical(case, settings):
+    plain = run(case)[0]
+    gated, _ = run(case, **settings)
+    assert plain.backwards == gated.backwards and same(plain.current, gated.current)
+    assert (plain.structure, plain.steps) == (gated.structure, gated.steps)
+
+
+@each
+def test_rates_are_the_trainers_own_between_steps(case, monkeypatch):
+    def rates_of(settings):
+        seen = {}
+        original = Log.begins
+
+        def begins(self, iteration, parameters):
+            seen[begins.before] = [group["lr"] for one in alive for group in one.param_groups]
+            begins.before = iteration
+            return original(self, iteration, parameters)
+
+        begins.before = None
+        with monkeypatch.context() as patch:
+            patch.setattr(Log, "begins", begins)
+            run(case, **settings)
+        return seen
+
+    alive = []
+    original_init = torch.optim.Adam.__init__
+
+    def noted(self, *args, **kwargs):
+        original_init(self, *args, **kwargs)
+        alive.append(self)
+
+    monkeypatch.setattr(torch.optim.Adam, "__init__", noted)
+    plain = rates_of({})
+    alive.clear()
+    gated = rates_of({"refine_share": SHARE})
+    assert len(gated) < len(plain)
+    for number, rates in gated.items():  # after each iteration that ran, of schedulers that count calls too
+        assert rates == pytest.approx(plain[number], rel=1e-9)
+
+
+@pytest.mark.parametrize("case", resumable, ids=lambda case: case.name)
+def test_interrupted_and_resumed_leaves_out_the_same(case, begun):
+    settings = {"refine_share": SHARE}
+    whole, _ = run(case, **settings)
+    numbers = list(begun)
+    middle = next(n for n in numbers if n >= case.module.LAST - 16)  # nothing is pending: no trainer saves gradients
+    new_log()
+    begun.clear()
+    trainer, train = case.make()
+    with SkipGate(trainer, **settings) as first:
+        checkpoint = train(last=middle)
+        state = json.loads(json.dumps(first.state_dict()))
+    trainer, train = case.resume(checkpoint)
+    with SkipGate(trainer, **settings) as second:
+        second.load_state_dict(state)
+        train()
+    assert begun == numbers
+    if case.module.ADAPTER not in ("nerfstudio",):  # its schedulers are not in the look-alike's checkpoint
+        assert same(log.current, whole.current)
+
+
+@each
+def test_no_range_stays_replaced(case):
+    trainer, _ = case.make()
+    gate = SkipGate(trainer, refine_share=SHARE)
+    replaced = [name for name in gate.patched if name.endswith(".range")]
+    assert len(replaced) == 1
+    gate.detach()
+    assert gate.patched == [] and "range" not in vars(case.module)
+
+
+def test_a_loop_around_a_pip_trainer_is_written_with_the_gates_iterations():
+    def train(numbers, trainer):
+        for step in numbers:
+            trainer.step(step_trainer.pick_camera(step_trainer.dataset(), step))
+        return trainer
+
+    new_log()
+    train(range(1, 61), plain := step_trainer.make())
+    structure = list(log.structure)
+    new_log()
+    trainer = step_trainer.make()
+    with SkipGate(trainer, refine_share=SHARE) as gate:
+        for step in gate.iterations(range(1, 61)):
+            trainer.step(step_trainer.pick_camera(step_trainer.dataset(), step))
+            assert trainer.curr_step == step
+    assert gate.report()["iterations_run"] == pytest.approx(16, abs=1)
+    assert trainer.raised == plain.raised == 6
+    assert [event for event in structure if event[0] < 21] == log.structure
+    trainer = step_trainer.make()
+    with SkipGate(trainer, refine_share=SHARE), pytest.raises(AdapterMismatchError, match="No loop over range"):
+        train(iter(list(range(1, 61))), trainer)

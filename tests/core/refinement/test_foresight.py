@@ -1,0 +1,98 @@
+"""How much of refinement a scene needs."""
+
+import itertools
+import json
+
+import pytest
+
+from skipgs_plug.core.refinement.foresight import CYCLE_ENDS, Foresight, mean_gain, needed_share, watched_views
+
+VIEWS = [f"{i}.png" for i in range(6)]
+
+
+def follow(losses, tolerance=0.05, iterations=800):
+    """Go through all cycles; `losses(view, share done)` is what a view shows."""
+    foresight = Foresight(tolerance)
+    for i in range(iterations):
+        done = i / iterations
+        foresight.progress(done)
+        if foresight.ended:
+            break
+        if foresight.watching:
+            view = VIEWS[i % len(VIEWS)]
+            foresight.see(view, losses(view, done))
+    return foresight, i / iterations
+
+
+def test_a_scene_that_needs_nothing_ends_after_the_second_cycle():
+    foresight, done = follow(lambda view, done: 0.1)
+    assert foresight.ended and done == CYCLE_ENDS[1]
+    assert foresight.gains == [(0.0, 0.0)] and foresight.foreseen == 0.0
+
+
+def test_a_scene_that_gains_to_the_end_gets_all():
+    foresight, _ = follow(lambda view, done: 0.1 * (1.0 - 0.5 * done))
+    assert not foresight.ended and foresight.cycle == len(CYCLE_ENDS) - 1
+    assert len(foresight.gains) == 2 and all(mean > 0.05 for mean, _ in foresight.gains)
+    foresight.progress(1.0)
+    assert foresight.ended
+
+
+def test_doubt_counts_for_going_on():
+    gains = {view: 0.002 * (i % 2) for i, view in enumerate(VIEWS)}
+    foresight, done = follow(lambda view, done: 0.1 - gains[view] * (done > 0.125))
+    assert foresight.gains[0][1] > 0.02 and done == CYCLE_ENDS[2]  # where it had brought nothing any more
+
+
+def test_views_that_get_worse_end_it():
+    foresight, done = follow(lambda view, done: 0.1 * (1.0 + done))
+    assert foresight.ended and done == CYCLE_ENDS[1] and foresight.foreseen < 0.0
+
+
+def test_progress_runs_from_zero_to_one_in_every_cycle():
+    foresight = Foresight(0.05)
+    seen = [foresight.progress(i / 80) for i in range(80)]
+    assert [i for i, (a, b) in enumerate(itertools.pairwise(seen), 1) if b < a] == [10, 20, 40]
+    assert min(seen) == 0.0 and max(seen) < 1.0
+
+
+def test_without_two_watched_views_nothing_is_judged():
+    foresight = Foresight(0.05)
+    for i in range(100):
+        foresight.progress(i / 100)
+    assert foresight.gains == [] and foresight.foreseen is None and not foresight.ended
+
+
+def test_a_saved_state_goes_on():
+    def losses(view, done):
+        return 0.1 * (1.0 - 0.3 * done) + 0.001 * VIEWS.index(view)
+
+    whole, _ = follow(losses)
+    first = Foresight(0.05)
+    for i in range(800):
+        if i == 150:
+            second = Foresight(0.05)
+            second.load_state_dict(json.loads(json.dumps(first.state_dict())))
+            first = second
+        first.progress(i / 800)
+        if first.watching:
+            first.see(VIEWS[i % len(VIEWS)], losses(VIEWS[i % len(VIEWS)], i / 800))
+    assert first.state_dict() == whole.state_dict()
+
+
+def test_the_share_follows_from_the_visits():
+    assert needed_share(15_000, 100) == 0.4
+    assert needed_share(2000, 172) == pytest.approx(0.86)
+    assert needed_share(1500, 300) == 1.0
+
+
+def test_watched_views_are_few_and_always_the_same():
+    names = [f"{i:03}.jpg" for i in range(255)]
+    assert watched_views(names) == watched_views(reversed(names)) and len(watched_views(names)) == 12
+    assert len(watched_views(names[:17])) == 3 and len(watched_views(names[:9])) == 2
+    assert watched_views(names[:3]) == frozenset()
+
+
+def test_gain_in_decibels():
+    assert mean_gain({"a": 0.1, "b": 0.1}, {"a": 0.01, "b": 0.01, "c": 1.0}) == pytest.approx((20.0, 0.0))
+    assert mean_gain({"a": 0.1}, {"a": 0.1}) is None

@@ -1,0 +1,173 @@
+"""What is read off a loop: iterations that something hangs on."""
+
+import re
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from skipgs_plug import SkipGSError
+from skipgs_plug.core.refinement.loop_range import line_of
+from skipgs_plug.core.refinement.milestones import milestones
+
+NUMBERS = range(50, 100)
+
+
+def found(loop, pure=()):
+    """Milestones of a function, from inside its loop; it must call `stop(names)` there."""
+    caught = {}
+
+    class Stopped(Exception):
+        pass
+
+    def stop(**names):
+        code = sys._getframe(1).f_code
+        caught.update(milestones(code, line_of(code), NUMBERS, {**loop.__globals__, **names}, pure))
+        raise Stopped
+
+    with pytest.raises(Stopped):
+        loop(stop)
+    return {re.sub(r"^line \d+: ", "", reason): sorted(numbers) for reason, numbers in caught.items()}
+
+
+def report(step, saves):
+    """Something that a loop calls with its number."""
+
+
+def is_due(step, every):
+    return step % every == 0
+
+
+def test_conditions_on_the_number():
+    def loop(stop):
+        opt = SimpleNamespace(every=20, until=70)
+        saves = [60, 99, 1000]
+        for step in range(100):
+            stop(opt=opt, saves=saves)
+            if step % 25 == 0:
+                print("SH")
+            if step in saves or step == 51:
+                print("save")
+            if step > opt.until and step % opt.every == 0:
+                print("prune")
+            elif step < 10 and step % 3 == 0:
+                print("never in these")
+            if step >= 10:
+                print("a stretch of them")
+            flag = "now" if step == 77 else "not now"
+            print(flag)
+            if not step % 40:
+                print("remainder as a truth")
+
+    assert found(loop) == {
+        "step % 25 == 0": [50, 75],
+        "step in saves or step == 51": [51, 60, 99],
+        "step > opt.until and step % opt.every == 0": [80],
+        "step == 77": [77],
+        "not step % 40": [80],
+    }
+
+
+def test_the_rarer_side_of_a_condition_counts():
+    def loop(stop):
+        last = 99
+        for step in range(100):
+            stop(last=last)
+            if step != last:
+                print("all but one")
+
+    assert found(loop) == {"step != last": [99]}
+
+
+def test_what_cannot_be_known_but_the_number_may_hold():
+    def loop(stop):
+        for step in range(100):
+            stop()
+            size = len(str(step))
+            if size > 1 and step % 30 == 0:
+                print("depends on the model too")
+
+    assert found(loop) == {"size > 1 and step % 30 == 0": [60, 90]} or found(loop) == {
+        "len(str(step)) > 1 and step % 30 == 0": [60, 90]
+    }
+
+
+def test_nested_conditions_hold_together():
+    def loop(stop):
+        for step in range(100):
+            stop()
+            if step < 60:
+                if step % 10 == 0:
+                    print("densify")
+            else:
+                with open("/dev/null") as _:
+                    while step % 45 == 0:
+                        break
+
+    assert found(loop) == {"step % 10 == 0": [50], "step % 45 == 0": [90]}
+
+
+def test_names_that_stand_for_the_number():
+    def loop(stop):
+        views = list(range(17))
+        for step in range(100):
+            stop(views=views)
+            position = step % len(views)
+            if position == 0:
+                print("next round")
+
+    assert found(loop) == {"step % len(views) == 0": [51, 68, 85]}
+
+
+def test_lists_of_iterations_that_are_handed_on_with_the_number():
+    def loop(stop):
+        saves, sizes = [7, 70], [1.5, 60]
+        for step in range(100):
+            stop(saves=saves, sizes=sizes)
+            report(step, saves)
+            report(step, saves=sizes)
+
+    assert found(loop) == {"saves": [70]}
+
+
+def test_functions_that_only_look_at_numbers():
+    def loop(stop):
+        for step in range(100):
+            stop()
+            if is_due(step, 45):
+                print("log")
+
+    assert found(loop, pure=["is_due"]) == {"is_due(step, 45)": [90]}
+    with pytest.raises(SkipGSError, match=r"in a way that cannot be foreseen \(is_due\(step, 45\)\)"):
+        found(loop)
+
+
+def test_a_condition_on_what_changes_in_the_loop_is_refused():
+    def loop(stop):
+        upcoming = 60
+        for step in range(100):
+            stop(upcoming=upcoming)
+            if step == upcoming:
+                upcoming += 10
+
+    with pytest.raises(SkipGSError, match=r"cannot be foreseen \(step == upcoming\).*name the iterations"):
+        found(loop)
+
+
+def test_inner_loops_are_not_taken_for_the_loop():
+    def loop(stop):
+        for step in range(100):
+            for i in range(3):
+                if i == 0:
+                    stop()
+            if step == 90:
+                print("save")
+
+    assert found(loop) == {"step == 90": [90]}
+
+
+def test_a_source_that_cannot_be_read_is_refused():
+    names = {}
+    exec("def loop(stop):\n    for step in range(100):\n        stop()\n", names)
+    with pytest.raises(SkipGSError, match=r"source of loop\(\) .* cannot be read"):
+        found(names["loop"])

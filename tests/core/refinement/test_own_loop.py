@@ -1,0 +1,174 @@
+"""`for step in gate.iterations(range(...))`: loops of one's own."""
+
+import json
+
+import pytest
+import torch
+
+from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.core.refinement.rates import path_factor
+
+VIEWS = [f"{i}.png" for i in range(4)]
+
+
+class Loop:
+    """A training loop with what real ones have: a save by number, a rate by number, Adam."""
+
+    def __init__(self, begin=0, end=100, value=None, moments=None):
+        self.begin, self.end = begin, end
+        self.value = torch.nn.Parameter(torch.tensor([2.0, -1.0]) if value is None else value.clone())
+        self.optimizer = torch.optim.Adam([self.value], lr=0.1)
+        if moments is not None:
+            self.optimizer.load_state_dict(moments)
+        self.ran, self.saved, self.rates = [], [], []
+
+    def train(self, gate, **options):
+        for step in gate.iterations(range(self.begin, self.end), **options):
+            self.ran.append(step)
+            self.optimizer.param_groups[0]["lr"] = 0.1 * 0.99**step
+            loss = (self.value - step % 3).square().sum()
+            if gate.backward(loss, view=VIEWS[step % 4], step=step):
+                self.optimizer.step()
+                self.optimizer.zero_grad(set_to_none=True)
+            self.rates.append(self.optimizer.param_groups[0]["lr"])
+            if step % 25 == 0:
+                self.saved.append(step)
+        return self
+
+
+def test_a_share_of_the_iterations_runs_with_all_that_hangs_on_numbers():
+    with SkipGate(start_iter=40, refine_share=0.25) as gate:
+        loop = Loop().train(gate)
+    assert loop.ran[:40] == list(range(40)) and len(loop.ran) == 40 + 16  # the last one comes on top
+    assert loop.saved == [0, 25, 50, 75] and loop.ran[-1] == 99
+    assert loop.rates == [0.1 * 0.99**step for step in loop.ran]
+    report = gate.report()
+    assert (report["refine_share"], report["iterations_run"], report["iterations_skipped"]) == (0.25, 16, 44)
+    assert sum(report["always_run"].values()) == 2
+    assert report["backwards_run"] == 16 and report["reasons"] == {"full": 16}
+    assert "16 of 60 iterations run (26.7 %)" in gate.summary()
+
+
+def test_steps_are_larger_while_the_gate_is_attached():
+    loop, moved = Loop(), {}
+
+    def note(optimizer, args, kwargs):
+        moved[loop.ran[-1]] = optimizer.param_groups[0]["lr"] / (0.1 * 0.99 ** loop.ran[-1])
+
+    loop.optimizer.register_step_pre_hook(note)  # after the global hooks
+    gate = SkipGate(start_iter=40, refine_share=0.4)
+    loop.train(gate)
+    assert all(moved[step] == pytest.approx(1.0) for step in range(40))
+    assert all(moved[step] == pytest.approx(path_factor(0.4, (step - 40) / 60)) for step in loop.ran[40:])
+    gate.detach()
+    before = loop.value.detach().clone()
+    loop.value.grad = torch.ones(2)
+    moved.clear()
+    loop.optimizer.step()
+    assert next(iter(moved.values())) == pytest.approx(1.0) and not torch.equal(before, loop.value)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"enabled": False, "refine_share": 0.4}, {"refine_share": 1.0, "compensate": False}, {"refine_share": 1.0}],
+    ids=["off", "all", "all by default"],
+)
+def test_leaving_out_nothing_changes_nothing(settings):
+    plain, same = Loop(), Loop()
+    with SkipGate(start_iter=1000) as gate:
+        plain.train(gate)
+    with SkipGate(start_iter=40, **settings) as gate:
+        same.train(gate)
+    assert same.ran == plain.ran and torch.equal(same.value, plain.value)
+
+
+@pytest.mark.parametrize("settings", [{"refine_share": 0.4}, {"refine_share": "auto"}], ids=["share", "auto"])
+def test_interrupted_and_resumed_goes_as_uninterrupted(settings):
+    options = {} if settings["refine_share"] != "auto" else {"views": VIEWS}
+    with SkipGate(start_iter=40, **settings) as gate:
+        whole = Loop(end=400).train(gate, **options)
+    middle = 200
+    with SkipGate(start_iter=40, **settings) as gate:
+        # A save belongs to an iteration that runs; what comes after it is decided by the one who goes on.
+        first = Loop(end=400)
+        state = None
+        for step in first_part(first, gate, middle, options):
+            state = step
+    last = first.ran[-1]
+    with SkipGate(start_iter=40, **settings) as gate:
+        gate.load_state_dict(json.loads(json.dumps(state)))
+        second = Loop(last + 1, 400, first.value.detach(), first.optimizer.state_dict())
+        second.train(gate, **options)
+    assert first.ran + second.ran == whole.ran
+    assert torch.equal(second.value, whole.value)
+
+
+def first_part(loop, gate, middle, options):
+    """Train up to `middle`, giving the gate's state at the end of each iteration."""
+    for step in gate.iterations(range(loop.begin, loop.end), always=range(0, 400, 25), **options):
+        if step > middle:
+            return
+        loop.ran.append(step)
+        loop.optimizer.param_groups[0]["lr"] = 0.1 * 0.99**step
+        loss = (loop.value - step % 3).square().sum()
+        if gate.backward(loss, view=VIEWS[step % 4], step=step):
+            loop.optimizer.step()
+            loop.optimizer.zero_grad(set_to_none=True)
+        yield gate.state_dict()
+
+
+def test_a_state_of_another_share_is_refused():
+    with SkipGate(start_iter=10, refine_share=0.4) as gate:
+        Loop().train(gate)
+        state = gate.state_dict()
+    for settings in ({"refine_share": 0.5}, {}):
+        with SkipGate(start_iter=10, **settings) as gate, pytest.raises(SkipGSError, match=r"refine_share=0\.4"):
+            gate.load_state_dict(state)
+
+
+def test_auto_ends_where_nothing_is_gained_and_goes_on_with_what_hangs_on_numbers():
+    ran = []
+    with SkipGate(start_iter=100, refine_share="auto") as gate:
+        for step in gate.iterations(range(2100), views=[f"{i}.png" for i in range(20)]):
+            ran.append(step)
+            loss = torch.tensor(0.1, requires_grad=True)
+            gate.backward(loss * 1.0, view=f"{step % 20}.png", step=step)
+            if step % 500 == 0:
+                pass
+    report = gate.report()
+    # A quarter of 0.4 of 2,000 iterations, then 500, 1,000, 1,500, 2,000 and the last.
+    assert report["iterations_run"] == 200 + 5 and ran[-4:] == [1000, 1500, 2000, 2099]
+    assert report["foresight"]["ended"] and report["foresight"]["rest_worth_db"] == 0.0
+    assert report["reasons"]["over"] > 0 and report["reasons"]["watched"] > 0
+
+
+def test_auto_must_know_the_views():
+    with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match="give views="):
+        Loop().train(gate)
+
+
+def test_the_gate_makes_up_for_skipped_backwards_when_asked():
+    with SkipGate(start_iter=40, compensate=True) as gate, pytest.raises(SkipGSError, match=r"gate\.iterations"):
+        gate.backward(torch.ones((), requires_grad=True), view="a", step=50)
+    factors = []
+    loop = Loop(end=400)
+    loop.optimizer.register_step_pre_hook(
+        lambda optimizer, args, kwargs: factors.append(optimizer.param_groups[0]["lr"] / (0.1 * 0.99 ** loop.ran[-1]))
+    )
+    with SkipGate(start_iter=40, compensate=True, min_bwd_ratio=0.5, warmup=0) as gate:
+        loop.train(gate)
+    assert loop.ran == list(range(400)) and factors[40] == pytest.approx(4.0) and factors[-1] < 0.1
+
+
+def test_unfit_numbers_and_settings_are_refused():
+    with pytest.raises(SkipGSError, match=r"takes a range that goes up by one"):
+        SkipGate(start_iter=1).iterations(range(0, 10, 2))
+    for settings, sentence in [
+        ({"refine_share": 0.0}, r'refine_share must be "auto" or in \(0, 1\], not 0.0'),
+        ({"refine_share": "half"}, "not 'half'"),
+        ({"tolerance": -1.0}, "tolerance must be a number of decibels"),
+        ({"rate_peak": 0.0}, "rate_peak must be a factor above 0"),
+        ({"refine_share": 0.4, "step_mode": "adaptive_norm"}, "leave step_mode at 'off'"),
+    ]:
+        with pytest.raises(SkipGSError, match=sentence):
+            SkipGate(start_iter=1, **settings)

@@ -1,0 +1,89 @@
+"""Learning rates scaled for the length of a step."""
+
+import threading
+
+import pytest
+import torch
+
+from skipgs_plug.core.refinement.rates import ScaledRates, path_factor
+
+
+def parameter(value=1.0):
+    one = torch.nn.Parameter(torch.full((3,), value))
+    one.grad = torch.ones(3)
+    return one
+
+
+@pytest.fixture
+def rates():
+    scaled = ScaledRates()
+    yield scaled
+    scaled.remove()
+
+
+def test_the_path_is_conserved():
+    steps = 1000
+    for share in (0.25, 0.4, 1.0):
+        ran = round(share * steps)
+        path = sum(path_factor(share, i / ran) for i in range(ran))
+        assert path == pytest.approx(steps, rel=0.01)
+    assert path_factor(0.4, 1.0) == 0.0
+    assert path_factor(0.4, 0.5, peak=3.0) == 1.5
+
+
+class OwnStep(torch.optim.Adam):
+    """Like the sparse optimizers of trainers: a step of its own, with arguments, that calls the base's."""
+
+    def step(self, visible, n):
+        assert visible and n == 3
+        return super().step()
+
+
+@pytest.mark.parametrize("kind", ["sgd", "adam", "fused", "own", "tensor"])
+def test_a_step_is_as_long_as_the_factor_says_and_the_rate_comes_back(kind, rates):
+    value, other = parameter(), parameter()
+    make = {
+        "sgd": lambda p: torch.optim.SGD([p], lr=0.1),
+        "adam": lambda p: torch.optim.Adam([p], lr=0.1),
+        "fused": lambda p: torch.optim.Adam([p], lr=0.1, fused=True),
+        "own": lambda p: OwnStep([p], lr=0.1),
+        "tensor": lambda p: torch.optim.SGD([p], lr=torch.tensor(0.1)),
+    }[kind]
+    arguments = (True, 3) if kind == "own" else ()
+    scaled, plain = make(value), make(other)
+    rates.factor = 4.0
+    before = scaled.param_groups[0]["lr"]
+    scaled.step(*arguments)
+    assert scaled.param_groups[0]["lr"] is before
+    rates.factor = 1.0
+    plain.step(*arguments)
+    torch.testing.assert_close(1.0 - value.detach(), 4.0 * (1.0 - other.detach()), rtol=1e-5, atol=0)
+
+
+def test_a_step_that_raises_gives_its_rate_back_in_the_next_iteration(rates):
+    class Broken(torch.optim.SGD):
+        def step(self):
+            raise ZeroDivisionError
+
+    optimizer = Broken([parameter()], lr=0.1)
+    rates.factor = 5.0
+    with pytest.raises(ZeroDivisionError):
+        optimizer.step()
+    rates.follow_thread()
+    assert optimizer.param_groups[0]["lr"] == 0.1
+
+
+def test_other_threads_and_removed_hooks_are_left_alone(rates):
+    def moved():
+        value = parameter()
+        torch.optim.SGD([value], lr=0.1).step()
+        return round(1.0 - value[0].item(), 5)
+
+    rates.factor = 3.0
+    seen = []
+    thread = threading.Thread(target=lambda: seen.append(moved()))
+    thread.start()
+    thread.join()
+    assert seen == [0.1] and moved() == 0.3
+    rates.remove()
+    assert moved() == 0.1
