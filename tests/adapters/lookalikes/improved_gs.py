@@ -32,6 +32,13 @@ def compute_edge_score(camlist, gaussians, pipe, bg):
     return sum(picture["accum_weights"] for picture in pictures)
 
 
+def step(gaussians):
+    note_step(gaussians.optimizers())
+    for optimizer in gaussians.optimizers():
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+
+
 def training(dataset, opt, pipe, checkpoint, args):
     first_iter = 0
     gaussians = GaussianModel()
@@ -58,12 +65,15 @@ def training(dataset, opt, pipe, checkpoint, args):
                     gaussians.prune_gaussians(0.05, score)
                 if iteration % 8 == 0:
                     gaussians.reset_opacity()
-            every = 1 if iteration <= 20 else 4 if iteration <= 40 else 8
-            if iteration < opt.iterations and iteration % every == 0:
-                note_step(gaussians.optimizers())
-                for optimizer in gaussians.optimizers():
-                    optimizer.step()
-                    optimizer.zero_grad(set_to_none=True)
+            if iteration < opt.iterations:
+                if iteration <= 20:
+                    step(gaussians)
+                elif iteration <= 40:
+                    if iteration % 4 == 0:
+                        step(gaussians)
+                else:
+                    if iteration % 8 == 0:
+                        step(gaussians)
     return gaussians.capture(), iteration
 
 
