@@ -195,7 +195,7 @@ def test_answers_about_a_run_change_nothing(case, monkeypatch):
     trainer, train = case.make()
     with SkipGate(trainer):
         train(last=case.module.FIRST)
-    assert len(answers) == 2 and all(one == other for one, other in answers)
+    assert len(answers) >= 2 and all(one == other for one, other in answers)  # some answers ask for others
 
 
 @pytest.mark.parametrize("case", SCRIPTS, ids=lambda case: case.name)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+pytest.importorskip("PIL.Image")  # before pycolmap: the other order crashes Python later
 pycolmap = pytest.importorskip("pycolmap")
 
 from skipgs_plug.fallback_raster.compat import serve  # noqa: E402
