@@ -42,13 +42,10 @@ def gsplat_on_cpu() -> Iterator[None]:
         replaced.append((torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", AbsentLpips))
     if tuple(map(int, gsplat.__version__.split(".")[:2])) < (1, 5):
         replaced += [(module, "rasterization", rasterization_1_4) for module in (gsplat, gsplat.rendering)]
-    # Pillow first: the other order crashes Python later.
-    if (
-        usable("PIL.Image")
-        and usable("pycolmap")
-        and not hasattr(pycolmap := importlib.import_module("pycolmap"), "SceneManager")
-    ):
-        replaced.append((pycolmap, "SceneManager", SceneManager))
+    if usable("PIL.Image") and usable("pycolmap"):  # in this order: the other one crashes Python later
+        pycolmap = importlib.import_module("pycolmap")
+        if not hasattr(pycolmap, "SceneManager"):
+            replaced.append((pycolmap, "SceneManager", SceneManager))
     with install_as_gsplat():
         before = [(owner, name, getattr(owner, name, None)) for owner, name, _ in replaced]
         for owner, name, stand_in in replaced:
