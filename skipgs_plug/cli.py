@@ -2,83 +2,140 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
+import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, NamedTuple, Union
+
+
+class Command(NamedTuple):
+    """What a command does, and the extra that brings what it imports."""
+
+    meaning: str
+    extra: str
+
 
 COMMANDS = {
-    "demo": "train a scene the package makes itself, with and without the gate, and compare",
-    "train": "train a COLMAP, Blender or packed scene, gated",
-    "run": "run an unmodified training script of another project, gated",
-    "bench": "compare the gate with its controls on a scene",
-    "report": "make one HTML page of finished runs: tables, plots, comparison",
-    "doctor": "say which backends and extras work here, and how to get the rest",
+    "sfm": Command("turn photographs or a video into a scene", "train"),
+    "train": Command("train a COLMAP, Blender or packed scene, gated", "train"),
+    "view": Command("show a trained model in the browser, with its cameras, photographs and errors", "view"),
+    "render": Command("film or picture a trained model: colour and depth, along a path or held-out cameras", "view"),
+    "export": Command("convert a trained model for web viewers", "train"),
+    "report": Command("make one HTML page of finished runs: tables, plots, comparison", "report"),
+    "run": Command("run an unmodified training script of another project, gated", "run"),
+    "demo": Command("train a scene the package makes itself, with and without the gate, and compare", "full"),
+    "bench": Command("compare the gate with its controls on a scene", "full"),
+    "doctor": Command("say which backends and extras work here, and how to get the rest", "full"),
 }
+DESCRIPTION = "skipgs-plug COMMAND --help describes its options; --debug shows the traceback of an error."
 BAD_INPUT = 2
 INTERRUPTED = 130
+UNREAD = 141
+OURS = ("SkipGSError", "InputError", "WriteError")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Returns:
-        0 done; 2 bad input, one sentence on stderr; 130 interrupted. `--debug` shows the traceback.
+        0 done; 2 bad input, one sentence on stderr; 130 interrupted, 143 terminated, 141 nobody reads the output.
+        `--debug` shows the traceback.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     own = arguments[: arguments.index("--")] if "--" in arguments else arguments
     debug = "--debug" in own
     if debug:
         arguments.remove("--debug")
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(usage())
-        return 0 if arguments else BAD_INPUT
-    command, *rest = arguments
-    if command == "--version":
-        from importlib.metadata import version
-
-        print(version("skipgs_plug"))
-        return 0
-    if command not in COMMANDS:
-        return fail(f"There is no command {command!r}; the commands are {', '.join(COMMANDS)}.")
     try:
-        return importlib.import_module(f"skipgs_plug.commands.{command}").main(rest)
+        return run(arguments)
     except KeyboardInterrupt:
-        return INTERRUPTED
+        return interrupted()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes once more
+        return UNREAD
     except Exception as error:
-        sentence = explain(error)
+        if any(isinstance(one, KeyboardInterrupt) for one in chain(error)):  # met while a module was being loaded
+            return interrupted()
+        sentence = explain(error, COMMANDS[arguments[0]].extra if arguments and arguments[0] in COMMANDS else "run")
         if debug or sentence is None:
             traceback.print_exc()
             return BAD_INPUT if sentence else 1
         return fail(sentence)
 
 
-def explain(error: Exception) -> str | None:
-    """Return the sentence for the user, or None for a defect of ours, which deserves its traceback."""
-    from skipgs_plug.core.errors import SkipGSError
-    from skipgs_plug.trainer.errors import InputError
+def run(arguments: list[str]) -> int:
+    """Find the command and call it, or say what there is."""
+    name, *rest = arguments or [""]
+    if name == "--version":
+        from importlib.metadata import PackageNotFoundError, version
 
-    if isinstance(error, (SkipGSError, InputError)):
+        try:
+            print(version("skipgs_plug"))
+        except PackageNotFoundError:
+            print("not installed: run from a checkout")
+        return 0
+    if name in COMMANDS:
+        return importlib.import_module(f"skipgs_plug.commands.{name}").main(rest)
+    if name and not name.startswith("-"):
+        return fail(f"There is no command {name!r}; the commands are {', '.join(COMMANDS)}.")
+    return overview(arguments) if arguments else overview(["--help"]) or BAD_INPUT
+
+
+def overview(arguments: list[str]) -> int:
+    """Answer --help and requests for shell completion.
+
+    `--tyro-print-completion bash` (or zsh, tcsh) needs the options of all commands, and so the packages of all.
+    """
+    import tyro
+
+    complete = any(argument.startswith("--tyro-") for argument in arguments)
+    options: list[Any] = []
+    for name, command in COMMANDS.items():
+        module = importlib.import_module(f"skipgs_plug.commands.{name}") if complete else None
+        kind = getattr(module, "Args", None) or dataclasses.make_dataclass(name, ())
+        options.append(Annotated[kind, tyro.conf.subcommand(name, description=command.meaning)])
+    commands: Any = Union[tuple(options)]  # noqa: UP007 - made at run time
+    try:
+        tyro.cli(commands, args=arguments, prog="skipgs-plug", description=DESCRIPTION)
+    except SystemExit as ended:
+        return int(ended.code or 0)
+    return 0
+
+
+def explain(error: Exception, extra: str) -> str | None:
+    """Return the sentence for the user, or None for a defect of ours, which deserves its traceback.
+
+    `extra` brings the packages of the command.
+
+    Imports nothing that may be missing, or that a Ctrl-C may have left half loaded.
+    """
+    if any(one.__name__ in OURS and one.__module__.startswith("skipgs_plug.") for one in type(error).__mro__):
         return str(error)
     if isinstance(error, ModuleNotFoundError) and not (error.name or "").startswith("skipgs_plug"):
-        return f"This command needs the package {error.name}; run: pip install 'skipgs_plug[full]'."
-    if isinstance(error, (PermissionError, IsADirectoryError, NotADirectoryError, FileExistsError)):
-        return f"{error.filename}: {error.strerror}; give another path."
+        from skipgs_plug.install import install_command
+
+        return f"This command needs the package {error.name}; run: {install_command(extra)}"
+    if isinstance(error, OSError) and error.errno and error.strerror:
+        where = error.filename if error.filename is not None else "A file"
+        return f"{where}: {error.strerror}; make room there or give another path."
     return None
+
+
+def chain(error: BaseException | None) -> Iterator[BaseException]:
+    """An error, and those that it arose from."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def interrupted() -> int:
+    print("skipgs-plug: interrupted.", file=sys.stderr)
+    return INTERRUPTED
 
 
 def fail(sentence: str) -> int:
     print(f"skipgs-plug: {sentence}", file=sys.stderr)
     return BAD_INPUT
-
-
-def usage() -> str:
-    rows = "\n".join(f"  {name:8} {meaning}" for name, meaning in COMMANDS.items())
-    return (
-        f"usage: skipgs-plug COMMAND ... [--debug]\n\n{rows}\n\n"
-        "skipgs-plug COMMAND --help describes its options; --debug shows the traceback of an error."
-    )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,19 +3,95 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import logging
 import os
+import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+log = logging.getLogger(__name__)
+
+OUT_OF_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+LEFTOVER = re.compile(r"\..+\.\d+(\.tmp)?")
+
+
+class WriteError(OSError):
+    """A file that cannot be written: the disk is full, read-only, or out of reach. One sentence that says so."""
+
 
 @contextlib.contextmanager
-def write_aside(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; renamed onto it on success, removed on failure."""
+def write_aside(path: str | Path, size: int | None = None) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; renamed onto it on success, removed on failure.
+
+    Args:
+        size: bytes that the file will about have, where that is known beforehand.
+
+    Raises:
+        WriteError: the file cannot be written; says why, and how much room is needed.
+    """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield temporary
+            os.replace(temporary, path)
+        finally:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
+    except (OSError, RuntimeError) as error:
+        cause = os_error(error)
+        if cause is None or type(error).__module__.startswith("skipgs_plug."):  # which carries its own sentence
+            raise
+        raise write_error(path, cause, size) from error
+
+
+def os_error(error: BaseException) -> OSError | None:
+    """Return the OSError that an error is or came from: torch's writer raises RuntimeError on top of it."""
+    found: BaseException | None = error
+    while found is not None and not isinstance(found, OSError):
+        found = found.__cause__ or found.__context__
+    return found
+
+
+@contextlib.contextmanager
+def keep_going(failed: list[WriteError]) -> Iterator[None]:
+    """Let a file that cannot be written cost that file only: the error is logged and added to `failed`."""
+    try:
+        yield
+    except OSError as error:
+        sentence = error if isinstance(error, WriteError) else write_error(Path(error.filename or "A file"), error)
+        log.warning("%s", sentence)
+        failed.append(sentence)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what writers that were killed left aside in a folder; nobody may be writing there now."""
+    for path in folder.glob(".*"):
+        if LEFTOVER.fullmatch(path.name) and path.is_file():
+            path.unlink(missing_ok=True)
+
+
+def write_error(path: Path, error: OSError, size: int | None = None) -> WriteError:
+    """Return what to raise when `path`, of `size` bytes, cannot be written."""
+    reason = os.strerror(error.errno) if error.errno else str(error)
+    free = _free(path)
+    # numpy's writer says how many items it wrote instead of why it stopped.
+    if error.errno not in OUT_OF_SPACE and not (error.errno is None and free is not None and free < (size or 2**20)):
+        return WriteError(f"{path} cannot be written ({reason}); make its folder writable or give another one.")
+    needed = "more room than there is" if size is None else f"about {_megabytes(size)}"
+    left = "" if free is None else f", {_megabytes(free)} are free"
+    return WriteError(f"{path} cannot be written ({reason}): it needs {needed}{left}; make room or give another one.")
+
+
+def _free(path: Path) -> int | None:
+    try:
+        return shutil.disk_usage(path.parent).free
+    except OSError:
+        return None
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:,.1f} MB"

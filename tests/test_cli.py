@@ -6,6 +6,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -36,10 +38,23 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
 def test_help_lists_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     shown = capsys.readouterr().out
-    assert all(f"  {name}" in shown for name in COMMANDS)
+    assert all(f"• {name}" in shown for name in COMMANDS)
     assert main([]) == 2
     assert main(["tarin"]) == 2
     assert "no command 'tarin'" in one_sentence(capsys)
+
+
+def test_the_shell_completes_commands_and_their_options(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--tyro-print-completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    assert all(f"'{name}'" in script for name in COMMANDS)
+    assert "--data-factor" in script and "--cameras" in script
+
+
+def test_the_package_runs_as_a_module(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "skipgs_plug", "export", str(tmp_path / "none.ply"), "out.splat"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2 and "none.ply does not exist" in ended.stderr
 
 
 def test_bad_input_is_one_sentence(tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -42,7 +42,7 @@ class ReferenceTrainer(AbstractAdapter):
         hooks.wrap(trainer, "backward", gated)
         hooks.own_loop(trainer, "iterations")
         n_views = len(trainer.view_names)
-        scale = trainer.max_steps / FULL_SCHEDULE
+        scale = trainer.config.schedule / FULL_SCHEDULE
         hooks.ready(
             TrainerFacts(
                 trainer.refine_stop_iter,

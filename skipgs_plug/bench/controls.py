@@ -19,12 +19,18 @@ class PlannedSkipping(Policy):
 
     Args:
         first: first iteration after warm-up; earlier ones are never skipped.
+        end: iteration after the last.
         skips: iterations whose backward is left out.
     """
 
-    def __init__(self, first: int, skips: Iterable[int]) -> None:
-        self.first = first
+    def __init__(self, first: int, end: int, skips: Iterable[int]) -> None:
+        self.first, self.end = first, end
         self.skips = frozenset(skips)
+
+    @property
+    def floor(self) -> float:
+        """Share of the iterations after warm-up that run a backward."""
+        return 1.0 - len(self.skips) / max(self.end - self.first, 1)
 
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
         if step < self.first:
@@ -44,10 +50,10 @@ class PlannedSkipping(Policy):
 
 def random_skipping(first: int, end: int, n_skips: int, seed: int) -> PlannedSkipping:
     """Skip `n_skips` of the iterations first..end-1, every choice equally likely, from an own generator."""
-    return PlannedSkipping(first, random.Random(seed).sample(range(first, end), n_skips))
+    return PlannedSkipping(first, end, random.Random(seed).sample(range(first, end), n_skips))
 
 
 def periodic_skipping(first: int, end: int, n_skips: int) -> PlannedSkipping:
     """Skip `n_skips` of the iterations first..end-1, spread as evenly as whole numbers allow (Bresenham)."""
     n = end - first
-    return PlannedSkipping(first, (first + i for i in range(n) if (i + 1) * n_skips // n > i * n_skips // n))
+    return PlannedSkipping(first, end, (first + i for i in range(n) if (i + 1) * n_skips // n > i * n_skips // n))

@@ -17,6 +17,7 @@ from skipgs_plug.trainer import Trainer
 from skipgs_plug.trainer.errors import InputError
 
 REFERENCE = "ungated"  # what the others are compared with
+SHARE = 0.4  # of the iterations, where whole ones are left out
 Earlier = Mapping[str, RunRecord]
 GateMaker = Callable[[Trainer, Earlier], SkipGate | None]
 Plan = Callable[[int, int, int, int], PlannedSkipping]  # of first, end, number of skips, seed
@@ -28,13 +29,14 @@ def gate_with(**settings: Any) -> GateMaker:
     return lambda trainer, earlier: SkipGate(trainer, record_trace=True, on_nonfinite="raise", **settings)
 
 
-def planned_as(name: str, plan: Plan) -> GateMaker:
-    """Return what attaches a control: as many skips as policy `name`, after the same warm-up."""
+def planned_as(name: str, plan: Plan, **settings: Any) -> GateMaker:
+    """Return what attaches a control: as many skips as policy `name`, after the same warm-up; `settings` as above."""
 
     def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
         copied = earlier[name]
         first, end = trainer.refine_stop_iter + copied.warm_up, trainer.max_steps
-        return gate_with(policy=plan(first, end, copied.skips, trainer.config.seed))(trainer, earlier)  # type: ignore[return-value]
+        policy = plan(first, end, copied.skips, trainer.config.seed)
+        return gate_with(policy=policy, **settings)(trainer, earlier)  # type: ignore[return-value]
 
     return make
 
@@ -48,6 +50,16 @@ def as_long_as(name: str) -> Callable[[Trainer, Earlier], int]:
         return min(full, max(1, round(full * share)))
 
     return iterations
+
+
+def thinned_as_long_as(name: str) -> GateMaker:
+    """Return what leaves out whole iterations, so many that the rest takes as long as policy `name` did."""
+
+    def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
+        share = min(1.0, earlier[name].t_post / earlier[REFERENCE].t_post)
+        return gate_with(refine_share=share)(trainer, earlier)  # type: ignore[return-value]
+
+    return make
 
 
 def no_gate(trainer: Trainer, earlier: Earlier) -> None:
@@ -101,6 +113,41 @@ POLICIES = {
             "shortened",
             "control: no skips, fewer iterations, schedule compressed to the gate's time",
             iterations=as_long_as("gate"),
+            needs=(REFERENCE, "gate"),
+        ),
+        PolicySpec(
+            "ungated-larger",
+            "every iteration runs, with the larger, shrinking steps of thinned",
+            gate_with(refine_share=1.0, rate_peak=2.0 / SHARE),
+        ),
+        PolicySpec(
+            "thinned", "40 % of the iterations run, with larger, shrinking steps", gate_with(refine_share=SHARE)
+        ),
+        PolicySpec("automatic", "as many iterations as the scene needs, likewise", gate_with(refine_share="auto")),
+        PolicySpec(
+            "thinned-plain",
+            "control: 40 % of the iterations run, steps as they are",
+            gate_with(refine_share=SHARE, compensate=False),
+        ),
+        PolicySpec("gate-larger", "the paper's gate, with larger, shrinking steps", gate_with(compensate=True)),
+        PolicySpec(
+            "random-larger",
+            "control: random, with larger, shrinking steps",
+            planned_as("gate", random_skipping, compensate=True),
+            needs=("gate",),
+        ),
+        PolicySpec(
+            "periodic-larger",
+            "control: periodic, with larger, shrinking steps",
+            planned_as(
+                "gate", lambda first, end, n_skips, seed: periodic_skipping(first, end, n_skips), compensate=True
+            ),
+            needs=("gate",),
+        ),
+        PolicySpec(
+            "shortened-larger",
+            "control: iterations thinned to the gate's time, with larger, shrinking steps",
+            thinned_as_long_as("gate"),
             needs=(REFERENCE, "gate"),
         ),
     )

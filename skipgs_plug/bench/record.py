@@ -19,6 +19,9 @@ REASON_CODES = {
     "inactive": "i",
     "non-finite": "x",
     "other rank": "o",
+    "full": "a",
+    "watched": "v",
+    "over": "e",
 }
 OTHER_REASON = "u"  # a reason of a policy that is not in the table
 LEFT_OUT = "."  # the whole iteration was left out, forward too

@@ -20,6 +20,7 @@ from skipgs_plug.bench.summary import Row, row_from_dict
 from skipgs_plug.bench.table import legend, markdown, notes, tables
 from skipgs_plug.trainer import TrainConfig, load_scene
 from skipgs_plug.trainer.files import write_aside, write_json
+from skipgs_plug.trainer.lock import exclusive
 
 
 @dataclass
@@ -74,7 +75,8 @@ def run(args: Args, command: str) -> list[Row]:
         f"{scene.name}: {len(args.seeds)} seeds x {len(args.policies)} policies, iterations to {config.max_steps:,}, "
         f"densification to {bench.refine_stop_iter:,}, backend {bench.backend.name}"
     )
-    records = bench.run()
+    with exclusive(folder.root):
+        records = bench.run()
     result = build_result(bench, records, command)
     rows = [row_from_dict(row) for row in result["rows"]]
     parts = [

@@ -11,6 +11,7 @@ import tyro
 from skipgs_plug import SkipGate
 from skipgs_plug.core.report import write_report
 from skipgs_plug.trainer import TrainConfig, Trainer
+from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.pictures import Curve, plot_refinement, save_comparison
 from skipgs_plug.trainer.run_folder import RunFolder
 from skipgs_plug.trainer.synthetic import make_scene
@@ -53,7 +54,9 @@ class Result:
 
 
 def main(argv: list[str]) -> int:
-    run(tyro.cli(Args, args=argv, prog="skipgs-plug demo", config=(tyro.conf.FlagCreatePairsOff,)))
+    args = tyro.cli(Args, args=argv, prog="skipgs-plug demo", config=(tyro.conf.FlagCreatePairsOff,))
+    with exclusive(Path(args.out)):
+        run(args)
     return 0
 
 

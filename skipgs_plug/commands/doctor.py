@@ -9,22 +9,32 @@ import sys
 
 import torch
 
-FULL = "pip install 'skipgs_plug[full]'"
+from skipgs_plug.install import install_command
+
 # import name, distribution, what for
 EXTRAS = (
     ("warp", "warp-lang", "rasterizer on the CPU"),
     ("gsplat", "gsplat", "densification, rasterizer on CUDA"),
-    ("PIL.Image", "pillow", "images"),  # before pycolmap, or writing a PNG crashes: see trainer/loaders/native.py
-    ("pycolmap", "pycolmap", "COLMAP scenes; in your own code import PIL.Image before it"),
+    ("PIL.Image", "pillow", "images"),
+    ("pycolmap", "pycolmap", "COLMAP scenes"),  # after Pillow, see IMPORT_ORDER
     ("plyfile", "plyfile", "PLY"),
     ("scipy", "scipy", "initial scales"),
     ("tyro", "tyro", "command line"),
+    ("filelock", "filelock", "one process per run folder"),
     ("tqdm", "tqdm", "progress bar"),
     ("yaml", "pyyaml", "cfg.yml"),
     ("torchmetrics", "torchmetrics", "SSIM"),
     ("matplotlib", "matplotlib", "plots"),
+    ("jinja2", "jinja2", "report"),
+    ("imageio_ffmpeg", "imageio-ffmpeg", "videos"),
+    ("viser", "viser", "view"),
     ("tensorboard", "tensorboard", "--tensorboard"),
 )
+
+# Not tried here: the process that does it wrong crashes, or hangs in pycolmap's handler of crashes.
+IMPORT_ORDER = """
+      In scripts of your own, import PIL.Image before pycolmap, as this package does. In the other order
+      Pillow is bound to the zlib of pycolmap (seen with 4.2.1), and the first PNG that is saved ends the process."""
 
 
 def main(argv: list[str]) -> int:
@@ -36,10 +46,12 @@ def main(argv: list[str]) -> int:
     print(f"Python {platform.python_version()}, torch {torch.__version__}, {cuda}, {torch.get_num_threads()} threads")
     print("\nPackages")
     missing = [check_package(*extra) for extra in EXTRAS].count(False)
+    if "PIL.Image" in sys.modules and "pycolmap" in sys.modules:
+        print(IMPORT_ORDER)
     print("\nBackends")
     works = [check_backend(name) for name in ("gsplat", "warp")]
     if missing:
-        print(f"\nGet all missing packages with: {FULL}")
+        print(f"\nGet all missing packages with: {install_command()}")
     return 0 if any(works) else 1
 
 
@@ -56,9 +68,9 @@ def check_package(module: str, distribution: str, purpose: str) -> bool:
 
 def check_backend(name: str) -> bool:
     """Render four Gaussians at 16x16 with a backend, and differentiate."""
-    from skipgs_plug.trainer.backend import resolve_backend
-
     try:
+        from skipgs_plug.trainer.backend import resolve_backend
+
         backend = resolve_backend(name)
         means = torch.tensor([[0.0, 0, 2], [0.2, 0, 2], [0, 0.2, 2], [-0.2, 0, 2]], device=backend.device)
         means.requires_grad_()

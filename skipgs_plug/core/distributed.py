@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 
 import torch
@@ -42,7 +43,7 @@ def agree(own: Decision) -> Decision:
     """Reduce this rank's decision with those of all others: skip only when every rank would.
 
     Raises:
-        SkipGSError: Another rank stopped with an error.
+        SkipGSError: Another rank stopped with an error, or does not answer.
     """
     vote = _SKIP if own.skip else _RUN
     lowest = _lowest(_POISONED if own is decision.NON_FINITE else vote)
@@ -56,12 +57,19 @@ def agree(own: Decision) -> Decision:
 
 
 def abort() -> None:
-    """Tell the other ranks that this one raises, so that they do not wait for it."""
-    _lowest(_ABORT)
+    """Tell the other ranks that this one raises, so that they do not wait for it; they may be gone themselves."""
+    with contextlib.suppress(SkipGSError):
+        _lowest(_ABORT)
 
 
 def _lowest(vote: int) -> int:
     device = "cuda" if dist.get_backend() == "nccl" else "cpu"
     votes = torch.tensor(vote, dtype=torch.int32, device=device)
-    dist.all_reduce(votes, op=dist.ReduceOp.MIN)
-    return int(votes)
+    try:
+        dist.all_reduce(votes, op=dist.ReduceOp.MIN)
+        return int(votes)
+    except RuntimeError as error:  # also of NCCL, which reports a peer that is gone when the result is read
+        raise SkipGSError(
+            "Another process of the group did not answer: it ended, or waited longer than the time-out of "
+            "init_process_group(); see its output, and resume all from their last checkpoint."
+        ) from error

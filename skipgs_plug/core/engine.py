@@ -21,9 +21,10 @@ from skipgs_plug.core.optimizers import OptimizerSteps
 from skipgs_plug.core.policy import Policy, SkipPolicy
 from skipgs_plug.core.refinement.compensation import Compensation
 from skipgs_plug.core.refinement.policy import RefinementPolicy
+from skipgs_plug.core.refinement.rates import Optimizers
 from skipgs_plug.core.refinement.refinement import Refinement
 from skipgs_plug.core.scene_check import SceneCheck
-from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state
+from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, require_state
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.views import require_unique, warn_unless_recurring
@@ -72,6 +73,7 @@ class Engine:
         if config.enabled and config.refine_share is not None:
             self.refinement = Refinement(config, self._go_on_from_saved)
         self.compensation: Compensation | None = None
+        self._optimizers: Optimizers | None = None
         self.trace: list[TraceRow] | None = [] if record_trace else None
         self._guard = NonFiniteGuard(config.on_nonfinite)
         self._must_run = must_run
@@ -125,10 +127,16 @@ class Engine:
         if self._pending_state is not None:
             self.load_state_dict(self._pending_state)
 
+    def scale_only(self, optimizers: Optimizers) -> None:
+        """Scale the learning rates of these optimizers only: others may step in this thread too."""
+        self._optimizers = optimizers
+        if self.refinement is not None:
+            self.refinement.optimizers = optimizers
+
     def compensate_until(self, last: int) -> None:
         """Scale learning rates for the paper's gate, if that was asked for; `last` is the run's last iteration."""
         if self.config.compensates and self.refinement is None and self.compensation is None:
-            self.compensation = Compensation(self.config, self.start, last)
+            self.compensation = Compensation(self.config, self.start, last, self._optimizers)
 
     def release(self) -> None:
         """Let go of loops and optimizers; counts stay readable."""
@@ -238,25 +246,24 @@ class Engine:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As `SkipGate.load_state_dict`; before `configure` the state is kept until then."""
-        if not state:
-            raise SkipGSError("The gate state is empty: it was saved before training began; start afresh.")
+        require_state(state)
         if self.policy is None:
             self._pending_state = dict(state)
             # The loop asks about its first number before the trainer says anything else.
-            self._load_refinement(state.get("refinement"))
+            self._load_refinement(gate_state(state).get("refinement"))
             return
         pending, self._pending_state = self._pending_state is not None, None
         accumulator = self.steps.accumulator
+        state = gate_state(state)
         if is_release_state(state):
-            self._refuse_other_scene(state.get("view_loss_ema", ()))
+            self._refuse_other_scene(state["view_loss_ema"])
             self.policy.load_state_dict(state)
             self.stats.load_release_state(state)
             accumulator.load_release_state(state)
             step = None
         else:
-            state = gate_state(state)
             if not pending:
-                self._load_refinement(state.get("refinement"))
+                self._load_refinement(state["refinement"])
             self._refuse_other_scene(state["stats"]["views"])
             self.policy.load_state_dict(state["policy"])
             self.stats.load_state_dict(state["stats"])

@@ -192,7 +192,11 @@ class Hooks:
             self._engine.refinement.describe(always)
 
     def own_loop(self, owner: Any, name: str) -> None:
-        """`owner.name(...)` gives the range that the training loop counts with, and nothing hangs on its numbers."""
+        """`owner.name(...)` gives the range that the training loop counts with, and nothing hangs on its numbers.
+
+        The learning rates of the adapter's `optimizers` are scaled, and of no others.
+        """
+        self._engine.scale_only(self._adapter.optimizers)
         if self._engine.refinement is None:
             return
         refinement = self._engine.refinement

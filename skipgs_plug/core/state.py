@@ -1,19 +1,132 @@
-"""Saved states: versions, and the one of the authors' controller."""
+"""Saved states: what they hold, their versions, and the one of the authors' controller."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from numbers import Real
+from typing import Any, TypedDict
 
+from skipgs_plug import schema
 from skipgs_plug.core.errors import SkipGSError
 
 POLICY_VERSION = 2
 GATE_VERSION = 2
-POLICY_KEYS = ("means", "budget", "warmup_end", "pause_until", "events")
-GATE_KEYS = ("policy", "stats", "accumulator", "non_finite_in_a_row", "clock", "step")
-STATS_KEYS = ("iterations", "backwards", "skips", "reasons", "events", "views")
-REFINEMENT_KEYS = ("asked", "share", "first", "next", "thinning", "recovery", "foresight")
-BUDGET_KEYS = ("floor", "backwards", "skips", "calibrating", "would_skip", "would_total")
+
+
+class BudgetState(TypedDict):
+    """As `BackwardBudget.state_dict`."""
+
+    floor: float
+    backwards: int
+    skips: int
+    calibrating: bool
+    would_skip: int
+    would_total: int
+
+
+class PolicyState(TypedDict):
+    """As `SkipPolicy.state_dict`."""
+
+    version: int
+    means: dict[Any, float]
+    budget: BudgetState
+    warmup_end: int | None
+    pause_until: int
+    events: int
+
+
+class StatsState(TypedDict):
+    """As `GateStats.state_dict`; a view's row is visits, backwards, skips, last loss."""
+
+    iterations: int
+    backwards: int
+    skips: int
+    reasons: dict[str, int]
+    events: dict[str, int]
+    views: dict[str, tuple[int, int, int, Real]]
+
+
+class AccumulatorState(TypedDict):
+    """As `StepAccumulator.state_dict`."""
+
+    norm_mean: Real | None
+    square_mean: Real | None
+
+
+class ClockState(TypedDict):
+    """As `GateClock.state_dict`."""
+
+    t_total: float
+    t_post: float
+
+
+class ThinningState(TypedDict):
+    """As `Thinning.state_dict`."""
+
+    share: float
+    run: int
+    left_out: int
+    due: int
+
+
+class ForesightState(TypedDict):
+    """As `Foresight.state_dict`."""
+
+    cycle: int
+    ended: bool
+    gains: list[tuple[float, float]]
+    foreseen: float | None
+    now: dict[str, float]
+    before: dict[str, float]
+
+
+class RefinementState(TypedDict):
+    """As `Refinement.state_dict`."""
+
+    asked: float | str
+    share: float | None
+    first: int | None
+    next: int | None
+    thinning: ThinningState
+    recovery: tuple[int, int]
+    foresight: ForesightState | None
+
+
+class GateState(TypedDict):
+    """As `SkipGate.state_dict`; the policy checks its own part, which another policy fills with other things."""
+
+    version: int
+    policy: dict[str, Any]
+    stats: StatsState
+    accumulator: AccumulatorState
+    non_finite_in_a_row: int
+    clock: ClockState
+    step: int | None
+    refinement: RefinementState | None
+
+
+class ReleaseStats(TypedDict):
+    """Counts of the authors' controller."""
+
+    bwd: int
+    skip: int
+
+
+class ReleaseState(TypedDict):
+    """State of the authors' controller, `state_version` 1."""
+
+    view_loss_ema: dict[Any, float]
+    stats: ReleaseStats
+    min_bwd_ratio_effective: float
+    calibrated: bool
+    warmup_would_skip: int
+    warmup_would_total: int
+
+
+class ReleaseGateState(ReleaseState):
+    """The same with what only a whole gate reads."""
+
+    single_scale_ema: Real | None
 
 
 def is_release_state(state: Mapping[str, Any]) -> bool:
@@ -29,50 +142,63 @@ def policy_state(state: Mapping[str, Any], release_warmup_end: int) -> dict[str,
         release_warmup_end: Iteration at which the authors' warm-up ends; their state does not hold it.
 
     Raises:
-        SkipGSError: Another version, or something is missing.
+        SkipGSError: Another version, or an entry is missing or of another type.
     """
+    require_state(state)
     if is_release_state(state):
         state = _from_release(state, release_warmup_end)
-    require_version(state, POLICY_VERSION)
-    require(state, POLICY_KEYS, "Gate state")
-    require(state["budget"], BUDGET_KEYS, "Gate state's budget")
+    _require_version(state, POLICY_VERSION)
+    _require(state, PolicyState, "policy")
     return dict(state)
 
 
 def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Check the state of a whole gate, as saved by `SkipGate.state_dict`.
+    """Check the state of a whole gate, as saved by `SkipGate.state_dict`, or by the authors' controller.
 
     Raises:
-        SkipGSError: Another version, or something is missing.
+        SkipGSError: Another version, or an entry is missing or of another type.
     """
-    require_version(state, GATE_VERSION)
-    require(state, GATE_KEYS, "Gate state")
-    require(state["stats"], STATS_KEYS, "Gate state's stats")
-    if state.get("refinement") is not None:
-        require(state["refinement"], REFINEMENT_KEYS, "Gate state's refinement")
+    require_state(state)
+    if is_release_state(state):
+        _require_release_version(state)
+        _require(state, ReleaseGateState, "state")
+    else:
+        _require_version(state, GATE_VERSION)
+        state = {"refinement": None, **state}  # states from before iterations could be left out
+        _require(state, GateState, "state")
     return dict(state)
 
 
-def require_version(state: Mapping[str, Any], expected: int) -> None:
-    """Raise SkipGSError that names the version of a state when it is another."""
+def require_state(state: Any) -> None:
+    """Raise SkipGSError unless this can be a state at all."""
+    if not isinstance(state, Mapping):
+        raise SkipGSError(f"A gate state is a dict, not {type(state).__name__}; start the gate afresh.")
+    if not state:
+        raise SkipGSError("The gate state is empty: it was saved before training began; start afresh.")
+
+
+def _require_version(state: Mapping[str, Any], expected: int) -> None:
     version = state.get("version")
     if version != expected:
         raise SkipGSError(f"Gate state has version {version!r}, expected {expected}; start the gate afresh.")
 
 
-def require(state: Mapping[str, Any], keys: tuple[str, ...], what: str) -> None:
-    """Raise SkipGSError that names what is missing from a state."""
-    missing = [key for key in keys if key not in state]
-    if missing:
-        raise SkipGSError(f"{what} lacks {', '.join(missing)}: it is damaged; start the gate afresh.")
-
-
-def _from_release(state: Mapping[str, Any], warmup_end: int) -> dict[str, Any]:
+def _require_release_version(state: Mapping[str, Any]) -> None:
     version = state["state_version"]
     if version != 1:
         raise SkipGSError(f"State of the authors' controller has version {version!r}; only 1 can be loaded.")
-    keys = ("view_loss_ema", "stats", "min_bwd_ratio_effective", "calibrated")
-    require(state, (*keys, "warmup_would_skip", "warmup_would_total"), "State of the authors' controller")
+
+
+def _require(state: Mapping[str, Any], kind: type, name: str) -> None:
+    try:
+        schema.check(state, kind, name)
+    except schema.SchemaError as error:
+        raise SkipGSError(f"Gate state is damaged ({error}); start the gate afresh.") from error
+
+
+def _from_release(state: Mapping[str, Any], warmup_end: int) -> dict[str, Any]:
+    _require_release_version(state)
+    _require(state, ReleaseState, "state")
     return {
         "version": POLICY_VERSION,
         "means": state["view_loss_ema"],

@@ -6,6 +6,8 @@ import importlib
 from types import ModuleType, TracebackType
 from typing import Any
 
+from skipgs_plug.install import install_command
+
 _MODULES = ("gsplat", "gsplat.rendering")
 _originals: dict[str, Any] = {}
 _open: set[Installation] = set()
@@ -73,4 +75,4 @@ def _gsplat_modules() -> list[ModuleType]:
     try:
         return [importlib.import_module(name) for name in _MODULES]
     except ImportError as error:
-        raise ImportError('install_as_gsplat needs gsplat: pip install "skipgs_plug[full]".') from error
+        raise ImportError(f"install_as_gsplat needs gsplat: {install_command()}.") from error

@@ -30,6 +30,8 @@ from typing import Annotated, Any, NamedTuple, get_args, get_origin
 import torch
 from torch import Tensor
 
+from skipgs_plug.install import install_command
+
 from . import guard
 from .cache import load_or_rebuild
 from .guard import Sizes
@@ -290,7 +292,7 @@ def _warp() -> Any:
     try:
         wp: Any = importlib.import_module("warp")
     except ImportError as error:
-        raise ImportError('The CPU rasterizer needs NVIDIA Warp: pip install "skipgs_plug[full]".') from error
+        raise ImportError(f"The CPU rasterizer needs NVIDIA Warp: {install_command()}.") from error
     wp.config.quiet = True
     wp.config.log_level = wp.LOG_ERROR
     with _quiet_stderr():

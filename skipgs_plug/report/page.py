@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
 from typing import Any
 
 from skipgs_plug.bench.store import flat
 from skipgs_plug.bench.summary import row_from_dict
 from skipgs_plug.bench.table import legend, notes, tables
-from skipgs_plug.report import html, plots
+from skipgs_plug.report import plots
+from skipgs_plug.report.blocks import Block, Details, Picture, Section, Strip, Table, Text, write_page
 from skipgs_plug.report.source import BenchSource, RunSource
 
-RUN_HEADING = (
+GATE_HEADING = (
     "run",
     "iterations",
     "gated",
@@ -22,95 +22,158 @@ RUN_HEADING = (
     "floor",
     "paused",
     "non-finite",
-    "T_post s",
-    "T_total s",
 )
+RESULTS = (
+    "held-out PSNR, dB",
+    "worst view, dB",
+    "SSIM",
+    "Gaussians",
+    "training, s",
+    "after densification, s",
+    "backwards skipped, %",
+)
+PICTURED = 3  # held-out views of each run, the worst ones
 
 
 def build_page(sources: Sequence[RunSource | BenchSource]) -> str:
     """Return one self-contained HTML page."""
     runs = [source for source in sources if isinstance(source, RunSource)]
-    body = []
-    if len(runs) > 1:
-        body.append(run_table("All runs", runs))
+    sections = [comparison(runs)] if len(runs) > 1 else []
     for source in sources:
-        body += bench_section(source) if isinstance(source, BenchSource) else run_section(source)
+        sections.append(bench_section(source) if isinstance(source, BenchSource) else run_section(source))
     title = "SkipGS: " + ", ".join(source.name for source in sources)
-    return html.document(title, "Which backward passes were left out, what that saved, and what it cost.", body)
+    return write_page(title, "What training reached, what was left out of it, what that saved and cost.", sections)
 
 
-def run_section(run: RunSource) -> list[str]:
-    data = run.data
-    parts = [f"<h2>{escape(run.name)}</h2>", run_table("What the gate did", [run])]
+def comparison(runs: Sequence[RunSource]) -> Section:
+    """Runs side by side."""
+    blocks: list[Block] = [results("All runs", runs)]
+    names = unique_names(runs)
+    curves = {name: run.curve for name, run in names.items() if run.curve}
+    if curves:
+        blocks.append(picture(plots.loss_over_time(curves), "Training loss over iterations."))
+    views = {name: run.views for name, run in names.items() if run.views}
+    if views:
+        blocks.append(picture(plots.quality_of_views(views), "PSNR of every held-out view; dashed: their means."))
+    return Section("Side by side", blocks)
+
+
+def unique_names(runs: Sequence[RunSource]) -> dict[str, RunSource]:
+    """Return the runs by name, by path where a name is not theirs alone."""
+    names = [run.name for run in runs]
+    return {run.name if names.count(run.name) == 1 else str(run.path): run for run in runs}
+
+
+def run_section(run: RunSource) -> Section:
+    blocks: list[Block] = [results("Results", [run])]
+    if run.curve:
+        blocks.append(picture(plots.loss_over_time({run.name: run.curve}), "Training loss over iterations."))
+    if run.views:
+        blocks.append(picture(plots.quality_of_views({run.name: run.views}), "PSNR of held-out views; dashed: mean."))
+    blocks += pictured_views(run)
+    if run.gate is not None:
+        blocks += gate_blocks(run.name, run.gate)
+    if run.views:
+        names = list(run.views[0])
+        rows = [[rounded(row[name]) for name in names] for row in run.views]
+        blocks.append(Details(f"Table of {len(rows)} held-out views", [Table("Held-out views", names, rows)]))
     if run.metrics:
-        rows = [(name, rounded(value)) for name, value in run.metrics.items()]
-        parts.append(html.table("Last evaluation", ("metric", "value"), rows, text=True))
+        metrics = [(name, rounded(value)) for name, value in run.metrics.items()]
+        blocks.append(Details("Last evaluation", [Table("Last evaluation", ("metric", "value"), metrics, text=True)]))
+    if run.settings:
+        blocks.append(Details("Settings of training", [settings_table("Settings of training", run.settings)]))
+    return Section(run.name, blocks)
+
+
+def pictured_views(run: RunSource) -> list[Block]:
+    """The worst held-out views; the first ones, when their quality is not known."""
+    if len(run.views) != len(run.renders):
+        return [Strip(path.name, plots.split_render(path)) for path in run.renders[:PICTURED]]
+    worst = sorted(zip(run.views, run.renders, strict=True), key=lambda pair: pair[0]["psnr"])[:PICTURED]
+    return [
+        Strip(
+            f"{row['view']}: {row['psnr']:.2f} dB, {place} of {len(run.views)} held-out views.",
+            plots.split_render(path),
+        )
+        for place, (row, path) in zip(("worst", "second worst", "third worst"), worst, strict=False)
+    ]
+
+
+def gate_blocks(name: str, data: dict[str, Any]) -> list[Block]:
+    blocks: list[Block] = [gate_table("What the gate did", name, data)]
+    views = data["views"]
     if data["gated_iterations"] == 0:
-        parts.append(html.paragraphs(["The gate was never active in this run, so there is nothing to draw."]))
+        blocks.append(Text(["The gate was never active in this run, so there is nothing to draw."]))
     else:
-        parts.append(picture(plots.reasons(data), "Iterations since the gate became active, by what decided."))
-        parts.append(picture(plots.view_shares(data["views"]), "Share of visits skipped, by training view."))
-        if any(row["mean_loss"] is not None for row in data["views"]):
-            parts.append(picture(plots.loss_against_skips(data["views"]), "One point per view: its loss and skips."))
-    for path in run.renders:
-        parts.append(html.picture(plots.inline_png(path), f"{path.name}: truth (left) and render (right).", width=720))
-    if data["views"]:
-        parts.append(html.details(f"Table of {len(data['views'])} views", view_table(data["views"])))
-    parts.append(html.details("Settings", settings_table(data["settings"])))
-    return parts
+        blocks.append(picture(plots.reasons(data), "Iterations since the gate became active, by what decided."))
+        blocks.append(picture(plots.view_shares(views), "Share of visits skipped, by training view."))
+        if any(row["mean_loss"] is not None for row in views):
+            blocks.append(picture(plots.loss_against_skips(views), "One point per view: its loss and skips."))
+    if views:
+        names = ("view", "visits", "backwards", "skips", "mean_loss", "last_loss")
+        rows = [[rounded(row[name]) for name in names] for row in views]
+        blocks.append(Details(f"Table of {len(views)} training views", [Table("Training views", names, rows)]))
+    blocks.append(Details("Settings of the gate", [settings_table("Settings of the gate", data["settings"])]))
+    return blocks
 
 
-def bench_section(bench: BenchSource) -> list[str]:
+def bench_section(bench: BenchSource) -> Section:
     data = bench.data
     rows = [row_from_dict(row) for row in data["rows"]]
-    parts = [
-        f"<h2>Bench: {escape(data['settings']['scene']['name'])}</h2>",
-        *(html.table(caption, lines[0], lines[1:]) for caption, lines in tables(rows)),
-        html.paragraphs(notes(rows, data)),
-    ]
-    parts += [html.picture(plots.inline_png(path), text) for path, text in bench.pictures]
+    blocks: list[Block] = [Table(caption, lines[0], lines[1:]) for caption, lines in tables(rows)]
+    blocks.append(Text(notes(rows, data)))
+    blocks += [Picture(plots.inline_png(path), text, wide=True) for path, text in bench.pictures]
     if any(any(trace.skipped) for trace in bench.decisions.values()):
         text = "Share of backwards skipped in the course of refinement, one curve per policy that skips."
-        parts.append(picture(plots.skips_over_time(bench.decisions), text))
-    parts.append(html.table("Policies", ("policy", "meaning"), legend(rows), text=True))
-    facts = {"command": data["command"], "commits": ", ".join(data["commits"]), **data["versions"]}
-    parts.append(html.details("Command, machine, versions, settings", settings_table({**facts, **data["settings"]})))
-    return parts
+        blocks.append(picture(plots.skips_over_time(bench.decisions), text))
+    blocks.append(Table("Policies", ("policy", "meaning"), legend(rows), text=True))
+    facts = {"command": data["command"], "commits": ", ".join(data["commits"]), **data["versions"], **data["settings"]}
+    blocks.append(Details("Command, machine, versions, settings", [settings_table("Settings", facts)]))
+    return Section(f"Bench: {data['settings']['scene']['name']}", blocks)
 
 
-def run_table(caption: str, runs: Sequence[RunSource]) -> str:
-    rows = []
+def results(caption: str, runs: Sequence[RunSource]) -> Table:
+    """What runs reached, and in what time, one column per run; a dash where a folder does not say."""
+    columns = []
     for run in runs:
-        data, gated = run.data, run.data["gated_iterations"]
-        share = f"{100 * data['backwards_skipped'] / gated:.1f}" if gated else "-"
-        floor = data["min_bwd_ratio_effective"]
-        rows.append(
-            (
-                run.name,
-                *(f"{data[k]:,}" for k in ("iterations", "gated_iterations", "backwards_run", "backwards_skipped")),
-                share,
-                "-" if floor is None else f"{floor:.3f}",
-                f"{data['paused']:,}",
-                f"{data['non_finite']:,}",
-                f"{data['t_post']:.1f}",
-                f"{data['t_total']:.1f}",
-            )
+        worst = min((row["psnr"] for row in run.views), default=None)
+        skipped = None
+        if run.gate is not None and run.gate["gated_iterations"]:
+            skipped = 100 * run.gate["backwards_skipped"] / run.gate["gated_iterations"]
+        values = (
+            (run.metrics.get("psnr"), ".2f"),
+            (worst, ".2f"),
+            (run.metrics.get("ssim"), ".4f"),
+            (run.metrics.get("num_GS"), ","),
+            (run.t_total, ".1f"),
+            (run.t_post, ".1f"),
+            (skipped, ".1f"),
         )
-    return html.table(caption, RUN_HEADING, rows)
+        columns.append(["-" if value is None else format(value, form) for value, form in values])
+    rows = [[name, *cells] for name, *cells in zip(RESULTS, *columns, strict=True)]
+    return Table(caption, ("", *unique_names(runs)), rows)
 
 
-def view_table(views: Sequence[dict[str, Any]]) -> str:
-    names = ("view", "visits", "backwards", "skips", "mean_loss", "last_loss")
-    return html.table("Views", names, [[rounded(row[name]) for name in names] for row in views])
+def gate_table(caption: str, name: str, data: dict[str, Any]) -> Table:
+    gated = data["gated_iterations"]
+    floor = data["min_bwd_ratio_effective"]
+    row = (
+        name,
+        *(f"{data[k]:,}" for k in ("iterations", "gated_iterations", "backwards_run", "backwards_skipped")),
+        f"{100 * data['backwards_skipped'] / gated:.1f}" if gated else "-",
+        "-" if floor is None else f"{floor:.3f}",
+        f"{data['paused']:,}",
+        f"{data['non_finite']:,}",
+    )
+    return Table(caption, GATE_HEADING, [row])
 
 
-def settings_table(settings: dict[str, Any]) -> str:
-    rows = [(name, value) for name, value in flat(settings).items()]
-    return html.table("Settings", ("name", "value"), rows, text=True)
+def settings_table(caption: str, settings: dict[str, Any]) -> Table:
+    return Table(caption, ("name", "value"), list(flat(settings).items()), text=True)
 
 
-def picture(figure: Any, alt: str) -> str:
-    return html.picture(plots.inline_svg(figure), alt)
+def picture(figure: Any, caption: str) -> Picture:
+    return Picture(plots.inline_svg(figure), caption)
 
 
 def rounded(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Pictures of one gated run, drawn from its skipgs.json, and of a bench, drawn from its decisions."""
+"""Pictures of runs, drawn from what their folders hold, and of a bench, drawn from its decisions."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skipgs_plug.bench.plots import SMALL, new_figure, style
+from skipgs_plug.bench.plots import COLOURS, MARKERS, SMALL, new_figure, style
 from skipgs_plug.bench.record import Trace
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+WIDTH = 5.2  # inches: letters stay readable when a phone shrinks the picture to its width
 RUN_COLOUR = "#0072B2"
 SKIP_COLOUR = "#D55E00"
+ERROR_GAIN = 4
 REASON_COLOURS = {
     "warm-up": "#999999",
     "new view": "#56B4E9",
@@ -30,7 +32,7 @@ REASON_COLOURS = {
 
 def skips_over_time(traces: Mapping[tuple[int, str], Trace], parts: int = 25) -> Figure:
     """Share of skipped backwards in equal parts of refinement, mean over seeds, for policies that skip."""
-    figure, axes = new_figure(9.0, 3.2)
+    figure, axes = new_figure(WIDTH, 3.4)
     for i, policy in enumerate(dict.fromkeys(policy for _, policy in traces)):
         colour, _ = style(policy)
         runs = [np.array(trace.skipped) for (_, name), trace in traces.items() if name == policy]
@@ -44,13 +46,41 @@ def skips_over_time(traces: Mapping[tuple[int, str], Trace], parts: int = 25) ->
     axes.set_ylim(-2, 102)
     axes.set_xlabel("iteration")
     axes.set_ylabel("backwards skipped (%)")
-    figure.legend(frameon=False, fontsize=SMALL, ncols=4, loc="outside upper center")
+    figure.legend(frameon=False, fontsize=SMALL, ncols=2, loc="outside upper center")
+    return figure
+
+
+def loss_over_time(curves: Mapping[str, Mapping[str, list[float]]]) -> Figure:
+    """Training loss of every run over iterations, each point a mean over a stretch of the run."""
+    figure, axes = new_figure(WIDTH, 3.4)
+    for i, (name, curve) in enumerate(curves.items()):
+        axes.plot(curve["step"], curve["loss"], color=COLOURS[i % len(COLOURS)], linewidth=1.2, label=name)
+    axes.set_xlabel("iteration")
+    axes.set_ylabel("training loss")
+    if len(curves) > 1:
+        figure.legend(frameon=False, fontsize=SMALL, ncols=2, loc="outside upper center")
+    return figure
+
+
+def quality_of_views(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
+    """Held-out PSNR of every view, in the order of their names; one mark per run."""
+    figure, axes = new_figure(WIDTH, 3.4)
+    for i, (name, views) in enumerate(runs.items()):
+        values = [row["psnr"] for row in views]
+        colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
+        axes.plot(range(len(views)), values, linestyle="none", marker=marker, markersize=5, color=colour, label=name)
+        axes.axhline(float(np.mean(values)), color=colour, linewidth=0.8, linestyle="--")
+    axes.set_xlabel("held-out view, by name")
+    axes.set_ylabel("PSNR (dB)")
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    if len(runs) > 1:
+        figure.legend(frameon=False, fontsize=SMALL, ncols=2, loc="outside upper center")
     return figure
 
 
 def view_shares(views: list[dict[str, Any]]) -> Figure:
     """Share of skipped visits of every view, in the order of their names."""
-    figure, axes = new_figure(9.0, 3.0)
+    figure, axes = new_figure(WIDTH, 3.0)
     share = [100 * row["skips"] / row["visits"] for row in views]
     axes.bar(range(len(views)), share, width=1.0 if len(views) > 60 else 0.8, color=SKIP_COLOUR)
     axes.set_ylim(0, 100)
@@ -64,7 +94,7 @@ def view_shares(views: list[dict[str, Any]]) -> Figure:
 
 def loss_against_skips(views: list[dict[str, Any]]) -> Figure:
     """Mean loss of every view against its share of skipped visits."""
-    figure, axes = new_figure(5.2, 3.4)
+    figure, axes = new_figure(WIDTH, 3.4)
     known = [row for row in views if row["mean_loss"] is not None]
     loss = np.array([row["mean_loss"] for row in known])
     share = np.array([100 * row["skips"] / row["visits"] for row in known])
@@ -77,7 +107,7 @@ def loss_against_skips(views: list[dict[str, Any]]) -> Figure:
 
 def reasons(data: dict[str, Any]) -> Figure:
     """All gated iterations by what decided: one bar of backwards run, one of those skipped."""
-    figure, axes = new_figure(9.0, 1.9)
+    figure, axes = new_figure(WIDTH, 2.6)
     run = {k: v for k, v in data["reasons"].items() if k not in ("deviation", "non-finite")}
     lost = data["non_finite"]
     if data["settings"].get("on_nonfinite") == "pass":
@@ -104,7 +134,7 @@ def reasons(data: dict[str, Any]) -> Figure:
     axes.set_xlabel("iterations since the gate became active")
     axes.grid(axis="y", visible=False)
     axes.tick_params(left=False)
-    figure.legend(frameon=False, fontsize=SMALL, ncols=4, loc="outside upper center")
+    figure.legend(frameon=False, fontsize=SMALL, ncols=2, loc="outside upper center")
     return figure
 
 
@@ -117,3 +147,25 @@ def inline_svg(figure: Figure) -> str:
 
 def inline_png(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+def split_render(path: Path) -> list[tuple[str, str]]:
+    """Return truth, render and error of a picture that shows the first two side by side: data URI and title each."""
+    from PIL import Image
+
+    with Image.open(path) as opened:
+        both = np.asarray(opened.convert("RGB"))
+    half = both.shape[1] // 2
+    truth, render = both[:, :half], both[:, half : 2 * half]
+    error = np.abs(truth.astype(np.int16) - render) * ERROR_GAIN
+    pictures = {"Photograph": truth, "Render": render, f"Error x{ERROR_GAIN}": error.clip(0, 255).astype(np.uint8)}
+    return [(inline_jpeg(picture), title) for title, picture in pictures.items()]
+
+
+def inline_jpeg(picture: np.ndarray) -> str:
+    """Return a picture [H, W, 3] uint8 as a data URI, a tenth of what a PNG takes."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, format="JPEG", quality=88)
+    return "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode()

@@ -37,24 +37,44 @@ BENCH_PICTURES = {
     "skipped_views.png": "Which visits of which training view were skipped, over iterations.",
     "loss_and_mean.png": "Loss of single views against their running mean; skipped visits are hollow.",
 }
-RENDERS_SHOWN = 3
+EVALUATIONS = "stats/val_step*.json"
+CURVE = "train_curve.json"
+CURVE_FIELDS = ("step", "seconds", "loss", "num_GS")
 
 
 @dataclass
 class RunSource:
-    """A gated run.
+    """A run, gated or not.
 
     Attributes:
-        data: content of skipgs.json.
+        gate: content of skipgs.json; None for a run without a gate.
         metrics: of the last evaluation that the run folder holds in gsplat's layout; empty without.
-        renders: some pictures, truth beside render.
+        views: metrics of each evaluated view, in the order of `renders`; empty where the trainer wrote none.
+        renders: pictures of that evaluation, truth beside render.
+        curve: columns `step seconds loss num_GS` of the course of training; empty without.
+        settings: those of training; empty without.
     """
 
     name: str
     path: Path
-    data: dict[str, Any]
+    gate: dict[str, Any] | None
     metrics: dict[str, Any] = field(default_factory=dict)
+    views: list[dict[str, Any]] = field(default_factory=list)
     renders: list[Path] = field(default_factory=list)
+    curve: dict[str, list[float]] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def t_total(self) -> float | None:
+        """Seconds of training, if they are known."""
+        if self.gate is not None:
+            return float(self.gate["t_total"])
+        return self.curve["seconds"][-1] if self.curve.get("seconds") else None
+
+    @property
+    def t_post(self) -> float | None:
+        """Seconds after densification, if they are known."""
+        return float(self.gate["t_post"]) if self.gate is not None else None
 
 
 @dataclass
@@ -80,22 +100,48 @@ def read_source(path: str | Path) -> RunSource | BenchSource:
     else:
         folder = path
         file = folder / "bench.json" if (folder / "bench.json").is_file() else folder / "skipgs.json"
+    name = folder.resolve().name
     if not file.is_file():
         if (folder / "settings.json").is_file() and (folder / "runs").is_dir():
             raise SkipGSError(f"{folder} holds a bench that has not finished; give its command again to continue it.")
-        raise SkipGSError(
-            f"{file} does not exist; give the folder of a gated run (skipgs-plug train or run) or of a bench."
-        )
+        run = read_run(name, folder, None)
+        if not run.metrics and not run.curve:
+            raise SkipGSError(
+                f"{folder} holds neither skipgs.json, bench.json nor {EVALUATIONS}; give the folder of a run "
+                "(skipgs-plug train or run) that has finished, or of a bench."
+            )
+        return run
     data = read_object(file)
-    name = folder.resolve().name
     if data.get("kind") == KIND:
         require(file, data, BENCH_FIELDS, BENCH_VERSION)
         pictures = [(folder / p, text) for p, text in BENCH_PICTURES.items() if (folder / p).is_file()]
         decisions = read_decisions(folder / DECISIONS) if (folder / DECISIONS).is_file() else {}
         return BenchSource(name, folder, data, pictures, decisions)
     require(file, data, RUN_FIELDS, RUN_VERSION)
+    return read_run(name, folder, data)
+
+
+def read_run(name: str, folder: Path, gate: dict[str, Any] | None) -> RunSource:
+    """Read what a folder holds besides skipgs.json."""
     metrics, renders = last_evaluation(folder)
-    return RunSource(name, folder, data, metrics, renders)
+    views = metrics.pop("per_view", [])
+    curve = folder / "stats" / CURVE
+    columns = read_object(curve) if curve.is_file() else {}
+    if columns and not all(isinstance(columns.get(name), list) for name in CURVE_FIELDS):
+        raise SkipGSError(f"{curve} is damaged (it lacks one of {', '.join(CURVE_FIELDS)}); remove it.")
+    return RunSource(name, folder, gate, metrics, views, renders, columns, read_settings(folder))
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """Return the settings of training in cfg.yml; empty for trainers that write none, or Python objects."""
+    import yaml
+
+    file = folder / "cfg.yml"
+    try:
+        content = yaml.safe_load(file.read_text()) if file.is_file() else {}
+    except (yaml.YAMLError, UnicodeDecodeError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def read_object(file: Path) -> dict[str, Any]:
@@ -120,14 +166,12 @@ def require(file: Path, data: dict[str, Any], fields: tuple[str, ...], version: 
 
 
 def last_evaluation(folder: Path) -> tuple[dict[str, Any], list[Path]]:
-    """Return metrics and renders of the last evaluation in gsplat's layout, if the folder has that."""
-    found = [(step_of(path), path) for path in (folder / "stats").glob("val_step*.json")]
+    """Return metrics and pictures of the last evaluation in gsplat's layout, if the folder has that."""
+    found = [(step_of(path), path) for path in folder.glob(EVALUATIONS)]
     if not found:
         return {}, []
     step, path = max(found)
-    renders = sorted((folder / "renders").glob(f"val_step{step}_*.png"))
-    every = max(1, len(renders) // RENDERS_SHOWN)
-    return read_object(path), renders[::every][:RENDERS_SHOWN]
+    return read_object(path), sorted((folder / "renders").glob(f"val_step{step}_*.png"))
 
 
 def step_of(path: Path) -> int:

@@ -10,9 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from skipgs_plug.install import install_command
 from skipgs_plug.trainer.errors import InputError
-
-INSTALL = "pip install 'skipgs_plug[full]'"
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def _gsplat_backend() -> Backend:
     try:
         from gsplat import rasterization
     except ImportError as error:
-        raise InputError(f"Backend gsplat cannot be imported ({error}); run: {INSTALL}.") from error
+        raise InputError(f"Backend gsplat cannot be imported ({error}); run: {install_command()}.") from error
     return Backend("gsplat", torch.device("cuda"), rasterization, l1_ssim_loss)
 
 
@@ -86,5 +85,5 @@ def _warp_backend() -> Backend:
     try:
         from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
     except ImportError as error:
-        raise InputError(f"Backend warp cannot be imported ({error}); run: {INSTALL}.") from error
+        raise InputError(f"Backend warp cannot be imported ({error}); run: {install_command()}.") from error
     return Backend("warp", torch.device("cpu"), rasterization, l1_ssim_loss)

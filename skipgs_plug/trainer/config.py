@@ -21,6 +21,7 @@ INTEGERS = {  # least and greatest value
     "init_num_pts": (4, 1 << 27),
     "seed": (-(1 << 62), 1 << 62),
     "max_steps": (1, MANY),
+    "schedule_steps": (1, MANY),
     "sh_degree": (0, 3),
     "sh_degree_interval": (1, MANY),
     "refine_start_iter": (0, MANY),
@@ -76,6 +77,9 @@ class TrainConfig:
     """Seed of view order, split noise and random backgrounds."""
     max_steps: int = 30_000
     """Training iterations."""
+    schedule_steps: int | None = None
+    """Iterations that milestones and learning rates are scaled to; default: max_steps. A run that is extended
+    keeps the schedule that it began with, and ends with the rates of its end."""
     ssim_lambda: float = 0.2
     """Loss = (1 - ssim_lambda) * L1 + ssim_lambda * (1 - SSIM)."""
 
@@ -138,6 +142,8 @@ class TrainConfig:
                 raise InputError(f"{field.name}={value} is not a finite number.")
         for name, (low, high) in INTEGERS.items():
             value = getattr(self, name)
+            if value is None and name == "schedule_steps":
+                continue
             if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
                 raise InputError(f"{name}={value!r} is not an integer in {low}..{high:,}.")
         for name, (least, greatest) in NUMBERS.items():
@@ -147,9 +153,14 @@ class TrainConfig:
         if self.near_plane >= self.far_plane:
             raise InputError(f"near_plane={self.near_plane:g} is not below far_plane={self.far_plane:g}.")
 
+    @property
+    def schedule(self) -> int:
+        """Iterations that milestones and learning rates are scaled to."""
+        return self.schedule_steps or self.max_steps
+
     def scaled(self, milestone: int) -> int:
         """Return a milestone of the 30,000-iteration schedule in iterations of this run, at least 1."""
-        return max(1, round(milestone * self.max_steps / REFERENCE_STEPS))
+        return max(1, round(milestone * self.schedule / REFERENCE_STEPS))
 
     def scaled_interval(self, interval: int, least: int) -> int:
         """Like `scaled`, but shrinks an interval no further than to `least` (or to itself if smaller)."""

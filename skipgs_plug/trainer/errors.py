@@ -1,4 +1,4 @@
-"""The two errors of the reference trainer: both carry one sentence that names the thing and the fix."""
+"""The errors of the reference trainer: each carries one sentence that names the thing and the fix."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ class InputError(ValueError):
 
 class MissingFileError(InputError, FileNotFoundError):
     """A file or folder that should exist and does not."""
+
+
+class DamagedCheckpointError(InputError):
+    """A checkpoint that does not hold what it should; an older one may."""
 
 
 def reason(error: BaseException) -> str:

@@ -22,7 +22,7 @@ from skipgs_plug.trainer.ply import write_ply
 from skipgs_plug.trainer.scene import Scene, View
 from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
 
-MEANS_LR_END = 0.01  # share of the positions' learning rate that is left at max_steps
+MEANS_LR_END = 0.01  # share of the positions' learning rate that is left at the end of the schedule
 
 
 class Stateful(Protocol):
@@ -37,10 +37,19 @@ class Iteration(NamedTuple):
     """What one iteration saw, for whoever looks on."""
 
     step: int
+    since: int  # number right after the previous iteration; smaller than `step` where a gate left some out
     view: str
     loss: float
     image: Tensor  # [H, W, 3], detached
     target: Tensor  # [H, W, 3]
+
+    def passes(self, every: int) -> bool:
+        """Whether a multiple of `every` lies among the numbers of this iteration and of those left out before it."""
+        return self.step // every > (self.since - 1) // every
+
+    def completes(self, every: int) -> bool:
+        """Whether another `every` numbers are done after this iteration."""
+        return (self.step + 1) // every > self.since // every
 
 
 class Trainer:
@@ -53,7 +62,8 @@ class Trainer:
         optimizers: one per parameter, by the same names.
         refine_stop_iter: end of densification in iterations of this run.
         on_step: called after every iteration, outside the clock.
-        stop_requested: set it (from a signal handler, say) to end `train` after the current iteration.
+        stop_requested: set it (from a signal handler, say) to end `train` after the current iteration, or, before it,
+            the next `train` at once.
     """
 
     def __init__(self, config: TrainConfig, scene: Scene, backend: Backend | None = None) -> None:
@@ -62,6 +72,7 @@ class Trainer:
         self.backend = backend or resolve_backend(config.backend)
         self.max_steps = config.max_steps
         self.step = self.ran = 0
+        self._since: int | None = None  # number after the previous iteration, set by `train`
         self.splats = create_splats(scene, config, self.backend.device)
         self.optimizers = create_optimizers(self.splats, config, scene.scene_scale)
         self.strategy = create_strategy(config)
@@ -93,24 +104,24 @@ class Trainer:
         return self.clock.t_post
 
     def train(self, until: int | None = None, progress: bool = True) -> None:
-        """Run iterations up to `until` (exclusive; default max_steps)."""
+        """Run iterations up to `until` (exclusive; default max_steps), fewer when `stop_requested` is set."""
         from tqdm import tqdm
 
         until = self.max_steps if until is None else min(until, self.max_steps)
-        self.stop_requested = False
         bar = tqdm(total=until, initial=self.step, desc="Training", disable=not progress, mininterval=0.5)
         with bar:
-            for step in self.iterations(until):
+            for step in () if self.stop_requested else self.iterations(until):
                 bar.update(step - self.step)
-                self.step = step
+                self._since, self.step = self.step, step
                 loss = self.train_step()
                 bar.update()
                 if self.ran % 10 == 0:
                     bar.set_postfix_str(f"loss={loss:.3f} | GS={len(self.splats['means'])}", refresh=False)
                 if self.stop_requested:
                     break
-            else:
-                self.step = max(self.step, until)
+            else:  # those at the end may have been left out
+                self.step = self.step if self.stop_requested else max(self.step, until)
+        self.stop_requested = False
 
     def iterations(self, until: int) -> range:
         """Numbers of the iterations up to `until` (exclusive): the seam where a gate leaves some out."""
@@ -149,8 +160,9 @@ class Trainer:
 
         self.step += 1
         self.ran += 1
+        since, self._since = step if self._since is None else self._since, None
         if self.on_step is not None:
-            self.on_step(Iteration(step, view.name, value, image.detach(), target))
+            self.on_step(Iteration(step, since, view.name, value, image.detach(), target))
         return value
 
     def backward(self, loss: Tensor, view: str, step: int) -> None:
@@ -170,7 +182,7 @@ class Trainer:
 
     def set_learning_rate(self, step: float) -> None:
         """Set the positions' learning rate to that of iteration `step`; the others are constant."""
-        decay = MEANS_LR_END ** (step / self.max_steps)
+        decay = MEANS_LR_END ** min(step / self.config.schedule, 1.0)
         rate = self.config.means_lr * self.scene.scene_scale * decay
         self.optimizers["means"].param_groups[0]["lr"] = rate
 
@@ -186,7 +198,11 @@ class Trainer:
         return colors[0]
 
     def evaluate(self, split: str = "test", lpips_net: str | None = None) -> dict[str, Any]:
-        """Return the means of the chosen metrics over the views of "test" or "train", `num_GS`, and the flavours."""
+        """Return the means of the chosen metrics over the views of "test" or "train", and what belongs to them.
+
+        Returns:
+            The means by name, their flavours, `num_GS step split views`, and `per_view`: the metrics of each.
+        """
         views = {"test": self.scene.test, "train": self.scene.train}[split]
         if not views:
             raise InputError(f"Scene {self.scene.name} has no {split} views; lower test_every to hold some out.")
@@ -200,6 +216,7 @@ class Trainer:
             "step": self.step,
             "split": split,
             "views": len(views),
+            "per_view": [{"view": view.name, **row} for view, row in zip(views, rows, strict=True)],
             **{f"{metric.name}_flavour": metric.flavour for metric in wanted},
         }
 

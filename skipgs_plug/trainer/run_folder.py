@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from skipgs_plug.files import remove_leftovers, write_aside
 from skipgs_plug.trainer.config import TrainConfig
-from skipgs_plug.trainer.errors import MissingFileError
-from skipgs_plug.trainer.files import write_aside, write_json
+from skipgs_plug.trainer.files import write_json
 from skipgs_plug.trainer.loop import Trainer
 
-CHECKPOINTS = "ckpt_*_rank0.pt"
+CHECKPOINT = re.compile(r"ckpt_(\d+)_rank0\.pt")
+KEPT = 2  # checkpoints; the older one serves when the last is damaged
+FOLDERS = ("", "ckpts", "ply", "stats", "renders")
 
 
 class RunFolder:
@@ -30,19 +33,24 @@ class RunFolder:
             temporary.write_text(yaml.safe_dump({**dataclasses.asdict(config), **extra}, sort_keys=False))
 
     def write_checkpoint(self, trainer: Trainer) -> Path:
+        """Write a checkpoint, then remove all but the last two."""
         path = self.root / "ckpts" / f"ckpt_{trainer.step - 1}_rank0.pt"
         trainer.save_checkpoint(path)
+        for old in self.checkpoints()[KEPT:]:
+            old.unlink(missing_ok=True)
         return path
 
-    def has_checkpoints(self) -> bool:
-        return any((self.root / "ckpts").glob(CHECKPOINTS))
+    def checkpoints(self) -> list[Path]:
+        """Return the checkpoints, that of the highest iteration first."""
+        found = [
+            (match, path) for path in (self.root / "ckpts").glob("*") if (match := CHECKPOINT.fullmatch(path.name))
+        ]
+        return [path for match, path in sorted(found, key=lambda entry: -int(entry[0][1]))]
 
-    def latest_checkpoint(self) -> Path:
-        """Return the checkpoint of the highest iteration."""
-        found = list((self.root / "ckpts").glob(CHECKPOINTS))
-        if not found:
-            raise MissingFileError(f"{self.root / 'ckpts'} holds no {CHECKPOINTS}; start without --resume.")
-        return max(found, key=lambda path: int(path.stem.split("_")[1]))
+    def remove_leftovers(self) -> None:
+        """Remove what a run that was killed left half written; nobody may be writing here now."""
+        for name in FOLDERS:
+            remove_leftovers(self.root / name)
 
     def write_ply(self, trainer: Trainer) -> Path:
         path = self.root / "ply" / f"point_cloud_{trainer.step - 1}.ply"

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from skipgs_plug.files import WriteError, keep_going
 from skipgs_plug.trainer.loop import Iteration, Trainer
 from skipgs_plug.trainer.metrics import METRICS
 
@@ -20,7 +21,7 @@ class ScalarLog:
     """Writes what a trainer does into a folder that TensorBoard reads.
 
     A folder in which an earlier run got further is continued: TensorBoard drops what that run wrote from this
-    iteration on.
+    iteration on. When the disk is full the curves end, and training goes on.
 
     Args:
         more: asked for further scalars with their own tags, at each iteration that is written.
@@ -31,10 +32,11 @@ class ScalarLog:
 
         self._trainer, self._more = trainer, more
         self._writer = SummaryWriter(str(folder), purge_step=trainer.step)
+        self._failed: list[WriteError] = []
 
     def iteration(self, iteration: Iteration) -> None:
         """Write `train/loss l1loss ssimloss num_GS mem` of every tenth iteration; may serve as `Trainer.on_step`."""
-        if iteration.step % EVERY:
+        if not iteration.passes(EVERY):
             return
         trainer, image, target = self._trainer, iteration.image, iteration.target
         with torch.no_grad():  # the parts of the loss that the trainer computes in one go
@@ -52,14 +54,18 @@ class ScalarLog:
         self._write(shown, self._trainer.step - 1)
 
     def _write(self, scalars: Mapping[str, float], step: int) -> None:
-        for tag, value in scalars.items():
-            self._writer.add_scalar(tag, value, step)
+        if self._failed:
+            return
+        with keep_going(self._failed):
+            for tag, value in scalars.items():
+                self._writer.add_scalar(tag, value, step)
 
     def __enter__(self) -> ScalarLog:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._writer.close()
+        with keep_going(self._failed):
+            self._writer.close()
 
 
 def peak_memory(device: torch.device) -> int | None:

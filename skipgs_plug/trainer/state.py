@@ -6,14 +6,17 @@ import copy
 import dataclasses
 import logging
 import pickle
+import zipfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from skipgs_plug.trainer.errors import InputError, MissingFileError
-from skipgs_plug.trainer.files import write_aside
+from skipgs_plug import schema
+from skipgs_plug.files import write_aside
+from skipgs_plug.trainer.errors import DamagedCheckpointError, InputError, MissingFileError
 
 if TYPE_CHECKING:
     from skipgs_plug.trainer.loop import Trainer
@@ -21,30 +24,53 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 VERSION = 1
-FREE_FIELDS = ("data_dir", "result_dir", "backend")  # may differ between a run and its continuation
+MOMENTS = {"step", "exp_avg", "exp_avg_sq"}
+# May differ between a run and its continuation; what it means for the two lengths, `_require_same_run` says.
+FREE_FIELDS = ("data_dir", "result_dir", "backend", "max_steps", "schedule_steps")
+# What reading damaged bytes raises depends on the byte: a length, a key, a decoder, a missing attribute.
+DAMAGE = (
+    *(pickle.UnpicklingError, zipfile.BadZipFile, EOFError, OSError, MemoryError, OverflowError),
+    *(RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError),
+)
+
+
+class ConfigEntry(TypedDict):
+    """What every config has: how long the run is, and how long its schedule."""
+
+    max_steps: int
+    schedule_steps: int
+
+
+class SceneEntry(TypedDict):
+    """What a checkpoint remembers of its scene."""
+
+    name: str
+    view_names: list[str]
+
+
+class Checkpoint(TypedDict):
+    """What a checkpoint file holds: as `capture`, with config and view names."""
+
+    version: int
+    step: int
+    ran: int
+    splats: dict[str, Tensor]
+    optimizers: dict[str, dict[str, Tensor]]
+    strategy: dict[str, Tensor | float | None]
+    clock: dict[str, float]
+    registered: dict[str, dict[str, Any]]
+    config: ConfigEntry
+    scene: SceneEntry
 
 
 def capture(trainer: Trainer) -> dict[str, Any]:
     """Return an independent copy of everything that the next iteration depends on.
 
-    Keys: `version`, `step` (next iteration), `splats`, `optimizers` (moments by parameter), `strategy`,
-    `clock` (seconds), `registered` (state_dict of each registered object). View order and split noise are
-    functions of seed and step and need no entry.
+    Keys: `version`, `step` (next iteration), `ran` (iterations that ran), `splats`, `optimizers` (moments by
+    parameter), `strategy`, `clock` (seconds), `registered` (state_dict of each registered object). View order and
+    split noise are functions of seed, step and `ran` and need no entry.
     """
-    moments = {}
-    for name, optimizer in trainer.optimizers.items():
-        moments[name] = dict(optimizer.state.get(trainer.splats[name], {}))
-    state = {
-        "version": VERSION,
-        "step": trainer.step,
-        "ran": trainer.ran,
-        "splats": {name: param.detach() for name, param in trainer.splats.items()},
-        "optimizers": moments,
-        "strategy": dict(trainer.strategy_state),
-        "clock": trainer.clock.state_dict(),
-        "registered": {name: owner.state_dict() for name, owner in trainer.registered.items()},
-    }
-    return copy.deepcopy(state)
+    return copy.deepcopy(_view(trainer))
 
 
 def apply(trainer: Trainer, state: dict[str, Any]) -> None:
@@ -54,7 +80,7 @@ def apply(trainer: Trainer, state: dict[str, Any]) -> None:
     """
     state = copy.deepcopy(state)
     trainer.step = state["step"]
-    trainer.ran = state.get("ran", trainer.step)  # before iterations could be left out, all had run
+    trainer.ran = state["ran"]
     for name, tensor in state["splats"].items():
         param = nn.Parameter(tensor.to(trainer.backend.device))
         trainer.splats[name] = param
@@ -72,14 +98,47 @@ def apply(trainer: Trainer, state: dict[str, Any]) -> None:
 
 
 def save_checkpoint(trainer: Trainer, path: str | Path) -> None:
-    """Write the captured state with config and view names; loads with `weights_only=True`."""
+    """Write the captured state with config and view names; loads with `weights_only=True`.
+
+    Raises:
+        WriteError: it cannot be written; says how much room it needs.
+    """
     content = {
-        **capture(trainer),
-        "config": dataclasses.asdict(trainer.config),
+        **_view(trainer),
+        "config": {**dataclasses.asdict(trainer.config), "schedule_steps": trainer.config.schedule},
         "scene": {"name": trainer.scene.name, "view_names": list(trainer.view_names)},
     }
-    with write_aside(path) as temporary:
-        torch.save(content, temporary)
+    size = sum(tensor.nbytes for tensor in _tensors(content))
+    # Through a file of ours: given a path, torch forgets why it could not write.
+    with write_aside(path, size) as temporary, temporary.open("wb") as file:
+        torch.save(content, file)
+
+
+def read_checkpoint(path: str | Path, device: torch.device) -> dict[str, Any]:
+    """Return the content of a checkpoint, every entry of it of the right type.
+
+    Raises:
+        MissingFileError: no such file.
+        DamagedCheckpointError: something is missing or of another type, or NaN.
+        InputError: of another version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MissingFileError(f"Checkpoint {path} does not exist; give a ckpts/ckpt_*.pt or start without --resume.")
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+        if isinstance(content, Mapping) and isinstance(content.get("version"), int) and content["version"] != VERSION:
+            raise InputError(f"Checkpoint {path} has version {content['version']}, expected {VERSION}; start afresh.")
+        schema.check(content, Checkpoint, "checkpoint")
+        _check_tensors(content)
+    except InputError:
+        raise
+    except DAMAGE as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise DamagedCheckpointError(
+            f"Checkpoint {path} is damaged or not one of this trainer ({reason}); use an older one or start afresh."
+        ) from error
+    return content
 
 
 def load_checkpoint(trainer: Trainer, path: str | Path) -> None:
@@ -87,41 +146,114 @@ def load_checkpoint(trainer: Trainer, path: str | Path) -> None:
 
     Raises:
         MissingFileError: no such file.
-        InputError: damaged, of another scene, made with other settings, or with NaN values.
+        DamagedCheckpointError: damaged, or with NaN values.
+        InputError: of another scene, or made with other settings.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise MissingFileError(f"Checkpoint {path} does not exist; give a ckpts/ckpt_*.pt or start without --resume.")
+    content = read_checkpoint(path, trainer.backend.device)
+    _require_same_run(trainer, content, path)
+    _require_same_shape(trainer, content, path)
     try:
-        content = torch.load(path, map_location=trainer.backend.device, weights_only=True)
-        version, splats, config = content["version"], content["splats"], content["config"]
-        views = content["scene"]["view_names"]
-    except (
-        RuntimeError,
-        pickle.UnpicklingError,
-        EOFError,
-        KeyError,
-        TypeError,
-        OSError,
-        ValueError,
-    ) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(
-            f"Checkpoint {path} is damaged or not one of this trainer ({reason}); use an older one or start afresh."
-        ) from error
-    if version != VERSION:
-        raise InputError(f"Checkpoint {path} has version {version}, expected {VERSION}; start afresh.")
-    if views != list(trainer.view_names):
-        raise InputError(f"Checkpoint {path} was made with other training views; resume with its own scene and split.")
-    for name, value in dataclasses.asdict(trainer.config).items():
-        if name not in FREE_FIELDS and config.get(name) != value:
-            raise InputError(
-                f"Checkpoint {path} was made with {name}={config.get(name)!r}, not {value!r}; resume with its settings."
-            )
-    for name, tensor in splats.items():
-        if not torch.isfinite(tensor).all():
-            raise InputError(f"Checkpoint {path} holds NaN or infinite {name}; use an older one or start afresh.")
-    apply(trainer, content)
+        apply(trainer, content)
+    except InputError:
+        raise
+    except DAMAGE as error:  # what a registered object refuses
+        raise DamagedCheckpointError(f"Checkpoint {path} cannot be continued: {error}") from error
     for name in trainer.registered:
         if name not in content["registered"]:
             log.warning("Checkpoint %s holds no state for %s: it starts fresh.", path, name)
+
+
+def _view(trainer: Trainer) -> dict[str, Any]:
+    """Return what `capture` copies, with the tensors of the trainer themselves."""
+    moments = {}
+    for name, optimizer in trainer.optimizers.items():
+        moments[name] = dict(optimizer.state.get(trainer.splats[name], {}))
+    return {
+        "version": VERSION,
+        "step": trainer.step,
+        "ran": trainer.ran,
+        "splats": {name: param.detach() for name, param in trainer.splats.items()},
+        "optimizers": moments,
+        "strategy": dict(trainer.strategy_state),
+        "clock": trainer.clock.state_dict(),
+        "registered": {name: owner.state_dict() for name, owner in trainer.registered.items()},
+    }
+
+
+def _tensors(value: Any) -> Iterator[Tensor]:
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, dict):
+        for entry in value.values():
+            yield from _tensors(entry)
+
+
+def _check_tensors(content: dict[str, Any]) -> None:
+    """Raise SchemaError unless all tensors are finite and speak of the same Gaussians."""
+    splats = content["splats"]
+    n = {len(tensor) if tensor.ndim else -1 for tensor in splats.values()}
+    if len(n) != 1 or min(n) < 1:
+        raise schema.SchemaError("its parameters are of different lengths, or empty")
+    if content["optimizers"].keys() != splats.keys():
+        raise schema.SchemaError("its optimizers are not those of its parameters")
+    for name, moments in content["optimizers"].items():
+        if moments and moments.keys() != MOMENTS:
+            raise schema.SchemaError(f"moments of {name} are {', '.join(sorted(moments))}")
+        for key, moment in moments.items():
+            if moment.shape != (() if key == "step" else splats[name].shape) or not moment.is_floating_point():
+                raise schema.SchemaError(f"{key} of {name} is {moment.dtype} of shape {list(moment.shape)}")
+            if not torch.isfinite(moment).all():
+                raise schema.SchemaError(f"it holds NaN or infinite {key} of {name}")
+    for name, tensor in splats.items():
+        if not torch.isfinite(tensor).all():
+            raise schema.SchemaError(f"it holds NaN or infinite {name}")
+    for name, value in content["strategy"].items():
+        if isinstance(value, Tensor) and value.shape != (*n,):
+            raise schema.SchemaError(f"{name} of the strategy has shape {list(value.shape)}")
+
+
+def _require_same_run(trainer: Trainer, content: dict[str, Any], path: str | Path) -> None:
+    if content["scene"]["view_names"] != list(trainer.view_names):
+        raise InputError(f"Checkpoint {path} was made with other training views; resume with its own scene and split.")
+    made_with = content["config"]
+    for name, value in dataclasses.asdict(trainer.config).items():
+        if name not in FREE_FIELDS and made_with.get(name) != value:
+            raise InputError(
+                f"Checkpoint {path} was made with {name}={made_with.get(name)!r}, not {value!r}; "
+                "resume with its settings."
+            )
+    schedule = made_with["schedule_steps"]
+    if schedule != trainer.config.schedule:
+        raise InputError(
+            f"Checkpoint {path} was made on a schedule of {schedule} iterations, not {trainer.config.schedule}; "
+            f"resume with max_steps={schedule}, or extend it with schedule_steps={schedule} and a larger max_steps."
+        )
+    if content["step"] > trainer.max_steps:
+        raise InputError(
+            f"Checkpoint {path} is {content['step']} iterations old, more than max_steps={trainer.max_steps}; "
+            "give at least as many."
+        )
+
+
+def _require_same_shape(trainer: Trainer, content: dict[str, Any], path: str | Path) -> None:
+    """Raise DamagedCheckpointError unless the trainer can hold these tensors, and knows all other entries."""
+    wrong = _difference(trainer, content)
+    if wrong is not None:
+        raise DamagedCheckpointError(
+            f"Checkpoint {path} is damaged or not one of this trainer ({wrong}); use an older one or start afresh."
+        )
+
+
+def _difference(trainer: Trainer, content: dict[str, Any]) -> str | None:
+    own = {name: (list(param.shape[1:]), param.dtype) for name, param in trainer.splats.items()}
+    read = {name: (list(tensor.shape[1:]), tensor.dtype) for name, tensor in content["splats"].items()}
+    if own != read:
+        return f"parameters {read}, not {own}"
+    if content["strategy"].keys() != trainer.strategy_state.keys():
+        return f"strategy {sorted(content['strategy'])}"
+    for name, value in content["strategy"].items():
+        if isinstance(value, (int, float)) != isinstance(trainer.strategy_state[name], (int, float)):
+            return f"{name} of the strategy is {type(value).__name__}"
+    if content["clock"].keys() != trainer.clock.state_dict().keys():
+        return f"clock {sorted(content['clock'])}"
+    return None

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from skipgs_plug.install import install_command
 from skipgs_plug.trainer.config import MIN_REFINE_EVERY, MIN_RESET_EVERY, TrainConfig
 from skipgs_plug.trainer.errors import InputError
 
@@ -17,7 +18,7 @@ def create_strategy(config: TrainConfig) -> Any:
         from gsplat import DefaultStrategy
     except ImportError as error:
         raise InputError(
-            f"Densification needs gsplat and it cannot be imported ({error}); run: pip install 'skipgs_plug[full]'."
+            f"Densification needs gsplat and it cannot be imported ({error}); run: {install_command()}."
         ) from error
     return DefaultStrategy(
         prune_opa=config.prune_opa,

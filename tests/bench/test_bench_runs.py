@@ -33,7 +33,9 @@ def test_every_policy_saw_the_same_views_in_the_same_order(finished):
         for policy in POLICIES:
             record = finished.run(policy, seed)
             assert record.trace.start == START
-            assert record.trace.view == full[: record.iterations]
+            seen = [view for view in record.trace.view if view is not None]
+            assert seen == full[: record.iterations_run]  # views take turns among the iterations that run
+            assert len(record.trace.view) == record.iterations
     assert finished.run("ungated", 0).trace.view != finished.run("ungated", 1).trace.view
 
 
@@ -131,17 +133,10 @@ def test_peak_memory_is_that_of_the_run_alone(monkeypatch):
 
 def test_a_policy_that_leaves_out_whole_iterations_is_one_entry(scene, tmp_path, monkeypatch):
     def every_second(trainer, earlier):
-        train_step = trainer.train_step
+        trainer.iterations = lambda until: [n for n in range(trainer.step, until) if n % 2 == 0]
 
-        def thinned():
-            loss = train_step()
-            trainer.step += 1
-            return loss
-
-        trainer.train_step = thinned
-
-    monkeypatch.setitem(POLICIES, "thinned", PolicySpec("thinned", "every second iteration", every_second))
-    full, record = make_bench(scene, tmp_path, seeds=(0,), policies=("ungated", "thinned")).run()
+    monkeypatch.setitem(POLICIES, "halved", PolicySpec("halved", "every second iteration", every_second))
+    full, record = make_bench(scene, tmp_path, seeds=(0,), policies=("ungated", "halved")).run()
     assert (record.iterations, record.iterations_run, record.backwards, record.skips) == (40, 20, 20, 0)
     assert record.trace.codes == "-." * 20
     assert all(
@@ -149,7 +144,7 @@ def test_a_policy_that_leaves_out_whole_iterations_is_one_entry(scene, tmp_path,
         for i, (view, loss) in enumerate(zip(record.trace.view, record.trace.loss, strict=True))
     )
     assert 0.0 < record.t_post < full.t_post
-    row = summarise([full, record], ("ungated", "thinned"), 40)[1]
+    row = summarise([full, record], ("ungated", "halved"), 40)[1]
     assert row.values["iterations_run"].mean == 20 and row.values["backwards_share"].mean == 50.0
 
 
@@ -192,7 +187,7 @@ def test_a_killed_bench_continues_where_it_stopped(scene, finished, tmp_path):
     assert sum("T_post" in line for line in said) == len(records) - 3
     assert all(path.read_bytes() == content for path, content in stored.items())
     for record in records:
-        if record.policy != "shortened":  # its length depends on measured time
+        if not record.policy.startswith("shortened"):  # its length depends on measured time
             whole = finished.run(record.policy, record.seed)
             assert record.trace == whole.trace
             assert record.metrics == whole.metrics

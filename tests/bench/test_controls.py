@@ -55,6 +55,6 @@ def test_random_has_its_own_generator():
 
 def test_a_plan_travels_in_its_state():
     saved = periodic_skipping(10, 50, 13)
-    restored = PlannedSkipping(0, ())
+    restored = PlannedSkipping(0, 1, ())
     restored.load_state_dict(saved.state_dict())
     assert decided(restored, 0, 60) == decided(saved, 0, 60)

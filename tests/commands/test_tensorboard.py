@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import warnings
 
 import pytest
@@ -77,8 +79,24 @@ def test_a_continued_run_replaces_what_came_after_its_checkpoint(scene, tmp_path
         trainer.step = first
         with ScalarLog(tmp_path, trainer) as log:
             for step in range(first, 40):
-                log.iteration(Iteration(step, "view", loss, image, image))
+                log.iteration(Iteration(step, step, "view", loss, image, image))
     assert read(tmp_path)["train/loss"] == {0: 1.0, 10: 1.0, 20: 2.0, 30: 2.0}
+
+
+def test_a_full_disk_ends_the_curves_and_not_the_run(scene, tmp_path, monkeypatch, caplog):
+    trainer = Trainer(TrainConfig(max_steps=40), scene)
+    image = torch.rand(16, 24, 3, generator=torch.Generator().manual_seed(0))
+
+    def full(*args):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "events.out")
+
+    with ScalarLog(tmp_path, trainer) as log:
+        log.iteration(Iteration(0, 0, "view", 1.0, image, image))
+        monkeypatch.setattr(log._writer, "add_scalar", full)
+        for step in (10, 20):
+            log.iteration(Iteration(step, step, "view", 1.0, image, image))
+    assert list(read(tmp_path)["train/loss"]) == [0]
+    assert caplog.text.count("events.out cannot be written (No space left on device)") == 1
 
 
 def test_bench_writes_every_run(packed, tmp_path):

@@ -6,8 +6,11 @@ import json
 import math
 import os
 import random
+import signal
 import sys
+import time
 import warnings
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -20,11 +23,17 @@ from skipgs_plug import SkipGate, SkipGSError
 STEPS = 300
 
 
-def start(rank: int, folder: str) -> None:
+def start(rank: int, folder: str, size: int = 2, seconds: float = 60) -> None:
     torch.set_num_threads(1)
     if sys.platform == "linux":
         os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # containers may not know their own host name
-    dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=2)
+    dist.init_process_group(
+        "gloo",
+        init_method=f"file://{folder}/rendezvous",
+        rank=rank,
+        world_size=size,
+        timeout=timedelta(seconds=seconds),
+    )
 
 
 def train(rank: int, folder: str) -> None:
@@ -87,3 +96,40 @@ def test_an_error_on_one_rank_ends_both(tmp_path: Path) -> None:
     mp.spawn(fail_on_one, args=(str(tmp_path),), nprocs=2)
     assert "view 'a'" in (tmp_path / "1.txt").read_text()
     assert "another process" in (tmp_path / "0.txt").read_text()
+
+
+def trouble(rank: int, folder: str, size: int, kind: str) -> None:
+    """Rank 1 dies, stops answering, or is late; says how each rank ended."""
+    start(rank, folder, size, seconds=3)
+    gate = SkipGate(start_iter=0, warmup=2)
+    parameter = torch.nn.Parameter(torch.ones(1))
+    said = "done"
+    try:
+        for step in range(20):
+            if (rank, step) == (1, 10):
+                if kind == "dies":
+                    os.kill(os.getpid(), signal.SIGKILL)
+                time.sleep({"lags": 1, "hangs": 6}[kind])
+            gate.backward(parameter.sum() * (rank + 1), view="a", step=step)
+    except SkipGSError as error:
+        said = str(error)
+    Path(folder, f"{rank}.txt").write_text(said)
+    os._exit(0)  # the group is broken: leaving it in order would wait for the dead
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize(("kind", "size"), [("lags", 2), ("dies", 2), ("hangs", 2), ("dies", 4)])
+def test_ranks_in_trouble_end_within_the_time_out(tmp_path: Path, kind: str, size: int) -> None:
+    context = mp.get_context("spawn")
+    ranks = [context.Process(target=trouble, args=(rank, str(tmp_path), size, kind)) for rank in range(size)]
+    for rank in ranks:
+        rank.start()
+    for rank in ranks:
+        rank.join(60)
+    assert not any(rank.is_alive() for rank in ranks)
+    said = {rank: (tmp_path / f"{rank}.txt").read_text() for rank in range(size) if (tmp_path / f"{rank}.txt").exists()}
+    assert said.keys() == set(range(size)) - ({1} if kind == "dies" else set())
+    if kind == "lags":
+        assert set(said.values()) == {"done"}
+    else:
+        assert all("did not answer" in sentence for sentence in said.values())

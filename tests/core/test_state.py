@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import math
+import warnings
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -66,6 +70,7 @@ def test_gate_state_is_plain_json_and_loads_weights_only(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
+        (lambda s: [], "is a dict, not list"),
         (lambda s: {}, "empty"),
         (lambda s: {**s, "version": 99}, "version 99"),
         (lambda s: {**s, "state_version": 2}, "version 2"),
@@ -79,6 +84,49 @@ def test_damaged_states_are_named(damage, message: str) -> None:
     gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
     with pytest.raises(SkipGSError, match=message):
         gate.load_state_dict(damage(gate.state_dict()))
+
+
+WRONG = (None, True, -1, 0.5, math.nan, "text", [], {}, ["text"], {"a": None}, {"a": ["text"]})
+
+
+def entries(state: dict, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The paths of all entries of a state."""
+    for key, value in state.items():
+        yield (*path, key)
+        if isinstance(value, dict):
+            yield from entries(value, (*path, key))
+
+
+@pytest.mark.parametrize("release", [False, True])
+def test_an_entry_that_is_missing_or_of_another_type_is_an_error_or_harmless(release: bool) -> None:
+    """Every entry of a state is taken away once, and replaced by everything else once."""
+    gate = SkipGate(start_iter=0)
+    gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
+    whole = RELEASE if release else json.loads(json.dumps(gate.state_dict()))
+    refused = 0
+    for path in entries(whole):
+        for wrong in (KeyError, *WRONG):
+            state = copy.deepcopy(whole)
+            parent = state
+            for key in path[:-1]:
+                parent = parent[key]
+            if wrong is KeyError:
+                del parent[path[-1]]
+            else:
+                parent[path[-1]] = wrong
+            other = SkipGate(start_iter=0)
+            try:
+                other.load_state_dict(state)
+            except SkipGSError as error:
+                refused += 1
+                assert str(error).count(";") >= 1 and len(str(error)) < 300
+                continue
+            # What is taken can be used, shown and saved.
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)
+                other.backward(torch.tensor(1.0, requires_grad=True), view="a", step=10**6)
+            assert other.report() and other.summary() and other.state_dict()
+    assert refused > len(WRONG) * 5
 
 
 def test_ambiguous_view_keys_are_refused() -> None:

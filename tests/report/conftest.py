@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from report_browser import COUNT_IMAGES, FLAGS
+from browser import FLAGS, find_chromium
+from report_browser import COUNT_IMAGES
 
 from skipgs_plug import SkipGate
 from skipgs_plug.cli import main
@@ -31,6 +30,14 @@ def train_folder(scene_file: str, tmp_path_factory: pytest.TempPathFactory) -> P
     """A run folder of `skipgs-plug train`."""
     folder = tmp_path_factory.mktemp("train") / "gated"
     assert main(["train", scene_file, "--out", str(folder), "--max-steps", "40", "--no-progress"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
+def ungated_folder(scene_file: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("train") / "ungated"
+    command = ["train", scene_file, "--out", str(folder), "--max-steps", "40", "--no-gate", "--no-progress"]
+    assert main(command) == 0
     return folder
 
 
@@ -58,11 +65,7 @@ def script_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def dump_dom(tmp_path: Path) -> Callable[[Path], str]:
     """Open a page in a headless browser and return its DOM, with the number of decoded images in <body>."""
-    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if browser is None:
-        if os.environ.get("CI") == "true":
-            pytest.fail("no chromium found; CI must open the report in a real browser")
-        pytest.skip("no chromium found; install it to open the report in a real browser")
+    browser = find_chromium()
 
     def dump(page: Path) -> str:
         copy = tmp_path / "copy.html"

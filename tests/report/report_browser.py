@@ -4,16 +4,6 @@ from __future__ import annotations
 
 import re
 
-FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-)
 # Runs in a copy of the page only: the page itself holds no script.
 COUNT_IMAGES = """<script>addEventListener("load", () => {
   const images = [...document.images];

@@ -5,9 +5,12 @@ import re
 import shutil
 
 import pytest
+from browser import Browser
 from report_browser import body_count
 
 from skipgs_plug.cli import main
+from skipgs_plug.trainer import TrainConfig, Trainer, load_scene
+from skipgs_plug.trainer.curve import LossCurve
 
 
 def make_page(tmp_path, *folders):
@@ -29,9 +32,60 @@ def test_browser_shows_a_training_run(train_folder, tmp_path, dump_dom):
     data = json.loads((train_folder / "skipgs.json").read_text())
     (row,) = rows_of(dom, "What the gate did")
     assert row[:5] == ["gated", "40", "20", str(data["backwards_run"]), str(data["backwards_skipped"])]
-    assert len(rows_of(dom, "Views")) == 6
+    assert len(rows_of(dom, "Training views")) == 6
     assert dict(rows_of(dom, "Last evaluation"))["num_GS"].isdigit()
-    assert body_count(dom, "images") == body_count(dom, "decoded") == 5  # three plots, two held-out renders
+    # Loss, quality of views, three plots of the gate; photograph, render and error of two held-out views.
+    assert body_count(dom, "images") == body_count(dom, "decoded") == 5 + 6
+
+
+def test_a_run_without_a_gate_is_shown_with_its_worst_view_first(ungated_folder, tmp_path, dump_dom):
+    dom = dump_dom(make_page(tmp_path, ungated_folder))
+    stats = json.loads((ungated_folder / "stats/val_step39.json").read_text())
+    worst, best = sorted(stats["per_view"], key=lambda row: row["psnr"])
+    results = dict(rows_of(dom, "Results"))
+    assert results["held-out PSNR, dB"] == f"{stats['psnr']:.2f}"
+    assert results["worst view, dB"] == f"{worst['psnr']:.2f}"
+    assert results["backwards skipped, %"] == "-" and float(results["training, s"]) > 0
+    captions = re.findall(r"<figcaption>(.*?)</figcaption>", dom)
+    first, second = (
+        captions.index(caption) for caption in captions if "held-out views." in caption and "dB" in caption
+    )
+    assert captions[first].startswith(f"{worst['view']}: {worst['psnr']:.2f} dB, worst of 2")
+    assert captions[second].startswith(best["view"])
+    assert "What the gate did" not in dom
+    assert body_count(dom, "images") == body_count(dom, "decoded") == 2 + 6
+
+
+def test_pages_fit_a_phone(train_folder, bench_folder, script_folder, tmp_path):
+    page = make_page(tmp_path, train_folder, bench_folder, script_folder)
+    with Browser(tmp_path / "profile", width=390, height=844) as browser:
+        browser.open(page.as_uri())
+        assert browser.evaluate("document.documentElement.scrollWidth") == 390
+        widths = browser.evaluate("[...document.querySelectorAll('figure')].map(f => f.getBoundingClientRect().right)")
+        assert len(widths) > 10 and max(widths) <= 390
+        sizes = browser.evaluate(
+            "[...document.querySelectorAll('td')].map(c => parseFloat(getComputedStyle(c).fontSize))"
+        )
+        assert min(sizes) >= 13
+
+
+def test_the_curve_of_a_run_goes_on_after_a_resume(scene_file, tmp_path):
+    scene = load_scene(scene_file)
+    whole, first, second = (Trainer(TrainConfig(max_steps=1200), scene) for _ in range(3))
+    curves = [LossCurve(trainer) for trainer in (whole, first, second)]
+    for trainer, curve in zip((whole, first, second), curves, strict=True):
+        trainer.on_step = curve.iteration
+    whole.train(until=21, progress=False)
+    first.train(until=11, progress=False)
+    second.restore(first.snapshot())
+    second.train(until=21, progress=False)
+    curves[0].write(tmp_path / "whole.json")
+    curves[2].write(tmp_path / "resumed.json")
+    contents = [json.loads((tmp_path / name).read_text()) for name in ("whole.json", "resumed.json")]
+    assert contents[0]["step"] == list(range(1, 21, 2)) and len(contents[0]["loss"]) == 10
+    for name in ("step", "loss", "num_GS"):
+        assert contents[0][name] == contents[1][name]
+    assert contents[1]["seconds"] == sorted(contents[1]["seconds"])
 
 
 def test_browser_shows_a_bench(bench_folder, tmp_path, dump_dom):
@@ -49,14 +103,28 @@ def test_browser_shows_the_run_of_an_upstream_script(script_folder, tmp_path, du
     dom = dump_dom(make_page(tmp_path, script_folder))
     (row,) = rows_of(dom, "What the gate did")
     assert row[:3] == ["output &amp; &lt;model&gt;", "60", "55"]
-    assert [row[0] for row in rows_of(dom, "Views")] == [f"cam/{i}&lt;b&gt;.png" for i in range(3)]
+    assert [row[0] for row in rows_of(dom, "Training views")] == [f"cam/{i}&lt;b&gt;.png" for i in range(3)]
     assert body_count(dom, "images") == body_count(dom, "decoded") == 3
 
 
-def test_browser_compares_several_runs(train_folder, script_folder, bench_folder, tmp_path, dump_dom):
-    dom = dump_dom(make_page(tmp_path, train_folder, script_folder, bench_folder))
-    assert [row[0] for row in rows_of(dom, "All runs")] == ["gated", "output &amp; &lt;model&gt;"]
-    assert body_count(dom, "images") == body_count(dom, "decoded") == 14
+def test_browser_compares_several_runs(train_folder, ungated_folder, script_folder, bench_folder, tmp_path, dump_dom):
+    dom = dump_dom(make_page(tmp_path, train_folder, ungated_folder, script_folder, bench_folder))
+    table = dom[dom.index("All runs") :]
+    names = re.findall(r'<th scope="col">(.*?)</th>', table[: table.index("</thead>")])
+    assert names == ["", "gated", "ungated", "output &amp; &lt;model&gt;"]
+    rows = {row[0]: row[1:] for row in rows_of(dom, "All runs")}
+    expected = [json.loads((f / "stats/val_step39.json").read_text()) for f in (train_folder, ungated_folder)]
+    assert rows["SSIM"] == [*(f"{stats['ssim']:.4f}" for stats in expected), "-"]
+    assert rows["Gaussians"] == [*(f"{stats['num_GS']:,}" for stats in expected), "-"]
+    # Two of the comparison, then those of each run and of the bench.
+    assert body_count(dom, "images") == body_count(dom, "decoded") == 2 + 11 + 8 + 3 + 6
+
+
+def test_runs_of_one_name_are_told_apart_by_their_paths(ungated_folder, tmp_path):
+    copy = tmp_path / "ungated"
+    shutil.copytree(ungated_folder, copy)
+    text = make_page(tmp_path, ungated_folder, copy).read_text()
+    assert f">{ungated_folder}<" in text and f">{copy}<" in text
 
 
 def test_page_loads_nothing_from_elsewhere(train_folder, bench_folder, tmp_path):
@@ -85,10 +153,18 @@ def test_a_run_whose_gate_was_never_active_is_shown(script_folder, tmp_path):
     assert "never active" in text and "<img" not in text
 
 
+def test_folders_without_a_run_are_named(tmp_path, capsys):
+    assert main(["report", str(tmp_path)]) == 2
+    assert f"{tmp_path} holds neither skipgs.json, bench.json nor stats" in capsys.readouterr().err
+    (tmp_path / "stats").mkdir()
+    (tmp_path / "stats/train_curve.json").write_text('{"step": [1]}')
+    assert main(["report", str(tmp_path)]) == 2
+    assert "train_curve.json is damaged" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        (None, "does not exist"),
         ("{", "is damaged"),
         ("[1]", "no JSON object"),
         ('{"schema_version": 99}', "schema version 99"),
@@ -97,8 +173,7 @@ def test_a_run_whose_gate_was_never_active_is_shown(script_folder, tmp_path):
     ],
 )
 def test_unusable_input_is_one_sentence(tmp_path, capsys, content, sentence):
-    if content is not None:
-        (tmp_path / "skipgs.json").write_text(content)
+    (tmp_path / "skipgs.json").write_text(content)
     assert main(["report", str(tmp_path), "--out", str(tmp_path / "page.html")]) == 2
     error = capsys.readouterr().err.strip()
     assert sentence in error and "skipgs.json" in error and len(error.splitlines()) == 1

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+from skipgs_plug import SkipGate
 from skipgs_plug.trainer import InputError, MissingFileError, Scene, TrainConfig, Trainer
 
 
@@ -102,7 +105,7 @@ def test_bad_checkpoints(tmp_path: Path, trainer: Trainer, tiny_scene: Scene) ->
 
     path.write_bytes(whole)
     other = Trainer(dataclasses.replace(trainer.config, max_steps=90), tiny_scene)
-    with pytest.raises(InputError, match=r"made with max_steps=60, not 90"):
+    with pytest.raises(InputError, match=r"on a schedule of 60 iterations, not 90"):
         other.load_checkpoint(path)
     fewer = dataclasses.replace(tiny_scene, train=tiny_scene.train[1:])
     with pytest.raises(InputError, match="other training views"):
@@ -114,3 +117,66 @@ def test_bad_checkpoints(tmp_path: Path, trainer: Trainer, tiny_scene: Scene) ->
     with pytest.raises(InputError, match=r"holds NaN or infinite scales"):
         trainer.load_checkpoint(path)
     assert [p.name for p in tmp_path.iterdir()] == ["c.pt"]
+
+
+def test_an_extended_run_keeps_its_schedule(tmp_path: Path, tiny_scene: Scene, tiny_config: TrainConfig) -> None:
+    longer = dataclasses.replace(tiny_config, max_steps=80, schedule_steps=60)
+    whole = Trainer(longer, tiny_scene)
+    whole.train(progress=False)
+    rate = whole.optimizers["means"].param_groups[0]["lr"]
+    assert rate == pytest.approx(tiny_config.means_lr * tiny_scene.scene_scale * 0.01)
+    assert whole.refine_stop_iter == 30
+    for stop in (20, 60):
+        first = Trainer(tiny_config, tiny_scene)
+        first.train(until=stop, progress=False)
+        first.save_checkpoint(tmp_path / "c.pt")
+        second = Trainer(longer, tiny_scene)
+        second.load_checkpoint(tmp_path / "c.pt")
+        second.train(progress=False)
+        assert_same(whole, second)
+    shorter = Trainer(dataclasses.replace(tiny_config, max_steps=59, schedule_steps=60), tiny_scene)
+    with pytest.raises(InputError, match=r"60 iterations old, more than max_steps=59"):
+        shorter.load_checkpoint(tmp_path / "c.pt")
+
+
+WRONG = (None, "text", {"a": None}, torch.zeros(3), torch.full((160, 3), math.nan))
+CHECKED_ELSEWHERE = ("config", "skipgs")  # compared one by one; see tests/core/test_state.py
+
+
+def entries(state: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The paths of all entries of a checkpoint."""
+    for key, value in state.items():
+        yield (*path, key)
+        if isinstance(value, dict) and key not in CHECKED_ELSEWHERE:
+            yield from entries(value, (*path, key))
+
+
+def test_an_entry_that_is_missing_or_of_another_type_is_an_error_or_harmless(
+    tmp_path: Path, trainer: Trainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every entry of a checkpoint is taken away once, and replaced by everything else once."""
+    SkipGate(trainer)
+    trainer.train(until=32, progress=False)
+    trainer.save_checkpoint(tmp_path / "c.pt")
+    whole = torch.load(tmp_path / "c.pt", weights_only=True)
+    refused = taken = 0
+    for path in entries(whole):
+        for wrong in (KeyError, *WRONG):
+            state = parent = dict(whole)
+            for key in path[:-1]:
+                parent[key] = parent = dict(parent[key])
+            if wrong is KeyError:
+                del parent[path[-1]]
+            else:
+                parent[path[-1]] = wrong
+            monkeypatch.setattr(torch, "load", lambda *args, state=state, **kwargs: state)
+            try:
+                with trainer.backend.exclusive_cores():
+                    trainer.load_checkpoint(tmp_path / "c.pt")
+            except InputError as error:
+                refused += 1
+                assert len(str(error)) < 900
+                continue
+            taken += 1
+            trainer.train_step()
+    assert refused > 200 and taken > 2

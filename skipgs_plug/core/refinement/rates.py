@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
 from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
+
+Optimizers = Callable[[], Iterable[torch.optim.Optimizer]]
 
 
 def path_factor(share: float, progress: float, peak: float | None = None) -> float:
@@ -25,17 +28,21 @@ def path_factor(share: float, progress: float, peak: float | None = None) -> flo
 
 
 class ScaledRates:
-    """Multiplies the learning rates of every optimizer that steps in this thread, and puts them back afterwards.
+    """Multiplies the learning rates of optimizers that step in this thread, and puts them back afterwards.
 
     PyTorch's own hooks around `step` are used, so fused, sparse and selective optimizers are reached alike, the
     trainer's schedule is never disturbed, and a checkpoint holds the trainer's rates.
+
+    Args:
+        only: Gives the optimizers that are meant; None for all that step, of which the trainer alone knows.
 
     Attributes:
         factor: in force; 1 touches nothing.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, only: Optimizers | None = None) -> None:
         self.factor = 1.0
+        self._only = only
         self._thread = threading.get_ident()
         self._depth: dict[int, int] = {}  # a step can call the step of its base class
         self._before: dict[int, list[tuple[dict[str, Any], Any]]] = {}
@@ -61,6 +68,8 @@ class ScaledRates:
 
     def _scale(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         if self.factor == 1.0 or threading.get_ident() != self._thread:
+            return
+        if self._only is not None and not any(optimizer is one for one in self._only()):
             return
         key = id(optimizer)
         self._depth[key] = self._depth.get(key, 0) + 1

@@ -11,7 +11,7 @@ from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.refinement.foresight import Foresight, needed_share, watched_views
 from skipgs_plug.core.refinement.loop_range import LoopRange, line_of
 from skipgs_plug.core.refinement.milestones import milestones
-from skipgs_plug.core.refinement.rates import ScaledRates, path_factor
+from skipgs_plug.core.refinement.rates import Optimizers, ScaledRates, path_factor
 from skipgs_plug.core.refinement.thinning import Thinning
 
 log = logging.getLogger(__name__)
@@ -44,6 +44,7 @@ class Refinement:
         always: numbers that must run, by the reason.
         watched: views that are watched and not trained on while `foresight` says so.
         gap: iterations left out right before the present one.
+        optimizers: gives those whose rates are scaled; None for all that step.
     """
 
     def __init__(self, config: SkipConfig, go_on: Callable[[int], None]) -> None:
@@ -55,6 +56,7 @@ class Refinement:
         self.always: dict[str, set[int]] = {}
         self.watched: frozenset[str] = frozenset()
         self.gap = self._left_out = 0
+        self.optimizers: Optimizers | None = None
         self._rates: ScaledRates | None = None
         self._start = 0
         self._last: int | None = None
@@ -214,7 +216,7 @@ class Refinement:
             assert self.share is not None
             self.thinning.share = self.share
         if self._scales and self._rates is None:
-            self._rates = ScaledRates()
+            self._rates = ScaledRates(self.optimizers)
         log.info(
             "Refinement: at most %.0f %% of iterations %d to %d run, %d of them in any case.",
             100 * (self.share or 1.0),

@@ -57,7 +57,7 @@ def load_scene(
     else:
         raise MissingFileError(
             f"Scene {path} holds neither {path / 'sparse' / '0'} (COLMAP) nor {path / 'transforms_train.json'} "
-            "(Blender) nor transforms.json (nerfstudio); run COLMAP on it or give another folder."
+            f"(Blender) nor transforms.json (nerfstudio); for photographs run: skipgs-plug sfm {path} SCENE."
         )
     if cloud is None:
         return scene

@@ -12,6 +12,7 @@ from typing import Any
 
 import PIL.Image  # noqa: F401
 
+from skipgs_plug.install import install_command
 from skipgs_plug.trainer.errors import InputError
 
 # sys.modules keeps the order in which modules were loaded.
@@ -28,7 +29,5 @@ def import_pycolmap() -> Any:
     try:
         import pycolmap
     except ImportError as error:
-        raise InputError(
-            f"Cameras of photographs need pycolmap ({error}); run: pip install 'skipgs_plug[full]'."
-        ) from error
+        raise InputError(f"Cameras of photographs need pycolmap ({error}); run: {install_command()}.") from error
     return pycolmap

@@ -1,0 +1,7 @@
+"""`python -m skipgs_plug` is the command `skipgs-plug`."""
+
+import sys
+
+from skipgs_plug.cli import main
+
+sys.exit(main())

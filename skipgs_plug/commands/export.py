@@ -1,0 +1,53 @@
+"""`skipgs-plug export MODEL OUT`: a trained model in the formats of web viewers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.files import write_aside
+from skipgs_plug.trainer.ply import write_ply
+from skipgs_plug.view.model import open_model
+
+FORMATS = {".compressed.ply": "ply_compressed", ".splat": "splat"}  # as gsplat.export_splats calls them
+
+
+@dataclass
+class Args:
+    """Convert the last model of a run folder, or any 3DGS PLY. The ending of OUT chooses the format.
+
+    .compressed.ply: SuperSplat, PlayCanvas; 61 bytes per Gaussian, invisible ones left out.
+    .splat: antimatter15 and most web viewers; 32 bytes, colours that do not change with direction.
+    .ply: 62 properties, exact.
+    """
+
+    model: tyro.conf.Positional[str]
+    """Run folder or PLY."""
+    out: tyro.conf.Positional[Path]
+    """File to write."""
+
+
+def main(argv: list[str]) -> int:
+    return run(tyro.cli(Args, args=argv, prog="skipgs-plug export"))
+
+
+def run(args: Args) -> int:
+    """Convert; see `Args`."""
+    out = args.out.expanduser()
+    ending = next((ending for ending in (*FORMATS, ".ply") if out.name.lower().endswith(ending)), None)
+    if ending is None:
+        raise InputError(f"{out.name} has an ending that is not written here; use {', '.join(FORMATS)} or .ply.")
+    splats = open_model(args.model).snapshots[-1].load()
+    if ending == ".ply":
+        write_ply(splats, out)
+    else:
+        from gsplat import export_splats
+
+        data = export_splats(**splats, format=FORMATS[ending])
+        with write_aside(out) as temporary:
+            temporary.write_bytes(data)
+    print(f"{len(splats['means']):,} Gaussians, {out.stat().st_size / 2**20:.1f} MiB: {out}")
+    return 0

@@ -1,0 +1,42 @@
+"""The settings of the gate in a checkpoint: a run goes on with those that it began with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from skipgs_plug import SkipGate
+from skipgs_plug.trainer import InputError
+
+
+class GateSettings:
+    """Travels in the checkpoints of a trainer, and refuses one that was made with other settings.
+
+    Args:
+        gate: the gate of the run, None for a run without.
+    """
+
+    def __init__(self, gate: SkipGate | None) -> None:
+        self._settings = None if gate is None else gate.config.as_dict()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"settings": self._settings}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Compare.
+
+        Raises:
+            InputError: the checkpoint was made with other settings; names the first.
+        """
+        before = state["settings"]
+        if (before is None) != (self._settings is None):
+            raise InputError(
+                "The run was begun without the gate; resume it with --no-gate."
+                if before is None
+                else "The run was begun with the gate; resume it without --no-gate."
+            )
+        for name, value in (self._settings or {}).items():
+            if before.get(name) != value:
+                raise InputError(
+                    f"The run was begun with gate.{name}={before.get(name)!r}, not {value!r}; "
+                    "resume it with its settings."
+                )

@@ -1,0 +1,104 @@
+"""`skipgs-plug render MODEL OUT`: a film or pictures of a trained model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from skipgs_plug.trainer.backend import resolve_backend
+from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.scene import View
+from skipgs_plug.view.draw import Painter, colour_depth, depth_range, to_bytes
+from skipgs_plug.view.film import write_film, write_pictures
+from skipgs_plug.view.model import open_model
+from skipgs_plug.view.path import camera_path
+
+RANGE_FRAMES = 8  # frames that the colours of depth are fitted to
+
+
+@dataclass
+class Args:
+    """Render the last model of a run folder, or any 3DGS PLY, along a camera path or from the held-out cameras."""
+
+    model: tyro.conf.Positional[str]
+    """Run folder or PLY."""
+    out: tyro.conf.Positional[Path]
+    """Film to write (.mp4), or folder for PNG files."""
+    scene: str | None = None
+    """Scene that gives the cameras; default: the one the run folder names."""
+    cameras: Literal["path", "held-out"] = "path"
+    """A path through the training cameras in the order of names, or each held-out camera."""
+    show: Literal["colour", "depth", "both"] = "colour"
+    """Colour, depth (red is near), or both side by side."""
+    frames: int = 240
+    """Length of the path."""
+    fps: int = 30
+    """Frames per second of a film."""
+    data_factor: int | None = None
+    """Size of the frames, as that of the scene's images_{factor}; default: as in training."""
+    backend: str = "auto"
+    """auto, gsplat (CUDA) or warp (CPU)."""
+    no_progress: bool = False
+    """No progress bar."""
+
+
+def main(argv: list[str]) -> int:
+    return run(tyro.cli(Args, args=argv, prog="skipgs-plug render", config=(tyro.conf.FlagCreatePairsOff,)))
+
+
+def run(args: Args) -> int:
+    """Render and write; see `Args`."""
+    for name in ("frames", "fps"):
+        if getattr(args, name) < 1:
+            raise InputError(f"--{name} {getattr(args, name)} is too small; give at least 1.")
+    model = open_model(args.model, args.scene, args.data_factor)
+    if model.scene is None:
+        raise InputError(f"{args.model} names no cameras to render from; add --scene with the scene it shows.")
+    held_out = sorted(model.scene.test, key=lambda view: view.name)
+    train = sorted(model.scene.train, key=lambda view: view.name)
+    if args.cameras == "held-out" and not held_out:
+        raise InputError(f"Scene {model.scene.name} holds out no view; use --cameras path.")
+    splats = model.snapshots[-1].load()
+    painter = Painter(resolve_backend(args.backend), model.scene.background, model.antialiased)
+
+    if args.cameras == "path":
+        lens = train[0]
+        cameras = [(pose, lens) for pose in camera_path(train, args.frames)]
+        names = [f"frame_{i:04d}" for i in range(args.frames)]
+    else:
+        cameras = [(view.viewmat, view) for view in held_out]
+        names = [Path(view.name).with_suffix("").as_posix() for view in held_out]
+
+    def draw(camera: tuple[Tensor, View]) -> tuple[Tensor, Tensor]:
+        pose, lens = camera
+        return painter.draw(splats, pose, lens.K, lens.width, lens.height)
+
+    limits = (0.0, 1.0)
+    if args.show != "colour":
+        limits = depth_range([draw(camera)[1] for camera in cameras[:: max(1, len(cameras) // RANGE_FRAMES)]])
+
+    def frames() -> Iterator[np.ndarray]:
+        for camera in tqdm(cameras, desc="Rendering", disable=args.no_progress):
+            image, depth = draw(camera)
+            parts = {"colour": to_bytes(image), "depth": colour_depth(depth, limits)}
+            yield np.concatenate(list(parts.values()), axis=1) if args.show == "both" else parts[args.show]
+
+    out = args.out.expanduser()
+    if out.suffix.lower() == ".mp4":
+        if len({(lens.width, lens.height) for _, lens in cameras}) > 1:
+            raise InputError("The held-out views differ in size, which a film cannot; give a folder as OUT.")
+        write_film(out, frames(), args.fps)
+    elif out.suffix:
+        raise InputError(f"{out} ends neither in .mp4 nor is it a folder's name; give one of the two.")
+    else:
+        write_pictures(out, frames(), names)
+    depths = "" if args.show == "colour" else f", depth from {limits[0]:.3g} to {limits[1]:.3g} scene units"
+    print(f"{len(cameras)} frames, {len(splats['means']):,} Gaussians{depths}: {out}")
+    return 0

@@ -1,0 +1,154 @@
+"""One session of a run: the iterations that are left, what happens between them, and what they leave behind."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from skipgs_plug import SkipGate
+from skipgs_plug.commands.signals import stop_on_signal
+from skipgs_plug.core.report import write_report
+from skipgs_plug.files import WriteError, keep_going
+from skipgs_plug.trainer import InputError, Trainer
+from skipgs_plug.trainer.autosave import Autosave
+from skipgs_plug.trainer.curve import LossCurve
+from skipgs_plug.trainer.loop import Iteration
+from skipgs_plug.trainer.run_folder import RunFolder
+from skipgs_plug.trainer.scalars import ScalarLog
+from skipgs_plug.view.live import LiveView
+
+
+@dataclass
+class SessionOptions:
+    """What a session writes and shows, and when; none of it changes what is trained."""
+
+    save_every: int | None = None
+    """Iterations between two checkpoints, of which two are kept; default: five minutes of training; 0: the end only."""
+    eval_every: int = 0
+    """Iterations between two evaluations on the way; 0: the end only."""
+    tensorboard: bool = False
+    """Log gsplat's scalars and the gate's counters to RUN/tb, every tenth iteration."""
+    view: bool = False
+    """Show training in the browser; costs at most 2 % of its time."""
+    lpips_net: Literal["alex", "vgg"] | None = None
+    """Also report LPIPS; its weights must be on this machine."""
+    no_progress: bool = False
+    """No progress bar."""
+
+    def __post_init__(self) -> None:
+        for name in ("save_every", "eval_every"):
+            value = getattr(self, name)
+            if value is not None and value < 0:
+                raise InputError(f"{name}={value} is not a number of iterations; 0 stands for the end only.")
+
+
+class Session:
+    """Trains a trainer to its end, and writes the run folder.
+
+    A file that cannot be written costs that file only: the others are written, and the run ends with an error that
+    says how to get it. The folder is held by this process alone (`trainer.lock`).
+    """
+
+    def __init__(
+        self, options: SessionOptions, folder: RunFolder, trainer: Trainer, gate: SkipGate | None, curve: LossCurve
+    ) -> None:
+        self._options, self._folder, self._trainer, self._gate = options, folder, trainer, gate
+        self._curve = curve
+        self._live: LiveView | None = None
+        self._autosave = Autosave(folder, trainer, options.save_every)
+        self._split = "val" if trainer.scene.test else "train"
+        self._log: ScalarLog | None = None
+        self._failed: list[WriteError] = []
+
+    def run(self) -> int:
+        """Train, and finish unless a signal stopped training.
+
+        Returns:
+            0 for a finished run, 128 + number of the signal for one that was stopped.
+
+        Raises:
+            InputError: a file could not be written.
+        """
+        trainer, begun_at = self._trainer, self._trainer.step
+        with self._open_log() as self._log, self._open_view() as self._live:
+            trainer.on_step = self._after_iteration
+            with stop_on_signal(trainer) as stop:
+                trainer.train(progress=not self._options.no_progress)
+                with keep_going(self._failed):
+                    self._autosave.save()
+            trainer.on_step = None
+            if not stop.exit_code:
+                if self._gate is not None and trainer.step > begun_at:
+                    self._gate.verify()
+                self._finish()
+        if self._failed:
+            raise InputError(
+                f"{len(self._failed)} files of {self._folder.root} could not be written; make room, and the same "
+                "command with --resume writes them."
+            )
+        if stop.exit_code:
+            print(f"Stopped after iteration {trainer.step - 1:,}; the same command with --resume continues.")
+        return stop.exit_code
+
+    def _open_view(self) -> contextlib.AbstractContextManager[LiveView | None]:
+        if not self._options.view:
+            return contextlib.nullcontext()
+        live = LiveView(self._trainer)
+        print(f"Watch it at http://127.0.0.1:{live.page.port}")
+        return live
+
+    def _open_log(self) -> contextlib.AbstractContextManager[ScalarLog | None]:
+        if not self._options.tensorboard:
+            return contextlib.nullcontext()
+        more = self._gate.scalars if self._gate is not None else dict
+        return ScalarLog(self._folder.root / "tb", self._trainer, more)
+
+    def _after_iteration(self, iteration: Iteration) -> None:
+        self._curve.iteration(iteration)
+        if self._live is not None:
+            self._live.iteration(iteration)
+        if self._log is not None:
+            self._log.iteration(iteration)
+        every = self._options.eval_every
+        if every and iteration.completes(every) and iteration.step + 1 < self._trainer.max_steps:
+            from tqdm import tqdm
+
+            tqdm.write(f"Iteration {iteration.step:,}: {self._described(self._evaluate([]))}")
+        self._autosave.iteration(iteration)
+
+    def _evaluate(self, failed: list[WriteError]) -> dict[str, Any]:
+        stats = self._trainer.evaluate("test" if self._split == "val" else "train", self._options.lpips_net)
+        with keep_going(failed):
+            self._folder.write_stats(self._trainer, stats, self._split)
+        if self._log is not None:
+            self._log.evaluation(stats, self._split)
+        return stats
+
+    def _finish(self) -> None:
+        """Evaluate and write everything that a finished run leaves; also what an earlier session did not get to."""
+        folder, trainer = self._folder, self._trainer
+        stats = self._evaluate(self._failed)
+        with keep_going(self._failed):
+            self._curve.write(folder.root / "stats" / "train_curve.json")
+        with keep_going(self._failed):
+            folder.write_renders(trainer, self._split)
+        ply = None
+        with keep_going(self._failed):
+            ply = folder.write_ply(trainer)
+        if self._gate is not None:
+            with keep_going(self._failed):
+                write_report(self._gate, folder.root / "skipgs.json")
+            print(self._gate.summary())
+        print(f"{self._described(stats)}; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s")
+        if ply is not None:
+            print(ply)
+
+    def _described(self, stats: dict[str, Any]) -> str:
+        net = self._options.lpips_net
+        where = f"{stats['views']} held-out views" if self._split == "val" else "TRAINING views (none held out)"
+        lpips = f", LPIPS ({net}) {stats[f'lpips_{net}']:.4f}" if net else ""
+        return (
+            f"PSNR {stats['psnr']:.2f} dB, SSIM {stats['ssim']:.4f} (torchmetrics padding){lpips} on {where}; "
+            f"{stats['num_GS']:,} Gaussians"
+        )

@@ -1,0 +1,96 @@
+"""`skipgs-plug sfm PHOTOS SCENE`: photographs or a video to a scene that `train` reads."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from tqdm.auto import tqdm
+
+from skipgs_plug.photos.gather import gather
+from skipgs_plug.photos.reconstruct import Matching, Reconstruction
+from skipgs_plug.photos.scene_folder import check_target, write_scene
+from skipgs_plug.photos.unplaced import explain_unplaced
+from skipgs_plug.trainer.errors import InputError
+
+NAMES_SHOWN = 6
+
+
+@dataclass
+class Args:
+    """Reconstruct where photographs were taken (COLMAP, on the CPU) and write a scene for `skipgs-plug train`.
+
+    Photographs are matched each with each up to 100 of them, beyond that with their neighbours in the order of names.
+    """
+
+    photos: tyro.conf.Positional[Path]
+    """Folder of photographs, or a video."""
+    scene: tyro.conf.Positional[Path]
+    """COLMAP folder to write: images, images_2, images_4, images_8, sparse/0."""
+    frames: int = 100
+    """Frames to take from a video, each the sharpest of its group."""
+    matching: Matching = "auto"
+    """Which photographs are compared."""
+    no_progress: bool = False
+    """No progress bars."""
+
+
+def main(argv: list[str]) -> int:
+    return run(tyro.cli(Args, args=argv, prog="skipgs-plug sfm", config=(tyro.conf.FlagCreatePairsOff,)))
+
+
+def run(args: Args) -> int:
+    """Reconstruct and print what was placed; see `Args`."""
+    if args.frames < 3:
+        raise InputError(f"--frames {args.frames} is too few to reconstruct from; give at least 3, better 100.")
+    scene = args.scene.expanduser()
+    photos = args.photos.expanduser()
+    check_target(scene, photos)
+    scene.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{scene.name}.", dir=scene.parent))
+
+    def bar(title: str, total: int | None = None) -> tqdm:
+        return tqdm(total=total, desc=title, disable=args.no_progress, unit="", leave=False)
+
+    try:
+        with bar("Reading photographs") as shown:
+            gathered = gather(photos, work / "photos", args.frames, shown.update)
+        count = len(gathered.names)
+        reconstruction = Reconstruction(gathered, work)
+        with bar("Finding features", count) as shown:
+            reconstruction.extract(shown.update)
+        with bar("Matching pairs") as shown:
+            matching = reconstruction.match(args.matching, shown.update)
+        with bar("Placing photographs", count) as shown:
+            models = reconstruction.map(shown.update)
+        unplaced = explain_unplaced(gathered, models, reconstruction.database)
+        error = models[0].compute_mean_reprojection_error()
+        points = models[0].num_points3D()
+        with bar("Writing the scene", count - len(unplaced)) as shown:
+            written = write_scene(reconstruction.undistort(models[0]), scene, shown.update)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    print(f"{written} of {count} photographs placed ({matching} matching), {points:,} points, ", end="")
+    print(f"mean reprojection error {error:.2f} px.")
+    print_unplaced(unplaced, matching)
+    print(f"Scene: {scene}. Next: skipgs-plug train {scene} --out runs/{scene.resolve().name}")
+    return 0
+
+
+def print_unplaced(reasons: dict[str, str], matching: str) -> None:
+    """Say which photographs were left out, by reason."""
+    if not reasons:
+        return
+    by_reason = defaultdict(list)
+    for name, reason in reasons.items():
+        by_reason[reason].append(name)
+    print("Not placed:")
+    for reason, names in by_reason.items():
+        more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+        print(f"  {', '.join(names[:NAMES_SHOWN])}{more}: {reason}")
+    if matching == "sequential":
+        print("  Mostly neighbours in the order of names were compared; --matching exhaustive compares all, slowly.")

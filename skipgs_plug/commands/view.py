@@ -1,0 +1,67 @@
+"""`skipgs-plug view MODEL`: a trained model in the browser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import tyro
+from torch import Tensor
+
+from skipgs_plug.trainer.backend import resolve_backend
+from skipgs_plug.trainer.scene import BLACK, View
+from skipgs_plug.view.draw import Painter
+from skipgs_plug.view.model import open_model
+from skipgs_plug.view.page import Page, Splats
+
+
+@dataclass
+class Args:
+    """Serve a page with the model, its cameras, and photographs beside renders and errors, until Ctrl-C."""
+
+    model: tyro.conf.Positional[str]
+    """Run folder or PLY."""
+    scene: str | None = None
+    """Scene with the photographs; default: the one the run folder names. A PLY is shown without, too."""
+    data_factor: int | None = None
+    """Reduction of the photographs; default: as in training."""
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 lets other machines of the network in."""
+    port: int = 8080
+    """Port to listen on; the next free one is taken."""
+    backend: str = "auto"
+    """auto, gsplat (CUDA) or warp (CPU)."""
+
+
+def main(argv: list[str]) -> int:
+    return run(tyro.cli(Args, args=argv, prog="skipgs-plug view", config=(tyro.conf.FlagCreatePairsOff,)))
+
+
+def run(args: Args) -> int:
+    """Serve the page; see `Args`."""
+    model = open_model(args.model, args.scene, args.data_factor)
+    painter = Painter(
+        resolve_backend(args.backend), model.scene.background if model.scene else BLACK, model.antialiased
+    )
+
+    def draw(splats: Splats, view: View) -> Tensor:
+        return painter.draw(splats, view.viewmat, view.K, view.width, view.height)[0]
+
+    by_step = {snapshot.step: snapshot for snapshot in model.snapshots}
+    steps = [step for step in by_step if step is not None]
+    page = Page(model.scene, draw, steps, args.host, args.port)
+    print(f"{model.name}: http://{args.host}:{page.port} (Ctrl-C ends)", flush=True)
+    shown = object()
+    try:
+        while True:
+            step = page.chosen_step if page.chosen_step is not None else model.snapshots[-1].step
+            if step != shown:
+                page.show(by_step[step].load(), model.name if step is None else f"Iteration {step:,}")
+                page.measure()
+                shown = step
+            else:
+                page.refresh()
+            page.wait()
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        page.stop()

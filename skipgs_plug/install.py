@@ -1,0 +1,44 @@
+"""How to get the optional packages, as a command that works wherever this package came from."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from importlib import metadata
+from pathlib import Path
+from urllib.parse import urlparse
+from urllib.request import url2pathname
+
+NAME = "skipgs_plug"
+
+
+def install_command(extra: str = "full") -> str:
+    """Return the `pip install` command for an extra of this package, from where the package itself came from."""
+    root = Path(__file__).resolve().parents[1]
+    if _is_checkout(root):
+        return f"pip install -e {shlex.quote(f'{root}[{extra}]')}"
+    source = _source()
+    return f"pip install {shlex.quote(f'{NAME}[{extra}]' + (f' @ {source}' if source else ''))}"
+
+
+def _is_checkout(root: Path) -> bool:
+    try:
+        return re.search(rf'^name = "{NAME}"$', (root / "pyproject.toml").read_text("utf-8"), re.MULTILINE) is not None
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _source() -> str | None:
+    """Return where the installed package came from when that is no index (PEP 610)."""
+    try:
+        found = json.loads(metadata.distribution(NAME).read_text("direct_url.json") or "{}")
+    except (metadata.PackageNotFoundError, ValueError):
+        return None
+    url = found.get("url")
+    if url is None:
+        return None
+    if url.startswith("file:") and not Path(url2pathname(urlparse(url).path)).exists():
+        return None
+    vcs = found.get("vcs_info")
+    return f"{vcs['vcs']}+{url}@{vcs['commit_id']}" if vcs else url

@@ -1,0 +1,117 @@
+"""Photographs as reconstruction wants them: upright, in formats that COLMAP reads, in one folder."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image, ImageOps
+
+from skipgs_plug.photos.video import VIDEO_SUFFIXES, sharpest_frames
+from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.loaders.images import ORIENTATION, decode
+
+AS_THEY_ARE = (".jpg", ".jpeg", ".png")
+CONVERTED = (".webp", ".bmp", ".tif", ".tiff")
+UNREADABLE = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
+MODEL, FOCAL_LENGTH, EXIF_BLOCK = 0x0110, 0x920A, 0x8769  # EXIF tags
+QUALITY: dict[str, Any] = {"quality": 97, "subsampling": 0}
+LEAST = 3  # photographs, below which nothing can be reconstructed
+
+
+@dataclass
+class Gathered:
+    """Photographs in a folder of their own.
+
+    Attributes:
+        names: paths relative to the folder, sorted.
+        one_camera: whether all have one size, camera model and focal length, so that they share intrinsics.
+    """
+
+    folder: Path
+    names: list[str]
+    one_camera: bool
+
+
+def gather(source: Path, folder: Path, frames: int, progress: Callable[[int], None]) -> Gathered:
+    """Put the photographs of `source` (a folder or a video) into `folder`.
+
+    Files are linked where they can stay as they are; photographs with an EXIF orientation are turned upright.
+
+    Args:
+        frames: how many a video gives, each the sharpest of its group.
+        progress: called with 1 for every photograph.
+
+    Raises:
+        MissingFileError: `source` does not exist.
+        InputError: a photograph or the video cannot be decoded, or there are fewer than three photographs.
+    """
+    if not source.exists():
+        raise MissingFileError(f"{source} does not exist; give a folder of photographs or a video.")
+    if source.is_file():
+        if source.suffix.lower() not in VIDEO_SUFFIXES:
+            raise InputError(f"{source} is neither a folder nor a video ({' '.join(VIDEO_SUFFIXES)}).")
+        gathered = gather_video(source, folder, frames, progress)
+    else:
+        gathered = gather_folder(source, folder, progress)
+    if len(gathered.names) < LEAST:
+        raise InputError(f"{source} gives {len(gathered.names)} photographs; take at least 20 that overlap.")
+    return gathered
+
+
+def gather_video(source: Path, folder: Path, frames: int, progress: Callable[[int], None]) -> Gathered:
+    names = []
+    folder.mkdir(parents=True)
+    for number, frame in sharpest_frames(source, frames):
+        names.append(f"frame_{number:06d}.jpg")
+        Image.fromarray(frame).save(folder / names[-1], **QUALITY)
+        progress(1)
+    return Gathered(folder, names, one_camera=True)
+
+
+def gather_folder(source: Path, folder: Path, progress: Callable[[int], None]) -> Gathered:
+    files = [path for path in sorted(source.rglob("*")) if path.is_file() and not path.name.startswith(".")]
+    unreadable = [path for path in files if path.suffix.lower() in UNREADABLE]
+    if unreadable:
+        raise InputError(
+            f"{unreadable[0]} has a format that cannot be read here ({len(unreadable)} such files); export as JPEG."
+        )
+    names, cameras = [], set()
+    for path in files:
+        if path.suffix.lower() not in AS_THEY_ARE + CONVERTED:
+            continue
+        name, camera = place(path, source, folder)
+        names.append(name)
+        cameras.add(camera)
+        progress(1)
+    return Gathered(folder, sorted(names), one_camera=len(cameras) == 1)
+
+
+def place(path: Path, source: Path, folder: Path) -> tuple[str, tuple[object, ...]]:
+    """Link or convert one photograph; return its name and what tells its camera from others."""
+    picture = decode(path, path)  # also so that a damaged file is named here, not by C++ code later
+    exif = picture.getexif()
+    target = folder / path.relative_to(source)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix.lower() in CONVERTED:
+        target = target.with_name(f"{path.name}.jpg")
+    if exif.get(ORIENTATION, 1) != 1 or path.suffix.lower() in CONVERTED:
+        picture = ImageOps.exif_transpose(picture)
+        options: dict[str, Any] = {} if target.suffix.lower() == ".png" else QUALITY
+        picture.convert("RGB").save(target, exif=picture.getexif(), **options)
+    else:
+        link(path, target)
+    camera = (picture.size, exif.get(MODEL), exif.get_ifd(EXIF_BLOCK).get(FOCAL_LENGTH))
+    return target.relative_to(folder).as_posix(), camera
+
+
+def link(path: Path, target: Path) -> None:
+    """Link where the file system can, else copy."""
+    try:
+        os.link(path, target)
+    except OSError:
+        shutil.copyfile(path, target)

@@ -1,0 +1,110 @@
+"""Structure from motion by pycolmap: features, matches, mapping, undistortion."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from skipgs_plug.photos.gather import Gathered
+from skipgs_plug.photos.progress import counted
+from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.loaders.native import import_pycolmap
+
+EXHAUSTIVE_UP_TO = 100  # photographs; beyond, all pairs take longer than neighbours in order
+OVERLAP = 10  # neighbours on either side, then those 16, 32, ... away
+KEY_PHOTOGRAPHS = 40  # of a sequence, compared each with each
+FEATURE_SIZE = 1600  # larger sides are reduced for feature detection, which gains little above
+SEED = 0
+
+Matching = Literal["auto", "exhaustive", "sequential"]
+Progress = Callable[[int], None]
+
+
+class Reconstruction:
+    """One reconstruction under way: its database and models lie in `work`.
+
+    Every step takes a function that is called with the number of finished photographs (of pairs, for matching).
+    """
+
+    def __init__(self, photos: Gathered, work: Path) -> None:
+        self._colmap = import_pycolmap()
+        self._colmap.logging.minloglevel = int(self._colmap.logging.FATAL)  # what matters is raised or counted here
+        self._photos = photos
+        self._work = work
+        self.database = work / "database.db"
+
+    def extract(self, progress: Progress) -> None:
+        """Detect features."""
+        options = self._colmap.FeatureExtractionOptions()
+        options.max_image_size = FEATURE_SIZE
+        mode = self._colmap.CameraMode.SINGLE if self._photos.one_camera else self._colmap.CameraMode.AUTO
+        with counted(self.database, "descriptors", progress):
+            self._colmap.extract_features(
+                self.database, self._photos.folder, self._photos.names, camera_mode=mode, extraction_options=options
+            )
+
+    def match(self, matching: Matching, progress: Progress) -> str:
+        """Match features and verify them geometrically; return the kind of matching that was taken."""
+        if matching == "auto":
+            matching = "exhaustive" if len(self._photos.names) <= EXHAUSTIVE_UP_TO else "sequential"
+        verification = self._colmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = SEED
+        with counted(self.database, "two_view_geometries", progress):
+            if matching == "exhaustive":
+                self._colmap.match_exhaustive(self.database, verification_options=verification)
+            else:
+                options = self._colmap.SequentialPairingOptions()
+                options.overlap = OVERLAP
+                self._colmap.match_sequential(self.database, pairing_options=options, verification_options=verification)
+                pairs = self._colmap.ImportedPairingOptions()
+                pairs.match_list_path = self._work / "pairs.txt"
+                pairs.match_list_path.write_text("\n".join(f"{a} {b}" for a, b in key_pairs(self._photos.names)))
+                self._colmap.match_image_pairs(self.database, pairing_options=pairs, verification_options=verification)
+        return matching
+
+    def map(self, progress: Progress) -> list[Any]:
+        """Place photographs and points; return the models, largest first.
+
+        Raises:
+            InputError: no two photographs could be placed.
+        """
+        options = self._colmap.IncrementalPipelineOptions()
+        options.random_seed = SEED
+        options.min_model_size = 3
+        # Points that two photographs alone show start training well, and are half of all in small sets.
+        options.triangulation.ignore_two_view_tracks = False
+        output = self._work / "models"
+        output.mkdir()
+        models = self._colmap.incremental_mapping(
+            self.database,
+            self._photos.folder,
+            output,
+            options=options,
+            initial_image_pair_callback=lambda: progress(2),
+            next_image_callback=lambda: progress(1),
+        )
+        if not models:
+            raise InputError(
+                f"None of the {len(self._photos.names)} photographs could be placed; take sharper ones that overlap by "
+                "two thirds, and walk around the subject instead of turning on the spot."
+            )
+        return sorted(models.values(), key=lambda model: -model.num_reg_images())
+
+    def undistort(self, model: Any) -> Path:
+        """Write the photographs of a model without distortion; return the folder with `images` and `sparse`."""
+        chosen, output = self._work / "chosen", self._work / "undistorted"
+        chosen.mkdir()
+        model.write(chosen)
+        self._colmap.undistort_images(output, chosen, self._photos.folder, jpeg_quality=97)
+        return output
+
+
+def key_pairs(names: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield all pairs among photographs that are evenly spread over the sequence: walks return to where they were.
+
+    COLMAP's list of pairs is separated by spaces, so names that hold some are left out.
+    """
+    spread = names[:: max(1, len(names) // KEY_PHOTOGRAPHS)]
+    return itertools.combinations([name for name in spread if not any(map(str.isspace, name))], 2)

@@ -1,0 +1,46 @@
+"""Checkpoints while a run trains, so that a process that is killed loses minutes."""
+
+from __future__ import annotations
+
+from skipgs_plug.files import keep_going
+from skipgs_plug.trainer.loop import Iteration, Trainer
+from skipgs_plug.trainer.run_folder import RunFolder
+
+SECONDS = 300.0  # of training between two checkpoints, unless told otherwise
+
+
+class Autosave:
+    """Writes a checkpoint now and then; one that cannot be written is reported, and training goes on.
+
+    Args:
+        every: iterations between two checkpoints; None for five minutes of training; 0 for none.
+    """
+
+    def __init__(self, folder: RunFolder, trainer: Trainer, every: int | None) -> None:
+        self._folder, self._trainer, self._every = folder, trainer, every
+        self._saved_at, self._saved_step = trainer.t_total, trainer.step
+
+    def save(self) -> None:
+        """Write a checkpoint, unless this session began or saved in this iteration.
+
+        Raises:
+            WriteError: it cannot be written.
+        """
+        if self._trainer.step != self._saved_step:
+            self._folder.write_checkpoint(self._trainer)
+            self._saved_step = self._trainer.step
+
+    def iteration(self, iteration: Iteration) -> None:
+        """Save when it is time; may serve as `Trainer.on_step`."""
+        if not self._due(iteration):
+            return
+        with keep_going([]):
+            self.save()
+        self._saved_at = self._trainer.t_total
+
+    def _due(self, iteration: Iteration) -> bool:
+        if iteration.step + 1 == self._trainer.max_steps:  # whoever trains saves the end
+            return False
+        if self._every is None:
+            return self._trainer.t_total - self._saved_at >= SECONDS
+        return self._every > 0 and iteration.completes(self._every)

@@ -1,0 +1,51 @@
+"""The loss of a run over iterations and seconds, thinned, for plots."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from skipgs_plug.trainer.files import write_json
+from skipgs_plug.trainer.loop import Iteration, Trainer
+
+POINTS = 500  # of a whole run
+
+
+class LossCurve:
+    """Means of the loss over equal stretches of a run; its `iteration` may serve as `Trainer.on_step`.
+
+    It travels in the trainer's checkpoints, so that a continued run has one curve.
+    """
+
+    def __init__(self, trainer: Trainer) -> None:
+        self._trainer = trainer
+        self._every = max(1, trainer.max_steps // POINTS)
+        self._pending: list[float] = []
+        self._columns: dict[str, list[Any]] = {"step": [], "seconds": [], "loss": [], "num_GS": []}
+        trainer.register_state("loss_curve", self)
+
+    def iteration(self, iteration: Iteration) -> None:
+        """Take in one iteration."""
+        self._pending.append(iteration.loss)
+        if len(self._pending) < self._every:
+            return
+        values = (
+            iteration.step,
+            round(self._trainer.t_total, 3),
+            sum(self._pending) / len(self._pending),
+            len(self._trainer.splats["means"]),
+        )
+        for column, value in zip(self._columns.values(), values, strict=True):
+            column.append(value)
+        self._pending.clear()
+
+    def write(self, path: str | Path) -> None:
+        """Write columns `step` (last of its stretch), `seconds` of training so far, mean `loss`, `num_GS`."""
+        write_json(path, self._columns)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"pending": list(self._pending), **{name: list(column) for name, column in self._columns.items()}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._pending = list(state["pending"])
+        self._columns = {name: list(state[name]) for name in self._columns}

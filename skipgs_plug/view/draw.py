@@ -1,0 +1,86 @@
+"""Draw a model as a camera sees it, and colour depths."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skipgs_plug.trainer.backend import Backend
+
+NEAR_PLANE = 0.01
+DEPTH_QUANTILES = (0.02, 0.98)
+
+
+class Painter:
+    """Renders models of the raw parameters that a trainer holds.
+
+    Args:
+        background: colour in [0, 1] behind the model.
+        antialiased: as the model was trained.
+    """
+
+    def __init__(self, backend: Backend, background: tuple[float, float, float], antialiased: bool = False) -> None:
+        self._backend = backend
+        self._background = background
+        self._mode = "antialiased" if antialiased else "classic"
+
+    @torch.no_grad()
+    def draw(
+        self,
+        splats: Mapping[str, Tensor],
+        viewmat: Tensor,  # [4, 4]
+        K: Tensor,  # [3, 3]
+        width: int,
+        height: int,
+    ) -> tuple[Tensor, Tensor]:
+        """Return colour [H, W, 3] in [0, 1] and expected depth [H, W] in scene units, 0 where nothing is."""
+        device = self._backend.device
+        raw = {name: tensor.detach().to(device) for name, tensor in splats.items()}
+        background = torch.tensor([self._background], device=device) if any(self._background) else None
+        with self._backend.exclusive_cores():
+            image, _, _ = self._backend.rasterization(
+                means=raw["means"],
+                quats=raw["quats"],
+                scales=torch.exp(raw["scales"]),
+                opacities=torch.sigmoid(raw["opacities"]),
+                colors=torch.cat([raw["sh0"], raw["shN"]], dim=1),
+                viewmats=viewmat[None].to(device),
+                Ks=K[None].to(device),
+                width=width,
+                height=height,
+                near_plane=NEAR_PLANE,
+                sh_degree=round((1 + raw["shN"].shape[1]) ** 0.5) - 1,
+                render_mode="RGB+ED",
+                rasterize_mode=self._mode,
+                backgrounds=background,
+                packed=False,
+            )
+        return image[0, ..., :3].clamp(0, 1).cpu(), image[0, ..., 3].cpu()
+
+
+def to_bytes(image: Tensor) -> np.ndarray:
+    """Return an image [H, W, 3] in [0, 1] as uint8."""
+    return (image.clamp(0, 1) * 255).round().byte().numpy()
+
+
+def depth_range(depths: list[Tensor]) -> tuple[float, float]:
+    """Return the depths between which nearly all of these maps [H, W] lie; 0 counts as empty."""
+    known = torch.cat([depth[depth > 0] for depth in depths])
+    if len(known) == 0:
+        return 0.0, 1.0
+    low, high = np.quantile(known.numpy(), DEPTH_QUANTILES)
+    return float(low), float(max(high, low + 1e-6))
+
+
+def colour_depth(depth: Tensor, limits: tuple[float, float]) -> np.ndarray:
+    """Return depths [H, W] as colours [H, W, 3] uint8: red is near, blue is far, black is empty."""
+    from matplotlib import colormaps
+
+    low, high = limits
+    nearness = ((high - depth) / (high - low)).clamp(0, 1).numpy()
+    colours = (colormaps["turbo"](nearness)[..., :3] * 255).round().astype(np.uint8)
+    colours[depth.numpy() <= 0] = 0
+    return colours

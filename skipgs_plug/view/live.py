@@ -1,0 +1,45 @@
+"""The page while a model trains."""
+
+from __future__ import annotations
+
+import time
+
+from skipgs_plug.trainer.loop import Iteration, Trainer
+from skipgs_plug.view.page import Page
+
+SHARE = 0.02  # of the time of training that the page may take
+EVERY = 2.0  # seconds between two models, at least
+LOOK = 0.5  # seconds between two looks for visitors
+
+
+class LiveView:
+    """Shows a trainer's model as it grows; its `iteration` may serve as `Trainer.on_step`.
+
+    It reads parameters and random state of nobody, so training gives the same result with it. Each update is timed,
+    and the next waits until it has cost no more than 2 % of training; without visitors there is none.
+    """
+
+    def __init__(self, trainer: Trainer, host: str = "127.0.0.1", port: int = 8080) -> None:
+        self._trainer = trainer
+        self.page = Page(trainer.scene, lambda _, view: trainer.render(view).clamp(0, 1), host=host, port=port)
+        self._next = 0.0
+
+    def iteration(self, iteration: Iteration) -> None:
+        """Show the model if it is time to and somebody looks on."""
+        now = time.perf_counter()
+        if now < self._next:
+            return
+        if self.page.visitors == 0:
+            self._next = now + LOOK
+            return
+        self.page.show(
+            dict(self._trainer.splats.items()), f"Iteration {iteration.step:,} of {self._trainer.max_steps:,}"
+        )
+        done = time.perf_counter()
+        self._next = done + max(EVERY, (done - now) / SHARE)
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.page.stop()

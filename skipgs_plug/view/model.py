@@ -1,0 +1,120 @@
+"""What a run folder or a PLY file holds to look at: models by iteration, and the scene they were trained on."""
+
+from __future__ import annotations
+
+import pickle
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.loaders import load_scene
+from skipgs_plug.trainer.ply import read_ply
+from skipgs_plug.trainer.scene import Scene
+
+# Where trainers leave their models: ours and gsplat's, then Inria's and those of its family. The last one of an
+# iteration counts: it is the format that is quickest to read.
+PLACES = ("ckpts/ckpt_*_rank0.pt", "point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
+NUMBER = re.compile(r"(?:ckpt|point_cloud|iteration)_(\d+)")
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A model as it was after an iteration; `step` is None for a single file."""
+
+    step: int | None
+    path: Path
+
+    def load(self) -> dict[str, Tensor]:
+        """Return the raw parameters `means scales quats opacities sh0 shN`.
+
+        Raises:
+            InputError: the file is damaged or no model.
+        """
+        if self.path.suffix == ".ply":
+            return read_ply(self.path)
+        try:
+            splats = torch.load(self.path, map_location="cpu", weights_only=True)["splats"]
+            return {name: splats[name] for name in ("means", "scales", "quats", "opacities", "sh0", "shN")}
+        except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, OSError, ValueError) as error:
+            raise InputError(f"Checkpoint {self.path} is damaged or not one of this trainer; remove it.") from error
+
+
+@dataclass
+class Model:
+    """Snapshots by iteration, the scene if it is known, and the settings that change how a model looks."""
+
+    name: str
+    snapshots: list[Snapshot]
+    scene: Scene | None
+    antialiased: bool = False
+
+
+def open_model(path: str | Path, scene: str | None = None, data_factor: int | None = None) -> Model:
+    """Open a run folder, or a PLY of any trainer.
+
+    Args:
+        scene: scene to take instead of the one that the run folder names.
+        data_factor: reduction of its images; default: as in training, 1 for a PLY.
+
+    Raises:
+        MissingFileError: there is no such file, no model in the folder, or no scene where the run folder says.
+        InputError: a file is damaged.
+    """
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise MissingFileError(f"{path} does not exist; give a run folder or a PLY.")
+    config: Mapping[str, Any] = {}
+    if path.is_file():
+        if path.suffix.lower() != ".ply":
+            raise InputError(f"{path} is neither a run folder nor a PLY.")
+        snapshots = [Snapshot(None, path)]
+    else:
+        snapshots = find_snapshots(path)
+        config = read_config(path)
+    source = scene or config.get("data_dir")
+    factor = data_factor or config.get("data_factor", 1)
+    loaded = None
+    if source:
+        if not scene and not Path(source).exists():
+            raise MissingFileError(f"{path} was trained on {source}, which does not exist here; add --scene.")
+        splits = {name: config[name] for name in ("test_every", "init_num_pts") if name in config}
+        loaded = load_scene(source, factor, **splits)
+    return Model(path.stem, snapshots, loaded, bool(config.get("antialiased", False)))
+
+
+def find_snapshots(folder: Path) -> list[Snapshot]:
+    """Return the models of a run folder, by iteration.
+
+    Raises:
+        MissingFileError: there is none.
+    """
+    found = {}
+    for place in PLACES:
+        for path in folder.glob(place):
+            number = NUMBER.search(path.relative_to(folder).as_posix())
+            if number:
+                step = int(number.group(1))
+                found[step] = Snapshot(step, path)
+    if not found:
+        raise MissingFileError(f"{folder} holds no model ({', '.join(PLACES)}); give a run folder or a PLY.")
+    return [found[step] for step in sorted(found)]
+
+
+def read_config(folder: Path) -> Mapping[str, Any]:
+    """Return the content of cfg.yml; empty for folders of other trainers, which have none or another."""
+    import yaml
+
+    file = folder / "cfg.yml"
+    if not file.is_file():
+        return {}
+    try:
+        content = yaml.safe_load(file.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError):
+        return {}  # gsplat's holds Python objects
+    return content if isinstance(content, dict) else {}

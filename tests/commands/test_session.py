@@ -1,0 +1,250 @@
+"""A run that is killed, stopped, starved of disk space or shared loses nothing, and ends as if nothing happened."""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from skipgs_plug.cli import main
+from skipgs_plug.trainer import Trainer, save_packed
+from skipgs_plug.trainer.synthetic import make_scene
+
+OPTIONS = ["--max-steps", "60", "--refine-every", "10", "--no-progress", "--warmup", "6", "--save-every", "20"]
+DECIDED = ("iterations", "gated_iterations", "backwards_run", "backwards_skipped", "reasons", "events", "views")
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("scene") / "tiny.npz"
+    save_packed(make_scene(n_views=10, width=32, height=24, n_points=160), path)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def whole(packed: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that nothing happened to."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    assert train(packed, out) == 0
+    return out
+
+
+def train(packed: str, out: Path, *more: str) -> int:
+    return main(["train", packed, "--out", str(out), *OPTIONS, *more])
+
+
+def checkpoints(out: Path) -> list[str]:
+    return sorted(path.name for path in (out / "ckpts").iterdir())
+
+
+def assert_same(out: Path, whole: Path) -> None:
+    """Same files, same bytes of models and pictures, same moments and decisions."""
+    kept = [{p.relative_to(r).as_posix() for p in r.rglob("*") if p.is_file()} for r in (out, whole)]
+    for names in kept:
+        names -= {name for name in names if name.startswith("ckpts/") and "_59_" not in name}
+    assert kept[0] == kept[1]
+    for name in kept[0]:
+        if name.startswith(("ply/", "renders/", "stats/")):
+            assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+    one, two = (torch.load(run / "ckpts/ckpt_59_rank0.pt", weights_only=True) for run in (out, whole))
+    for name in one["splats"]:
+        assert torch.equal(one["splats"][name], two["splats"][name]), name
+        for key, moment in one["optimizers"][name].items():
+            assert torch.equal(moment, two["optimizers"][name][key]), (name, key)
+    reports = [json.loads((run / "skipgs.json").read_text()) for run in (out, whole)]
+    for key in DECIDED:
+        assert reports[0][key] == reports[1][key], key
+
+
+def fail_to_write(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """Let the disk be full for files whose name contains one of these."""
+    replace = os.replace
+
+    def full(source: str | Path, target: str | Path) -> None:
+        if any(name in str(target) for name in names):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(source))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+
+
+def test_checkpoints_on_the_way_and_the_last_two_stay(whole: Path) -> None:
+    assert checkpoints(whole) == ["ckpt_39_rank0.pt", "ckpt_59_rank0.pt"]
+    assert not [path for path in whole.rglob(".*") if path.name != ".lock"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_a_checkpoint(
+    tmp_path: Path, packed: str, whole: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save = Trainer.save_checkpoint
+
+    def interrupted(self: Trainer, path: Path) -> None:
+        save(self, path)
+        if self.step == 20:  # during a save
+            os.kill(os.getpid(), number)
+
+    handlers = [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)]
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "save_checkpoint", interrupted)
+        assert train(packed, tmp_path / "run") == 128 + number
+    assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)] == handlers
+    assert checkpoints(tmp_path / "run") == ["ckpt_19_rank0.pt"]
+    assert train(packed, tmp_path / "run", "--resume") == 0
+    assert_same(tmp_path / "run", whole)
+
+
+def test_a_second_signal_ends_at_once_and_keeps_what_was_saved(
+    tmp_path: Path, packed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train_step = Trainer.train_step
+
+    def interrupted(self: Trainer) -> float:
+        if self.step == 30:
+            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGTERM)
+        return train_step(self)
+
+    monkeypatch.setattr(Trainer, "train_step", interrupted)
+    assert train(packed, tmp_path) == 130
+    assert checkpoints(tmp_path) == ["ckpt_19_rank0.pt"]
+
+
+@pytest.mark.parametrize("lost", ["ply/", "renders/", "stats/", "skipgs.json"])
+def test_a_finished_run_is_completed(tmp_path: Path, packed: str, whole: Path, lost: str) -> None:
+    """Killed while it wrote what a run leaves, with half a file aside."""
+    out = tmp_path / "run"
+    subprocess.run(["cp", "-r", str(whole), str(out)], check=True)
+    for path in [
+        path for path in out.rglob("*") if path.relative_to(out).as_posix().startswith(lost) and path.is_file()
+    ]:
+        path.rename(path.with_name(f".{path.name}.4711.tmp"))
+    (out / ".skipgs.json.4711").write_text("{")
+    assert train(packed, out, "--resume") == 0
+    assert_same(out, whole)
+
+
+def test_a_full_disk_costs_one_checkpoint(
+    tmp_path: Path, packed: str, whole: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    fail_to_write(monkeypatch, "ckpt_19_", "ckpt_39_")
+    assert train(packed, tmp_path / "run") == 0
+    assert checkpoints(tmp_path / "run") == ["ckpt_59_rank0.pt"]
+    sentences = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert len(sentences) == 2 and all("it needs about 0." in sentence for sentence in sentences)
+    assert "ckpt_19_rank0.pt cannot be written (No space left on device)" in sentences[0]
+    assert_same(tmp_path / "run", whole)
+
+
+def test_a_full_disk_at_the_end_costs_those_files(
+    tmp_path: Path, packed: str, whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with monkeypatch.context() as patch:
+        fail_to_write(patch, ".ply", "skipgs.json")
+        assert train(packed, tmp_path / "run") == 2
+    assert "2 files of" in capsys.readouterr().err
+    assert (tmp_path / "run/stats/val_step59.json").is_file() and (tmp_path / "run/renders").is_dir()
+    assert train(packed, tmp_path / "run", "--resume") == 0
+    assert_same(tmp_path / "run", whole)
+
+
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(
+    tmp_path: Path, packed: str, whole: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    subprocess.run(["cp", "-r", str(whole), str(out)], check=True)
+    newest, older = out / "ckpts/ckpt_59_rank0.pt", out / "ckpts/ckpt_39_rank0.pt"
+    newest.write_bytes(newest.read_bytes()[:-5000])
+    assert train(packed, out, "--resume") == 0
+    assert "Trying ckpt_39_rank0.pt" in caplog.text and "iterations 40 to 60" in capsys.readouterr().out
+    assert_same(out, whole)
+    content = torch.load(newest, weights_only=True)  # damaged inside, where only the gate can see it
+    content["registered"]["skipgs"]["policy"]["budget"]["floor"] = "high"
+    torch.save(content, newest)
+    assert train(packed, out, "--resume") == 0
+    assert_same(out, whole)
+    for path in (newest, older):
+        path.write_bytes(b"")
+    assert train(packed, out, "--resume") == 2
+    assert "ckpt_39_rank0.pt is damaged" in capsys.readouterr().err
+
+
+def test_a_run_is_extended(tmp_path: Path, packed: str, whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    subprocess.run(["cp", "-r", str(whole), str(out)], check=True)
+    extend = ["train", packed, "--out", str(out), *OPTIONS[2:], "--resume"]
+    assert main([*extend, "--max-steps", "70", "--eval-every", "5"]) == 0
+    shown = capsys.readouterr().out
+    assert "iterations 60 to 70, gate active from 30" in shown and "Iteration 64: PSNR" in shown
+    assert (out / "ply/point_cloud_69.ply").is_file() and (out / "stats/val_step64.json").is_file()
+    assert main(extend) == 0  # without a number it ends where it ended
+    assert "iterations 70 to 70" in capsys.readouterr().out
+    assert main([*extend, "--max-steps", "50"]) == 2
+    assert "more than max_steps=50" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--threshold", "0.1"], r"gate.threshold=0.0, not 0.1"),
+        (["--no-gate"], r"begun with the gate"),
+        (["--sh0-lr", "0.1"], r"sh0_lr=0.0025, not 0.1"),
+    ],
+)
+def test_other_settings_are_refused(
+    packed: str, whole: Path, options: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(packed, whole, "--resume", *options) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_two_processes_do_not_share_a_folder(tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code = (
+        "import sys, pathlib; from skipgs_plug.trainer.lock import exclusive\n"
+        "with exclusive(pathlib.Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None and other.stdout.readline() == b"held\n"
+        assert train(packed, tmp_path) == 2
+        assert f"is in use by process {other.pid} on {os.uname().nodename}" in capsys.readouterr().err
+        other.kill()
+    assert (tmp_path / ".owner.json").is_file()  # left behind, and no obstacle
+    assert train(packed, tmp_path, "--max-steps", "2") == 0
+    assert not (tmp_path / ".owner.json").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_one_sentence(
+    tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert train(packed, tmp_path / "file/run") == 2
+    error = capsys.readouterr().err
+    assert "cannot be written (Not a directory)" in error and "Traceback" not in error
+
+
+def test_a_run_folder_that_vanishes_is_made_anew(
+    tmp_path: Path, packed: str, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train_step, out = Trainer.train_step, tmp_path / "run"
+
+    def vanishing(self: Trainer) -> float:
+        if self.step == 30:
+            shutil.rmtree(out)
+        return train_step(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "train_step", vanishing)
+        assert train(packed, out) == 0
+    assert checkpoints(out) == checkpoints(whole)[-2:]
+    assert (out / "ply/point_cloud_59.ply").read_bytes() == (whole / "ply/point_cloud_59.ply").read_bytes()
+    assert train(packed, out, "--resume") == 0

@@ -1,0 +1,87 @@
+"""Photographs as they come from phones and cameras: orientation, formats, sharp and blurred frames."""
+
+from __future__ import annotations
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from PIL import Image
+
+from skipgs_plug.photos.gather import gather
+from skipgs_plug.photos.video import sharpest_frames, sharpness
+from skipgs_plug.trainer import InputError
+from skipgs_plug.trainer.loaders.images import ORIENTATION
+
+# imageio-ffmpeg leaves the pipes of a decoder that has ended to the garbage collector.
+LEAVES_PIPES = "ignore:unclosed file:ResourceWarning"
+
+
+@pytest.fixture
+def pattern() -> np.ndarray:
+    """Blocks of 4x4 pixels in random colours, 96x64."""
+    blocks = np.random.default_rng(0).integers(0, 256, (16, 24, 3), dtype=np.uint8)
+    return blocks.repeat(4, axis=0).repeat(4, axis=1)
+
+
+def blur(image: np.ndarray, size: int) -> np.ndarray:
+    """Return the image averaged over shifts of up to `size` pixels to the right: motion."""
+    return np.mean([np.roll(image, k, axis=1) for k in range(size)], axis=0).astype(np.uint8)
+
+
+def test_photographs_are_turned_upright_and_keep_what_exif_says(pattern, tmp_path):
+    source = tmp_path / "source"
+    (source / "left").mkdir(parents=True)
+    exif = Image.Exif()
+    exif[0x0110] = "Camera"
+    for name, orientation in (("a.jpg", 1), ("b.jpg", 6), ("left/c.jpg", 1)):
+        exif[ORIENTATION] = orientation
+        picture = Image.fromarray(np.rot90(pattern) if orientation == 6 else pattern)
+        picture.save(source / name, exif=exif, quality=95)
+    (source / "notes.txt").write_text("no photograph")
+    (source / "._a.jpg").write_text("what macOS leaves on foreign disks")
+    counted = []
+    gathered = gather(source, tmp_path / "photos", 10, counted.append)
+    assert gathered.names == ["a.jpg", "b.jpg", "left/c.jpg"] and sum(counted) == 3
+    assert gathered.one_camera
+    upright, turned = (Image.open(gathered.folder / name) for name in ("a.jpg", "b.jpg"))
+    assert upright.size == turned.size == (96, 64)
+    assert turned.getexif().get(ORIENTATION, 1) == 1 and turned.getexif()[0x0110] == "Camera"
+    assert np.abs(np.array(upright, dtype=float) - np.array(turned, dtype=float)).mean() < 3
+    assert (source / "a.jpg").stat().st_ino == (gathered.folder / "a.jpg").stat().st_ino  # linked, not copied
+
+
+def test_other_formats_are_converted_and_sizes_tell_cameras_apart(pattern, tmp_path):
+    source = tmp_path / "source"
+    source.mkdir()
+    Image.fromarray(pattern).save(source / "a.webp", quality=95)
+    Image.fromarray(pattern).save(source / "a.bmp")
+    Image.fromarray(pattern[:, :60]).save(source / "b.png")
+    gathered = gather(source, tmp_path / "photos", 10, lambda n: None)
+    assert gathered.names == ["a.bmp.jpg", "a.webp.jpg", "b.png"] and not gathered.one_camera
+    assert (gathered.folder / "a.bmp.jpg").read_bytes()[:2] == b"\xff\xd8"  # JPEG
+
+
+@pytest.mark.filterwarnings(LEAVES_PIPES)
+def test_the_sharpest_frame_of_each_group_is_taken(pattern, tmp_path):
+    shifted = [np.roll(pattern, 4 * i, axis=0) for i in range(12)]
+    sharp = (1, 3, 8, 10)
+    frames = [image if i in sharp else blur(image, 7) for i, image in enumerate(shifted)]
+    path = tmp_path / "video.mp4"
+    iio.imwrite(path, np.stack(frames), plugin="FFMPEG", fps=10, quality=10, macro_block_size=2)
+    taken = list(sharpest_frames(path, 4))
+    assert tuple(number for number, _ in taken) == sharp
+    for number, frame in taken:
+        assert np.abs(frame.astype(float) - shifted[number]).mean() < 25  # of 255, after lossy compression
+    assert [number for number, _ in sharpest_frames(path, 50)] == list(range(12))
+
+
+def test_a_damaged_video_is_named(tmp_path):
+    path = tmp_path / "video.mp4"
+    path.write_bytes(b"no video")
+    with pytest.raises(InputError, match=r"video\.mp4 cannot be decoded"):
+        gather(path, tmp_path / "photos", 10, lambda n: None)
+
+
+def test_sharpness_falls_with_blur(pattern):
+    levels = [sharpness(image) for image in (pattern, blur(pattern, 3), blur(pattern, 7))]
+    assert levels[0] > 2 * levels[1] > 2 * levels[2] > 0

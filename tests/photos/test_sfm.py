@@ -1,0 +1,122 @@
+"""The command: photographs and videos become scenes that load, and what was left out is named."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+import time
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from PIL import Image
+
+from skipgs_plug.cli import main
+from skipgs_plug.photos.progress import counted
+from skipgs_plug.photos.reconstruct import key_pairs
+from skipgs_plug.trainer import load_scene
+
+# imageio-ffmpeg leaves the pipes of a decoder that has ended to the garbage collector.
+LEAVES_PIPES = "ignore:unclosed file:ResourceWarning"
+
+
+def test_photographs_become_a_scene(photos, tmp_path, capsys):
+    scene = tmp_path / "scenes/fern"
+    assert main(["sfm", str(photos), str(scene)]) == 0
+    captured = capsys.readouterr()
+    assert "8 of 10 photographs placed (exhaustive matching)" in captured.out
+    assert re.search(r"blurred\.png: blurred", captured.out)
+    assert re.search(r"elsewhere\.png: overlaps no other photograph", captured.out)
+    assert "Placing photographs" in captured.err  # progress
+    assert sorted(path.name for path in scene.iterdir()) == ["images", "images_2", "images_4", "images_8", "sparse"]
+    assert sorted(path.name for path in scene.parent.iterdir()) == ["fern"]
+    loaded = load_scene(scene)
+    assert len(loaded.train) == 7 and len(loaded.test) == 1 and len(loaded.points) > 200
+    for factor in (2, 8):
+        reduced = load_scene(scene, data_factor=factor)
+        assert reduced.train[0].width == round(loaded.train[0].width / factor)
+    # Points lie in front of the cameras that see them and project into the image.
+    view = loaded.train[0]
+    seen = loaded.points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    pixels = (seen @ view.K.T)[:, :2] / seen[:, 2:]
+    inside = (seen[:, 2] > 0) & (pixels > 0).all(dim=1) & (pixels[:, 0] < view.width) & (pixels[:, 1] < view.height)
+    assert inside.float().mean() > 0.5
+
+
+@pytest.mark.filterwarnings(LEAVES_PIPES)
+def test_a_video_becomes_a_scene(fern, tmp_path, capsys):
+    frames = np.stack([np.array(Image.open(path).convert("RGB"))[:188] for path in fern[:8]])
+    video = tmp_path / "walk.mp4"
+    iio.imwrite(video, frames, plugin="FFMPEG", fps=10, quality=9, macro_block_size=2)
+    command = ["sfm", str(video), str(tmp_path / "scene"), "--matching", "sequential", "--no-progress"]
+    assert main(command) == 0
+    captured = capsys.readouterr()
+    assert re.search(r"[78] of 8 photographs placed \(sequential matching\)", captured.out) and captured.err == ""
+    names = sorted(path.name for path in (tmp_path / "scene/images").iterdir())
+    assert set(names) <= {f"frame_{i:06d}.jpg" for i in range(8)} and len(names) >= 7
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments", "sentence"),
+    [
+        (lambda p: None, (), "nowhere does not exist; give a folder of photographs or a video"),
+        (lambda p: p.write_text("x"), (), "nowhere is neither a folder nor a video"),
+        (lambda p: p.mkdir(), (), "gives 0 photographs"),
+        (lambda p: (p.mkdir(), (p / "a.jpg").write_bytes(b"no")), (), "a.jpg cannot be decoded"),
+        (lambda p: (p.mkdir(), (p / "a.HEIC").write_bytes(b"no")), (), "export as JPEG"),
+        (lambda p: p.mkdir(), ("--frames", "2"), "--frames 2 is too few"),
+    ],
+)
+def test_bad_input_is_one_sentence(tmp_path, capsys, make, arguments, sentence):
+    make(tmp_path / "nowhere")
+    assert main(["sfm", str(tmp_path / "nowhere"), str(tmp_path / "scene"), *arguments, "--no-progress"]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error and len(error.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir() if path.name != "nowhere"] == []
+
+
+def test_progress_is_read_by_another_process(tmp_path):
+    database = tmp_path / "some ?#% database.db"
+    connection = sqlite3.connect(database)
+    connection.execute("create table descriptors (k integer)")
+    seen = []
+    with counted(database, "descriptors", seen.append):
+        for total in (2, 5):
+            while sum(seen) < total:
+                if connection.execute("select count(*) from descriptors").fetchone()[0] < total:
+                    connection.execute("insert into descriptors values (1)")
+                    connection.commit()
+                time.sleep(0.05)
+    connection.close()
+    assert sum(seen) == 5
+
+
+def test_a_long_sequence_is_also_compared_across_its_length():
+    names = [f"{i:03d}.jpg" for i in range(120)] + ["with a space.jpg"]
+    pairs = list(key_pairs(names))
+    assert len(pairs) == 40 * 39 / 2 and ("000.jpg", "117.jpg") in pairs
+    assert not any(" " in name for pair in pairs for name in pair)
+
+
+def test_photographs_without_overlap_are_refused_and_leave_nothing(tmp_path, capsys):
+    folder = tmp_path / "noise"
+    folder.mkdir()
+    for i in range(4):
+        noise = np.random.default_rng(i).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+        Image.fromarray(noise).resize((256, 192)).save(folder / f"{i}.png")
+    assert main(["sfm", str(folder), str(tmp_path / "scene"), "--no-progress"]) == 2
+    assert "None of the 4 photographs could be placed" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["noise"]
+
+
+def test_no_folder_is_overwritten(tmp_path, capsys):
+    photos, scene = tmp_path / "photos", tmp_path / "scene"
+    for folder in (photos, scene):
+        folder.mkdir()
+        (folder / "kept.txt").write_text("kept")
+    assert main(["sfm", str(photos), str(scene)]) == 2
+    assert "not an empty folder" in capsys.readouterr().err
+    assert main(["sfm", str(photos), str(photos / "scene")]) == 2
+    assert "lies in the folder of the photographs" in capsys.readouterr().err
+    assert [path.read_text() for path in sorted(Path(tmp_path).rglob("*.txt"))] == ["kept", "kept"]

@@ -1,0 +1,173 @@
+"""Packages that are missing, disks that are full, Ctrl-C that comes early: one sentence, never a traceback."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from skipgs_plug import cli, install
+from skipgs_plug.files import WriteError, remove_leftovers, write_aside
+from skipgs_plug.install import install_command
+
+# A Python in which the named packages do not exist, that then gives a command.
+WITHOUT = """
+import sys
+missing = set(sys.argv[1].split(","))
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in missing:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name.partition(".")[0])
+sys.meta_path.insert(0, Missing())
+from skipgs_plug.cli import main
+sys.exit(main(sys.argv[2:]))
+"""
+EXTRAS = "warp,gsplat,pycolmap,PIL,plyfile,scipy,tyro,tqdm,filelock,yaml,torchmetrics,matplotlib,tensorboard"
+
+
+def without(packages: str, *command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", WITHOUT, packages, *command], capture_output=True, text=True, check=False, timeout=120
+    )
+
+
+def test_base_install_says_how_to_get_the_rest() -> None:
+    tried = without(EXTRAS, "train", "--help")
+    assert tried.returncode == 2 and "Traceback" not in tried.stderr
+    assert tried.stderr.strip().splitlines() == [
+        f"skipgs-plug: This command needs the package tyro; run: {install_command()}"
+    ]
+
+
+def test_doctor_works_without_extras() -> None:
+    tried = without(EXTRAS, "doctor")
+    assert tried.returncode == 1 and tried.stderr == ""
+    assert "tyro          missing, for: command line; run: pip install tyro" in tried.stdout
+    assert f"Get all missing packages with: {install_command()}" in tried.stdout
+
+
+def test_doctor_says_in_which_order_to_import() -> None:
+    tried = without("matplotlib", "doctor")
+    assert "import PIL.Image before pycolmap" in tried.stdout and tried.returncode == 0
+
+
+def test_the_cure_is_the_checkout_that_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = tmp_path / "a checkout"
+    (root / "skipgs_plug").mkdir(parents=True)
+    (root / "pyproject.toml").write_text('[project]\nname = "skipgs_plug"\n')
+    monkeypatch.setattr(install, "__file__", str(root / "skipgs_plug/install.py"))
+    assert shlex.split(install_command()) == ["pip", "install", "-e", f"{root}[full]"]
+
+
+@pytest.mark.parametrize(
+    ("origin", "requirement"),
+    [
+        (None, "skipgs_plug[full]"),
+        ('{"url": "file:///nowhere/at/all"}', "skipgs_plug[full]"),
+        (
+            '{"url": "https://host/repo", "vcs_info": {"vcs": "git", "commit_id": "abc"}}',
+            "skipgs_plug[full] @ git+https://host/repo@abc",
+        ),
+        ("damaged", "skipgs_plug[full]"),
+    ],
+)
+def test_the_cure_is_where_the_package_came_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, origin: str | None, requirement: str
+) -> None:
+    class Installed:
+        def read_text(self, name: str) -> str | None:
+            assert name == "direct_url.json"
+            return origin
+
+    monkeypatch.setattr(install, "__file__", str(tmp_path / "skipgs_plug/install.py"))
+    monkeypatch.setattr(metadata, "distribution", lambda name: Installed())
+    assert shlex.split(install_command()) == ["pip", "install", requirement]
+
+
+def test_ctrl_c_while_torch_is_being_imported() -> None:
+    code = (
+        "import sys, threading, os, signal, time\n"
+        "from skipgs_plug.cli import main\n"
+        "assert 'torch' not in sys.modules\n"
+        "def interrupt():\n"
+        "    while 'torch' not in sys.modules: time.sleep(0.001)\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "threading.Thread(target=interrupt, daemon=True).start()\n"
+        "sys.exit(main(['train', '--help']))\n"
+    )
+    command = [sys.executable, "-c", code]
+    tried = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert tried.returncode == 130
+    assert tried.stderr.strip() == "skipgs-plug: interrupted."
+
+
+def test_ctrl_c_that_an_import_turned_into_another_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(name: str) -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            for _ in range(10**6):
+                pass
+        except KeyboardInterrupt as error:
+            raise ImportError("initialization failed") from error
+
+    monkeypatch.setattr(cli.importlib, "import_module", broken)
+    assert cli.main(["train"]) == 130
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.ENOSPC, errno.EACCES, errno.ENAMETOOLONG, errno.EIO])
+def test_file_systems_in_trouble(
+    number: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Command:
+        @staticmethod
+        def main(argv: list[str]) -> int:
+            raise OSError(number, os.strerror(number), "/some/where")
+
+    monkeypatch.setattr(cli.importlib, "import_module", lambda name: Command)
+    assert cli.main(["report"]) == 2
+    assert capsys.readouterr().err == (
+        f"skipgs-plug: /some/where: {os.strerror(number)}; make room there or give another path.\n"
+    )
+
+
+def test_nobody_reads_the_output() -> None:
+    code = "import sys; from skipgs_plug.cli import main; sys.exit(main(['--help']))"
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "wb") as output:
+        tried = subprocess.run(
+            [sys.executable, "-u", "-c", code], stdout=output, stderr=subprocess.PIPE, check=False, timeout=60
+        )
+    assert tried.returncode == 141 and tried.stderr == b""
+
+
+def test_a_file_that_cannot_be_written_says_how_much_it_needs(tmp_path: Path) -> None:
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))  # as on a full disk, a write stops in the middle
+    try:
+        with (
+            pytest.raises(
+                WriteError, match=r"x\.bin cannot be written \(File too large\): it needs about 0.1 MB, .* MB are"
+            ),
+            write_aside(tmp_path / "x.bin", size=100_000) as temporary,
+        ):
+            temporary.write_bytes(bytes(100_000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
+
+
+def test_only_leftovers_are_removed(tmp_path: Path) -> None:
+    for name in (".x.ply.4711.tmp", ".skipgs.json.4711", ".lock", ".owner.json", ".hidden", "x.4711.tmp"):
+        (tmp_path / name).write_text("")
+    remove_leftovers(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".hidden", ".lock", ".owner.json", "x.4711.tmp"]

@@ -1,0 +1,32 @@
+"""A short run with a checkpoint, a PLY and a configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from skipgs_plug.cli import main
+from skipgs_plug.trainer import save_packed
+from skipgs_plug.trainer.synthetic import make_scene
+
+
+@pytest.fixture(scope="session")
+def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight views of 33x24, two of them held out."""
+    path = tmp_path_factory.mktemp("scene") / "tiny.npz"
+    save_packed(make_scene(n_views=8, width=33, height=24, n_points=160, test_every=4), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def run_folder(scene_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "tiny"
+    command = ["train", str(scene_file), "--out", str(folder), "--max-steps", "40", "--no-gate", "--no-progress"]
+    assert main(command) == 0
+    return folder
+
+
+@pytest.fixture
+def ply(run_folder: Path) -> Path:
+    return run_folder / "ply/point_cloud_39.ply"

@@ -1,0 +1,44 @@
+"""Formats of web viewers, decoded by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from skipgs_plug.cli import main
+from skipgs_plug.trainer.ply import read_ply
+
+SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+
+
+def test_splat_holds_every_gaussian(ply, tmp_path, capsys):
+    out = tmp_path / "model.splat"
+    assert main(["export", str(ply), str(out)]) == 0
+    splats = read_ply(ply)
+    assert f"{len(splats['means']):,} Gaussians" in capsys.readouterr().out
+    rows = np.frombuffer(out.read_bytes(), dtype=SPLAT)
+    assert len(rows) == len(splats["means"])
+    order = np.lexsort(splats["means"].numpy().T)
+    rows = rows[np.lexsort(rows["means"].T)]
+    assert np.array_equal(rows["means"], splats["means"].numpy()[order])
+    assert np.allclose(rows["scales"], splats["scales"].exp().numpy()[order], rtol=1e-5)
+    opacity = 255 * torch.sigmoid(splats["opacities"]).numpy()[order]
+    assert np.abs(rows["rgba"][:, 3] - opacity).max() <= 1
+    red = 255 * (0.5 + 0.28209479 * splats["sh0"][:, 0, 0].numpy()[order])
+    assert np.abs(rows["rgba"][:, 0] - red.clip(0, 255)).max() <= 1
+
+
+def test_a_run_folder_is_exported_compressed_and_as_ply(run_folder, ply, tmp_path):
+    assert main(["export", str(run_folder), str(tmp_path / "model.compressed.ply")]) == 0
+    header = (tmp_path / "model.compressed.ply").read_bytes().split(b"end_header")[0].decode()
+    assert "element chunk" in header and "property uint packed_position" in header
+    assert main(["export", str(run_folder), str(tmp_path / "model.ply")]) == 0
+    first, second = read_ply(ply), read_ply(tmp_path / "model.ply")
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("name", ["model.obj", "model"])
+def test_other_endings_are_refused(ply, tmp_path, capsys, name):
+    assert main(["export", str(ply), str(tmp_path / name)]) == 2
+    assert "use .compressed.ply, .splat or .ply" in capsys.readouterr().err

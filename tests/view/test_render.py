@@ -1,0 +1,116 @@
+"""Films and pictures of a run, and of a PLY alone."""
+
+from __future__ import annotations
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+from skipgs_plug.cli import main
+from skipgs_plug.trainer import load_scene
+from skipgs_plug.view.draw import colour_depth, depth_range
+from skipgs_plug.view.path import camera_path
+
+# imageio-ffmpeg leaves the pipes of a coder that has ended to the garbage collector.
+LEAVES_PIPES = "ignore:unclosed file:ResourceWarning"
+
+
+@pytest.mark.filterwarnings(LEAVES_PIPES)
+def test_a_film_along_the_path(run_folder, tmp_path, capsys):
+    film = tmp_path / "film.mp4"
+    command = ["render", str(run_folder), str(film), "--frames", "7", "--fps", "5", "--show", "both", "--no-progress"]
+    assert main(command) == 0
+    assert "7 frames" in capsys.readouterr().out
+    frames = iio.imread(film, plugin="FFMPEG")
+    assert frames.shape == (7, 24, 66, 3)
+    assert iio.immeta(film, plugin="FFMPEG")["fps"] == 5
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+    assert np.abs(frames[0].astype(float) - frames[-1]).mean() > 2  # the camera moves
+
+
+def test_held_out_pictures_are_what_the_trainer_renders(run_folder, scene_file, tmp_path):
+    out = tmp_path / "held_out"
+    assert main(["render", str(run_folder), str(out), "--cameras", "held-out", "--no-progress"]) == 0
+    scene = load_scene(scene_file)
+    names = sorted(path.name for path in out.iterdir())
+    assert len(names) == len(scene.test) == 2
+    for i, view in enumerate(scene.test):
+        with Image.open(run_folder / f"renders/val_step39_{i:04d}.png") as both:
+            expected = np.asarray(both)[:, view.width :]
+        with Image.open(out / view.name) as picture:
+            assert np.abs(np.asarray(picture).astype(int) - expected).max() <= 1
+
+
+def test_a_ply_needs_a_scene_and_may_lack_normals(ply, scene_file, tmp_path, capsys):
+    out = tmp_path / "pictures"
+    assert main(["render", str(ply), str(out)]) == 2
+    assert "add --scene" in capsys.readouterr().err
+    vertices = PlyData.read(str(ply))["vertex"].data
+    kept = [name for name in vertices.dtype.names if name not in ("nx", "ny", "nz")]
+    without = np.empty(len(vertices), dtype=[(name, "<f4") for name in kept])
+    for name in kept:
+        without[name] = vertices[name]
+    short = tmp_path / "short.ply"
+    PlyData([PlyElement.describe(without, "vertex")]).write(str(short))
+    pictures = []
+    for i, path in enumerate((ply, short)):
+        command = ["render", str(path), str(tmp_path / str(i)), "--scene", str(scene_file), "--frames", "2"]
+        assert main([*command, "--no-progress"]) == 0
+        with Image.open(tmp_path / str(i) / "frame_0001.png") as picture:
+            pictures.append(np.asarray(picture))
+    assert np.array_equal(*pictures) and pictures[0].std() > 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("nowhere", "out"), "nowhere does not exist"),
+        (("{empty}", "out"), "holds no model"),
+        (("{run}", "film.gif"), "ends neither in .mp4"),
+        (("{run}", "{run}"), "not an empty folder"),
+        (("{run}", "out", "--frames", "0"), "--frames 0 is too small"),
+        (("{run}", "out", "--scene", "gone"), "Scene gone does not exist"),
+    ],
+)
+def test_bad_input_is_one_sentence(run_folder, tmp_path, monkeypatch, capsys, arguments, sentence):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    filled = [argument.format(run=run_folder, empty=tmp_path / "empty") for argument in arguments]
+    assert main(["render", *filled, "--no-progress"]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error and len(error.splitlines()) == 1
+
+
+def test_a_run_whose_scene_has_gone_says_so(run_folder, tmp_path, capsys):
+    (tmp_path / "ply").mkdir()
+    (tmp_path / "ply/point_cloud_39.ply").write_bytes((run_folder / "ply/point_cloud_39.ply").read_bytes())
+    (tmp_path / "cfg.yml").write_text("data_dir: /gone/scene\n")
+    assert main(["render", str(tmp_path), str(tmp_path / "out")]) == 2
+    assert "was trained on /gone/scene, which does not exist here; add --scene" in capsys.readouterr().err
+
+
+def test_the_path_begins_and_ends_at_the_views_and_moves_evenly(scene_file):
+    views = load_scene(scene_file).train
+    poses = camera_path(views, 101)
+    assert torch.allclose(poses[0], views[0].viewmat, atol=1e-5)
+    assert torch.allclose(poses[-1], views[-1].viewmat, atol=1e-5)
+    assert torch.allclose(poses[:, :3, :3] @ poses[:, :3, :3].mT, torch.eye(3).expand(101, 3, 3), atol=1e-5)
+    worlds = torch.linalg.inv(poses)
+    turns = (worlds[1:, :3, :3].mT @ worlds[:-1, :3, :3]).diagonal(dim1=1, dim2=2).sum(1)
+    steps = (worlds[1:, :3, 3] - worlds[:-1, :3, 3]).norm(dim=1)
+    assert steps.max() < 4 * steps.mean() and turns.min() > 2.5  # no jump
+    single = camera_path(views[:1] * 2, 3)
+    assert torch.allclose(single, views[0].viewmat.expand(3, 4, 4), atol=1e-5)
+
+
+def test_colours_of_depth():
+    depth = torch.tensor([[0.0, 2.0], [3.0, 4.0]])
+    low, high = depth_range([depth])
+    assert 2.0 <= low < high <= 4.0
+    colours = colour_depth(depth, (2.0, 4.0))
+    assert colours[0, 0].tolist() == [0, 0, 0]
+    assert colours[0, 1, 0] > colours[0, 1, 2] and colours[1, 1, 2] > colours[1, 1, 1]  # near is red, far is blue
+    assert depth_range([torch.zeros(2, 2)]) == (0.0, 1.0)
