@@ -323,6 +323,11 @@ class SkipGate:
         """
         self._engine.load_state_dict(state)
 
+    @property
+    def trained(self) -> bool:
+        """Whether anything of a training was seen so far: an iteration, or a backward in none."""
+        return self._engine.iteration.step is not None if self._hooks is None else self._hooks.trained
+
     def verify(self) -> None:
         """Raise AdapterMismatchError unless the attached trainer ran one training backward per iteration.
 

@@ -45,9 +45,10 @@ def make_checkout(folder, lookalike, script):
     (folder / "scene/gaussian_model.py").write_text(from_lookalike)
     source = (LOOKALIKES / "lookalikes" / f"{lookalike}.py").read_text()
     renderers = [word for word in ("render_fastgs", "render_imp", "render") if f"def {word}(" in source]
+    of_model = [word for word in ("GaussianModel", "build_scaling_rotation") if f" {word}(" in source]
     (folder / script).write_text(
         f"{source}\nfrom gaussian_renderer import {', '.join(renderers)}\n"
-        "from scene.gaussian_model import GaussianModel\n"
+        f"from scene.gaussian_model import {', '.join(of_model)}\n"
         "if __name__ == '__main__':\n    train()\n    print('Training complete.')\n"
     )
 
@@ -62,6 +63,14 @@ SCRIPTS = [
     ("train_lightgaussian.py", "lightgaussian_distill", "distill_train.py"),
     ("train_gaussianspa.py", "gaussianspa", "train_imp_score.py"),
     ("train_gaussianspa.py", "gaussianspa_op", "train_op.py"),
+    ("train_mcmc.py", "mcmc", "train.py"),
+    ("train_mip_splatting.py", "mip_splatting", "train.py"),
+    ("train_absgs.py", "absgs", "train.py"),
+    ("train_pixel_gs.py", "pixel_gs", "train.py"),
+    ("train_2dgs.py", "surfels", "train.py"),
+    ("train_scaffold_gs.py", "scaffold_gs", "train.py"),
+    ("train_dash_gaussian.py", "dash_gaussian", "train_dash.py"),
+    ("train_improved_gs.py", "improved_gs", "train.py"),
 ]
 
 
@@ -96,7 +105,10 @@ def make_package(folder, **files):
 def test_gsplat_script_is_run_gated(run_example, tmp_path, monkeypatch):
     make_package(
         tmp_path / "checkout",
-        gsplat__distributed="def cli(fn, args, verbose=False):\n    return fn(0, 0, 1, args)\n",
+        gsplat__distributed=(
+            "def _distributed_worker(world_rank, world_size, fn, args):\n    return fn(0, 0, 1, args)\n"
+            "def cli(fn, args, verbose=False):\n    return _distributed_worker(0, 1, fn=fn, args=args)\n"
+        ),
         examples__simple_trainer=(
             "from gsplat.distributed import cli\nfrom lookalikes import gsplat_runner\n"
             "class Runner(gsplat_runner.Runner):\n    pass\n"

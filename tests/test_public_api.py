@@ -44,7 +44,7 @@ GATE = {
     "view_table": "(self) -> 'list[dict[str, Any]]'",
     "visible": "(self, mask: 'Tensor') -> 'Tensor'",
 }
-GATE_PROPERTIES = {"script_globals", "adapter", "config", "patched", "policy", "skipped", "trace"}
+GATE_PROPERTIES = {"script_globals", "adapter", "config", "patched", "policy", "skipped", "trace", "trained"}
 
 ADAPTER = {
     "attach": "(self, hooks: 'Hooks') -> 'None'",
@@ -53,6 +53,7 @@ ADAPTER = {
     "matches": "(trainer: 'Any') -> 'bool'",
     "must_run": "(self, step: 'int') -> 'bool'",
     "optimizers": "(self) -> 'Iterable[torch.optim.Optimizer]'",
+    "recognises_script": "(code: 'LoopCode') -> 'bool'",
     "timing": "(self) -> 'tuple[float, float] | None'",
 }
 HOOKS = {
@@ -141,9 +142,18 @@ def test_what_adapters_are_written_with() -> None:
     assert set(adapters.__all__) == {"AbstractAdapter", "Hooks", "TrainerFacts", "register_adapter"}
     assert signatures(AbstractAdapter) == ADAPTER
     assert AbstractAdapter.__abstractmethods__ == {"attach", "matches"}
-    assert set(AbstractAdapter.__annotations__) == {"name", "checked", "saved_state", "output_folder", "replaced"}
+    assert set(AbstractAdapter.__annotations__) == {
+        "name",
+        "checked",
+        "project",
+        "gated",
+        "left_alone",
+        "saved_state",
+        "output_folder",
+        "replaced",
+    }
     assert signatures(Hooks) == HOOKS
-    assert properties(Hooks) == {"gap", "patched", "state"}
+    assert properties(Hooks) == {"gap", "patched", "state", "trained"}
     assert str(inspect.signature(TrainerFacts)) == FACTS
     assert str(inspect.signature(adapters.register_adapter)) == (
         "(adapter: 'type[AbstractAdapter]') -> 'type[AbstractAdapter]'"

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.hooks import Hooks
 
@@ -26,6 +27,9 @@ class AbstractAdapter(ABC):
 
     Attributes:
         name: how users call it.
+        project: its name and home, in Markdown, for docs/adapters.md; as are the next two.
+        gated: from when on the gate decides, and what pauses it.
+        left_alone: what else is done or left alone in skipped iterations, beyond what holds for every trainer.
         checked: upstream version or commit that it was checked with, and in brackets how; part of error messages.
         saved_state: gives the state of the gate that belongs to the checkpoint which the trainer goes on from,
             if any; called once, with the first iteration. Set before the gate is made.
@@ -36,6 +40,9 @@ class AbstractAdapter(ABC):
 
     name: ClassVar[str]
     checked: ClassVar[str]
+    project: ClassVar[str] = ""
+    gated: ClassVar[str] = ""
+    left_alone: ClassVar[str] = ""
     saved_state: Callable[[int], dict[str, Any] | None] | None = None
     output_folder: str | None = None
     replaced: Sequence[str] = ()
@@ -48,6 +55,11 @@ class AbstractAdapter(ABC):
     def matches(cls, trainer: Any) -> bool:
         """Whether this is the trainer that the adapter knows. Imports nothing of it."""
 
+    @classmethod
+    def recognises_script(cls, code: LoopCode) -> bool:
+        """Whether a training script with these names is of the trainer that the adapter knows."""
+        return False
+
     @abstractmethod
     def attach(self, hooks: Hooks) -> None:
         """Hold on to `self.trainer`, which exists and has not begun training.
@@ -59,7 +71,7 @@ class AbstractAdapter(ABC):
     def attach_script(self, hooks: Hooks) -> None:
         """Hold on to a training script that is about to run in this process.
 
-        Its folder is first on `sys.path`, and none of its modules is imported yet.
+        Its file is `sys.argv[0]`, its folder is first on `sys.path`, and none of its modules is imported yet.
         """
         raise SkipGSError(f"Adapter {self.name!r} needs a trainer object; it has no script to run.")
 
@@ -84,6 +96,10 @@ class AbstractAdapter(ABC):
     def timing(self) -> tuple[float, float] | None:
         """Seconds of training in all and after densification, when the trainer keeps them itself."""
         return None
+
+
+# Marks a `torch.multiprocessing.spawn` that attaches a gate in each process.
+GATES_CHILDREN = "__skipgs_gates_children__"
 
 
 def refuse_other_processes(hooks: Hooks) -> None:

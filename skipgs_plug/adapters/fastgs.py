@@ -20,6 +20,12 @@ class FastGS(InriaFamily):
 
     name = "fastgs"
     checked = "fastgs/FastGS 44e02a5c (its script, run on the CPU)"
+    project = "[FastGS](https://github.com/fastgs/FastGS)"
+    gated = "From `densify_until_iter` on. The prunes at 18,000, 21,000, 24,000 and 27,000 pause the gate."
+    left_alone = (
+        "`optimizer_step(iteration)`: it steps every 16th, 32nd or 64th iteration on what the backwards since then "
+        "have left, and does so in an iteration that is skipped itself."
+    )
     mark = "render_fastgs"
     renders = ("render_fastgs",)
 

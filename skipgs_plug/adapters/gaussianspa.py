@@ -18,6 +18,11 @@ class GaussianSpa(InriaFamily):
 
     name = "gaussianspa"
     checked = "noodle-lab/GaussianSpa abdfaf64 (its three scripts, run on the CPU)"
+    project = "[GaussianSpa](https://github.com/noodle-lab/GaussianSpa)"
+    gated = "From `optimizing_spa_stop_iter` + 1 on, after a pause for the prune in the iteration before."
+    left_alone = (
+        "A gate that you start earlier runs all iterations with the ADMM term and keeps their losses out of the means."
+    )
     mark = "OptimizingSpa"
     renders = ("render_imp", "render")
     structural = (*InriaFamily.structural, "reinitial_pts")

@@ -8,8 +8,9 @@ from typing import Any
 
 import torch
 
-from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
+from skipgs_plug.adapters.base import GATES_CHILDREN, AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
+from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import TrainerFacts
@@ -28,6 +29,14 @@ class GsplatRunner(AbstractAdapter):
 
     name = "gsplat"
     checked = "nerfstudio-project/gsplat v1.5.3 and v1.6.0 90d7b4b3 (its script, run on the CPU)"
+    project = "[gsplat, `examples/simple_trainer.py`](https://github.com/nerfstudio-project/gsplat)"
+    gated = "From `strategy.refine_stop_iter` on (15,000, for MCMC 25,000)."
+    left_alone = (
+        "MCMC's position noise is left out where the gradient step is: alone it is a random walk. Batches of several "
+        "images have one joint loss and so one mean. Where the script spawns a process for each GPU, `skipgs-plug run` "
+        "attaches a gate in each: a backward is left out when all of them would (checked with gloo on the CPU, not on "
+        "GPUs)."
+    )
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
@@ -38,13 +47,21 @@ class GsplatRunner(AbstractAdapter):
         strategy = getattr(getattr(trainer, "cfg", None), "strategy", None)
         return hasattr(strategy, "step_pre_backward") and hasattr(trainer, "rasterize_splats")
 
-    def attach_script(self, hooks: Hooks) -> None:
-        def launched(original: Callable[..., Any], main: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            self.attach_on_call(hooks, main.__globals__["Runner"], "train")
-            return original(main, *args, **kwargs)
+    @classmethod
+    def recognises_script(cls, code: LoopCode) -> bool:
+        return "Runner" in code.names and any(name.startswith("gsplat.") for name in code.names)
 
-        refuse_other_processes(hooks)
-        hooks.wrap(importlib.import_module("gsplat.distributed"), "cli", launched)
+    def attach_script(self, hooks: Hooks) -> None:
+        def started(
+            original: Callable[..., Any], rank: int, size: int, fn: Callable[..., Any], *args: Any, **kwargs: Any
+        ) -> Any:
+            self.attach_on_call(hooks, fn.__globals__["Runner"], "train")
+            return original(rank, size, fn, *args, **kwargs)
+
+        # The launcher attaches in each process that is spawned; nobody else does.
+        if not getattr(torch.multiprocessing.spawn, GATES_CHILDREN, False):
+            refuse_other_processes(hooks)
+        hooks.wrap(importlib.import_module("gsplat.distributed"), "_distributed_worker", started)
 
     def attach(self, hooks: Hooks) -> None:
         runner = self.trainer

@@ -14,26 +14,28 @@ import warnings
 import weakref
 from abc import abstractmethod
 from collections import ChainMap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 
 from skipgs_plug.adapters import registry
 from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.loop_code import LOOP, LoopCode
+from skipgs_plug.adapters.stillness import Stillness
+from skipgs_plug.adapters.strangers import refuse_strangers
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.views import view_key
-
-LOOP = "training"  # name of the function that holds the loop, in the whole family
 
 
 class InriaFamily(AbstractAdapter):
     """Shared by Inria 3DGS and its forks: only the backward is gated, optimizers keep their schedules.
 
     Attributes:
-        mark: a global name that only this fork's training scripts have.
+        mark: a name that only this fork's training scripts have, or only their loop uses.
         renders: names of the functions that render a training view; at least one must exist.
         structural: methods of `GaussianModel` that make losses jump.
         scenes: names that the loop's variable for its Scene can have.
@@ -53,12 +55,36 @@ class InriaFamily(AbstractAdapter):
     @classmethod
     def matches(cls, trainer: Any) -> bool:
         names = namespace_of(trainer)
-        return names is not None and LOOP in names and "GaussianModel" in names and cls.recognises(names)
+        return (
+            names is not None
+            and {LOOP, "GaussianModel"} <= names.keys()
+            and cls.recognises_script(LoopCode.of_module(names))
+        )
 
     @classmethod
-    def recognises(cls, names: Mapping[str, Any]) -> bool:
-        """Whether a train module with these global names is this trainer's, unless one asked before it knows it."""
+    def recognises_script(cls, code: LoopCode) -> bool:
+        return bool(code.used) and "GaussianModel" in code.names and cls.recognises(code.names)
+
+    @classmethod
+    def recognises(cls, names: Container[str]) -> bool:
+        """Whether a training script with these names is this trainer's, unless one asked before it knows it.
+
+        Args:
+            names: Its global names, and whatever its function `training` uses, attributes too.
+        """
         return cls.mark in names
+
+    def examine(self, code: LoopCode, namespace: Mapping[str, Any], model: type) -> None:
+        """Look for what this adapter does not know, before anything runs.
+
+        Args:
+            code: The training script.
+            namespace: Where its renderers are.
+            model: Its GaussianModel.
+
+        Raises:
+            AdapterMismatchError: It cannot be gated.
+        """
 
     def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
         """Keep what later answers need of a run, which begins now; arguments as for `start_iter`."""
@@ -87,13 +113,23 @@ class InriaFamily(AbstractAdapter):
                 f"Adapter {self.name!r} expects a train module with {LOOP}() and GaussianModel, or its "
                 f"{LOOP} function, as in {self.checked}."
             )
-        self._refuse_fork(names)
+        code = LoopCode.of_module(names)
+        self._refuse_fork(code)
+        self.examine(code, names, names["GaussianModel"])
         self._attach_to(hooks, names, names["GaussianModel"], names)
 
     def attach_script(self, hooks: Hooks) -> None:
+        code = LoopCode.of_script(Path(sys.argv[0]))
+        if not code.used:
+            raise AdapterMismatchError(
+                f"Adapter {self.name!r} expects a function {LOOP}(), which {code.place} does not have; "
+                f"it was checked with {self.checked}."
+            )
+        self._refuse_fork(code)
         # The script binds these names when it imports them, so they are replaced before.
         renderer = importlib.import_module("gaussian_renderer")
         model = importlib.import_module("scene.gaussian_model").GaussianModel
+        self.examine(code, vars(renderer), model)
         self._attach_to(hooks, vars(renderer), model, hooks.script_globals)
 
     def _attach_to(self, hooks: Hooks, names: dict[str, Any], model: type, script: dict[str, Any]) -> None:
@@ -104,15 +140,21 @@ class InriaFamily(AbstractAdapter):
                 f"it was checked with {self.checked}."
             )
 
+        stillness = Stillness(hooks.state)
+
         def heartbeat(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             # Frame 2 is the loop. Its variables are read once, before they hold an iteration's graph.
             if self._model() is not args[0]:
                 frame = sys._getframe(2)
-                self._refuse_fork(frame.f_globals)
+                self._refuse_fork(LoopCode.of_module(frame.f_globals))
                 self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
                 self._model = weakref.ref(args[0])
             else:
                 self._step = hooks.number(self._step + 1)
+                own = [one for one in vars(args[0]).values() if isinstance(one, torch.optim.Optimizer)]
+                if moved := stillness.moved(own):
+                    self._give_up(hooks, moved)
+                    return original(*args, **kwargs)
             hooks.iteration(self._step)
             return original(*args, **kwargs)
 
@@ -145,15 +187,26 @@ class InriaFamily(AbstractAdapter):
         """Every key that `view_key` can give."""
         return [getattr(camera, self._label) for camera in cameras]
 
-    def _refuse_fork(self, names: Mapping[str, Any]) -> None:
+    def _refuse_fork(self, code: LoopCode) -> None:
         own, family = type(self), [one for one in registry.builtin_adapters() if issubclass(one, InriaFamily)]
         asked = family if own in family else [own, *family]
-        right = next(one for one in asked if one.recognises(names))  # the last one does in any case
+        right = next(one for one in asked if one.recognises(code.names))  # the last one does in any case
         if right is not own:
             raise AdapterMismatchError(
-                f"Adapter {self.name!r} is for {self.checked}, but {names.get('__file__') or names.get('__name__')} "
+                f"Adapter {self.name!r} is for {self.checked}, but {code.place} "
                 f"looks like the training script of {right.name!r}."
             )
+
+    def _give_up(self, hooks: Hooks, moved: list[str]) -> None:
+        """Let training go on ungated: an error would throw away what was trained so far."""
+        hooks.restore()
+        warnings.warn(
+            f"The loop moved {', '.join(moved)} in iteration {self._step - 1}, whose backward was skipped: it does "
+            f"something of its own that adapter {self.name!r} does not know. The gate is detached, and training goes "
+            "on without it. Gate this loop by hand with SkipGate(start_iter=...).",
+            RuntimeWarning,
+            stacklevel=2,
+        )
 
     def _read_run(self, hooks: Hooks, loop: Mapping[str, Any]) -> None:
         """Read options, views and first iteration from the loop's variables."""
@@ -189,14 +242,30 @@ class InriaFamily(AbstractAdapter):
 
 
 class Inria(InriaFamily):
-    """graphdeco-inria/gaussian-splatting: densification ends before `densify_until_iter`."""
+    """graphdeco-inria/gaussian-splatting: densification ends before `densify_until_iter`.
+
+    Asked last, it is also what an unknown fork is taken for: one whose loop draws noise or writes into tensors is
+    refused, and one that calls more of its model or its renderer than Inria's is gated with a warning.
+    """
 
     name = "inria"
     checked = "graphdeco-inria/gaussian-splatting 8a70a8cd and 54c035f (their scripts, run on the CPU)"
+    project = "[Inria 3DGS](https://github.com/graphdeco-inria/gaussian-splatting)"
+    gated = "From `densify_until_iter` on: that iteration does not densify any more."
+    left_alone = (
+        "Both optimizers of the current version, sparse Adam too. Renders of the viewer and of evaluations are not "
+        "taken for training. When two images have the same name in different folders (older versions keep the name "
+        "only), the gate warns and tells views apart by their position. A fork that no adapter knows is refused when "
+        "its loop draws noise or writes into tensors, and otherwise gated with a list of what was not recognised."
+    )
 
     @classmethod
-    def recognises(cls, names: Mapping[str, Any]) -> bool:
+    def recognises(cls, names: Container[str]) -> bool:
         return True  # asked last: what is not a fork's is the original's
+
+    def examine(self, code: LoopCode, namespace: Mapping[str, Any], model: type) -> None:
+        if "render" in namespace:  # else `attach` says so
+            refuse_strangers(code, namespace["render"], model, self.structural)
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter)

@@ -19,6 +19,13 @@ class LightGaussian(InriaFamily):
 
     name = "lightgaussian"
     checked = "VITA-Group/LightGaussian 6676b983 (its three scripts, run on the CPU)"
+    project = "[LightGaussian](https://github.com/VITA-Group/LightGaussian)"
+    gated = (
+        "`prune_finetune.py`: from the second iteration on (the first one prunes), after a pause; counted from the "
+        "first iteration of the run, not from zero. `train_densify_prune.py`: from `densify_until_iter` on, its later "
+        "prunes pause the gate. `distill_train.py`: from the first iteration on."
+    )
+    left_alone = "Jittered cameras (two of three iterations with `--augmented_view`) have means of their own."
     mark = "calculate_v_imp_score"
     scenes = ("scene", "student_scene")
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
+from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.loss_scaler import guard_scaler
 from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
 from skipgs_plug.core.errors import AdapterMismatchError
@@ -27,6 +28,13 @@ class Nerfstudio(AbstractAdapter):
 
     name = "nerfstudio"
     checked = "nerfstudio-project/nerfstudio 1.1.5 50e0e3c7 (ns-train, run on the CPU)"
+    project = "[nerfstudio, splatfacto and splatfacto-mcmc](https://github.com/nerfstudio-project/nerfstudio)"
+    gated = "As gsplat; decided on `main_loss`, since other terms appear in every tenth iteration only."
+    left_alone = (
+        "An enabled loss scaler is not asked to update without a gradient. As in a shell: `skipgs-plug run nerfstudio "
+        "-- ns-train splatfacto ...` (also `-m nerfstudio.scripts.train`). `skipgs.json` lies beside its "
+        "`config.yml`."
+    )
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
@@ -35,6 +43,10 @@ class Nerfstudio(AbstractAdapter):
     @classmethod
     def matches(cls, trainer: Any) -> bool:
         return hasattr(trainer, LOOP) and hasattr(trainer, "grad_scaler")
+
+    @classmethod
+    def recognises_script(cls, code: LoopCode) -> bool:
+        return any(name.startswith("nerfstudio.") for name in code.names)
 
     def attach_script(self, hooks: Hooks) -> None:
         refuse_other_processes(hooks)

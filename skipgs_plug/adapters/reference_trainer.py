@@ -22,6 +22,9 @@ class ReferenceTrainer(AbstractAdapter):
 
     name = "reference"
     checked = "the trainer of this package (itself, on the CPU, by the tests)"
+    project = "this package's own trainer"
+    gated = "From the end of densification on."
+    left_alone = "Gate state travels in its snapshots and checkpoints."
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:

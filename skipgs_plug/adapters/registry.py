@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import SkipGSError, UnknownTrainerError
 
 # In the order in which they are asked: forks before what they were forked from. Loaded when asked for.
@@ -20,6 +22,14 @@ BUILTIN = {
     "speedy_splat": "skipgs_plug.adapters.speedy_splat:SpeedySplat",
     "lightgaussian": "skipgs_plug.adapters.lightgaussian:LightGaussian",
     "gaussianspa": "skipgs_plug.adapters.gaussianspa:GaussianSpa",
+    "mcmc": "skipgs_plug.adapters.mcmc:MCMC",
+    "mip_splatting": "skipgs_plug.adapters.mip_splatting:MipSplatting",
+    "absgs": "skipgs_plug.adapters.absgs:AbsGS",
+    "pixel_gs": "skipgs_plug.adapters.pixel_gs:PixelGS",
+    "2dgs": "skipgs_plug.adapters.surfels:Surfels",
+    "scaffold_gs": "skipgs_plug.adapters.scaffold_gs:ScaffoldGS",
+    "dash_gaussian": "skipgs_plug.adapters.dash_gaussian:DashGaussian",
+    "improved_gs": "skipgs_plug.adapters.improved_gs:ImprovedGS",
     "inria": "skipgs_plug.adapters.inria:Inria",
 }
 
@@ -83,6 +93,20 @@ def find_adapter(trainer: Any, name: str | None = None) -> AbstractAdapter:
         f"No adapter knows {_describe(trainer)}; there are {', '.join(adapter_names())} (adapter=NAME). "
         "Any other loop can be gated by hand: SkipGate(start_iter=...) and gate.backward(loss, view, step)."
     )
+
+
+def find_script_adapter(script: Path) -> type[AbstractAdapter]:
+    """Return the adapter for a training script, by the names in it; the script is not run.
+
+    Raises:
+        UnknownTrainerError: No adapter knows it.
+    """
+    code = LoopCode.of_script(script)
+    for candidate in adapter_names():
+        adapter = get_adapter(candidate)
+        if adapter.recognises_script(code):
+            return adapter
+    raise UnknownTrainerError(f"No adapter knows {script}; name one of {', '.join(adapter_names())} instead of auto.")
 
 
 def _load(place: str) -> type[AbstractAdapter]:

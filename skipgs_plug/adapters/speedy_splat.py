@@ -17,6 +17,12 @@ class SpeedySplat(InriaFamily):
 
     name = "speedy_splat"
     checked = "j-alex-hanson/speedy-splat 6b523aa3 (its script, run on the CPU)"
+    project = "[Speedy-Splat](https://github.com/j-alex-hanson/speedy-splat)"
+    gated = (
+        "From `densify_until_iter` + 1 on: a hard prune falls on `densify_until_iter` itself, and every "
+        "`prune_interval` until the end, and each pauses the gate."
+    )
+    left_alone = "The backwards that compute pruning scores always run."
     mark = "score_func"
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
@@ -31,10 +32,23 @@ class StepTrainer(AbstractAdapter):
 
     name = "step_trainer"
     checked = "gaussian-splatting 2.11.0 of PyPI (its script, run on the CPU)"
+    project = "[pip gaussian-splatting](https://pypi.org/project/gaussian-splatting/)"
+    gated = (
+        "From the latest of its inclusive bounds + 1 on, after a pause for the opacity reset that falls on that "
+        "bound. Modes without densification need `--start-iter`."
+    )
+    left_alone = (
+        "`before_optim_hook`, which reads gradients, is left out with the backward. Attach to the outermost trainer; "
+        "wrappers added later are fine."
+    )
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:
         return all(hasattr(trainer, name) for name in EXPECTED)
+
+    @classmethod
+    def recognises_script(cls, code: LoopCode) -> bool:
+        return "prepare_trainer" in code.names
 
     def attach_script(self, hooks: Hooks) -> None:
         # `python -m gaussian_splatting.train` binds this name when it is run.

@@ -16,6 +16,12 @@ class Taming(InriaFamily):
 
     name = "taming"
     checked = "humansensinglab/taming-3dgs fd0f7d9e (its script, run on the CPU)"
+    project = "[Taming 3DGS](https://github.com/humansensinglab/taming-3dgs)"
+    gated = "From `densify_until_iter` on."
+    left_alone = (
+        "Both optimizers keep their schedules, with `--sh_lower` too. Freezing the opacity at `ho_iteration` changes "
+        "no image and does not pause the gate."
+    )
     mark = "get_count_array"
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,14 +15,15 @@ import tyro
 
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.adapters.base import AbstractAdapter
-from skipgs_plug.adapters.registry import get_adapter
+from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster.compat import FAMILIES, serve
+from skipgs_plug.scripts import children
 from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
 from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED
-from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu
-from skipgs_plug.scripts.launch import run_script
+from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu, exclusive_cores
+from skipgs_plug.scripts.launch import Attach, run_script, source_of
 
 # Stand-ins are named after the extension modules, which not every adapter has to itself.
 FAMILY_OF = {"step_trainer": "pip_gaussian_splatting"}
@@ -36,7 +38,7 @@ class Args:
     """
 
     adapter: tyro.conf.Positional[str]
-    """Name of the trainer: inria, fastgs, taming, ..."""
+    """Name of the trainer: inria, fastgs, taming, ...; or auto, to recognise it by its script."""
     gate: tyro.conf.OmitArgPrefixes[GateOptions] = dataclasses.field(default_factory=GateOptions)
     resume_gate: str = "auto"
     """State the gate goes on from: auto (the one beside the checkpoint the script loads), off (afresh), or a path."""
@@ -67,8 +69,33 @@ def run(args: Args, command: list[str]) -> int:
         The script's exit code.
 
     Raises:
-        SkipGSError: The script cannot be run or gated, or did not train.
+        SkipGSError: The script cannot be run or gated.
     """
+    if args.adapter == "auto":
+        args = dataclasses.replace(args, adapter=find_script_adapter(source_of(command)).name)
+        say(f"{script_name(command)} is run as {args.adapter}.")
+    with children.gated_when_spawned(functools.partial(run_spawned, args, command)) as spawned:
+        code, gate = run_gated(args, command, functools.partial(run_script, command))
+    if code == 0 and gate is not None and gate.trained:
+        gate.verify()
+    elif code == 0 and not spawned:
+        say(f"{script_name(command)} ended without a training iteration; nothing was gated.")
+    return code
+
+
+def run_spawned(args: Args, command: list[str], rank: int, call: bytes) -> None:
+    """What a process does that the script spawns: all of `run`, with the script's call at the end."""
+    code, gate = run_gated(args, command, lambda attach: children.run_call(command, attach, rank, call), rank)
+    if code:
+        sys.exit(code)
+    if gate is not None and gate.trained:
+        gate.verify()
+
+
+def run_gated(
+    args: Args, command: list[str], execute: Callable[[Attach], int], rank: int = 0
+) -> tuple[int, SkipGate | None]:
+    """Attach a gate to what `execute(attach)` runs, and write skipgs.json where `rank` is 0."""
     adapter = get_adapter(args.adapter)()
     checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
     adapter.replaced = (*REPLACED, *(f"torch.cuda.{name}" for name in CUDA_REPLACED if args.cpu))
@@ -85,14 +112,17 @@ def run(args: Args, command: list[str]) -> int:
     with cpu_instead_of_cuda(args, command) if args.cpu else contextlib.nullcontext():
         try:
             with checkpoints.watch():
-                code = run_script(command, attach)
+                code = execute(attach)
         finally:
             for gate in gates:
                 gate.detach()
-                report(gate, adapter)
-    if code == 0:
-        gates[0].verify()
-    return code
+                if rank == 0:
+                    report(gate, adapter)
+    return code, gates[0] if gates else None
+
+
+def say(sentence: str) -> None:
+    print(f"skipgs-plug: {sentence}", file=sys.stderr)
 
 
 def script_name(command: Sequence[str]) -> str:
@@ -122,5 +152,5 @@ def cpu_instead_of_cuda(args: Args, command: Sequence[str]) -> Iterator[None]:
     if family not in FAMILIES:
         names = sorted((set(FAMILIES) | set(FAMILY_OF)) - {"inria_accelerated", *FAMILY_OF.values()})
         raise SkipGSError(f"--cpu has no stand-ins for {args.adapter!r}; it has for {', '.join(names)}.")
-    with serve(family), cuda_on_cpu():
+    with serve(family), cuda_on_cpu(), exclusive_cores():
         yield

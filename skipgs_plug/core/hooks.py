@@ -258,6 +258,11 @@ class Hooks:
         """Every name that is replaced at present."""
         return self._patches.names
 
+    @property
+    def trained(self) -> bool:
+        """Whether an iteration was seen, or a training backward that was in none."""
+        return self._iterations + self._backwards > 0
+
     def restore(self) -> None:
         """Put back every replaced name."""
         self._patches.restore()

@@ -90,6 +90,20 @@ def cuda_on_cpu() -> Iterator[None]:
                 setattr(torch.cuda, name, original)
 
 
+@contextmanager
+def exclusive_cores() -> Iterator[None]:
+    """Keep torch to one thread inside the block: the CPU rasterizer, which stands in for the GPU, has its own.
+
+    torch's idle OpenMP threads spin for a while after each operation, and take the cores from the rasterizer.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 class _CpuPlacement(TorchFunctionMode):
     def __torch_function__(
         self, func: Callable, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None

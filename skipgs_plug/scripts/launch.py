@@ -8,6 +8,7 @@ import importlib.util
 import runpy
 import sys
 import traceback
+import types
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,8 +18,21 @@ import torch
 
 from skipgs_plug.core.errors import SkipGSError
 
+Attach = Callable[[], dict[str, Any]]  # see `run_script`
 
-def run_script(command: Sequence[str], attach: Callable[[], dict[str, Any]] | None = None) -> int:
+# For advice: parts of every checkout of the Inria family, CUDA extensions, packages not called as their module.
+OF_CHECKOUTS = frozenset({"arguments", "gaussian_renderer", "scene", "utils"})
+EXTENSIONS = ("diff_", "simple_knn", "fused_ssim")
+PACKAGES = {
+    "cv2": "opencv-python",
+    "PIL": "pillow",
+    "skimage": "scikit-image",
+    "sklearn": "scikit-learn",
+    "yaml": "pyyaml",
+}
+
+
+def run_script(command: Sequence[str], attach: Attach | None = None) -> int:
     """Execute an unmodified script in its own checkout and give its exit code.
 
     The script sees its own folder first on `sys.path`, its own `sys.argv`, and `__name__ == "__main__"`.
@@ -34,19 +48,54 @@ def run_script(command: Sequence[str], attach: Callable[[], dict[str, Any]] | No
         SkipGSError: There is no such script or module, or a module of the script's checkout was imported
             before from somewhere else.
     """
-    program = _resolve(command)
+    return _run(_resolve(command), attach, None)
+
+
+def run_in_script(command: Sequence[str], attach: Attach, run: Callable[[str, dict[str, Any]], None]) -> int:
+    """As `run_script`, with `run(file of the script, names for its globals)` in place of running it."""
+    return _run(_resolve(command), attach, run)
+
+
+def _run(program: _Program, attach: Attach | None, instead: Callable[[str, dict[str, Any]], None] | None) -> int:
     with _as_main_program(program), _whole_checkpoints():
-        names = {} if attach is None else attach()
         try:
-            program.run(names)
+            names = {} if attach is None else attach()
+            if instead is None:
+                program.run(names)
+            else:
+                instead(str(program.source), names)
         except SystemExit as stop:
             return _exit_code(stop.code)
         except SkipGSError:
             raise
         except BaseException as error:
-            _print_traceback(error, program.source)
+            _print_traceback(error, program)
+            if isinstance(error, ModuleNotFoundError) and error.name:
+                print(f"skipgs-plug: {what_brings(error.name, program.source)}", file=sys.stderr)
             return 130 if isinstance(error, KeyboardInterrupt) else 1
     return 0
+
+
+def source_of(command: Sequence[str]) -> Path:
+    """The file that `run_script` would run for this command.
+
+    Raises:
+        SkipGSError: There is none.
+    """
+    return _resolve(command).source
+
+
+def what_brings(module: str, script: Path) -> str:
+    """A sentence for a module that a script asks for and that is not there."""
+    top = module.partition(".")[0]
+    if top in OF_CHECKOUTS:
+        return f"{script.name} is not in its checkout: there is no {top} beside it; run the one in a whole checkout."
+    if top.startswith(EXTENSIONS):
+        return (
+            f"{top} is a CUDA extension that comes with the trainer: build it as the trainer's README says, or run on "
+            "the CPU with --cpu before '--'."
+        )
+    return f"{script.name} needs the module {module}: pip install {PACKAGES.get(top, top)}."
 
 
 class _Program(NamedTuple):
@@ -107,10 +156,15 @@ def _exit_code(code: Any) -> int:
     return 1
 
 
-def _print_traceback(error: BaseException, source: Path) -> None:
-    """As the interpreter prints it: from the script's own first frame on."""
+def _print_traceback(error: BaseException, program: _Program) -> None:
+    """As the interpreter prints it: from the first frame on that is the script's or lies in its checkout."""
+
+    def is_ours(trace: types.TracebackType) -> bool:
+        file = trace.tb_frame.f_code.co_filename
+        return file != str(program.source) and program.folder not in Path(file).parents
+
     trace = error.__traceback__
-    while trace is not None and trace.tb_frame.f_code.co_filename != str(source):
+    while trace is not None and is_ours(trace):
         trace = trace.tb_next
     traceback.print_exception(type(error), error, trace or error.__traceback__)
 

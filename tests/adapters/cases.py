@@ -9,17 +9,25 @@ from types import ModuleType
 from typing import Any
 
 from lookalikes import (
+    absgs,
+    dash_gaussian,
     fastgs,
     gaussianspa,
     gaussianspa_op,
     gsplat_runner,
+    improved_gs,
     inria,
     lightgaussian_densify_prune,
     lightgaussian_distill,
     lightgaussian_prune_finetune,
+    mcmc,
+    mip_splatting,
     nerfstudio,
+    pixel_gs,
+    scaffold_gs,
     speedy_splat,
     step_trainer,
+    surfels,
     taming,
 )
 from lookalikes.splats import NAMES, log, new_log
@@ -123,6 +131,14 @@ SCRIPTS = [
     script("lightgaussian_distill_plain", lightgaussian_distill, augmented_view=False),
     script("gaussianspa", gaussianspa),
     script("gaussianspa_op", gaussianspa_op),
+    script("mcmc", mcmc),
+    script("mip_splatting", mip_splatting),
+    script("absgs", absgs),
+    script("pixel_gs", pixel_gs),
+    script("surfels", surfels),
+    script("scaffold_gs", scaffold_gs),
+    script("dash_gaussian", dash_gaussian),
+    script("improved_gs", improved_gs),
 ]
 CASES = [
     *SCRIPTS,

@@ -43,9 +43,7 @@ def test_wrong_fork_of_a_script_is_noticed_in_its_first_iteration():
     with SkipGate(copied(inria)) as gate:
         adapter, hooks = gate.adapter, gate._hooks
         gate.detach()
-        adapter._attach_to(
-            hooks, vars(module), module.GaussianModel, {}
-        )  # as attach_script does with gaussian_renderer
+        adapter._attach_to(hooks, vars(module), module.GaussianModel, vars(module))  # as attach_script does
         with pytest.raises(AdapterMismatchError, match="looks like the training script of 'speedy_splat'"):
             module.training(dataset(), types.SimpleNamespace(last=5, iterations=5), None)
 
@@ -95,6 +93,8 @@ def training(dataset, opt, pipe):
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         loss = photo_loss(render(viewpoint_cam, gaussians)["render"], viewpoint_cam)
         {backward}
+        if iteration < opt.densify_until_iter:
+            pass  # densification
         done.append(iteration)
 """
 

@@ -15,7 +15,7 @@ from skipgs_plug.adapters.registry import get_adapter
 each = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 resumable = [case for case in CASES if case.resume]
 REAL_BACKWARD = torch.Tensor.backward
-NOT_EVENTS = ("frozen", "relocate")  # change nothing about the losses, or belong to every iteration
+NOT_EVENTS = ("frozen", "relocate", "filter")  # change nothing about the losses, or belong to every iteration
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +195,7 @@ def test_answers_about_a_run_change_nothing(case, monkeypatch):
     trainer, train = case.make()
     with SkipGate(trainer):
         train(last=case.module.FIRST)
-    assert len(answers) == 2 and all(one == other for one, other in answers)
+    assert len(answers) >= 2 and all(one == other for one, other in answers)  # some answers ask for others
 
 
 @pytest.mark.parametrize("case", SCRIPTS, ids=lambda case: case.name)

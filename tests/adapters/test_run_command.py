@@ -4,6 +4,7 @@ import json
 import operator
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 import torch
@@ -83,6 +84,8 @@ TRAIN = """
                 sys.exit(3)
             loss.backward()
             end.record()
+            if iteration < opt.densify_until_iter:
+                pass  # densification
             torch.cuda.synchronize()
             gaussians.optimizer.step()
             gaussians.optimizer.zero_grad(set_to_none=True)
@@ -168,9 +171,9 @@ def test_failing_script_keeps_its_code_and_leaves_a_report(checkout, tmp_path):
     assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 4
 
 
-def test_script_that_never_trains_is_an_error(checkout, tmp_path, capfd):
-    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path), "--idle"]) == cli.BAD_INPUT
-    assert "no iteration of a training loop was seen" in capfd.readouterr().err
+def test_script_that_never_trains_keeps_its_code(checkout, tmp_path, capfd):
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path), "--idle"]) == 0
+    assert "train.py ended without a training iteration; nothing was gated." in capfd.readouterr().err
     assert not (tmp_path / "skipgs.json").exists()
 
 
@@ -264,3 +267,47 @@ def test_gate_states_go_with_their_checkpoints(train):
     (gated / "chkpnt10.pth").unlink()
     train("gated")
     assert sorted(path.name for path in gated.glob("*.skipgs.json")) == states[1:]
+
+
+def test_auto_recognises_the_script_before_it_runs(checkout, tmp_path, capfd):
+    assert cli.main(["run", "auto", "--cpu", "--warmup", "10", "--", checkout, str(tmp_path)]) == 0
+    assert "skipgs-plug: train.py is run as inria." in capfd.readouterr().err
+    assert json.loads((tmp_path / "skipgs.json").read_text())["settings"]["adapter"] == "inria"
+    other = tmp_path / "other.py"
+    other.write_text("def main():\n    pass\n")
+    assert cli.main(["run", "auto", "--", str(other)]) == cli.BAD_INPUT
+    assert "No adapter knows" in capfd.readouterr().err
+
+
+def test_wrong_adapter_is_refused_before_anything_is_imported(checkout, tmp_path, capfd):
+    assert cli.main(["run", "mcmc", "--cpu", "--", checkout, str(tmp_path)]) == cli.BAD_INPUT
+    assert "looks like the training script of 'inria'" in capfd.readouterr().err
+    assert "gaussian_renderer" not in sys.modules
+
+
+def test_missing_extension_is_the_scripts_own_error(checkout, tmp_path, capfd):
+    assert cli.main(["run", "inria", "--", checkout, str(tmp_path)]) == 1  # without --cpu there are no stand-ins
+    error = capfd.readouterr().err
+    assert "Traceback" in error and "gaussian_renderer/__init__.py" in error and "launch.py" not in error
+    assert "diff_gaussian_rasterization is a CUDA extension that comes with the trainer" in error
+    assert "skipgs_plug[full]" not in error
+
+
+def test_script_outside_its_checkout_is_said(checkout, tmp_path, capfd):
+    lonely = tmp_path / "lonely" / "train.py"
+    lonely.parent.mkdir()
+    lonely.write_text(Path(checkout).read_text())
+    assert cli.main(["run", "inria", "--cpu", "--", str(lonely), str(tmp_path)]) == 1
+    assert "train.py is not in its checkout: there is no gaussian_renderer beside it" in capfd.readouterr().err
+
+
+def test_torch_keeps_to_one_thread_on_the_cpu(checkout, tmp_path, capfd):
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        with open(checkout, "a") as script:
+            script.write("    print('threads', torch.get_num_threads())\n")
+        assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 0
+        assert "threads 1\n" in capfd.readouterr().out and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)

@@ -2,18 +2,28 @@
 
 import importlib
 import importlib.util
+import math
+import os
+import shutil
+import subprocess
 import sys
 
 import pytest
 import torch
-from compat_scenes import HEIGHT, WIDTH, camera, gaussians
+from compat_scenes import HEIGHT, WIDTH, camera, gaussians, intrinsics, oracle
 
 from skipgs_plug.fallback_raster.compat import (
     FAMILIES,
+    absgs,
     fastgs,
     gaussianspa,
+    improved_gs,
     inria,
     lightgaussian,
+    mcmc,
+    mip_splatting,
+    pixel_gs,
+    scaffold_gs,
     serve,
     speedy_splat,
     taming,
@@ -205,3 +215,86 @@ def test_missing_torchvision_is_stood_in_for(tmp_path):
         assert gray.shape == (1, 5, 7)
         with pytest.raises(RuntimeError, match="vgg16 needs torchvision"):
             torchvision.models.vgg16()
+
+
+def test_mip_splatting_filters_conserve_opacity_and_sum_absolute_gradients():
+    scene = gaussians()
+    offset = torch.zeros(HEIGHT, WIDTH, 2)
+    color, radii = rasterizer(mip_splatting, kernel_size=0.1, subpixel_offset=offset)(**scene)
+    with torch.no_grad():
+        expected, _ = oracle(scene, camera(), intrinsics(), rasterize_mode="antialiased", eps2d=0.1)
+    torch.testing.assert_close(color.double(), expected, rtol=2e-3, atol=2e-5)
+    color.square().sum().backward()
+    gradient = scene["means2D"].grad
+    assert (gradient[:, 2] >= gradient[:, :2].abs().sum(dim=1) * (1 - 1e-4)).all() and (
+        gradient[radii > 0, 2] > 0
+    ).all()
+    with pytest.raises(NotImplementedError, match="without --ray_jitter"):
+        rasterizer(mip_splatting, kernel_size=0.1, subpixel_offset=offset + 0.5)(**scene)
+
+
+def test_absgs_sums_blend_weights():
+    scene = gaussians() | {"means2D": torch.zeros(30, 4, requires_grad=True)}
+    color, radii, weight = rasterizer(absgs)(**scene)
+    _, _, expected, area, _ = rasterizer(gaussianspa)(**scene)
+    torch.testing.assert_close(weight, expected)
+    color.sum().backward()
+    assert (weight <= area).all() and (scene["means2D"].grad[radii > 0, 2:] > 0).all()
+
+
+def test_pixel_gs_counts_pixels_and_fades_near_gradients():
+    def gradients(threshold):
+        scene = gaussians()
+        color, _, pixels = rasterizer(pixel_gs, depth_threshold=threshold)(**scene)
+        color.square().sum().backward()
+        return scene, pixels, scene["means2D"].grad
+
+    scene, pixels, whole = gradients(1e-3)
+    _, _, faded = gradients(3.0)
+    depth = scene["means3D"].detach() @ camera()["viewmatrix"][:3, 2] + camera()["viewmatrix"][3, 2]
+    torch.testing.assert_close(faded, whole * (depth / 3.0).square().clamp_max(1.0)[:, None])
+    assert not torch.equal(faded, whole) and torch.equal(whole, gradients(None)[2])
+    assert torch.equal(pixels[:, 0], rasterizer(gaussianspa)(**gaussians())[3].float())
+
+
+def test_improved_gs_weights_are_linear_in_the_picture():
+    scene = gaussians() | {"means2D": torch.zeros(30, 4, requires_grad=True)}
+    ones = rasterizer(improved_gs, pixel_weights=torch.ones(HEIGHT, WIDTH))(**scene)
+    assert len(ones) == 13 and len(rasterizer(improved_gs, pixel_weights=None)(**scene)[9]) == 0
+    torch.testing.assert_close(ones[9], rasterizer(absgs)(**scene)[2])
+    left = (torch.arange(WIDTH) < WIDTH // 2).float().expand(HEIGHT, WIDTH)
+    halves = [rasterizer(improved_gs, pixel_weights=w)(**scene)[9] for w in (left, 1 - left)]
+    torch.testing.assert_close(halves[0] + halves[1], ones[9])
+
+
+def test_mcmc_marks_what_is_drawn_and_relocates_unchanged_pictures():
+    color, radii, used = rasterizer(mcmc)(**gaussians())
+    assert color.requires_grad and torch.equal(used, (radii > 0).int()) and used.any()
+    binoms = torch.tensor([[math.comb(n, k) for k in range(51)] for n in range(51)], dtype=torch.float32)
+    opacity, scale = torch.tensor([0.3, 0.8]), torch.rand(2, 3)
+    same = mcmc.compute_relocation(opacity, scale, torch.tensor([1, 1]), binoms, 51)
+    torch.testing.assert_close(same, (opacity, scale))
+    shared, smaller = mcmc.compute_relocation(opacity, scale, torch.tensor([2, 3]), binoms, 51)
+    torch.testing.assert_close((1 - shared) ** torch.tensor([2, 3]), 1 - opacity)
+    assert (smaller < scale).all()
+
+
+def test_scaffold_gs_filters_anchors_and_takes_maxima():
+    scene = {name: gaussians()[name] for name in ("means3D", "scales", "rotations")}
+    module = rasterizer(scaffold_gs)
+    found = module.visible_filter(**scene)
+    assert torch.equal(found > 0, module(**gaussians() | {"opacities": torch.ones(30, 1)})[1] > 0)
+    assert (module.visible_filter(scene["means3D"] - 100, scene["scales"], scene["rotations"]) == 0).all()
+    values = torch.tensor([[1.0, -4.0], [3.0, -2.0], [-5.0, -9.0]])
+    groups = torch.tensor([0, 0, 2])[:, None].expand(-1, 2)
+    largest, _ = scaffold_gs.scatter_max(values, groups, dim=0)
+    assert torch.equal(largest[[0, 2]], torch.tensor([[3.0, -2.0], [-5.0, -9.0]]))
+
+
+@pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="there is an nvidia-smi")
+def test_scaffold_gs_is_told_of_one_free_gpu():
+    ask = "nvidia-smi -q -d Memory | grep -A4 GPU | grep Used"
+    before = os.environ["PATH"]
+    with serve("scaffold_gs"):
+        answer = subprocess.run(ask, shell=True, capture_output=True, text=True, check=True).stdout
+    assert [int(line.split()[2]) for line in answer.splitlines()] == [0] and os.environ["PATH"] == before

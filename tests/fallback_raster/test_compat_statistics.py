@@ -5,14 +5,9 @@ import torch
 from compat_scenes import HEIGHT, WIDTH, camera, gaussians, intrinsics, oracle
 
 from skipgs_plug.fallback_raster.compat.inria import GaussianRasterizationSettings
+from skipgs_plug.fallback_raster.compat.pairs import pairs_by_strip, squared_gradients, strongest
 from skipgs_plug.fallback_raster.compat.rendering import render, splats
-from skipgs_plug.fallback_raster.compat.statistics import (
-    count_per_gaussian,
-    pairs_by_strip,
-    squared_gradients,
-    strongest,
-    sum_per_gaussian,
-)
+from skipgs_plug.fallback_raster.compat.statistics import Footprint, gather
 
 
 @pytest.fixture
@@ -43,18 +38,40 @@ def dense(f):
     return falloff, alpha, light, left
 
 
-def test_contributions_are_those_of_dense_compositing(footprint):
+def test_statistics_are_those_of_dense_compositing(footprint):
     _, alpha, light, _ = dense(footprint)
-    assert torch.equal(count_per_gaussian(footprint), (alpha > 0).sum(0).int())
-    torch.testing.assert_close(
-        sum_per_gaussian(footprint, lambda p: p.weight).double(),
-        (alpha * light).sum(0).detach(),
-        rtol=1e-4,
-        atol=1e-5,
-    )
-    pixels = torch.arange(HEIGHT * WIDTH) % 3 == 0
-    counted = count_per_gaussian(footprint, lambda p: pixels[p.pixel])
-    assert torch.equal(counted, (alpha[pixels] > 0).sum(0).int())
+    values = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(2))
+    found = gather(footprint, values)
+    hit, weight = (alpha > 0).double(), (alpha * light).detach()
+    assert torch.equal(found.pixels, hit.sum(0).int())
+    assert torch.equal(found.contributions.flatten(), hit.sum(1).int())
+    value = values.reshape(-1, 1).double()
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    distance = torch.cdist(torch.stack([x, y], -1).reshape(-1, 2).double(), footprint.means2d.double())
+    expected = (weight, hit * light, hit * value, weight * value, hit * distance)
+    for one, other in zip(found[1:6], expected, strict=True):
+        torch.testing.assert_close(one.double(), other.sum(0), rtol=1e-4, atol=1e-4)
+    best = weight.amax(1)
+    assert torch.equal(found.strongest.flatten() >= 0, best > 0)
+    torch.testing.assert_close(weight.gather(1, found.strongest.flatten().clamp_min(0).long()[:, None])[:, 0], best)
+
+
+def test_statistics_of_the_kernel_are_those_of_the_pairs(footprint):
+    found = gather(footprint)
+    count, weight = torch.zeros(2, len(footprint))
+    for pairs in pairs_by_strip(footprint):
+        count.index_add_(0, pairs.gaussian, torch.ones(len(pairs.gaussian)))
+        weight.index_add_(0, pairs.gaussian, pairs.weight)
+        rows = strongest(pairs)
+        assert torch.equal(found.strongest.flatten()[pairs.pixel[rows]], pairs.gaussian[rows].int())
+    assert torch.equal(found.pixels, count.int()) and (found.value == 0).all()
+    torch.testing.assert_close(found.weight, weight)
+
+
+def test_statistics_of_nothing_are_zero(footprint):
+    blind = Footprint(*footprint[:4], torch.zeros_like(footprint.drawn), WIDTH, HEIGHT)
+    nothing = gather(blind)
+    assert not any(one.any() for one in nothing[:-1]) and (nothing.strongest == -1).all()
 
 
 def test_blend_weights_are_the_gradient_of_the_image_by_the_colours(footprint):
@@ -62,7 +79,7 @@ def test_blend_weights_are_the_gradient_of_the_image_by_the_colours(footprint):
     colors = torch.rand(len(scene["means3D"]), 3).double().requires_grad_()
     image, _ = oracle(scene, camera(), intrinsics(), colors=colors, sh_degree=None)
     image[0].sum().backward()
-    weights = sum_per_gaussian(footprint, lambda p: p.weight)
+    weights = gather(footprint).weight
     torch.testing.assert_close(weights.double(), colors.grad[:, 0], rtol=1e-3, atol=1e-4)
 
 

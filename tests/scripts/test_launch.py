@@ -153,3 +153,18 @@ def test_a_module_imported_from_elsewhere_is_refused(checkout, tmp_path, monkeyp
     __import__("neighbour_of_script")
     with pytest.raises(SkipGSError, match=r"'neighbour_of_script' was already imported .* one training"):
         run_script([write(checkout, "pass\n")])
+
+
+def test_missing_module_is_named_with_its_package(checkout, capfd):
+    assert run_script([write(checkout, "import absent_module_of_script.part\n")]) == 1
+    error = capfd.readouterr().err
+    assert "Traceback" in error and "train.py needs the module absent_module_of_script: pip install" in error
+
+
+def test_error_while_attaching_is_the_scripts(checkout, capfd):
+    (checkout / "neighbour_of_script" / "__init__.py").write_text("import simple_knn\n")
+    script = write(checkout, "from neighbour_of_script import VALUE\n")
+    assert run_script([script], lambda: __import__("neighbour_of_script")) == 1
+    error = capfd.readouterr().err
+    assert "neighbour_of_script/__init__.py" in error and "launch.py" not in error
+    assert "simple_knn is a CUDA extension" in error

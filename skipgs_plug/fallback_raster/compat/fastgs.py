@@ -13,7 +13,7 @@ from torch import Tensor
 from .inria import RasterizerModule
 from .rendering import render, splats
 from .sparse_adam import SparseGaussianAdam
-from .statistics import count_per_gaussian
+from .statistics import gather
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam"]
 
@@ -46,6 +46,5 @@ class GaussianRasterizer(RasterizerModule):
         result = render(settings, splats(means3D, means2D, opacities, **gaussians))
         counts = torch.empty(0, dtype=torch.int32)
         if settings.get_flag:
-            poor = settings.metric_map.reshape(-1) == 1
-            counts = count_per_gaussian(result.footprint, lambda pairs: poor[pairs.pixel])
+            counts = gather(result.footprint, settings.metric_map == 1).value.to(torch.int32)
         return result.color, result.radii, counts

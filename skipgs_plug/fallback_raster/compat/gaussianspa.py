@@ -9,8 +9,9 @@ from torch import Tensor
 
 from ..torch_reference_projection import rotation_matrices
 from .inria import GaussianRasterizationSettings, RasterizerModule
+from .pairs import pairs_by_strip, strongest
 from .rendering import Splats, render, splats
-from .statistics import pairs_by_strip, strongest
+from .statistics import gather
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
@@ -23,13 +24,10 @@ class GaussianRasterizer(RasterizerModule):
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
         result = render(self.raster_settings, splats(means3D, means2D, opacities, **gaussians))
-        f = result.footprint
-        weights, count, largest = torch.zeros(3, len(f))
-        for pairs in pairs_by_strip(f):
-            weights.index_add_(0, pairs.gaussian, pairs.weight)
-            count += torch.bincount(pairs.gaussian, minlength=len(f))
-            largest += torch.bincount(pairs.gaussian[strongest(pairs)], minlength=len(f))
-        return result.color, result.radii, weights, count.to(torch.int32), largest
+        found = gather(result.footprint)
+        leading = found.strongest[found.strongest >= 0]
+        largest = torch.bincount(leading, minlength=len(means3D)).to(torch.float32)
+        return result.color, result.radii, found.weight, found.pixels, largest
 
     @torch.no_grad()
     def render_depth(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> dict[str, Tensor]:

@@ -3,50 +3,76 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
-import warnings
+import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from .. import rasterization
 from ..install import install_as_gsplat
 from ..torch_reference_projection import rotation_matrices
+from .lpips import AbsentLpips
+from .packages import usable
+from .relocation import compute_relocation
+from .scene_manager import SceneManager
 
 
 @contextmanager
 def gsplat_on_cpu() -> Iterator[None]:
     """Replace gsplat's rasterizer and the two CUDA functions its MCMC strategy calls.
 
-    Where torchvision is missing, torchmetrics' LPIPS is replaced too: the script builds it at the start.
+    Where torchvision is missing, torchmetrics' LPIPS is replaced too: the script builds it at the start. The pycolmap
+    that is installed gets the `SceneManager` of the one that gsplat's script wants up to 1.5.3.
 
     Raises:
         ImportError: gsplat is not installed.
     """
-    import gsplat.rendering
-    import gsplat.strategy.ops
+    with _no_cuda_toolkit():
+        import gsplat.rendering
+        import gsplat.strategy.ops
     import torchmetrics.image.lpip
 
     replaced: list[tuple[Any, str, Any]] = [
         (gsplat.strategy.ops, "compute_relocation", compute_relocation),
         (gsplat.strategy.ops, "quat_scale_to_covar_preci", quat_scale_to_covar_preci),
     ]
-    if importlib.util.find_spec("torchvision") is None:
+    if not usable("torchvision"):
         replaced.append((torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", AbsentLpips))
     if tuple(map(int, gsplat.__version__.split(".")[:2])) < (1, 5):
         replaced += [(module, "rasterization", rasterization_1_4) for module in (gsplat, gsplat.rendering)]
+    if usable("PIL.Image") and usable("pycolmap"):  # in this order: the other one crashes Python later
+        pycolmap = importlib.import_module("pycolmap")
+        if not hasattr(pycolmap, "SceneManager"):
+            replaced.append((pycolmap, "SceneManager", SceneManager))
     with install_as_gsplat():
-        before = [(owner, name, getattr(owner, name)) for owner, name, _ in replaced]
+        before = [(owner, name, getattr(owner, name, None)) for owner, name, _ in replaced]
         for owner, name, stand_in in replaced:
             setattr(owner, name, stand_in)
         try:
             yield
         finally:
             for owner, name, original in before:
-                setattr(owner, name, original)
+                if original is None:
+                    delattr(owner, name)
+                else:
+                    setattr(owner, name, original)
+
+
+@contextmanager
+def _no_cuda_toolkit() -> Iterator[None]:
+    """Keep gsplat from compiling its extension when it is imported, which it does since 1.6 where it finds `nvcc`."""
+    if not usable("torch.utils.cpp_extension"):  # it needs setuptools, and gsplat needs it to compile
+        yield
+        return
+    places: Any = importlib.import_module("torch.utils.cpp_extension")
+    find = places._find_cuda_home
+    places._find_cuda_home = lambda: None
+    try:
+        yield
+    finally:
+        places._find_cuda_home = find
 
 
 @functools.wraps(rasterization)
@@ -54,35 +80,6 @@ def rasterization_1_4(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[s
     """With one radius per Gaussian, as gsplat's strategies read it before 1.5."""
     image, alpha, info = rasterization(*args, **kwargs)
     return image, alpha, info | {"radii": info["radii"].amax(dim=-1)}
-
-
-def compute_relocation(
-    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, min_opacity: float | None = None
-) -> tuple[Tensor, Tensor]:
-    """Opacity and scales of a Gaussian split into `ratios` equal ones (3DGS-MCMC, equation 9).
-
-    Args:
-        opacities: [N], or [N, 1] as nerfstudio keeps them
-        scales: [N, 3]
-        ratios: Number of copies, capped at n_max. [N]
-        binoms: Binomial coefficients. [n_max, n_max]
-        min_opacity: Least new opacity; gsplat gives it since 1.6, and bounds it later itself before.
-
-    Returns:
-        New opacities, in their old shape, and scales [N, 3]; n copies drawn over each other look like the
-        original.
-    """
-    n_max = len(binoms)
-    copies = ratios.clamp(min=1, max=n_max).long()
-    flat = opacities.flatten()
-    shared = 1 - (1 - flat) ** (1 / copies)
-    if min_opacity is not None:
-        shared = shared.clamp(min_opacity, 1 - torch.finfo(shared.dtype).eps)
-    k = torch.arange(n_max)
-    signs = torch.where(k % 2 == 0, 1.0, -1.0) / (k + 1).sqrt()
-    rows = (binoms * signs * shared[:, None, None] ** (k + 1)).tril().sum(dim=2)  # [N, n_max]
-    denominator = torch.where(k < copies[:, None], rows, 0.0).sum(dim=1)
-    return shared.view_as(opacities), (flat / denominator)[:, None] * scales
 
 
 def quat_scale_to_covar_preci(
@@ -103,15 +100,3 @@ def quat_scale_to_covar_preci(
     roots = (rotation * scales[:, None, :], rotation / scales[:, None, :])
     covariance, precision = (root @ root.transpose(-1, -2) for root in roots)
     return covariance if compute_covar else None, precision if compute_preci else None
-
-
-class AbsentLpips(torch.nn.Module):
-    """LPIPS where its network cannot be had: a warning when first asked, and nan for a value."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__()
-
-    def forward(self, image: Tensor, target: Tensor) -> Tensor:
-        """Not a number. Shapes are not checked."""
-        warnings.warn("LPIPS needs torchvision, which is not installed: reporting nan.", stacklevel=2)
-        return torch.tensor(torch.nan)

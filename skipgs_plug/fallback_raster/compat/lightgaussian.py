@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .inria import RasterizerModule
 from .rendering import render, splats
-from .statistics import count_per_gaussian, sum_per_gaussian
+from .statistics import gather
 
 
 class GaussianRasterizationSettings(NamedTuple):
@@ -40,7 +40,6 @@ class GaussianRasterizer(RasterizerModule):
             return render(settings, scene)[:2]
         with torch.no_grad():  # the CUDA counting pass is outside autograd
             result = render(settings, scene)
-        f = result.footprint
+        found = gather(result.footprint)
         # Opacity times the light that arrives: the importance the CUDA kernel adds per pixel.
-        score = sum_per_gaussian(f, lambda pairs: f.opacities[pairs.gaussian] * pairs.transmittance)
-        return count_per_gaussian(f), score, result.color, result.radii
+        return found.pixels, result.footprint.opacities * found.light, result.color, result.radii

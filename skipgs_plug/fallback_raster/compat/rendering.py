@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .statistics import Footprint, squared_gradients
+from .pairs import squared_gradients
+from .statistics import Footprint
 
 NEAR_PLANE = 0.2  # `in_frustum` of the CUDA code
 EPS2D = 0.3  # its low-pass filter, added to the 2D covariance
@@ -98,7 +99,14 @@ class Rendering(NamedTuple):
     inverse_depth: Tensor | None  # [1, H, W]
 
 
-def render(settings: Any, gaussians: Splats, antialiased: bool = False, inverse_depth: bool = False) -> Rendering:
+def render(
+    settings: Any,
+    gaussians: Splats,
+    antialiased: bool = False,
+    inverse_depth: bool = False,
+    eps2d: float = EPS2D,
+    absgrad: bool = False,
+) -> Rendering:
     """Render `gaussians`, differentiable in every member of `Splats`.
 
     Args:
@@ -106,8 +114,11 @@ def render(settings: Any, gaussians: Splats, antialiased: bool = False, inverse_
         gaussians: The scene.
         antialiased: Compensate opacities for the low-pass filter.
         inverse_depth: Also blend 1 / depth.
+        eps2d: Added to the 2D covariance, square pixels.
+        absgrad: Put the sum of both absolute gradients into column 2 of `means2D`'s; where that has four columns,
+            columns 2 and 3 receive them one by one anyway.
     """
-    call = _Call(settings, Camera.from_settings(settings), antialiased, inverse_depth)
+    call = _Call(settings, Camera.from_settings(settings), antialiased, inverse_depth, eps2d, absgrad)
     if torch.is_grad_enabled():
         color, inverse = _Render.apply(call, *gaussians)
     else:
@@ -118,10 +129,13 @@ def render(settings: Any, gaussians: Splats, antialiased: bool = False, inverse_
 class _Call:
     """One forward pass; keeps what the backward and the statistics need."""
 
-    def __init__(self, settings: Any, camera: Camera, antialiased: bool, inverse_depth: bool) -> None:
+    def __init__(
+        self, settings: Any, camera: Camera, antialiased: bool, inverse_depth: bool, eps2d: float, absgrad: bool
+    ) -> None:
         self.settings, self.camera = settings, camera
         self.mode = "antialiased" if antialiased else "classic"
         self.inverse_depth = inverse_depth
+        self.eps2d, self.absgrad = eps2d, absgrad
         self.means2d: list[Tensor] = []  # one per pass over the Gaussians
         self.radii: Tensor
         self.footprint: Footprint
@@ -166,11 +180,11 @@ class _Call:
             width=self.camera.width,
             height=self.camera.height,
             near_plane=NEAR_PLANE,
-            eps2d=EPS2D,
+            eps2d=self.eps2d,
             sh_degree=degree,
             packed=False,
             backgrounds=background,
-            absgrad=g.means2D.shape[1] == 4,
+            absgrad=self.absgrad or g.means2D.shape[1] == 4,
             rasterize_mode=self.mode,
         )
         self.means2d.append(info["means2d"])
@@ -225,6 +239,8 @@ def _screen_gradient(call: _Call, means2D: Tensor, on_screen: list[Tensor], valu
         gradient[:, :2] += value[0] * half
         if means2D.shape[1] == 4:
             gradient[:, 2:] += means2d.absgrad[0] * half  # type: ignore[attr-defined]
+        elif call.absgrad:
+            gradient[:, 2] += (means2d.absgrad[0] * half).sum(dim=1)  # type: ignore[attr-defined]
     return gradient
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import ModuleType
+
+from .nvidia_smi import one_free_gpu
+from .packages import usable
 
 _CLASSES = ("GaussianRasterizationSettings", "GaussianRasterizer")
 _ACCELERATED = (*_CLASSES, "SparseGaussianAdam")
@@ -31,6 +33,17 @@ FAMILIES: dict[str, _Source] = {
         _RASTERIZER: (".inria", _CLASSES),
         **_KNN,
     },
+    "mcmc": {_RASTERIZER: (".mcmc", (*_CLASSES, "compute_relocation")), **_KNN},
+    "mip_splatting": {_RASTERIZER: (".mip_splatting", _CLASSES), **_KNN},
+    "absgs": {f"{_RASTERIZER}_abs": (".absgs", _CLASSES), **_KNN},
+    "pixel_gs": {_RASTERIZER: (".pixel_gs", _CLASSES), **_KNN},
+    "scaffold_gs": {
+        _RASTERIZER: (".scaffold_gs", _CLASSES),
+        "torch_scatter": (".scaffold_gs", ("scatter_max",)),
+        **_KNN,
+    },
+    "dash_gaussian": {_RASTERIZER: (".inria_accelerated", _ACCELERATED), **_KNN, **_SSIM},
+    "improved_gs": {_RASTERIZER: (".improved_gs", _ACCELERATED), **_KNN, **_SSIM},
     "pip_gaussian_splatting": {
         f"{_PIP}{_RASTERIZER}": (".inria", _CLASSES),
         f"{_PIP}simple_knn": (".knn", ()),
@@ -40,14 +53,15 @@ FAMILIES: dict[str, _Source] = {
     "gsplat": _SSIM,
     "nerfstudio": {},  # all of CUDA that splatfacto needs is in gsplat
 }
-_ON_GSPLAT = ("gsplat", "nerfstudio")
+# What is served besides where torchvision cannot be imported.
+_WITHOUT_TORCHVISION: dict[str, _Source] = {"scaffold_gs": {"lpips": (".lpips", ("LPIPS",))}}
 
 
 @contextmanager
 def serve(family: str) -> Iterator[None]:
     """Serve the extension modules of one family of trainers from the CPU rasterizer.
 
-    Where torchvision is not installed, the few functions of it that these trainers call come along.
+    Where torchvision cannot be imported, the few functions of it that these trainers call come along.
     Modules of the same names that were imported before are set aside and come back at the end.
 
     Raises:
@@ -57,8 +71,9 @@ def serve(family: str) -> Iterator[None]:
         raise ValueError(f"No stand-ins for {family!r}; there are some for: {', '.join(sorted(FAMILIES))}.")
     served = {name: _module(name, *source) for name, source in FAMILIES[family].items()}
     # gsplat's script has no use for torchvision.
-    if family != "gsplat" and importlib.util.find_spec("torchvision") is None:
+    if family != "gsplat" and not usable("torchvision"):
         served |= importlib.import_module(".vision", __package__).modules()
+        served |= {name: _module(name, *source) for name, source in _WITHOUT_TORCHVISION.get(family, {}).items()}
     before = {name: sys.modules.get(name) for name in served}
     try:
         # First what torchmetrics is imported for: it must not find a part of torchvision.
@@ -74,12 +89,12 @@ def serve(family: str) -> Iterator[None]:
 
 
 def _extras(family: str) -> AbstractContextManager[None]:
-    """gsplat's functions are replaced inside gsplat, which is a real package here."""
-    if family not in _ON_GSPLAT:
-        return nullcontext()
-    from .gsplat_script import gsplat_on_cpu
+    """What cannot be had by serving modules."""
+    if family in ("gsplat", "nerfstudio"):  # functions are replaced inside gsplat, which is a real package here
+        from .gsplat_script import gsplat_on_cpu
 
-    return gsplat_on_cpu()
+        return gsplat_on_cpu()
+    return one_free_gpu() if family == "scaffold_gs" else nullcontext()
 
 
 def _module(name: str, source: str, offered: tuple[str, ...]) -> ModuleType:

@@ -10,7 +10,7 @@ from torch import Tensor
 from .inria import RasterizerModule
 from .rendering import render, splats
 from .sparse_adam import SparseGaussianAdam
-from .statistics import Footprint, count_per_gaussian, pairs_by_strip, sum_per_gaussian
+from .statistics import gather
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam"]
 
@@ -47,21 +47,8 @@ class GaussianRasterizer(RasterizerModule):
         whole, fraction = torch.empty(0, dtype=torch.int32), torch.empty(0)
         counts, sums = whole, (fraction, whole, fraction, fraction)
         if weights is not None and len(weights):
-            weights = weights.detach().reshape(-1)
-            counts = _contributions_per_pixel(f)
-            sums = (
-                sum_per_gaussian(f, lambda pairs: weights[pairs.pixel]),
-                count_per_gaussian(f),
-                sum_per_gaussian(f, lambda pairs: pairs.weight),
-                sum_per_gaussian(f, lambda pairs: pairs.offset.norm(dim=1)),
-            )
+            found = gather(f, weights)
+            counts, sums = found.contributions, (found.value, found.pixels, found.weight, found.distance)
         centers = f.means2d - 0.5  # the CUDA code has the first pixel centre at 0
         lists = (whole, fraction, fraction)
         return result.color, result.radii, counts, *lists, centers, f.depths, result.radii, *sums
-
-
-def _contributions_per_pixel(f: Footprint) -> Tensor:
-    total = torch.zeros(f.height * f.width, dtype=torch.int64)
-    for pairs in pairs_by_strip(f):
-        total += torch.bincount(pairs.pixel, minlength=len(total))
-    return total.reshape(f.height, f.width).to(torch.int32)

@@ -9,7 +9,8 @@ ADAPTER, FIRST, START, LAST = "inria", 1, 20, 60
 
 
 class GaussianModel(SplatModel):
-    pass
+    def densify_and_prune(self, share):
+        self.prune_gaussians(share, self.values["opacity"])
 
 
 def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0):
@@ -42,7 +43,7 @@ def training(dataset, opt, pipe, checkpoint=None):
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
                 if iteration % 5 == 0:
-                    gaussians.prune_gaussians(0.05, gaussians.values["opacity"])
+                    gaussians.densify_and_prune(0.05)
                 if iteration % 8 == 0:
                     gaussians.reset_opacity()
             if iteration < opt.iterations:

@@ -1,0 +1,27 @@
+"""AbsGS: Inria's loop with absolute gradients, and prunes by blend weight that go on after densification."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+
+
+class AbsGS(InriaFamily):
+    """With `--use_prune_weight` it prunes once a round of the views until `prune_until_iter`, and each prune pauses.
+
+    A pause lasts a round of the views at least, so that the gate then begins with the last of them.
+    """
+
+    name = "absgs"
+    checked = "TY424/AbsGS 87d7a5aa (its script, run on the CPU)"
+    project = "[AbsGS](https://github.com/TY424/AbsGS)"
+    gated = (
+        "From `densify_until_iter` on. With `--use_prune_weight` every prune until `prune_until_iter` pauses the gate."
+    )
+    left_alone = "Blend weights are gathered in skipped iterations too: they come from the forward."
+    mark = "use_prune_weight"
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return int(opt.densify_until_iter)

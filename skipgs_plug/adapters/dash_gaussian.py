@@ -1,0 +1,22 @@
+"""DashGaussian: train_dash.py, whose resolution rises while it densifies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+
+
+class DashGaussian(InriaFamily):
+    """Resolution and number of Gaussians are scheduled until `densify_until_iter`, and constant from then on."""
+
+    name = "dash_gaussian"
+    checked = "YouyuChen0207/DashGaussian 4e3b5606 (train_dash.py, run on the CPU)"
+    project = "[DashGaussian, `train_dash.py`](https://github.com/YouyuChen0207/DashGaussian)"
+    gated = "From `densify_until_iter` on, where resolution and number of Gaussians are constant."
+    left_alone = "Both optimizers, sparse Adam too. Its `train.py` is Inria's, and so is the adapter for it."
+    mark = "TrainingScheduler"
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return int(opt.densify_until_iter)

@@ -1,0 +1,34 @@
+"""Improved-GS: gradients accumulate over 5 and 20 iterations, so only the backward may be gated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+
+ACCUMULATES_FROM = 15_000  # the loop has this number in it
+
+
+class ImprovedGS(InriaFamily):
+    """Both optimizers step every 5th iteration from 15,001 on and every 20th from 22,501 on, as upstream.
+
+    They are called in skipped iterations too, where they may have the gradients of earlier ones to apply.
+    """
+
+    name = "improved_gs"
+    checked = "XiaoBin2001/Improved-GS d008d118 (its script, run on the CPU)"
+    project = "[Improved-GS](https://github.com/XiaoBin2001/Improved-GS)"
+    gated = "From `densify_until_iter` on."
+    left_alone = (
+        "Both optimizers step every 5th and later every 20th iteration on what the backwards since then have left, in "
+        "skipped iterations too."
+    )
+    mark = "compute_edge_score"
+    structural = (*InriaFamily.structural, "only_prune")
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return int(opt.densify_until_iter)
+
+    def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
+        return opt.optimizer_type == "default" and self.start_iter(opt, loop) >= ACCUMULATES_FROM

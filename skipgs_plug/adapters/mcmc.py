@@ -1,0 +1,69 @@
+"""3DGS-MCMC: positions are noised in every iteration, inside the loop."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+
+from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.adapters.loop_code import LOOP
+from skipgs_plug.core.hooks import Hooks
+
+NOISE = "build_scaling_rotation"  # the loop calls it for nothing but its noise
+
+
+class MCMC(InriaFamily):
+    """The noise belongs to the gradient step: left alone, it is a random walk.
+
+    It is computed between the lines of `training`, but its covariance comes from a function of another module:
+    in skipped iterations the loop is given zeros there. The random numbers are drawn as ever.
+    Relocation reads no gradients. A gate that is started before it ends runs the iterations that relocate.
+    """
+
+    name = "mcmc"
+    checked = "ubc-vision/3dgs-mcmc 7b4fc9f7 (its script, run on the CPU)"
+    project = "[3DGS-MCMC](https://github.com/ubc-vision/3dgs-mcmc)"
+    gated = (
+        "From `densify_until_iter` (25,000) on, where relocation ends. A gate that you start earlier runs the "
+        "iterations that relocate."
+    )
+    left_alone = (
+        "The position noise between the lines of the loop is zero where the gradient step is left out; its random "
+        "numbers are drawn as ever."
+    )
+    mark = NOISE
+
+    def __init__(self, trainer: Any = None) -> None:
+        super().__init__(trainer)
+        self._relocations = range(0)
+
+    def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
+        interval = int(opt.densification_interval)
+        first = int(opt.densify_from_iter) // interval * interval + interval
+        self._relocations = range(first, int(opt.densify_until_iter), interval)
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return int(opt.densify_until_iter)
+
+    def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return 0
+
+    def must_run(self, step: int) -> bool:
+        return step in self._relocations
+
+    def _attach_to(self, hooks: Hooks, names: dict[str, Any], model: type, script: dict[str, Any]) -> None:
+        super()._attach_to(hooks, names, model, script)
+
+        def covariance(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            factor = original(*args, **kwargs)
+            # Frame 2 called it; the model does so too, where it matters.
+            in_loop = sys._getframe(2).f_code.co_name == LOOP
+            return torch.zeros_like(factor) if in_loop and hooks.state.skipped else factor
+
+        # A script takes it from this module when it imports it.
+        owner = vars(importlib.import_module("scene.gaussian_model")) if self.trainer is None else names
+        hooks.wrap(owner, NOISE, covariance)

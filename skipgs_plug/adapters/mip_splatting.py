@@ -1,0 +1,28 @@
+"""Mip-Splatting: a 3D filter beside the parameters, computed anew after densification too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+
+
+class MipSplatting(InriaFamily):
+    """`compute_3D_filter` goes on every hundredth iteration, skipped or not.
+
+    It follows from positions and cameras alone: where nothing moved, it gives what was there. So it pauses nothing.
+    """
+
+    name = "mip_splatting"
+    checked = "autonomousvision/mip-splatting dda02ab5 (its script, run on the CPU)"
+    project = "[Mip-Splatting](https://github.com/autonomousvision/mip-splatting)"
+    gated = "From `densify_until_iter` on."
+    left_alone = (
+        "The 3D filter is computed anew every hundredth iteration, skipped or not: where nothing moved it is what it "
+        "was, so it does not pause the gate."
+    )
+    mark = "create_offset_gt"
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return int(opt.densify_until_iter)

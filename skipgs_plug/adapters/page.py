@@ -1,0 +1,35 @@
+"""docs/adapters.md, made of what the adapters say of themselves: `python -m skipgs_plug.adapters.page`."""
+
+from __future__ import annotations
+
+import textwrap
+
+from skipgs_plug.adapters.registry import builtin_adapters
+
+HEAD = """# Trainers
+
+*Made by `python -m skipgs_plug.adapters.page > docs/adapters.md` from the adapters' own declarations; a test compares.*
+
+In every trainer only the training backward is gated. Learning rates, SH degree, view order, logging, evaluation,
+saving, prunes and optimizer calls go on in skipped iterations; an optimizer without a gradient does nothing by itself.
+Views are known by image name. A gate that would start while densification still reads gradients is refused.
+
+`skipgs-plug run NAME -- SCRIPT ...` takes the name, or `auto`, which reads the script and finds it. How each was
+checked beyond its last line stands in [examples/README.md](../examples/README.md).
+"""
+
+_WRAP = textwrap.TextWrapper(118, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+
+
+def adapters_page() -> str:
+    """The page: for each trainer what is gated, from when on, what is left alone, and with what it was checked."""
+    parts = [HEAD]
+    for adapter in builtin_adapters():
+        facts = {"Gated": adapter.gated, "Beside that": adapter.left_alone, "Checked with": f"{adapter.checked}."}
+        lines = [_WRAP.fill(f"- **{what}.** {text}") for what, text in facts.items() if text]
+        parts.append(f"## `{adapter.name}`: {adapter.project}\n" + "\n".join(lines) + "\n")
+    return "\n".join(parts)
+
+
+if __name__ == "__main__":
+    print(adapters_page(), end="")

@@ -1,0 +1,22 @@
+"""Pixel-GS: gradients weighted by pixels and depth while it densifies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+
+
+class PixelGS(InriaFamily):
+    """What it adds to Inria's loop is read by densification alone, so nothing of it matters to the gate."""
+
+    name = "pixel_gs"
+    checked = "zhengzhang01/Pixel-GS 05c9d557 (its script, run on the CPU)"
+    project = "[Pixel-GS](https://github.com/zhengzhang01/Pixel-GS)"
+    gated = "From `densify_until_iter` on."
+    left_alone = "Pixel counts and the gradients they weight are read by densification alone."
+    mark = "depth_threshold"
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return int(opt.densify_until_iter)

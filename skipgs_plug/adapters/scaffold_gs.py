@@ -1,0 +1,26 @@
+"""Scaffold-GS: anchors, from which small networks make Gaussians anew for each view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+
+
+class ScaffoldGS(InriaFamily):
+    """Anchors are grown and pruned before `update_until`; networks are parameters of the same optimizer."""
+
+    name = "scaffold_gs"
+    checked = "city-super/Scaffold-GS 59c833b5 (its script, run on the CPU)"
+    project = "[Scaffold-GS](https://github.com/city-super/Scaffold-GS)"
+    gated = "From `update_until` on, where anchors are neither grown nor pruned any more."
+    left_alone = "Networks and anchors have one optimizer, which is left alone."
+    mark = "prefilter_voxel"
+    structural = ("prune_anchor", "training_setup")
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return int(opt.update_until)
+
+    def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return int(opt.update_until)

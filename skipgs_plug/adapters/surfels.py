@@ -1,0 +1,26 @@
+"""2D Gaussian Splatting: discs in place of Gaussians, and two more terms in the loss."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+
+
+class Surfels(InriaFamily):
+    """The gate decides on the whole loss, with normal consistency and depth distortion.
+
+    Both weights are constant from iteration 7,000 on. A gate that starts earlier sees losses rise there, and runs
+    the backwards of views until they are below their means again.
+    """
+
+    name = "2dgs"
+    checked = "hbb1/2d-gaussian-splatting 1920a239 (look-alike only: its rasterizer has no stand-in)"
+    project = "[2D Gaussian Splatting](https://github.com/hbb1/2d-gaussian-splatting)"
+    gated = "From `densify_until_iter` on; decided on the whole loss, with normal consistency and depth distortion."
+    left_alone = "Needs CUDA: `--cpu` has no stand-in for its surfel rasterizer."
+    mark = "render_net_image"
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return int(opt.densify_until_iter)

@@ -1,0 +1,77 @@
+"""Stand-in for the `SceneManager` of another package called pycolmap, which gsplat's script asks for up to 1.5.3.
+
+Both packages have the same import name. This one reads with the official one, so that nothing has to be replaced.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Image(NamedTuple):
+    """A registered image: its pose takes world points to the camera."""
+
+    name: str
+    camera_id: int
+    rotation: np.ndarray  # [3, 3]
+    tvec: np.ndarray  # [3]
+
+    def R(self) -> np.ndarray:
+        """Rotation of the pose. [3, 3]"""
+        return self.rotation
+
+
+class Camera:
+    """A camera: `camera_type` names COLMAP's model; `fx fy cx cy` in pixels, and its distortion `k1 k2 p1 ...`."""
+
+    def __init__(self, camera: Any) -> None:
+        self.camera_type = getattr(camera.model, "name", str(camera.model))
+        self.width, self.height = camera.width, camera.height
+        K = camera.calibration_matrix()
+        self.fx, self.fy, self.cx, self.cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+        for name, value in zip(camera.params_info.replace(" ", "").split(","), camera.params, strict=True):
+            setattr(self, {"f": "fx", "k": "k1"}.get(name, name), value)
+
+
+class SceneManager:
+    """A COLMAP model, as gsplat's parser reads it.
+
+    Attributes:
+        cameras: by id.
+        images: by id.
+        name_to_image_id: of every image.
+        points3D: world points. [P, 3]
+        point3D_colors: [P, 3] uint8
+        point3D_errors: mean reprojection errors, pixels. [P]
+        point3D_id_to_point3D_idx: row of a point by its id.
+        point3D_id_to_images: (image id, place in the image) of every observation, by id. [L, 2]
+    """
+
+    def __init__(self, colmap_results_folder: str) -> None:
+        import pycolmap
+
+        model = pycolmap.Reconstruction(colmap_results_folder)
+        self.cameras = {i: Camera(camera) for i, camera in model.cameras.items()}
+        self.images = {}
+        for i, image in sorted(model.images.items()):
+            if image.has_pose:
+                pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+                matrix = np.array(pose.matrix())
+                self.images[i] = Image(image.name, image.camera_id, matrix[:, :3], matrix[:, 3])
+        self.name_to_image_id = {image.name: i for i, image in self.images.items()}
+        points = sorted(model.points3D.items())
+        self.points3D = np.array([point.xyz for _, point in points], dtype=np.float64).reshape(-1, 3)
+        self.point3D_colors = np.array([point.color for _, point in points], dtype=np.uint8).reshape(-1, 3)
+        self.point3D_errors = np.array([point.error for _, point in points], dtype=np.float64)
+        self.point3D_id_to_point3D_idx = {i: row for row, (i, _) in enumerate(points)}
+        self.point3D_id_to_images = {
+            i: np.array([(e.image_id, e.point2D_idx) for e in point.track.elements]).reshape(-1, 2)
+            for i, point in points
+        }
+
+    def load_cameras(self) -> None:
+        """Nothing: all was read at once, as are the next two."""
+
+    load_images = load_points3D = load_cameras
