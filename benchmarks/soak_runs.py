@@ -130,6 +130,9 @@ def _strike(kind: str, at: int) -> None:
     os.replace = struck  # type: ignore[assignment]
 
 
+CURVE = "stats/train_curve.json"
+
+
 def assert_same(out: Path, whole: Path) -> None:
     """Raise AssertionError unless both runs left the same: files, models and pictures, moments, decisions."""
     last = f"ckpts/ckpt_{STEPS - 1}_rank0.pt"
@@ -137,7 +140,10 @@ def assert_same(out: Path, whole: Path) -> None:
     left = [{name for name in names if not name.startswith("ckpts/") or name == last} for names in left]
     assert left[0] == left[1], left[0] ^ left[1]
     for name in left[0]:
-        if name.startswith(("ply/", "renders/", "stats/")):
+        if name == CURVE:  # its seconds are those of each run
+            curves = [json.loads((run / name).read_text()) | {"seconds": None} for run in (out, whole)]
+            assert curves[0] == curves[1], name
+        elif name.startswith(("ply/", "renders/", "stats/")):
             assert (out / name).read_bytes() == (whole / name).read_bytes(), name
     one, two = (torch.load(run / last, weights_only=True) for run in (out, whole))
     for part in ("splats", "optimizers", "strategy"):

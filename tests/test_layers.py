@@ -15,7 +15,7 @@ MAY_IMPORT = {
     "core": set(),
     "adapters": {"core"},
     "gate": {"core", "adapters"},
-    "scripts": {"core", "gate"},
+    "scripts": {"core", "adapters", "gate"},
     "fallback_raster": set(),
     "trainer": {"fallback_raster"},
 }

@@ -42,7 +42,7 @@ def test_base_install_says_how_to_get_the_rest() -> None:
     tried = without(EXTRAS, "train", "--help")
     assert tried.returncode == 2 and "Traceback" not in tried.stderr
     assert tried.stderr.strip().splitlines() == [
-        f"skipgs-plug: This command needs the package tyro; run: {install_command()}"
+        f"skipgs-plug: This command needs the package tyro; run: {install_command('train')}"
     ]
 
 

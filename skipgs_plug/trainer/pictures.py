@@ -1,7 +1,8 @@
-"""Pictures of a comparison: truth, two renders and their errors; loss and skips over iterations."""
+"""Pictures of a comparison: truth, renders and their errors; loss and skips over iterations."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -31,12 +32,12 @@ class Curve:
         self.skipped.append(skipped)
 
 
-def save_comparison(path: Path, views: list[View], ungated: list[Tensor], gated: list[Tensor], rows: int = 3) -> None:
-    """Write a PNG with columns truth, ungated, gated, error of each, for up to `rows` views.
+def save_comparison(path: Path, views: list[View], renders: Mapping[str, Sequence[Tensor]], rows: int = 3) -> None:
+    """Write a PNG with columns truth, each run, error of each run, for up to `rows` views.
 
     Args:
         views: held-out views, truth [H, W, 3] uint8 in them.
-        ungated, gated: their renders, each [H, W, 3] in [0, 1].
+        renders: of these views by name of the run, each [H, W, 3] in [0, 1].
     """
     from PIL import Image, ImageDraw
 
@@ -44,16 +45,16 @@ def save_comparison(path: Path, views: list[View], ungated: list[Tensor], gated:
     lines = []
     for i in picked:
         truth = views[i].image.numpy().astype(np.float32) / 255.0
-        plain, skipping = (render[i].numpy().clip(0, 1) for render in (ungated, gated))
-        errors = [(ERROR_GAIN * np.abs(image - truth)).clip(0, 1) for image in (plain, skipping)]
-        lines.append(np.concatenate([truth, plain, skipping, *errors], axis=1))
+        images = [render[i].numpy().clip(0, 1) for render in renders.values()]
+        errors = [(ERROR_GAIN * np.abs(image - truth)).clip(0, 1) for image in images]
+        lines.append(np.concatenate([truth, *images, *errors], axis=1))
     pixels = np.rint(np.concatenate(lines) * 255).astype(np.uint8).repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)
     header = 20
     sheet = Image.new("RGB", (pixels.shape[1], pixels.shape[0] + header), "white")
     sheet.paste(Image.fromarray(pixels), (0, header))
-    titles = ("truth", "ungated", "gated", f"ungated error x{ERROR_GAIN:g}", f"gated error x{ERROR_GAIN:g}")
+    titles = ("truth", *renders, *(f"{name} error x{ERROR_GAIN:g}" for name in renders))
     for k, title in enumerate(titles):
-        ImageDraw.Draw(sheet).text((k * pixels.shape[1] // 5 + 6, 4), title, fill="black")
+        ImageDraw.Draw(sheet).text((k * pixels.shape[1] // len(titles) + 6, 4), title, fill="black")
     with write_aside(path) as temporary:
         sheet.save(temporary, format="PNG")
 

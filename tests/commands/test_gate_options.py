@@ -21,6 +21,10 @@ GIVEN = {
     "pause_iters": 9,
     "step_mode": "adaptive_norm",
     "step_trigger": "ref_k",
+    "refine_share": 0.25,
+    "tolerance": 0.1,
+    "compensate": True,
+    "rate_peak": 3.0,
 }
 COMMANDS = pytest.mark.parametrize(
     ("args", "own"), [(run.Args, ["inria"]), (train.Args, ["scene", "--out", "folder"])], ids=["run", "train"]

@@ -6,15 +6,19 @@ from typing import Any
 
 import pytest
 import torch
+from compat_scenes import camera, gaussians
 from raster_scenes import leaves, random_scene
 
 from skipgs_plug.fallback_raster import adam, binning, blend, guard, l1_ssim_loss, loss, project, rasterization, sh
+from skipgs_plug.fallback_raster.compat import statistics
+from skipgs_plug.fallback_raster.compat.inria import GaussianRasterizationSettings
+from skipgs_plug.fallback_raster.compat.rendering import render, splats
 from skipgs_plug.fallback_raster.launch import FloatArray, IntArray, LongArray, Worker, worker
 from skipgs_plug.fallback_raster.source import KERNELS, PRELUDE, read_kernel
 
 WORKERS = {
     found._name: found
-    for module in (adam, binning, blend, loss, project, sh)
+    for module in (adam, binning, blend, loss, project, sh, statistics)
     for value in vars(module).values()
     for found in (value.values() if isinstance(value, dict) else [value])
     if isinstance(found, Worker)
@@ -27,7 +31,7 @@ def test_every_kernel_file_is_used_and_tested() -> None:
     texts = [PRELUDE, *(found._code for found in WORKERS.values())]
     unused = [path.name for path in KERNELS.glob("*.h") if not any(f'kernels/{path.name}"' in text for text in texts)]
     assert not unused
-    assert len(WORKERS) == 23
+    assert len(WORKERS) == 24
 
 
 @pytest.mark.parametrize("name", WORKERS)
@@ -80,6 +84,8 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker, list[A
         param = torch.nn.Parameter(torch.ones(5, 3))
         param.grad = torch.ones(5, 3)
         adam.adam_rows(torch.ones(5) > 0, param, torch.zeros(5, 3), torch.zeros(5, 3), 0.1, (0.9, 0.999), 1e-15)
+        with torch.no_grad():
+            statistics.gather(render(GaussianRasterizationSettings(**camera()), splats(**gaussians())).footprint)
     return list(calls.values())
 
 
