@@ -4,7 +4,8 @@ Refinement runs in cycles of steps that shrink to nothing, so that a cycle leave
 1/8, 1/4, 1/2 and all of what may run, each as long as all before it. Up to the last one, the losses of a few watched
 views at the end of a cycle say what it brought to views that are not trained on. What a doubling of the iterations
 brings hardly ever grows with the next doubling, so the last gain times the doublings that are left bounds what the
-rest would still bring; when that is less than the tolerance, refinement ends. In the last cycle all views are trained.
+rest would still bring; when that is less than the tolerance, refinement ends. Watched views that get worse still lose
+what only training gave them, which says nothing of the others. In the last cycle all views are trained.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ class Foresight:
             if gain is not None:
                 self.gains.append(gain)
                 mean, error = gain
-                self.foreseen = (mean + 2.0 * error) * math.log2(1.0 / end)
+                self.foreseen = (abs(mean) + 2.0 * error) * math.log2(1.0 / end)
                 self.ended = self.foreseen < self._tolerance
         self._before = {**self._before, **self._now}
         self._now = {}

@@ -44,9 +44,9 @@ def test_doubt_counts_for_going_on():
     assert foresight.gains[0][1] > 0.02 and done == CYCLE_ENDS[2]  # where it had brought nothing any more
 
 
-def test_views_that_get_worse_end_it():
-    foresight, done = follow(lambda view, done: 0.1 * (1.0 + done))
-    assert foresight.ended and done == CYCLE_ENDS[1] and foresight.foreseen < 0.0
+def test_views_that_get_worse_say_nothing():
+    foresight, _ = follow(lambda view, done: 0.1 * (1.0 + done))
+    assert not foresight.ended and all(mean < -0.05 for mean, _ in foresight.gains)
 
 
 def test_progress_runs_from_zero_to_one_in_every_cycle():
