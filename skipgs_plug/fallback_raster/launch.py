@@ -34,12 +34,13 @@ from skipgs_plug.install import install_command
 
 from . import guard
 from .cache import load_or_rebuild
+from .cores import usable_cores
 from .guard import Sizes
 from .source import PRELUDE, SHARED, declare
 
 _lock = threading.RLock()
 _scratch = threading.local()
-_num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+_num_threads = usable_cores()
 _pool: ThreadPoolExecutor | None = None
 _busy = False  # threads of the pool may still be at work
 _forked = False  # this process inherited torch's OpenMP without its threads, and has not been told so
@@ -50,7 +51,7 @@ _COUNTER_OFFSET = 64
 
 
 def get_num_threads() -> int:
-    """Number of threads that the CPU rasterizer runs on; all cores of this process unless set."""
+    """Number of threads that the CPU rasterizer runs on; all cores this process may use unless set."""
     return _num_threads
 
 
