@@ -1,0 +1,71 @@
+"""Iterations left out of the reference trainer: interrupted and resumed, in turns, and what is counted."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from skipgs_plug import SkipGate
+from skipgs_plug.trainer import TrainConfig, Trainer
+from skipgs_plug.trainer.synthetic import make_scene
+
+STEPS = 120
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(n_views=9, width=32, height=24, n_points=200)
+
+
+def trainer_of(scene) -> Trainer:
+    return Trainer(TrainConfig(max_steps=STEPS, seed=3), scene)
+
+
+def left(trainer: Trainer) -> list[torch.Tensor]:
+    return [parameter.detach().clone() for parameter in trainer.splats.values()]
+
+
+@pytest.mark.parametrize("settings", [{}, {"compensate": False}], ids=["larger steps", "spread evenly"])
+@pytest.mark.parametrize("at", [50, 70, 95])
+def test_resumed_equals_uninterrupted(scene, tmp_path, settings, at) -> None:
+    whole = trainer_of(scene)
+    with SkipGate(whole, refine_share=0.4, **settings) as gate:
+        whole.train(progress=False)
+    assert (whole.step, whole.ran) == (STEPS, 60 + gate.report()["iterations_run"])
+    first = trainer_of(scene)
+    with SkipGate(first, refine_share=0.4, **settings):
+        first.train(until=at, progress=False)
+        first.save_checkpoint(tmp_path / "checkpoint.pt")
+    second = trainer_of(scene)
+    with SkipGate(second, refine_share=0.4, **settings) as resumed:
+        second.load_checkpoint(tmp_path / "checkpoint.pt")
+        second.train(progress=False)
+    assert (second.step, second.ran) == (whole.step, whole.ran)
+    assert all(torch.equal(one, two) for one, two in zip(left(whole), left(second), strict=True))
+    for key in ("iterations_run", "iterations_skipped", "backwards_run", "reasons"):
+        assert resumed.report()[key] == gate.report()[key]
+
+
+def test_trainers_that_take_turns_do_not_scale_each_others_rates(scene) -> None:
+    alone = trainer_of(scene)
+    alone.train(progress=False)
+    plain, thinned = trainer_of(scene), trainer_of(scene)
+    with SkipGate(thinned, refine_share=0.4):
+        for until in range(20, STEPS + 1, 20):
+            thinned.train(until=until, progress=False)
+            plain.train(until=until, progress=False)
+    assert all(torch.equal(one, two) for one, two in zip(left(alone), left(plain), strict=True))
+
+
+def test_multiples_are_met_where_numbers_are_left_out(scene) -> None:
+    trainer, passed, completed = trainer_of(scene), [], []
+
+    def look(iteration) -> None:
+        passed.append(iteration.passes(10))
+        completed.append(iteration.completes(10))
+
+    trainer.on_step = look
+    with SkipGate(trainer, refine_share=0.4):
+        trainer.train(progress=False)
+    # 84 iterations up to 83, then the last one alone passes the multiples that are left.
+    assert sum(passed) == 9 + 1 and sum(completed) == 8 + 1 and len(passed) == trainer.ran
