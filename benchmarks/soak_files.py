@@ -1,4 +1,4 @@
-"""Mutated scene, image and PLY files: each is refused with a sentence or loads as something sound.
+"""Mutated scene, image, PLY, checkpoint and state files: each is refused with a sentence or loads as something sound.
 
     from benchmarks.soak_files import run
     run(count=20_000, seed=7)
@@ -23,6 +23,7 @@ from collections import Counter
 from pathlib import Path
 
 from benchmarks.soak_sources import Source, write_sources
+from skipgs_plug import SkipGSError
 from skipgs_plug.trainer import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -135,7 +136,7 @@ class Case:
         outcome = {"outcome": "loaded"}
         try:
             source.load()
-        except InputError as error:
+        except (InputError, SkipGSError) as error:
             outcome = {"outcome": "refused"}
             if not str(error) or "\n" in str(error).strip() or len(str(error)) > 2000:
                 outcome = {"outcome": "failed", "why": f"not one sentence: {str(error)[:500]!r}"}
@@ -218,6 +219,7 @@ TARGETS = [  # (source, file); the binary model twice, for it is what others sen
     ("nerfstudio", "view_001.png"),
     ("packed", "scene.npz"),
     ("packed", "scene.npz"),
+    *(("states", name) for name in ("ckpt.pt", "chkpnt.pth.skipgs.json") * 2),
     *(("images", f"picture.{suffix}") for suffix in ("png", "jpg", "tif", "webp", "gif", "bmp")),
     *(("ply", f"{name}.ply") for name in ("model", "model", "text", "points")),
 ]

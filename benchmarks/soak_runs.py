@@ -68,6 +68,7 @@ class Run:
         """
         resume = ["--resume"] if any((self.out / "ckpts").glob("ckpt_*.pt")) else []
         log = self.out.with_suffix(".log")
+        log.touch()  # a signal may come before the process opens it
         process = CONTEXT.Process(target=_child, args=([*self._command, *resume], str(log), fault))
         process.start()
         self.starts += 1

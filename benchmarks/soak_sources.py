@@ -1,4 +1,4 @@
-"""Small valid scenes, images and PLY files, and the functions that load them: what `soak_files` mutates."""
+"""Small valid scenes, images, PLY files, checkpoints and gate states, and what loads them: for `soak_files`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from skipgs_plug.trainer import Scene, load_scene, save_packed
+from skipgs_plug import SkipGate
+from skipgs_plug.scripts.checkpoints import SUFFIX, Checkpoints
+from skipgs_plug.trainer import Scene, TrainConfig, Trainer, load_scene, save_packed
 from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.ply import read_ply, read_points, write_ply
@@ -52,6 +54,7 @@ def write_sources(root: Path) -> dict[str, Source]:
         "packed": write_packed(scene, root / "packed"),
         "images": write_images(root / "images"),
         "ply": write_plys(scene, root / "ply"),
+        "states": write_states(scene, root / "states"),
     }
 
 
@@ -182,3 +185,26 @@ def write_plys(scene: Scene, root: Path) -> Source:
         assert np.isfinite(points).all() and points.shape == colours.shape
 
     return Source(root, ["model.ply", "text.ply", "points.ply"], load_plys)
+
+
+def write_states(scene: Scene, root: Path) -> Source:
+    """Write a trainer's checkpoint, and a gate's state as it lies beside a script's checkpoint."""
+    root.mkdir()
+    trainer = Trainer(TrainConfig(max_steps=10), scene)
+    trainer.save_checkpoint(root / "ckpt.pt")
+    gate = SkipGate(start_iter=2, warmup=1)
+    for step in range(12):
+        gate.backward(torch.tensor(1.0 / (step + 1), requires_grad=True), view=f"{step % 3}.png", step=step)
+    state = root / f"chkpnt.pth{SUFFIX}"
+    state.write_text(json.dumps({"adapter": "inria", "script": "train.py", "gate": gate.state_dict()}))
+
+    def load_states() -> None:
+        trainer.load_checkpoint(root / "ckpt.pt")
+        assert all(parameter.isfinite().all() for parameter in trainer.splats.values())
+        content = Checkpoints("inria", "train.py", str(state)).state_for(12)
+        resumed = SkipGate(start_iter=2, warmup=1)
+        resumed.load_state_dict(content or {})
+        resumed.backward(torch.tensor(0.5, requires_grad=True), view="0.png", step=12)
+        assert resumed.report()["iterations"] >= 1
+
+    return Source(root, ["ckpt.pt", state.name], load_states)

@@ -116,7 +116,7 @@ def _read(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text())
         if {"adapter", "script"} <= content.keys() and "step" in content["gate"]:
             return content
-    except (OSError, ValueError, AttributeError, KeyError, TypeError):
+    except (OSError, ValueError, AttributeError, KeyError, TypeError, RecursionError):
         pass
     raise SkipGSError(
         f"{path} holds no gate state: give a file that ends in {SUFFIX}, as it lies beside the checkpoints of a gated "
