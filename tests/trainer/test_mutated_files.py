@@ -1,4 +1,4 @@
-"""A few hundred mutated scene, image and PLY files; `benchmarks.soak_files` runs as many as one has time for."""
+"""A few hundred mutated scene, image, PLY, checkpoint and state files; `benchmarks.soak_files` runs as many as one has time for."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ def test_cases_repeat(soak_files: ModuleType) -> None:
 
 def test_what_counts_as_a_failure(soak_files: ModuleType, tmp_path: Path) -> None:
     case = soak_files.Case(0, 0)
+    (tmp_path / case.file).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / case.file).write_bytes(b"sound")
 
     def outcome(load) -> str:
