@@ -1,4 +1,4 @@
-"""A few hundred mutated scene, image, PLY, checkpoint and state files; `benchmarks.soak_files` runs as many as one has time for."""
+"""A few hundred mutated files of every kind; `benchmarks.soak_files` runs as many as one has time for."""
 
 from __future__ import annotations
 
