@@ -86,8 +86,8 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
         worth = foresight["rest_worth_db"]
         judged = "not judged" if worth is None else f"worth at most {worth:.2f} dB when last judged"
         lines.append(
-            f"  {'ended early' if foresight['ended'] else 'not ended'}, cycle {foresight['cycle'] + 1}; the rest was "
-            f"{judged} (tolerance {config.tolerance} dB), {len(foresight['watched'])} views watched"
+            f"  {'ended early' if foresight['ended_early'] else 'not ended early'}, in cycle {foresight['cycle'] + 1}; "
+            f"the rest was {judged} (tolerance {config.tolerance} dB), {len(foresight['watched'])} views watched"
         )
     elif config.refine_share == "auto":
         lines.append("  each view comes up too seldom in this schedule to leave out iterations: all of them run")

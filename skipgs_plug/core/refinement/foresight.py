@@ -63,6 +63,11 @@ class Foresight:
         """Whether watched views are left out of training at present."""
         return not self.ended and self.cycle < len(self._ends) - 1
 
+    @property
+    def early(self) -> bool:
+        """Whether refinement ended before all that may run has run."""
+        return self.ended and self.cycle < len(self._ends) - 1
+
     def see(self, view: str, loss: float) -> None:
         """A watched view was rendered; its last loss in a cycle counts."""
         if loss > 0.0:
@@ -94,6 +99,8 @@ class Foresight:
                 mean, error = gain
                 self.foreseen = (abs(mean) + 2.0 * error) * math.log2(1.0 / end)
                 self.ended = self.foreseen < self._tolerance
+                if self.ended:
+                    return
         self._before = {**self._before, **self._now}
         self._now = {}
         self.cycle += 1

@@ -274,7 +274,7 @@ class Refinement:
             "foresight": None
             if foresight is None or not self._auto
             else {
-                "ended": foresight.ended,
+                "ended_early": foresight.early,
                 "cycle": foresight.cycle,
                 "gains_db": [list(gain) for gain in foresight.gains],
                 "rest_worth_db": foresight.foreseen,

@@ -26,7 +26,7 @@ def follow(losses, tolerance=0.05, iterations=800):
 
 def test_a_scene_that_needs_nothing_ends_after_the_second_cycle():
     foresight, done = follow(lambda view, done: 0.1)
-    assert foresight.ended and done == CYCLE_ENDS[1]
+    assert foresight.early and done == CYCLE_ENDS[1]
     assert foresight.gains == [(0.0, 0.0)] and foresight.foreseen == 0.0
 
 
@@ -35,7 +35,7 @@ def test_a_scene_that_gains_to_the_end_gets_all():
     assert not foresight.ended and foresight.cycle == len(CYCLE_ENDS) - 1
     assert len(foresight.gains) == 2 and all(mean > 0.05 for mean, _ in foresight.gains)
     foresight.progress(1.0)
-    assert foresight.ended
+    assert foresight.ended and not foresight.early
 
 
 def test_doubt_counts_for_going_on():

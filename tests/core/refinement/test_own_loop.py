@@ -159,7 +159,8 @@ def test_auto_ends_where_nothing_is_gained_and_goes_on_with_what_hangs_on_number
     report = gate.report()
     # A quarter of 0.4 of 2,000 iterations, then 500, 1,000, 1,500, 2,000 and the last.
     assert report["iterations_run"] == 200 + 5 and ran[-4:] == [1000, 1500, 2000, 2099]
-    assert report["foresight"]["ended"] and report["foresight"]["rest_worth_db"] == 0.0
+    assert report["foresight"]["ended_early"] and "ended early, in cycle 2" in gate.summary()
+    assert report["foresight"]["rest_worth_db"] == 0.0
     assert report["reasons"]["over"] > 0 and report["reasons"]["watched"] > 0
 
 
