@@ -23,6 +23,15 @@ GATE_HEADING = (
     "paused",
     "non-finite",
 )
+REFINEMENT_HEADING = (
+    "run",
+    "may run, %",
+    "iterations run",
+    "left out",
+    "run in any case",
+    "ended early",
+    "rest foreseen to be worth, dB",
+)
 RESULTS = (
     "held-out PSNR, dB",
     "worst view, dB",
@@ -101,6 +110,8 @@ def pictured_views(run: RunSource) -> list[Block]:
 
 def gate_blocks(name: str, data: dict[str, Any]) -> list[Block]:
     blocks: list[Block] = [gate_table("What the gate did", name, data)]
+    if data.get("refine_share") is not None:  # reports from before iterations could be left out do not say
+        blocks.append(refinement_table("Whole iterations left out", name, data))
     views = data["views"]
     if data["gated_iterations"] == 0:
         blocks.append(Text(["The gate was never active in this run, so there is nothing to draw."]))
@@ -166,6 +177,20 @@ def gate_table(caption: str, name: str, data: dict[str, Any]) -> Table:
         f"{data['non_finite']:,}",
     )
     return Table(caption, GATE_HEADING, [row])
+
+
+def refinement_table(caption: str, name: str, data: dict[str, Any]) -> Table:
+    foresight = data["foresight"] or {}
+    worth = foresight.get("rest_worth_db")
+    row = (
+        name,
+        f"{100 * data['refine_share']:.0f}",
+        *(f"{data[k]:,}" for k in ("iterations_run", "iterations_skipped")),
+        f"{sum(data['always_run'].values()):,}",
+        {None: "-", True: "yes", False: "no"}[foresight.get("ended_early")],
+        "-" if worth is None else f"{worth:.2f}",
+    )
+    return Table(caption, REFINEMENT_HEADING, [row])
 
 
 def settings_table(caption: str, settings: dict[str, Any]) -> Table:
