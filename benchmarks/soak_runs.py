@@ -26,6 +26,7 @@ STEPS = 80
 OPTIONS = ["--max-steps", str(STEPS), "--refine-every", "10", "--no-progress"]
 GATED = ["--warmup", "8"]
 DECIDED = ("iterations", "gated_iterations", "backwards_run", "backwards_skipped", "reasons", "events", "views")
+CURVE = "stats/train_curve.json"
 LIMIT = 120.0  # seconds that a run of seconds may take before it counts as hung
 FAULTS = ("killed before", "killed after", "disk full")  # at the renaming of a file
 
@@ -131,12 +132,9 @@ def _strike(kind: str, at: int) -> None:
     os.replace = struck  # type: ignore[assignment]
 
 
-CURVE = "stats/train_curve.json"
-
-
-def assert_same(out: Path, whole: Path) -> None:
-    """Raise AssertionError unless both runs left the same: files, models and pictures, moments, decisions."""
-    last = f"ckpts/ckpt_{STEPS - 1}_rank0.pt"
+def assert_same(out: Path, whole: Path, steps: int = STEPS) -> None:
+    """Raise AssertionError unless both runs of so many steps left the same: files, models, moments, decisions."""
+    last = f"ckpts/ckpt_{steps - 1}_rank0.pt"
     left = [{p.relative_to(r).as_posix() for p in r.rglob("*") if p.is_file()} for r in (out, whole)]
     left = [{name for name in names if not name.startswith("ckpts/") or name == last} for names in left]
     assert left[0] == left[1], left[0] ^ left[1]
