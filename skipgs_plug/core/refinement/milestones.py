@@ -55,17 +55,18 @@ class Condition:
             SkipGSError: It depends on something that changes in the loop.
         """
         found: set[int] = set()
+        values = dict(names)  # once: it holds every global name of the loop's module
         for assumed in (True, False):  # of parts that say nothing of the number
             holds: set[int] = set()
             rest: set[int] = set()
             for number in numbers:
-                values = {**names, self._loop.target: number}
+                values[self._loop.target] = number
                 if all(self._value(outer, values, True) for outer in self._path):
                     (holds if self._value(self._test, values, assumed) else rest).add(number)
             found |= holds if len(holds) <= len(rest) else rest
         return found
 
-    def _value(self, node: ast.expr, values: Mapping[str, Any], assumed: bool) -> bool:
+    def _value(self, node: ast.expr, values: dict[str, Any], assumed: bool) -> bool:
         if isinstance(node, ast.BoolOp):
             combine = all if isinstance(node.op, ast.And) else any
             return combine(self._value(part, values, assumed) for part in node.values)
@@ -81,7 +82,7 @@ class Condition:
         if leaf.code is None:
             return assumed
         try:
-            return bool(eval(leaf.code, dict(values)))
+            return bool(eval(leaf.code, values))
         except Exception:  # a name that is not bound yet, a number of another kind
             return assumed
 
