@@ -19,13 +19,18 @@ CYCLE_ENDS = (0.125, 0.25, 0.5, 1.0)
 ONE_CYCLE = (1.0,)  # for a share that is given: nothing is to be foreseen
 LEAST_VISITS = 10  # of each view: with fewer, larger steps did not make up for what was left out
 LEAST_SHARE = 0.4
+ALL = 0.95
 WATCHED_SHARE = 1 / 12  # of the views
 LEAST_WATCHED, MOST_WATCHED = 3, 12
 
 
 def needed_share(iterations: int, n_views: int) -> float:
-    """Share of the refinement iterations that may be needed, known beforehand: each view ten times, at least 0.4."""
-    return min(1.0, max(LEAST_SHARE, LEAST_VISITS * n_views / max(iterations, 1)))
+    """Share of the refinement iterations that may be needed, known beforehand: each view ten times, at least 0.4.
+
+    So much that leaving out the rest is not worth it means all.
+    """
+    share = max(LEAST_SHARE, LEAST_VISITS * n_views / max(iterations, 1))
+    return share if share < ALL else 1.0
 
 
 def watched_views(names: Iterable[str], seed: int = 0) -> frozenset[str]:

@@ -17,7 +17,6 @@ from skipgs_plug.core.refinement.thinning import Thinning
 log = logging.getLogger(__name__)
 
 SEARCHED = 10  # iterations from the start on, after which the training loop must have been recognised
-ALL = 0.95  # a share above this is not worth leaving anything out
 RECOVERY = 500  # iterations that run after a structural change which comes when refinement has ended
 
 Always = Callable[[range], Iterable[int]]
@@ -42,7 +41,7 @@ class Refinement:
     Attributes:
         share: of the iterations that run, or may run where it is found automatically; None before refinement.
         thinning: counts what ran and what was left out.
-        foresight: None unless the share is found automatically.
+        foresight: follows the cycles of steps that shrink, one where the share is given; None where rates stay.
         always: numbers that must run, by the reason.
         watched: views that are watched and not trained on while `foresight` says so.
         gap: iterations left out right before the present one.
@@ -240,7 +239,7 @@ class Refinement:
     def _scales(self) -> bool:
         if self._keeps_rates or not self._config.compensates:
             return False
-        return self._config.rate_peak is not None or (self.share is not None and self.share < ALL)
+        return self._config.rate_peak is not None or (self.share is not None and self.share < 1.0)
 
     def _set_pace(self, number: int) -> None:
         """Set the share and the factor with which this number is decided on."""
