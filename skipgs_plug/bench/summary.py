@@ -36,13 +36,13 @@ class Row:
     Attributes:
         seeds: those that the means are over.
         excluded: the others, with the reason.
-        values: by name: `t_post t_total processor_post` (s), `t_post_saved t_total_saved processor_post_saved` (% less
-            than ungated, same seed), `time_to_ungated` (s of refinement until the final PSNR of ungated, same seed,
-            missing where it is not reached), `iterations_run`, `backwards_share` (% of the refinement
-            iterations of the full schedule), `share_forward ...` (% of
-            t_post), every metric by its own name, `train_` before it on training views, `_gain` after it above ungated, same seed; `num_GS`, `peak_memory_gib`; `wanted` and `held_back`:
-            backwards after warm-up that a gate's rule asked for, and skips that its floor forbade (% of the
-            iterations after warm-up).
+        values: by name: `t_post t_total processor_post` (s), `t_post_saved t_total_saved processor_post_saved` (%
+            less than ungated, same seed), `time_to_ungated` (s of refinement until the final PSNR of ungated, same
+            seed, missing where it is not reached), `iterations_run`, `backwards_share` (% of the refinement
+            iterations of the full schedule), `share_forward ...` (% of t_post), every metric by its own name,
+            `train_` before it on training views, `_gain` after it above ungated, same seed; `num_GS`,
+            `peak_memory_gib`; `wanted` and `held_back`: backwards after warm-up that a gate's rule asked for, and
+            skips that its floor forbade (% of the iterations after warm-up).
     """
 
     policy: str
