@@ -1,4 +1,4 @@
-"""`skipgs-plug train SCENE --out RUN`: the reference trainer, gated unless told otherwise."""
+"""`skipgs-plug train SCENE --out RUN`: the reference trainer, with a gate when asked for one."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ class Options(TrainConfig):
 
 @dataclass
 class Args:
-    """Train a COLMAP, nerfstudio or Blender folder or a packed .npz."""
+    """Train a COLMAP, nerfstudio or Blender folder or a packed .npz: the 3DGS recipe, every iteration of it.
+
+    --refine-share 0.4 (or auto) refines in fewer iterations with larger, shrinking steps.
+    """
 
     scene: tyro.conf.Positional[str]
     """Folder with sparse/0, transforms.json or transforms_train.json, or packed .npz."""
@@ -43,9 +46,9 @@ class Args:
     max_steps: int | None = None
     """Training iterations; default: 30,000, or with --resume those of the run, which a larger number extends."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
-    gate: tyro.conf.OmitArgPrefixes[GateOptions] = dataclasses.field(default_factory=GateOptions)
-    no_gate: bool = False
-    """Train without the gate."""
+    gate: bool = False
+    """Attach the paper's gate. Any of its settings, --refine-share among them, attaches a gate as well."""
+    gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
     resume: bool = False
     """Continue from the last checkpoint in --out, or write what a finished run lacks."""
     session: Annotated[SessionOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=SessionOptions)
@@ -68,7 +71,8 @@ def run(args: Args) -> int:
     checkpoints, config = configure(args, found)
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
     trainer = Trainer(config, scene)
-    gate = None if args.no_gate else SkipGate(trainer, **args.gate.given())
+    settings = args.gate_options.given()
+    gate = SkipGate(trainer, **settings) if args.gate or settings else None
     trainer.register_state("gate_settings", GateSettings(gate))
     curve = LossCurve(trainer)
     with exclusive(folder.root):
@@ -82,7 +86,7 @@ def run(args: Args) -> int:
             f"{scene.name}: {len(scene.train)} training views, {len(scene.test)} held out, "
             f"{len(scene.points):,} points, backend {trainer.backend.name}, "
             f"iterations {trainer.step:,} to {trainer.max_steps:,}"
-            + (f", gate active from {trainer.refine_stop_iter:,}" if gate is not None else ", no gate")
+            + (f", gate active from {gate.config.start_iter:,}" if gate is not None else "")
         )
         return Session(args.session, folder, trainer, gate, curve).run()
 

@@ -22,7 +22,7 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def run_folder(scene_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "tiny"
-    command = ["train", str(scene_file), "--out", str(folder), "--max-steps", "40", "--no-gate", "--no-progress"]
+    command = ["train", str(scene_file), "--out", str(folder), "--max-steps", "40", "--no-progress"]
     assert main(command) == 0
     return folder
 
