@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -81,7 +82,7 @@ def run(args: Args) -> int:
         folder.remove_leftovers()
         if checkpoints:
             first_sound(checkpoints, trainer.load_checkpoint)
-        folder.write_config(config, gate=None if gate is None else gate.config.as_dict())
+        folder.write_config(config, near_plane=trainer.near_plane, gate=None if gate is None else gate.config.as_dict())
         print(
             f"{scene.name}: {len(scene.train)} training views, {len(scene.test)} held out, "
             f"{len(scene.points):,} points, backend {trainer.backend.name}, "
@@ -115,4 +116,7 @@ def configure(args: Args, checkpoints: list[Path]) -> tuple[list[Path], TrainCon
         checkpoints, run = first_sound(checkpoints, lengths)
     if args.max_steps is not None:
         run["max_steps"] = args.max_steps
-    return checkpoints, dataclasses.replace(args.train, data_dir=args.scene, result_dir=args.out, **run)
+    # What looks at the run later may do so from another folder.
+    paths = (args.scene, args.train.init_ply)
+    scene, start = (os.path.abspath(Path(path).expanduser()) if path else "" for path in paths)
+    return checkpoints, dataclasses.replace(args.train, data_dir=scene, init_ply=start, result_dir=args.out, **run)

@@ -63,11 +63,11 @@ class Recipe(NamedTuple):
 
 
 RECIPES = {"default": Recipe(0.1, 1.0, 15_000, 0.0, 0.0), "mcmc": Recipe(0.5, 0.1, 25_000, 0.01, 0.01)}  # gsplat's
-OPTIONAL = ("schedule_steps", *Recipe._fields)
 BELONGS_TO = {
     **dict.fromkeys(("grow_grad2d", "grow_scale3d", "prune_scale3d", "reset_every", "absgrad"), "default"),
     **dict.fromkeys(("cap_max", "noise_lr"), "mcmc"),
 }
+FROM_OTHERS = ("schedule_steps", "near_plane", *Recipe._fields)  # None: follows from other settings or the scene
 
 
 @dataclass
@@ -135,8 +135,8 @@ class TrainConfig:
     """Compensate opacities for the 2D low-pass filter (Mip-Splatting)."""
     random_bkgd: bool = False
     """Train on random background colours."""
-    near_plane: float = 0.01
-    """Near clipping plane, world units."""
+    near_plane: float | None = None
+    """Near clipping plane, world units; default: a tenth of the depth of the nearest points that a view shows."""
     far_plane: float = 1e10
     """Far clipping plane, world units."""
 
@@ -176,13 +176,13 @@ class TrainConfig:
                 raise InputError(f"{field.name}={value} is not a finite number.")
         for name, (low, high) in INTEGERS.items():
             value = getattr(self, name)
-            if value is None and name in OPTIONAL:
+            if value is None and name in FROM_OTHERS:
                 continue
             if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
                 raise InputError(f"{name}={value!r} is not an integer in {low}..{high:,}.")
         for name, (least, greatest) in NUMBERS.items():
             value = getattr(self, name)
-            if value is None and name in OPTIONAL:
+            if value is None and name in FROM_OTHERS:
                 continue
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value <= greatest:
                 raise InputError(f"{name}={value!r} is outside {least:g}..{greatest:g}.")
@@ -191,7 +191,7 @@ class TrainConfig:
         for name, strategy in BELONGS_TO.items():
             if strategy != self.strategy and getattr(self, name) != type(self).__dataclass_fields__[name].default:
                 raise InputError(f"{name} belongs to strategy {strategy}, and this is {self.strategy}; leave it out.")
-        if self.near_plane >= self.far_plane:
+        if self.near_plane is not None and self.near_plane >= self.far_plane:
             raise InputError(f"near_plane={self.near_plane:g} is not below far_plane={self.far_plane:g}.")
 
     @property
