@@ -24,7 +24,9 @@ def load_scene(
     init_num_pts: int = 100_000,
     init_ply: str | Path | None = None,
 ) -> Scene:
-    """Load a COLMAP, nerfstudio or Blender folder or a packed .npz. Writes nothing.
+    """Load a COLMAP, nerfstudio or Blender folder or a packed .npz.
+
+    Writes nothing but `undistorted_cache` in a scene whose cameras are distorted, if it can.
 
     Args:
         path: folder with `sparse/0` or `sparse`, with `transforms_train.json`, with `transforms.json`, or .npz file.
