@@ -142,7 +142,7 @@ class Session:
             print(self._gate.summary())
         print(f"{self._described(stats)}; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s")
         if ply is not None:
-            print(ply)
+            print(f"{ply}\nNext: skipgs-plug view {folder.root}")
 
     def _described(self, stats: dict[str, Any]) -> str:
         net = self._options.lpips_net

@@ -11,16 +11,19 @@ from typing import Annotated, Any
 import tyro
 
 from skipgs_plug import SkipGate
+from skipgs_plug.commands import sfm
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.commands.gate_settings import GateSettings
 from skipgs_plug.commands.session import Session, SessionOptions
+from skipgs_plug.photos.gather import are_photographs
 from skipgs_plug.trainer import InputError, MissingFileError, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.config import REFERENCE_STEPS
 from skipgs_plug.trainer.curve import LossCurve
+from skipgs_plug.trainer.loaders import is_scene
 from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.metrics import require_lpips
 from skipgs_plug.trainer.resume import first_sound, lengths
-from skipgs_plug.trainer.run_folder import RunFolder
+from skipgs_plug.trainer.run_folder import SCENE, RunFolder
 
 
 @dataclass
@@ -41,9 +44,11 @@ class Args:
     """
 
     scene: tyro.conf.Positional[str]
-    """Folder with sparse/0, transforms.json or transforms_train.json, or packed .npz."""
+    """Folder with sparse/0, transforms.json or transforms_train.json, packed .npz; with --sfm: photographs, a video."""
     out: str
     """Run folder to write."""
+    sfm: bool = False
+    """Find out first where the photographs were taken, as the command sfm does, and keep the scene in OUT/scene."""
     max_steps: int | None = None
     """Training iterations; default: 30,000, or with --resume those of the run, which a larger number extends."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
@@ -69,6 +74,8 @@ def run(args: Args) -> int:
     folder = RunFolder(args.out)
     found = folder.checkpoints()
     check(args, found)
+    if args.sfm:
+        args = dataclasses.replace(args, scene=str(scene_of_photographs(args, folder)))
     checkpoints, config = configure(args, found)
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
     trainer = Trainer(config, scene)
@@ -96,14 +103,32 @@ def check(args: Args, checkpoints: list[Path]) -> None:
     """Refuse what can be refused before anything is read.
 
     Raises:
-        InputError: LPIPS cannot be computed, or --resume does not fit what --out holds.
+        InputError: LPIPS cannot be computed, --resume does not fit what --out holds, or --sfm what SCENE is.
     """
+    given = Path(args.scene).expanduser()
+    if args.sfm and not are_photographs(given):
+        what = "is a scene already" if is_scene(given) else "is neither a video nor a folder with photographs"
+        raise InputError(f"{args.scene} {what}; leave out --sfm or give photographs.")
+    if not args.sfm and are_photographs(given):
+        raise InputError(
+            f"{args.scene} holds photographs and nothing that says where they were taken; add --sfm to find that out "
+            f"first, or run: skipgs-plug sfm {args.scene} SCENE."
+        )
     if args.session.lpips_net is not None:
         require_lpips(args.session.lpips_net)
     if checkpoints and not args.resume:
         raise InputError(f"{args.out} already holds a run; add --resume to continue it or give another --out.")
     if args.resume and not checkpoints:
         raise MissingFileError(f"{args.out} holds no checkpoint (ckpts/ckpt_*_rank0.pt); start without --resume.")
+
+
+def scene_of_photographs(args: Args, folder: RunFolder) -> Path:
+    """Return the scene of the run's photographs, which is made in its folder unless it is there."""
+    scene = folder.root / SCENE
+    if not is_scene(scene):
+        with exclusive(folder.root):
+            sfm.reconstruct(sfm.Args(Path(args.scene), scene, no_progress=args.session.no_progress))
+    return scene
 
 
 def configure(args: Args, checkpoints: list[Path]) -> tuple[list[Path], TrainConfig]:

@@ -17,6 +17,7 @@ from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.loaders import load_scene
 from skipgs_plug.trainer.near_plane import near_plane
 from skipgs_plug.trainer.ply import read_ply
+from skipgs_plug.trainer.run_folder import SCENE
 from skipgs_plug.trainer.scene import BLACK, Scene
 
 # Where trainers leave their models: ours and gsplat's, then Inria's and those of its family. The last one of an
@@ -97,6 +98,8 @@ def open_model(path: str | Path, scene: str | None = None, data_factor: int | No
     factor = data_factor or config.get("data_factor", 1)
     loaded = None
     if source:
+        if not scene and not Path(source).exists() and (path / SCENE).is_dir():
+            source = path / SCENE  # the run was moved together with it
         if not scene and not Path(source).exists():
             raise MissingFileError(f"{path} was trained on {source}, which does not exist here; add --scene.")
         loaded = load_scene(source, factor, **{name: config[name] for name in LOADING if name in config})

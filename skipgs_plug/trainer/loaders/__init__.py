@@ -16,6 +16,13 @@ from skipgs_plug.trainer.loaders.packed import load_packed
 from skipgs_plug.trainer.ply import read_start
 from skipgs_plug.trainer.scene import Scene
 
+TRANSFORMS = ("transforms_train.json", "transforms.json")
+
+
+def is_scene(folder: Path) -> bool:
+    """Whether `load_scene` recognises what a folder holds."""
+    return (folder / "sparse").is_dir() or any((folder / name).is_file() for name in TRANSFORMS)
+
 
 def load_scene(
     path: str | Path,
