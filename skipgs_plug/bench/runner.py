@@ -46,9 +46,10 @@ class Bench:
         check_policies(policies)
         if not seeds or len(set(seeds)) < len(seeds):
             raise InputError("Give at least one seed, each once.")
-        if config.scaled(config.refine_stop_iter) >= config.max_steps:
+        stop = config.scaled(config.recipe.refine_stop_iter)
+        if stop >= config.max_steps:
             raise InputError(
-                f"Densification ends at iteration {config.scaled(config.refine_stop_iter):,} of {config.max_steps:,}, "
+                f"Densification ends at iteration {stop:,} of {config.max_steps:,}, "
                 "which leaves nothing to refine; lower --refine-stop-iter."
             )
         if not scene.test:
@@ -70,7 +71,7 @@ class Bench:
     @property
     def refine_stop_iter(self) -> int:
         """First iteration of refinement."""
-        return self.config.scaled(self.config.refine_stop_iter)
+        return self.config.scaled(self.config.recipe.refine_stop_iter)
 
     def run(self) -> list[RunRecord]:
         """Return one record per seed and policy, by seed, in the order of `policies`."""

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -39,7 +39,7 @@ class Args:
 
     adapter: tyro.conf.Positional[str]
     """Name of the trainer: inria, fastgs, taming, ...; or auto, to recognise it by its script."""
-    gate: tyro.conf.OmitArgPrefixes[GateOptions] = dataclasses.field(default_factory=GateOptions)
+    gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
     resume_gate: str = "auto"
     """State the gate goes on from: auto (the one beside the checkpoint the script loads), off (afresh), or a path."""
     no_gate: bool = False
@@ -99,7 +99,7 @@ def run_gated(
     adapter = get_adapter(args.adapter)()
     checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
     adapter.replaced = (*REPLACED, *(f"torch.cuda.{name}" for name in CUDA_REPLACED if args.cpu))
-    settings = args.gate.given() | ({"enabled": False} if args.no_gate else {})
+    settings = args.gate_options.given() | ({"enabled": False} if args.no_gate else {})
     gates: list[SkipGate] = []
 
     def attach() -> dict[str, Any]:

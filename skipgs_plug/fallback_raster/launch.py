@@ -33,7 +33,7 @@ from torch import Tensor
 from skipgs_plug.install import install_command
 
 from . import guard
-from .cache import load_or_rebuild
+from .cache import load_or_rebuild, say_unwritable
 from .cores import usable_cores
 from .guard import Sizes
 from .source import PRELUDE, SHARED, declare
@@ -234,11 +234,12 @@ class Worker:
         inputs = [0] * len(declared)
         # Warp compiles for blocks of one thread on the CPU.
         folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(1)
-        command = load_or_rebuild(
-            folder,
-            lambda: wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False),
-            kernel.module.unload,
-        )
+
+        def load() -> Any:
+            with say_unwritable():
+                return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
+
+        command = load_or_rebuild(folder, load, kernel.module.unload)
         # Every call fills a block of parameters of its own, which the threads share.
         bounds, *parameters = command.params
         fields = [(name, type(parameter)) for name, parameter in zip(declared, parameters, strict=True)]
@@ -296,7 +297,7 @@ def _warp() -> Any:
         raise ImportError(f"The CPU rasterizer needs NVIDIA Warp: {install_command()}.") from error
     wp.config.quiet = True
     wp.config.log_level = wp.LOG_ERROR
-    with _quiet_stderr():
+    with _quiet_stderr(), say_unwritable():
         wp.init()
     return wp
 
