@@ -23,7 +23,6 @@ _torchs_adam = _module.adam
 class Adam(torch.optim.Adam):
     """`torch.optim.Adam` whose steps are those of `adam` below: options, state, state_dict and hooks are torch's."""
 
-    @torch.no_grad()
     def step(self, closure: Any = None) -> Any:  # type: ignore[override]
         """Update every parameter that has a gradient.
 
@@ -37,19 +36,23 @@ class Adam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        for group in self.param_groups:
-            lists: tuple[list[Tensor], ...] = ([], [], [], [], [], [])
-            has_complex = self._init_group(group, *lists)
-            adam(
-                *lists,
-                has_complex=has_complex,
-                beta1=group["betas"][0],
-                beta2=group["betas"][1],
-                grad_scale=getattr(self, "grad_scale", None),
-                found_inf=getattr(self, "found_inf", None),
-                **{name: group[name] for name in _OPTIONS if name in group},
-            )
+        with torch.set_grad_enabled(self.defaults["differentiable"]):
+            for group in self.param_groups:
+                self._step(group)
         return loss
+
+    def _step(self, group: dict[str, Any]) -> None:
+        lists: tuple[list[Tensor], ...] = ([], [], [], [], [], [])
+        has_complex = self._init_group(group, *lists)
+        adam(
+            *lists,
+            has_complex=has_complex,
+            beta1=group["betas"][0],
+            beta2=group["betas"][1],
+            grad_scale=getattr(self, "grad_scale", None),
+            found_inf=getattr(self, "found_inf", None),
+            **{name: group[name] for name in _OPTIONS if name in group},
+        )
 
 
 def moments(optimizer: torch.optim.Optimizer, param: Tensor) -> dict[str, Tensor]:
