@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from skipgs_plug.fallback_raster.launch import release_memory
 from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.clock import TrainClock
@@ -301,6 +302,7 @@ class Trainer:
         with torch.random.fork_rng(enabled=step % self.strategy.refine_every == 0):
             if step % self.strategy.refine_every == 0:
                 torch.manual_seed(derive_seed(self.config.seed, step))
+                release_memory()  # of gradients, while copies of all parameters and moments are made
             args = (self.splats, self.optimizers, self.strategy_state, step)
             self.strategy.step_post_backward(*args, info, packed=False)
             reset_opacity_if_missed(self.strategy, *args)
