@@ -36,10 +36,12 @@ from . import guard
 from .cache import load_or_rebuild, say_unwritable
 from .cores import usable_cores
 from .guard import Sizes
+from .memory import LARGE, SUPPORTED, Pool
 from .source import PRELUDE, SHARED, declare
 
 _lock = threading.RLock()
 _scratch = threading.local()
+_memory = Pool()
 _num_threads = usable_cores()
 _pool: ThreadPoolExecutor | None = None
 _busy = False  # threads of the pool may still be at work
@@ -76,12 +78,25 @@ def set_num_threads(n: int) -> None:
 
 def floats(*shape: int) -> Tensor:
     """A float32 tensor with undefined content, whatever the default dtype and device of the process."""
-    return guard.poison(torch.empty(shape, dtype=torch.float32, device="cpu"))
+    return _empty(shape, torch.float32)
 
 
 def ints(*shape: int) -> Tensor:
     """An int32 tensor with undefined content."""
-    return guard.poison(torch.empty(shape, dtype=torch.int32, device="cpu"))
+    return _empty(shape, torch.int32)
+
+
+def _empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    if not SUPPORTED or math.prod(shape) * dtype.itemsize < LARGE:
+        return guard.poison(torch.empty(shape, dtype=dtype, device="cpu"))
+    with _lock:
+        return guard.poison(_memory.empty(shape, dtype))
+
+
+def release_memory() -> None:
+    """Gives memory back to the system that tensors of the rasterizer lay in and none lies in now."""
+    with _lock:
+        _memory.release()
 
 
 def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:

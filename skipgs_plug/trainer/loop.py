@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from skipgs_plug.fallback_raster.launch import release_memory
 from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.clock import TrainClock
@@ -339,7 +340,10 @@ class Trainer:
         return pending and self.splats["means"].grad is None
 
     def _densify(self, strategy: Any, step: int, info: dict[str, Any]) -> None:
-        with self._seeded(step) if step % strategy.refine_every == 0 else nullcontext():
+        due = step % strategy.refine_every == 0
+        if due:
+            release_memory()  # of gradients, while copies of all parameters and moments are made
+        with self._seeded(step) if due else nullcontext():
             args = (self.splats, self.optimizers, self.strategy_state, step)
             strategy.step_post_backward(*args, info, packed=False)
             reset_opacity_if_missed(strategy, *args)
@@ -347,6 +351,8 @@ class Trainer:
     def _move(self, mcmc: Mcmc, step: int, updated: bool) -> None:
         # The noise belongs to the update: alone it is a random walk.
         if updated or mcmc.moves(step):
+            if mcmc.moves(step):
+                release_memory()
             rate = self.optimizers["means"].param_groups[0]["lr"] if updated else 0.0
             with self._seeded(step):
                 mcmc.after_update(self.splats, self.optimizers, step, rate)
