@@ -1,8 +1,11 @@
 // Front-to-back compositing, one tile at a time.
 #include "blend_tile.h"
+#include "reached_blocks.h"
+#include "sorted_tile.h"
 for (int t = first; t < last; ++t) {
     const Tile tile(t, tile_start, tiles_x, width, height);
     const int x0 = tile.x0, y0 = tile.y0, begin = tile.begin, end = tile.end;
+    SortedTile list(begin, sorted ? begin : end, unsorted, buffer, tile_list, tile_place, pair_row);
 
     alignas(64) v16 P[16], T[16], C[16][D];
     alignas(64) i16 stop[16];
@@ -15,30 +18,26 @@ for (int t = first; t < last; ++t) {
         stop[b] = (i16)begin;
         if (any(inside)) open |= 1u << b;
     }
-    // First pixel of each block.
-    const v16 corner_x = 4.0f * lane_x + (x0 + 0.5f), corner_y = 4.0f * lane_y + (y0 + 0.5f);
     for (int base = begin; base < end && open; base += 64) {
         alignas(64) float chunk[65 * RECORD];  // their records, and one that no pixel sees
         unsigned long long live[16] = {};  // by block, the Gaussians of these 64 that reach it
         const int count = smaller(64, end - base);
+        list.sort(base - begin + 64);
+        const int listed = sorted ? end : begin + list.done;
         clear(chunk + 64 * RECORD, RECORD);
         chunk[64 * RECORD + 5] = -100.0f;
         for (int j = 0; j < count; j += 16) {
-            int reached[16] = {};
-            for (int i = 0; i < 16 && j + i < count; ++i) {
-                __builtin_prefetch(records + (long long)RECORD * tile_list[smaller(base + j + i + 16, end - 1)]);
-                const float* r = records + (long long)RECORD * tile_list[base + j + i];
-                store(chunk + RECORD * (j + i), load(r));
-                const v16 left = corner_x - r[0], right = left + 3.0f, top = corner_y - r[1], bottom = top + 3.0f;
-                // A convex function is least at the point nearest to the centre or on an edge that faces it.
-                const v16 near_x = vmax(left, vmin(right, (v16)0.0f)), near_y = vmax(top, vmin(bottom, (v16)0.0f));
-                const v16 at_y = vmax(top, vmin(bottom, r[13] * near_x));
-                const v16 at_x = vmax(left, vmin(right, r[12] * near_y));
-                const v16 p = r[2] * near_x + r[3] * at_y, w = r[4] * at_y;
-                const v16 q = r[2] * at_x + r[3] * near_y, u = r[4] * near_y;
-                // A little more than exact: every pixel is tested again.
-                const i16 near = vmin(p * p + w * w, q * q + u * u) <= r[14] + 0.01f;
-                reached[i] = shortcuts & BLOCK_BOUNDS ? bits(near) : 65535;
+            alignas(64) int reached[16] = {};
+            for (int i = 0; i < 16 && j + i < count; i += 4) {
+                const float* r[4];
+                for (int g = 0; g < 4; ++g) {
+                    const int k = base + j + i + g;
+                    __builtin_prefetch(records + (long long)RECORD * tile_list[smaller(k + 16, listed - 1)]);
+                    r[g] = records + (long long)RECORD * tile_list[smaller(k, listed - 1)];
+                    store(chunk + RECORD * (j + i + g), load(r[g]));
+                }
+                const i16 blocks = shortcuts & BLOCK_BOUNDS ? reached_blocks(r, tile.x0, tile.y0) : (i16)65535;
+                for (int g = 0; g < 4 && j + i + g < count; ++g) reached[i + g] = blocks[4 * g];
             }
             const i16 of_gaussian = *(const i16*)reached;
             for (int b = 0; b < 16; ++b) live[b] |= (unsigned long long)bits(of_gaussian & (1 << b)) << j;
