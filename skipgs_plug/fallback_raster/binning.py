@@ -12,7 +12,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from .constants import MAX_CHANNELS, RECORD, tiles
+from .constants import BOX, MAX_CHANNELS, RECORD, tiles
 from .launch import FloatArray, IntArray, LongArray, floats, get_num_threads, ints, longs, worker, zeros
 from .shortcuts import active_shortcuts
 from .source import read_kernel
@@ -45,7 +45,7 @@ def pack_and_count(
     sigmas: Annotated[FloatArray, "R, 2"],
     colors: Annotated[FloatArray, "R, stride"],
     records: Annotated[FloatArray, "R, RECORD"],  # out, only visible rows are written
-    boxes: Annotated[IntArray, "n, 4"],  # out, first and last column and row of tiles
+    boxes: Annotated[IntArray, "n, BOX"],  # out
     counts: Annotated[IntArray, "slices, tiles_x, tiles_y"],  # out
     totals: Annotated[LongArray, "slices + 1"],  # out, pairs of each slice
     tiles_per_gauss: Annotated[IntArray, "R"],  # out, zeros before
@@ -76,7 +76,7 @@ def fill_pairs(
     visible: Annotated[IntArray, "n"],
     depths: Annotated[FloatArray, "R"],
     records: Annotated[FloatArray, "R, RECORD"],
-    boxes: Annotated[IntArray, "n, 4"],
+    boxes: Annotated[IntArray, "n, BOX"],
     counts: Annotated[IntArray, "slices, tiles_x, tiles_y"],  # next free place
     totals: Annotated[LongArray, "slices + 1"],
     pair_start: Annotated[IntArray, "n + 1"],  # out
@@ -93,6 +93,7 @@ def fill_pairs(
 
 @worker(read_kernel("sort_tiles.h"), items="tiles", grain="2")
 def sort_tiles(
+    records: Annotated[FloatArray, "R, RECORD"],
     tile_start: Annotated[IntArray, "tiles + 1"],
     pair_row: Annotated[IntArray, "P"],
     unsorted: Annotated[LongArray, "P"],
@@ -133,7 +134,7 @@ class Bins:
         """Sorts the lists of all tiles to their ends."""
         buffer = longs(len(self.unsorted))
         sort_tiles(
-            self.tile_start, self.pair_row, self.unsorted, buffer, self.tile_list, self.tile_place,
+            self.records, self.tile_start, self.pair_row, self.unsorted, buffer, self.tile_list, self.tile_place,
             len(self.tile_start) - 1,
         )  # fmt: skip
 
@@ -159,7 +160,7 @@ def bin_gaussians(
     rows, channels = colors.shape
     # Any number of slices gives the same lists; some per thread keep all busy.
     slices = 1 if n < 1024 or get_num_threads() == 1 else SLICES * get_num_threads()
-    records, boxes, counts = floats(rows, RECORD), ints(n, 4), ints(slices, tiles_x * tiles_y)
+    records, boxes, counts = floats(rows, RECORD), ints(n, BOX), ints(slices, tiles_x * tiles_y)
     tile_start, pair_start = ints(tiles_x * tiles_y + 1), ints(n + 1)
     tiles_per_gauss, totals = zeros(rows, dtype=torch.int32), longs(slices + 1)
     pack_and_count(

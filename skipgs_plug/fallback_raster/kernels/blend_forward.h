@@ -5,7 +5,7 @@
 for (int t = first; t < last; ++t) {
     const Tile tile(t, tile_start, tiles_x, width, height);
     const int x0 = tile.x0, y0 = tile.y0, begin = tile.begin, end = tile.end;
-    SortedTile list(begin, sorted ? begin : end, unsorted, buffer, tile_list, tile_place, pair_row);
+    SortedTile list(begin, sorted ? begin : end, unsorted, buffer, tile_list, tile_place, pair_row, records);
 
     alignas(64) v16 P[16], T[16], C[16][D];
     alignas(64) i16 stop[16];
@@ -32,7 +32,6 @@ for (int t = first; t < last; ++t) {
                 const float* r[4];
                 for (int g = 0; g < 4; ++g) {
                     const int k = base + j + i + g;
-                    __builtin_prefetch(records + (long long)RECORD * tile_list[smaller(k + 16, listed - 1)]);
                     r[g] = records + (long long)RECORD * tile_list[smaller(k, listed - 1)];
                     store(chunk + RECORD * (j + i + g), load(r[g]));
                 }

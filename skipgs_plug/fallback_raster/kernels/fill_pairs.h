@@ -9,10 +9,14 @@ for (int s = first; s < last; ++s) {
         const int g = visible[i];
         const long long key = (long long)((const int*)depths)[g] << 32;
         pair_start[i] = pair;
-        const int* box = boxes + 4ll * i;
-        if (box[0] == box[1] && box[2] == box[3]) {
-            pair_row[pair] = g;
-            unsorted[next[box[2] * tiles_x + box[0]]++] = key | (unsigned)pair++;
+        const int* box = boxes + (long long)BOX * i;
+        if (box[4] >= 0) {
+            int* corner = next + box[2] * tiles_x + box[0];
+            for (int rest = box[4]; rest; rest &= rest - 1) {
+                const int j = __builtin_ctz(rest);
+                pair_row[pair] = g;
+                unsorted[corner[(j >> 1) * tiles_x + (j & 1)]++] = key | (unsigned)pair++;
+            }
             continue;
         }
         const Ellipse ellipse(records + (long long)RECORD * g, box, width, shortcuts & EXACT_TILES);

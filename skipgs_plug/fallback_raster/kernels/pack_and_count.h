@@ -19,8 +19,9 @@ for (int s = first; s < last; ++s) {
         v16 half = vsqrt(vmax(2.0f * reach / LOG2_E, (v16)0.0f)) * 1.0001f + 1e-3f;
         v16 mx = gather(means2d, row, 2, 0), my = gather(means2d, row, 2, 1);
         v16 half_w = half * gather(sigmas, row, 2, 0), half_h = half * gather(sigmas, row, 2, 1);
-        v16 value[RECORD] = {mx, my, along, along * (b / a), across, log2_opacity, half_h, half_w, {}, {}, {}, {},
-                             -b / a, -b / c, reach, 1.0f / along};
+        const v16 slope = b / a;
+        v16 value[RECORD] = {mx, my, along, along * slope, across, log2_opacity, half_h, half_w, {}, {}, {}, {},
+                             -slope, -b / c, reach, 1.0f / along};
         for (int k = 0; k < channels; ++k) value[8 + k] = gather(colors, row, stride, k);
         transpose(value);
         for (int l = 0; l < lanes; ++l) store(records + (long long)RECORD * row[l], value[l]);
@@ -35,17 +36,38 @@ for (int s = first; s < last; ++s) {
         const i16 bottom = clamped(__builtin_elementwise_floor(my + half_h - 0.5f), -1.0f, height - 1.0f);
         static_assert(TILE == 16, "pixels to tiles");
         const i16 empty = (left > right) | (top > bottom);
-        alignas(64) int box[4][16];
-        *(i16*)box[0] = left >> 4, *(i16*)box[1] = right >> 4, *(i16*)box[2] = top >> 4;
-        *(i16*)box[3] = empty ? (i16)-1 : bottom >> 4;
+        alignas(64) int box[BOX][16];
+        const i16 first_column = left >> 4, last_column = right >> 4, first_row = top >> 4, last_row = bottom >> 4;
+        *(i16*)box[0] = first_column, *(i16*)box[1] = last_column, *(i16*)box[2] = first_row;
+        *(i16*)box[3] = empty ? (i16)-1 : last_row;
+        // Which of the four tiles of a box of at most 2 x 2 the ellipse meets, or a hair more: a convex function is least
+        // at the point nearest to the centre or on an edge that faces it.
+        i16 meets = (i16)0;
+        for (int j = 0; j < 4; ++j) {
+            const v16 x0 = 16.0f * __builtin_convertvector(first_column + j % 2, v16) + 0.5f - mx, x1 = x0 + 15.0f;
+            const v16 y0 = 16.0f * __builtin_convertvector(first_row + j / 2, v16) + 0.5f - my, y1 = y0 + 15.0f;
+            const v16 near_x = vmax(x0, vmin(x1, (v16)0.0f)), near_y = vmax(y0, vmin(y1, (v16)0.0f));
+            const v16 at_y = vmax(y0, vmin(y1, -b / c * near_x)), at_x = vmax(x0, vmin(x1, -slope * near_y));
+            const v16 p = along * (near_x + slope * at_y), w = across * at_y;
+            const v16 q = along * (at_x + slope * near_y), u = across * near_y;
+            const i16 meets_it = (vmin(p * p + w * w, q * q + u * u) <= reach + 0.01f) | !(shortcuts & EXACT_TILES);
+            const i16 in_box = (first_column + j % 2 <= last_column) & (first_row + j / 2 <= last_row);
+            meets |= meets_it & in_box & (1 << j);
+        }
+        const i16 small = (last_column - first_column <= 1) & (last_row - first_row <= 1);
+        *(i16*)box[4] = empty ? (i16)0 : (small ? meets : (i16)-1);
         for (int l = 0; l < lanes; ++l) {
-            int* own = boxes + 4ll * (i + l);
-            for (int j = 0; j < 4; ++j) own[j] = box[j][l];
-            int pairs = 1;
-            if (own[0] == own[1] && own[2] == own[3]) {
-                ++count[own[2] * tiles_x + own[0]];
+            int* own = boxes + (long long)BOX * (i + l);
+            for (int j = 0; j < BOX; ++j) own[j] = box[j][l];
+            int pairs = 0;
+            if (own[4] >= 0) {
+                int* corner = count + own[2] * tiles_x + own[0];
+                for (int rest = own[4]; rest; rest &= rest - 1) {
+                    const int j = __builtin_ctz(rest);
+                    ++corner[(j >> 1) * tiles_x + (j & 1)];
+                }
+                pairs = __builtin_popcount(own[4]);
             } else {
-                pairs = 0;
                 const Ellipse ellipse(records + (long long)RECORD * row[l], own, width, shortcuts & EXACT_TILES);
                 for (int ty = ellipse.first_row; ty <= ellipse.last_row; ++ty) {
                     int left, right;
