@@ -13,8 +13,8 @@ from torch.autograd.function import once_differentiable
 
 from .binning import Bins, bin_gaussians, pack_colors
 from .blend import backward_worker, forward_worker, reduce_pairs
-from .constants import BLOCK, MAX_CHANNELS, PAIR, blocks, tiles
-from .launch import floats, ints, scratch, zeros
+from .constants import BLOCK, MAX_CHANNELS, PAIR, blocks, padded, tiles
+from .launch import floats, ints, longs, scratch, zeros
 from .project import list_visible, project_backward, project_forward
 from .sh import sh_backward, sh_forward
 from .shortcuts import SHORTCUTS, active_shortcuts
@@ -36,6 +36,12 @@ def _saved(ctx: Any, **shapes: torch.Size) -> tuple[Tensor, ...]:
                 "backward() before the number of Gaussians changes."
             )
     return tensors  # type: ignore[no-any-return]
+
+
+def all_rows(n: int) -> tuple[Tensor, Tensor]:
+    """All of `n` rows as visible ones, and where each block of rows begins among them."""
+    starts = torch.arange(0, BLOCK * (blocks(n) + 1), BLOCK, dtype=torch.int32, device="cpu").clamp(max=n)
+    return torch.arange(n, dtype=torch.int32, device="cpu"), starts
 
 
 class Project(torch.autograd.Function):
@@ -133,8 +139,7 @@ class SphericalHarmonics(torch.autograd.Function):
         n = len(means)
         colors = floats(n, 3)
         if not active_shortcuts() & SHORTCUTS["visible_only"]:
-            visible = torch.arange(n, dtype=torch.int32, device="cpu")
-            block_start = torch.arange(0, BLOCK * (blocks(n) + 1), BLOCK, dtype=torch.int32, device="cpu").clamp(max=n)
+            visible, block_start = all_rows(n)
         ctx.layout = (3 * base.shape[1], 3 * base.shape[1], 3) if rest is None else (3, 3 * rest.shape[1], 0)
         ctx.degree = degree
         ctx.joined = rest is None
@@ -175,6 +180,7 @@ class Blend(torch.autograd.Function):
         depths: Tensor,  # [R]
         sigmas: Tensor,  # [R, 2]
         visible: Tensor,  # [M]
+        block_start: Tensor,  # [ceil(R / BLOCK) + 1]
         width: int,
         height: int,
         absolute: Tensor | None,
@@ -184,14 +190,20 @@ class Blend(torch.autograd.Function):
         tiles_x, tiles_y = tiles(width, height)
         image, transmittance = floats(height, width, channels), floats(height, width)
         pixel_stop, tile_stop = ints(height, width), ints(tiles_x * tiles_y)
-        pair_blocks = ints(len(bins.tile_list))
+        pairs = len(bins.tile_list)
+        pair_blocks = ints(pairs)
+        in_one = channels <= MAX_CHANNELS
+        if not in_one:
+            bins.sort()
+        buffer = longs(pairs if in_one else 0)
         for channel in range(0, channels, MAX_CHANNELS):
             some = min(MAX_CHANNELS, channels - channel)
             if channel > 0:
                 pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
             forward_worker(some)(
-                bins.records, bins.tile_start, bins.tile_list, image, transmittance, pixel_stop, tile_stop,
-                pair_blocks, width, height, tiles_x, tiles_y, channels, channel, some, active_shortcuts(),
+                bins.records, bins.tile_start, bins.pair_row, bins.unsorted, buffer, bins.tile_list, bins.tile_place,
+                image, transmittance, pixel_stop, tile_stop, pair_blocks, width, height, tiles_x, tiles_y, channels,
+                channel, some, int(not in_one), active_shortcuts(),
             )  # fmt: skip
         ctx.save_for_backward(means2d, conics, opacities, colors, transmittance, pixel_stop, tile_stop, pair_blocks)
         ctx.shapes = {
@@ -201,7 +213,8 @@ class Blend(torch.autograd.Function):
             "colors": colors.shape,
             "alphas": transmittance.shape,
         }
-        ctx.bins, ctx.absolute = bins, absolute
+        bins.unsorted = bins.pair_row = longs(0)  # no longer needed
+        ctx.bins, ctx.block_start, ctx.absolute = bins, block_start, absolute
         ctx.mark_non_differentiable(bins.tiles_per_gauss)
         return image, transmittance, bins.tiles_per_gauss
 
@@ -218,20 +231,22 @@ class Blend(torch.autograd.Function):
         v_means2d, v_conics, v_opacities, v_colors = (floats(*t.shape) for t in (means2d, conics, opacities, colors))
         with_absolute = ctx.absolute is not None
         absolute = ctx.absolute if with_absolute else floats(0)
-        v_pairs = scratch("v_pairs", len(bins.tile_list), PAIR)
+        pairs = len(bins.tile_list)
+        v_pairs = scratch("v_pairs", pairs, PAIR)
         for channel in range(0, channels, MAX_CHANNELS):
             some = min(MAX_CHANNELS, channels - channel)
             if channels > MAX_CHANNELS:
                 pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
+            written = zeros(padded(pairs), dtype=torch.uint8)
             backward_worker(some, with_absolute)(
-                bins.records, bins.tile_start, bins.tile_list, tile_stop, pair_blocks, transmittance, pixel_stop,
-                v_image, v_transmittance, v_pairs, width, height, tiles_x, tiles_y, channels, channel, some,
+                bins.records, bins.tile_start, bins.tile_list, bins.tile_place, tile_stop, pair_blocks, transmittance,
+                pixel_stop, v_image, v_transmittance, v_pairs, written, width, height, tiles_x, tiles_y, channels, channel, some,
                 active_shortcuts(),
             )  # fmt: skip
             reduce_pairs(
-                bins.pair_start, bins.pair_slot, v_pairs, conics, opacities, v_means2d, v_conics, v_opacities,
-                absolute, v_colors, len(means2d), len(bins.tile_list), channels, channel, some, int(with_absolute),
+                bins.visible, ctx.block_start, bins.pair_start, v_pairs, written, conics, opacities, v_means2d,
+                v_conics, v_opacities, absolute, v_colors, len(means2d), channels, channel, some, int(with_absolute),
             )  # fmt: skip
             # The gradient of the transmittance belongs to the first pass alone.
             v_transmittance = torch.zeros_like(v_transmittance) if channels > MAX_CHANNELS else v_transmittance
-        return v_means2d, v_conics, v_opacities, v_colors, *[None] * 6
+        return v_means2d, v_conics, v_opacities, v_colors, *[None] * 7
