@@ -20,6 +20,7 @@ from skipgs_plug.trainer.model import create_optimizers, create_splats
 from skipgs_plug.trainer.near_plane import near_plane
 from skipgs_plug.trainer.order import ViewOrder, derive_seed
 from skipgs_plug.trainer.ply import write_ply
+from skipgs_plug.trainer.row_order import sort_rows, sorts_rows
 from skipgs_plug.trainer.scene import Scene, View
 from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
 
@@ -197,8 +198,8 @@ class Trainer:
     def render(self, view: View) -> Tensor:
         """Return the image [H, W, 3] of a view, in [0, 1] up to overshoot."""
         degree = self.active_sh_degree(max(self.step - 1, 0))
-        colors, _, _ = self._rasterize(view, degree, self._background())
-        return colors[0]
+        image, _ = self._rasterize(view, degree, self._background())
+        return image
 
     def evaluate(self, split: str = "test", lpips_net: str | None = None) -> dict[str, Any]:
         """Return the means of the chosen metrics over the views of "test" or "train", and what belongs to them.
@@ -255,37 +256,30 @@ class Trainer:
         background = self._background()
         if self.config.random_bkgd:
             generator = torch.Generator().manual_seed(derive_seed(self.config.seed, step))
-            background = torch.rand(1, 3, generator=generator).to(self.backend.device)
-        colors, _, info = self._rasterize(view, degree, background)
-        return (*leave_out(colors[0], self._target(view), view.mask), info)
+            background = torch.rand(3, generator=generator).to(self.backend.device)
+        image, info = self._rasterize(view, degree, background)
+        return (*leave_out(image, self._target(view), view.mask), info)
 
-    def _rasterize(self, view: View, degree: int, background: Tensor | None) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        device = self.backend.device
-        splats = self.splats
-        return self.backend.rasterization(
-            means=splats["means"],
-            quats=splats["quats"],
-            scales=torch.exp(splats["scales"]),
-            opacities=torch.sigmoid(splats["opacities"]),
-            colors=self.backend.sh_colors(splats["sh0"], splats["shN"]),
-            viewmats=view.viewmat[None].to(device),
-            Ks=view.K[None].to(device),
+    def _rasterize(self, view: View, degree: int, background: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+        return self.backend.render(
+            self.splats,
+            view.viewmat,
+            view.K,
+            background,
+            antialiased=self.config.antialiased,
             width=view.width,
             height=view.height,
+            sh_degree=degree,
             near_plane=self.near_plane,
             far_plane=self.config.far_plane,
-            sh_degree=degree,
-            packed=False,
             absgrad=self.config.absgrad,
-            rasterize_mode="antialiased" if self.config.antialiased else "classic",
-            backgrounds=background,
         )
 
     def _background(self) -> Tensor | None:
-        """Return the scene's background [1, 3]; None for black, which needs no compositing."""
+        """Return the scene's background [3]; None for black, which needs no compositing."""
         if not any(self.scene.background):
             return None
-        return torch.tensor([self.scene.background], dtype=torch.float32, device=self.backend.device)
+        return torch.tensor(self.scene.background, dtype=torch.float32, device=self.backend.device)
 
     def _target(self, view: View) -> Tensor:
         return view.image.to(self.backend.device).float() / 255.0
@@ -293,10 +287,18 @@ class Trainer:
     def _optimizer_step(self, info: dict[str, Any]) -> None:
         for optimizer in self.optimizers.values():
             if self.config.visible_adam:
-                optimizer.step((info["radii"] > 0).all(dim=-1).any(dim=0))  # type: ignore[arg-type]
+                optimizer.step(self._visible(info))  # type: ignore[call-overload]
             else:
                 optimizer.step()
             optimizer.zero_grad(set_to_none=True)
+
+    def _visible(self, info: dict[str, Any]) -> Tensor:
+        """Return which Gaussians the image shows [N]."""
+        if info["gaussian_ids"] is None:
+            return (info["radii"] > 0).all(dim=-1).any(dim=0)  # type: ignore[no-any-return]
+        visible = torch.zeros(len(self.splats["means"]), dtype=torch.bool, device=self.backend.device)
+        visible[info["gaussian_ids"]] = True
+        return visible
 
     def _densify(self, step: int, info: dict[str, Any]) -> None:
         # gsplat draws split noise from the global generator; seeding it by step makes resuming exact and
@@ -305,8 +307,10 @@ class Trainer:
             if step % self.strategy.refine_every == 0:
                 torch.manual_seed(derive_seed(self.config.seed, step))
             args = (self.splats, self.optimizers, self.strategy_state, step)
-            self.strategy.step_post_backward(*args, info, packed=False)
+            self.strategy.step_post_backward(*args, info, packed=info["gaussian_ids"] is not None)
             reset_opacity_if_missed(self.strategy, *args)
+        if sorts_rows(self.strategy, step):
+            sort_rows(self.splats, self.optimizers, self.strategy_state)
 
     def _warm_up(self, view: View) -> None:
         """Compile kernels before the clock runs: one forward and backward whose gradients are dropped."""
