@@ -48,7 +48,7 @@ def pack_and_count(
     boxes: Annotated[IntArray, "n, BOX"],  # out
     counts: Annotated[IntArray, "slices, tiles_x, tiles_y"],  # out
     totals: Annotated[LongArray, "slices + 1"],  # out, pairs of each slice
-    tiles_per_gauss: Annotated[IntArray, "R"],  # out, zeros before
+    tiles_per_gauss: Annotated[IntArray, "R if dense else 0"],  # out, zeros before
     n: int,
     stride: int,
     channels: int,
@@ -57,6 +57,7 @@ def pack_and_count(
     height: float,
     tiles_x: int,
     tiles_y: int,
+    dense: int,
     shortcuts: int,
 ) -> None: ...
 
@@ -149,8 +150,11 @@ def bin_gaussians(
     colors: Tensor,  # [R, D]
     width: int,
     height: int,
+    dense: bool = True,
 ) -> Bins:
     """Lists the visible Gaussians of one image per tile, not yet sorted by depth, with their first channels.
+
+    `tiles_per_gauss` is empty unless `dense`.
 
     Raises:
         ValueError: There are more (tile, Gaussian) pairs than can be listed.
@@ -162,11 +166,11 @@ def bin_gaussians(
     slices = 1 if n < 1024 or get_num_threads() == 1 else SLICES * get_num_threads()
     records, boxes, counts = floats(rows, RECORD), ints(n, BOX), ints(slices, tiles_x * tiles_y)
     tile_start, pair_start = ints(tiles_x * tiles_y + 1), ints(n + 1)
-    tiles_per_gauss, totals = zeros(rows, dtype=torch.int32), longs(slices + 1)
+    tiles_per_gauss, totals = zeros(rows if dense else 0, dtype=torch.int32), longs(slices + 1)
     pack_and_count(
         visible, means2d, conics, opacities, sigmas, colors, records, boxes, counts, totals, tiles_per_gauss,
         n, channels, min(channels, MAX_CHANNELS), slices, float(width), float(height), tiles_x, tiles_y,
-        active_shortcuts(),
+        int(dense), active_shortcuts(),
     )  # fmt: skip
     scan_pairs(counts, totals, tile_start, slices, tiles_x * tiles_y)
     pairs = int(totals[-1])

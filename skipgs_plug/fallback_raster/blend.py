@@ -9,9 +9,9 @@ takes block after block, so that its pixels stay in registers while the Gaussian
 
 The adjoint walks the same lists back to front, Gaussian after Gaussian, so that here its sums stay in registers, and
 visits only blocks in which the forward pass blended the Gaussian. It needs, beside the colour, the moments of v_sigma
-about the centre: of 1, dx, dy, dx^2, dx dy and dy^2. Each (tile, Gaussian) pair writes its sums to its own place, in the
-order of rows, and `reduce_pairs` adds a Gaussian's pairs in a fixed order and makes gradients of them: no atomics, and
-bit-equal for any thread count.
+about the centre: of 1, dx, dy, dx^2, dx dy and dy^2. Each (tile, Gaussian) pair writes its sums to its own place, in
+the order of rows, and `reduce_pairs` adds a Gaussian's pairs in a fixed order and makes gradients of them: no atomics,
+and bit-equal for any thread count.
 """
 
 from typing import Annotated
@@ -40,7 +40,7 @@ def _forward(channels: int) -> Worker:
         transmittance: Annotated[FloatArray, "height, width"],  # out, behind the last Gaussian blended
         pixel_stop: Annotated[IntArray, "height, width"],  # out, place in tile_list behind the last Gaussian blended
         tile_stop: Annotated[IntArray, "tiles_x, tiles_y"],  # out, their maximum
-        pair_blocks: Annotated[IntArray, "P"],  # out, blocks in which it was blended, as bits; not written beyond tile_stop
+        pair_blocks: Annotated[IntArray, "P"],  # out, blocks where it was blended, as bits; nothing beyond tile_stop
         width: int,
         height: int,
         tiles_x: int,
@@ -114,7 +114,7 @@ def reduce_pairs(
     written: Annotated[ByteArray, "padded(pairs)"],
     conics: Annotated[FloatArray, "rows, 3"],
     opacities: Annotated[FloatArray, "rows"],
-    # Out; added to from the second pass over the channels on, as the next two.
+    # Out, all rows where `dense`, else visible ones; added to from the second pass over the channels on, as the next.
     v_means2d: Annotated[FloatArray, "rows, 2"],
     v_conics: Annotated[FloatArray, "rows, 3"],
     v_opacities: Annotated[FloatArray, "rows"],
@@ -125,4 +125,5 @@ def reduce_pairs(
     channel: int,
     channels: int,
     absgrad: int,
+    dense: int,
 ) -> None: ...

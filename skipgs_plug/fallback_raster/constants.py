@@ -14,8 +14,8 @@ BLOCK = 512
 # column; p^2 + w^2 at ALPHA_MIN; 1 / r[2]. Together a cache line.
 RECORD = 16
 
-# Numbers of the box of tiles around a Gaussian: its first and last column, its first and last row, and which of its tiles
-# the Gaussian meets, as bits, where they are at most 2 x 2; -1 where they are more.
+# Numbers of the box of tiles around a Gaussian: its first and last column, its first and last row, and which of its
+# tiles the Gaussian meets, as bits, where they are at most 2 x 2; -1 where they are more.
 BOX = 5
 
 # Sums of a (tile, Gaussian) pair in the adjoint: the six moments; up to four channels of colour; |v_x|, |v_y|; the rest

@@ -282,8 +282,8 @@ def worker(
 ) -> Callable[[Callable[..., None]], Worker]:
     """Turns a stub function into a `Worker`.
 
-    The stub's parameters are annotated `FloatArray`, `IntArray`, `LongArray`, `ByteArray`, `int` or `float`; arrays also
-    `Annotated[FloatArray, "n, 3"]` with the sizes that `guard.Sizes` checks.
+    The stub's parameters are annotated `FloatArray`, `IntArray`, `LongArray`, `ByteArray`, `int` or `float`; arrays
+    also `Annotated[FloatArray, "n, 3"]` with the sizes that `guard.Sizes` checks.
 
     Args:
         code: C++ that handles items `[first, last)`; array parameters of the stub are pointers of their name. It knows

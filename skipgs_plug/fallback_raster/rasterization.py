@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from .arguments import check_tensors, refuse_unsupported
-from .autograd import Blend, Project, SphericalHarmonics, all_rows
+from .autograd import Blend, Project, SphericalHarmonics
 from .constants import TILE, tiles
+from .rows import all_rows
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]

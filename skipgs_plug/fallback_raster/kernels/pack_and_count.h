@@ -76,7 +76,7 @@ for (int s = first; s < last; ++s) {
                     if (right >= left) pairs += right - left + 1;
                 }
             }
-            tiles_per_gauss[row[l]] = pairs;
+            if (dense) tiles_per_gauss[row[l]] = pairs;
             of_slice += pairs;
         }
     }

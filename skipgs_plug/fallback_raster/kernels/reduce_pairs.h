@@ -1,7 +1,7 @@
 // Adds up the pairs of each row of a block in a fixed order and turns their moments into gradients.
 const int row_begin = BLOCK * first, rows_here = smaller(BLOCK, rows - row_begin);
 const bool more = channel > 0;
-if (!more) {
+if (!more && dense) {
     // Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
     clear(v_means2d + 2ll * row_begin, 2 * rows_here);
     clear(v_conics + 3ll * row_begin, 3 * rows_here);
@@ -17,7 +17,14 @@ for (int i = block_start[first]; i < block_start[first + 1]; ++i) {
             sums += load(v_pairs + (long long)PAIR * p);
             received = true;
         }
-    if (!received) continue;
+    if (!received) {
+        if (dense || more) continue;
+        clear(v_means2d + 2ll * g, 2);
+        clear(v_conics + 3ll * g, 3);
+        clear(v_opacities + g, 1);
+        clear(v_colors + (long long)stride * g, stride);
+        continue;
+    }
     float total[PAIR];
     store(total, sums);
     const float a = conics[3 * g], b = conics[3 * g + 1], c = conics[3 * g + 2];

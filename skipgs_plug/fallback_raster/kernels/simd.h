@@ -128,6 +128,18 @@ static constexpr auto exp2 = [](v16 t) -> v16 {
     p = p * f + 1.000000072f;
     return (v16)((i16)p + ((i16)r << 23));
 };
+// e^x, with the product by log2(e) in two parts; saturates where float's range ends.
+static constexpr auto vexp = [](v16 x) INLINE -> v16 {
+#pragma clang fp contract(off)
+    const v16 magic = (v16)12582912.0f;
+    x = x < -87.0f ? (v16)-87.0f : (x > 88.0f ? (v16)88.0f : x);
+    const v16 r = x * 1.44269502f + magic, whole = r - magic;
+    const v16 f = __builtin_elementwise_fma(x, (v16)1.44269502f, -whole) + x * 1.92596303e-8f;
+    const v16 p = exp2(f);
+    return (v16)((i16)p + ((i16)r << 23));
+};
+static constexpr auto sigmoid = [](v16 x) INLINE -> v16 { return 1.0f / (1.0f + vexp(-x)); };
+
 // BATCH of them, step by step, so that their chains of instructions lie side by side.
 static constexpr int BATCH = 4;
 static constexpr auto exp2s = [](const v16* t, v16* result) INLINE {
