@@ -14,6 +14,7 @@ import torch
 import skipgs_plug
 from skipgs_plug.trainer import Scene, TrainConfig
 from skipgs_plug.trainer.backend import Backend
+from skipgs_plug.trainer.near_plane import near_plane
 
 MEASURING = ("skipgs_plug", "benchmarks/*.py")  # the code that figures come from
 PACKAGES = ("torch", "warp-lang", "gsplat", "numpy", "torchmetrics")
@@ -84,6 +85,7 @@ def scene_facts(scene: Scene, config: TrainConfig) -> dict[str, Any]:
         "train_views": len(scene.train),
         "test_views": len(scene.test),
         "points": len(scene.points),
+        "near_plane": near_plane(config, scene),
     }
 
 

@@ -46,6 +46,7 @@ NUMBERS = {
     "prune_opa": (0.0, 1.0),
     "prune_scale3d": (0.0, 1e6),
 }
+FROM_OTHERS = ("schedule_steps", "near_plane")  # None: follows from other settings or the scene
 
 
 @dataclass
@@ -111,8 +112,8 @@ class TrainConfig:
     """Compensate opacities for the 2D low-pass filter (Mip-Splatting)."""
     random_bkgd: bool = False
     """Train on random background colours."""
-    near_plane: float = 0.01
-    """Near clipping plane, world units."""
+    near_plane: float | None = None
+    """Near clipping plane, world units; default: a tenth of the depth of the nearest points that a view shows."""
     far_plane: float = 1e10
     """Far clipping plane, world units."""
 
@@ -142,15 +143,17 @@ class TrainConfig:
                 raise InputError(f"{field.name}={value} is not a finite number.")
         for name, (low, high) in INTEGERS.items():
             value = getattr(self, name)
-            if value is None and name == "schedule_steps":
+            if value is None and name in FROM_OTHERS:
                 continue
             if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
                 raise InputError(f"{name}={value!r} is not an integer in {low}..{high:,}.")
         for name, (least, greatest) in NUMBERS.items():
             value = getattr(self, name)
+            if value is None and name in FROM_OTHERS:
+                continue
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value <= greatest:
                 raise InputError(f"{name}={value!r} is outside {least:g}..{greatest:g}.")
-        if self.near_plane >= self.far_plane:
+        if self.near_plane is not None and self.near_plane >= self.far_plane:
             raise InputError(f"near_plane={self.near_plane:g} is not below far_plane={self.far_plane:g}.")
 
     @property

@@ -18,6 +18,7 @@ from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.mask import leave_out
 from skipgs_plug.trainer.model import create_optimizers, create_splats
+from skipgs_plug.trainer.near_plane import near_plane
 from skipgs_plug.trainer.order import ViewOrder, derive_seed
 from skipgs_plug.trainer.ply import write_ply
 from skipgs_plug.trainer.scene import Scene, View
@@ -62,6 +63,7 @@ class Trainer:
         splats: raw parameters `means scales quats opacities sh0 shN`.
         optimizers: one per parameter, by the same names.
         refine_stop_iter: end of densification in iterations of this run.
+        near_plane: near clipping plane, world units.
         on_step: called after every iteration, outside the clock.
         stop_requested: set it (from a signal handler, say) to end `train` after the current iteration, or, before it,
             the next `train` at once.
@@ -72,6 +74,7 @@ class Trainer:
         self.scene = scene
         self.backend = backend or resolve_backend(config.backend)
         self.max_steps = config.max_steps
+        self.near_plane = near_plane(config, scene)
         self.step = self.ran = 0
         self._since: int | None = None  # number after the previous iteration, set by `train`
         self.splats = create_splats(scene, config, self.backend.device)
@@ -270,7 +273,7 @@ class Trainer:
             Ks=view.K[None].to(device),
             width=view.width,
             height=view.height,
-            near_plane=self.config.near_plane,
+            near_plane=self.near_plane,
             far_plane=self.config.far_plane,
             sh_degree=degree,
             packed=False,

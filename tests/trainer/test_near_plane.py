@@ -1,0 +1,54 @@
+"""The near plane follows the scene, whatever its unit."""
+
+import pytest
+import torch
+
+from skipgs_plug.trainer import InputError, TrainConfig
+from skipgs_plug.trainer.near_plane import NEAREST, SHARE, SHARE_OF_EXTENT, near_plane, nearest_depth
+from skipgs_plug.trainer.scene import Scene, View
+
+
+def scene(unit: float = 1.0, depth: float = 4.0, n_points: int = 1000, seed: int = 0) -> Scene:
+    """Two cameras look along +z at points between `depth` and twice that."""
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(n_points, 3, generator=generator) - 0.5
+    points[:, 2] = depth * (points[:, 2] + 1.5)
+    K = torch.tensor([[50.0, 0, 16], [0, 50.0, 16], [0, 0, 1]])
+    views = []
+    for i, x in enumerate((-0.5, 0.5)):
+        viewmat = torch.eye(4)
+        viewmat[0, 3] = x * unit
+        views.append(View(f"{i}.png", torch.zeros(32, 32, 3, dtype=torch.uint8), K, viewmat))
+    return Scene("two", views, [], points * unit, torch.zeros(n_points, 3, dtype=torch.uint8), 0.55 * unit)
+
+
+def test_a_tenth_of_the_nearest_depth() -> None:
+    assert near_plane(TrainConfig(), scene()) == pytest.approx(SHARE * 4.0, rel=0.05)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 7.0, 1e4])
+def test_scales_with_the_unit_of_the_scene(unit: float) -> None:
+    assert near_plane(TrainConfig(), scene(unit)) == pytest.approx(unit * near_plane(TrainConfig(), scene()), rel=1e-4)
+
+
+def test_a_few_points_at_the_lens_do_not_count_but_a_close_view_does() -> None:
+    usual = nearest_depth(scene().train, scene().points)
+    stray = scene()
+    stray.points[: int(NEAREST * 1000) // 2] = torch.tensor([0.0, 0.0, 0.01])
+    assert nearest_depth(stray.train, stray.points) == pytest.approx(usual, rel=0.05)
+    close = scene()
+    close.train[1].viewmat[2, 3] = -3.0  # three units ahead
+    assert nearest_depth(close.train, close.points) == pytest.approx(1.0, rel=0.1)
+
+
+def test_without_points_in_view_the_cameras_tell() -> None:
+    behind = scene()
+    behind.points[:, 2] *= -1
+    assert nearest_depth(behind.train, behind.points) is None
+    assert near_plane(TrainConfig(), behind) == pytest.approx(SHARE_OF_EXTENT * 0.55)
+
+
+def test_settings_go_first_and_must_lie_before_the_far_plane() -> None:
+    assert near_plane(TrainConfig(near_plane=0.7), scene()) == 0.7
+    with pytest.raises(InputError, match=r"near plane 0\.4.* is not below far_plane=0.3"):
+        near_plane(TrainConfig(far_plane=0.3), scene())
