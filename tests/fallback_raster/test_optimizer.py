@@ -276,7 +276,12 @@ def test_the_block_ends_with_an_error_too() -> None:
 
 def test_it_leaves_torchs_compiler_alone() -> None:
     code = (
-        "import sys, torch; from skipgs_plug.fallback_raster.optimizer import Adam; p = torch.nn.Parameter(torch.ones(3));"
-        "o = Adam([p]); p.grad = torch.ones(3); o.step(); o.zero_grad(); sys.exit('torch._dynamo' in sys.modules)"
+        "import sys, torch\n"
+        "from skipgs_plug.fallback_raster.optimizer import Adam\n"
+        "param = torch.nn.Parameter(torch.ones(3))\n"
+        "optimizer = Adam([param])\n"
+        "param.grad = torch.ones(3)\n"
+        "optimizer.step(), optimizer.zero_grad()\n"
+        "sys.exit('torch._dynamo' in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
