@@ -1,6 +1,7 @@
 """`torch.optim.Adam` on all cores, as a class of its own and in place of torch's function."""
 
 import importlib
+import inspect
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -22,6 +23,16 @@ _torchs_adam = _module.adam
 
 class Adam(torch.optim.Adam):
     """`torch.optim.Adam` whose steps are those of `adam` below: options, state, state_dict and hooks are torch's."""
+
+    # Torch wraps these two, and its wrapper loads the compiler: 75 MB and 800 modules that training has no use for.
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """As torch's."""
+        inspect.unwrap(torch.optim.Optimizer.add_param_group)(self, param_group)
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """As torch's."""
+        inspect.unwrap(torch.optim.Optimizer.zero_grad)(self, set_to_none)
 
     def step(self, closure: Any = None) -> Any:  # type: ignore[override]
         """Update every parameter that has a gradient.

@@ -308,7 +308,7 @@ class Trainer:
         return torch.tensor(self.scene.background, dtype=torch.float32, device=self.backend.device)
 
     def _target(self, view: View) -> Tensor:
-        return view.image.to(self.backend.device).float() / 255.0
+        return view.image.to(self.backend.device).float().div_(255.0)
 
     def _loss(self, image: Tensor, target: Tensor) -> Tensor:
         loss = self.backend.loss(image, target, self.config.ssim_lambda)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import importlib
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -270,3 +272,16 @@ def test_the_block_ends_with_an_error_too() -> None:
         assert module.adam is not before
         _ = 1 / 0
     assert module.adam is before
+
+
+def test_it_leaves_torchs_compiler_alone() -> None:
+    code = (
+        "import sys, torch\n"
+        "from skipgs_plug.fallback_raster.optimizer import Adam\n"
+        "param = torch.nn.Parameter(torch.ones(3))\n"
+        "optimizer = Adam([param])\n"
+        "param.grad = torch.ones(3)\n"
+        "optimizer.step(), optimizer.zero_grad()\n"
+        "sys.exit('torch._dynamo' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
