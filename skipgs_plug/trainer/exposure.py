@@ -15,8 +15,8 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 class Exposure:
     """Learns, for every training view, how its photograph's colours follow from those of the model.
 
-    The model itself stays without: what it looks like is what all photographs have in common. Held-out views have
-    no correction of their own; see `fit_colours`.
+    The model itself stays without: what it looks like is what the photographs have in common, so the mean of all
+    corrections is kept at the identity. Held-out views have none of their own; see `fit_colours`.
 
     Attributes:
         affine: matrix and offset on RGB in [0, 1], the identity at first  # [V, 3, 4]
@@ -38,6 +38,15 @@ class Exposure:
             return image
         affine = self.affine[self._index[name]]
         return image @ affine[:, :3].T + affine[:, 3]
+
+    def step(self) -> None:
+        """Update, unless a gate left this iteration without a gradient or puts the update off."""
+        pending = self.affine.grad is not None
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        if pending and self.affine.grad is None:
+            with torch.no_grad():  # else model and corrections drift together: on fern by 4 dB in 600 iterations
+                self.affine -= self.affine.mean(dim=0) - torch.eye(3, 4, device=self.affine.device)
 
     def state_dict(self) -> dict[str, Any]:
         return {"affine": self.affine.detach(), **self.optimizer.state.get(self.affine, {})}

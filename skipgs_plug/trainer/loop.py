@@ -329,8 +329,7 @@ class Trainer:
                 optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         if self.exposure is not None:
-            self.exposure.optimizer.step()
-            self.exposure.optimizer.zero_grad(set_to_none=True)
+            self.exposure.step()
         return pending and self.splats["means"].grad is None
 
     def _visible(self, info: dict[str, Any]) -> Tensor:
