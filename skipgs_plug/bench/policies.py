@@ -45,9 +45,8 @@ def as_long_as(name: str) -> Callable[[Trainer, Earlier], int]:
     """Return what tells how many ungated iterations take as long as policy `name` did."""
 
     def iterations(trainer: Trainer, earlier: Earlier) -> int:
-        share = earlier[name].t_post / earlier[REFERENCE].t_post
         full = all_iterations(trainer, earlier)
-        return min(full, max(1, round(full * share)))
+        return max(1, round(full * share_of_time(name, earlier)))
 
     return iterations
 
@@ -56,10 +55,14 @@ def thinned_as_long_as(name: str) -> GateMaker:
     """Return what leaves out whole iterations, so many that the rest takes as long as policy `name` did."""
 
     def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
-        share = min(1.0, earlier[name].t_post / earlier[REFERENCE].t_post)
-        return gate_with(refine_share=share)(trainer, earlier)  # type: ignore[return-value]
+        return gate_with(refine_share=share_of_time(name, earlier))(trainer, earlier)  # type: ignore[return-value]
 
     return make
+
+
+def share_of_time(name: str, earlier: Earlier) -> float:
+    """Return the refinement time of policy `name`, as a share of ungated's, at most 1."""
+    return min(1.0, earlier[name].t_post / earlier[REFERENCE].t_post)
 
 
 def no_gate(trainer: Trainer, earlier: Earlier) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from skipgs_plug.bench import provenance
 from skipgs_plug.bench.policies import PolicySpec, check_policies, rounds
@@ -15,8 +15,10 @@ from skipgs_plug.bench.refine import DivergedError, densify, refine
 from skipgs_plug.bench.store import BenchFolder
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.backend import resolve_backend
+from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.metrics import LPIPS_WEIGHTS, require_lpips
 
+Clock = Literal["wall", "processor"]
 NOT_SETTINGS = ("data_dir", "result_dir", "seed", "backend")
 
 
@@ -27,9 +29,11 @@ class Bench:
         config: settings of training; its seed is replaced by each of `seeds`.
         say: called with one line per event.
         tensorboard: write TensorBoard scalars of every run that is missing.
+        clock: see `TrainClock`.
 
     Raises:
-        InputError: an unknown policy, no held-out views, or a folder made with other settings.
+        InputError: an unknown policy, no held-out views, processor time with a GPU, or a folder made with other
+            settings.
     """
 
     def __init__(
@@ -42,6 +46,7 @@ class Bench:
         say: Callable[[str], None] = print,
         progress: bool = True,
         tensorboard: bool = False,
+        clock: Clock = "wall",
     ) -> None:
         check_policies(policies)
         if not seeds or len(set(seeds)) < len(seeds):
@@ -58,6 +63,9 @@ class Bench:
         self.seeds, self.policies = list(seeds), list(policies)
         self.say, self.progress, self.tensorboard = say, progress, tensorboard
         self.backend = resolve_backend(config.backend)
+        self.clock = clock
+        if clock == "processor" and self.backend.device.type != "cpu":
+            raise InputError("A GPU works while no thread is running: --clock processor is for the CPU; leave it out.")
         self.lpips_net = available_lpips()
         self.commit = provenance.commit()
         self.settings = {
@@ -65,6 +73,7 @@ class Bench:
             "scene": provenance.scene_facts(scene, config),
             "machine": provenance.machine(self.backend),
             "lpips": self.lpips_net,
+            "clock": clock,
         }
         folder.require_settings(self.settings)
 
@@ -131,7 +140,9 @@ class Bench:
                     yield RunRecord(seed, name, "diverged", str(error))
 
     def _trainer(self, seed: int) -> Trainer:
-        return Trainer(dataclasses.replace(self.config, seed=seed), self.scene, self.backend)
+        trainer = Trainer(dataclasses.replace(self.config, seed=seed), self.scene, self.backend)
+        trainer.clock = TrainClock(self.backend.device, processor=self.clock == "processor")
+        return trainer
 
     def _densified(self, trainer: Trainer) -> dict[str, Any]:
         seed, path = trainer.config.seed, self.folder.snapshot(trainer.config.seed)

@@ -19,6 +19,8 @@ from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster.compat import FAMILIES, serve
+from skipgs_plug.fallback_raster.optimizer import REPLACED as ADAM_REPLACED
+from skipgs_plug.fallback_raster.optimizer import instead_of_torchs_adam
 from skipgs_plug.scripts import children
 from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
 from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED
@@ -98,7 +100,8 @@ def run_gated(
     """Attach a gate to what `execute(attach)` runs, and write skipgs.json where `rank` is 0."""
     adapter = get_adapter(args.adapter)()
     checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
-    adapter.replaced = (*REPLACED, *(f"torch.cuda.{name}" for name in CUDA_REPLACED if args.cpu))
+    for_cpu = (*(f"torch.cuda.{name}" for name in CUDA_REPLACED), ADAM_REPLACED)
+    adapter.replaced = (*REPLACED, *(for_cpu if args.cpu else ()))
     settings = args.gate_options.given() | ({"enabled": False} if args.no_gate else {})
     gates: list[SkipGate] = []
 
@@ -152,5 +155,5 @@ def cpu_instead_of_cuda(args: Args, command: Sequence[str]) -> Iterator[None]:
     if family not in FAMILIES:
         names = sorted((set(FAMILIES) | set(FAMILY_OF)) - {"inria_accelerated", *FAMILY_OF.values()})
         raise SkipGSError(f"--cpu has no stand-ins for {args.adapter!r}; it has for {', '.join(names)}.")
-    with serve(family), cuda_on_cpu(), exclusive_cores():
+    with serve(family), cuda_on_cpu(), exclusive_cores(), instead_of_torchs_adam():
         yield

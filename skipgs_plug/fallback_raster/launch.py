@@ -36,10 +36,12 @@ from . import guard
 from .cache import load_or_rebuild, say_unwritable
 from .cores import usable_cores
 from .guard import Sizes
+from .memory import LARGE, SUPPORTED, Pool
 from .source import PRELUDE, SHARED, declare
 
 _lock = threading.RLock()
 _scratch = threading.local()
+_memory = Pool()
 _num_threads = usable_cores()
 _pool: ThreadPoolExecutor | None = None
 _busy = False  # threads of the pool may still be at work
@@ -76,12 +78,30 @@ def set_num_threads(n: int) -> None:
 
 def floats(*shape: int) -> Tensor:
     """A float32 tensor with undefined content, whatever the default dtype and device of the process."""
-    return guard.poison(torch.empty(shape, dtype=torch.float32, device="cpu"))
+    return _empty(shape, torch.float32)
 
 
 def ints(*shape: int) -> Tensor:
     """An int32 tensor with undefined content."""
-    return guard.poison(torch.empty(shape, dtype=torch.int32, device="cpu"))
+    return _empty(shape, torch.int32)
+
+
+def _empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    if not SUPPORTED or math.prod(shape) * dtype.itemsize < LARGE:
+        return guard.poison(torch.empty(shape, dtype=dtype, device="cpu"))
+    with _lock:
+        return guard.poison(_memory.empty(shape, dtype))
+
+
+def release_memory() -> None:
+    """Gives memory back to the system that tensors of the rasterizer lay in and none lies in now."""
+    with _lock:
+        _memory.release()
+
+
+def longs(*shape: int) -> Tensor:
+    """An int64 tensor with undefined content."""
+    return guard.poison(torch.empty(shape, dtype=torch.int64, device="cpu"))
 
 
 def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -114,6 +134,10 @@ class LongArray:
     """Marks a worker's parameter as a contiguous int64 tensor, passed flat."""
 
 
+class ByteArray:
+    """Marks a worker's parameter as a contiguous uint8 tensor, passed flat."""
+
+
 class _Kind(NamedTuple):
     """What a parameter is in Python, in Warp and in C++."""
 
@@ -127,6 +151,7 @@ _KINDS: dict[type, _Kind] = {
     FloatArray: _Kind(torch.float32, "wp.uint64", "float"),
     IntArray: _Kind(torch.int32, "wp.uint64", "int"),
     LongArray: _Kind(torch.int64, "wp.uint64", "long long"),
+    ByteArray: _Kind(torch.uint8, "wp.uint64", "unsigned char"),
     int: _Kind(None, "wp.int32", ""),
     float: _Kind(None, "wp.float32", ""),
 }
@@ -257,8 +282,8 @@ def worker(
 ) -> Callable[[Callable[..., None]], Worker]:
     """Turns a stub function into a `Worker`.
 
-    The stub's parameters are annotated `FloatArray`, `IntArray`, `LongArray`, `int` or `float`; arrays also
-    `Annotated[FloatArray, "n, 3"]` with the sizes that `guard.Sizes` checks.
+    The stub's parameters are annotated `FloatArray`, `IntArray`, `LongArray`, `ByteArray`, `int` or `float`; arrays
+    also `Annotated[FloatArray, "n, 3"]` with the sizes that `guard.Sizes` checks.
 
     Args:
         code: C++ that handles items `[first, last)`; array parameters of the stub are pointers of their name. It knows

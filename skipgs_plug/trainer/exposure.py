@@ -46,7 +46,7 @@ class Exposure:
         self.optimizer.zero_grad(set_to_none=True)
         if pending and self.affine.grad is None:
             with torch.no_grad():  # else model and corrections drift together: on fern by 4 dB in 600 iterations
-                self.affine -= self.affine.mean(dim=0) - torch.eye(3, 4, device=self.affine.device)
+                self.affine.sub_(self.affine.mean(dim=0) - torch.eye(3, 4, device=self.affine.device))
 
     def state_dict(self) -> dict[str, Any]:
         return {"affine": self.affine.detach(), **self.optimizer.state.get(self.affine, {})}

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from skipgs_plug.fallback_raster.launch import release_memory
 from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.clock import TrainClock
@@ -23,6 +24,7 @@ from skipgs_plug.trainer.model import create_optimizers, create_splats
 from skipgs_plug.trainer.near_plane import near_plane
 from skipgs_plug.trainer.order import ViewOrder, derive_seed
 from skipgs_plug.trainer.ply import write_ply
+from skipgs_plug.trainer.row_order import sort_rows, sorts_rows
 from skipgs_plug.trainer.scene import Scene, View
 from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
 
@@ -219,8 +221,8 @@ class Trainer:
     def render(self, view: View) -> Tensor:
         """Return the image [H, W, 3] of a view, in [0, 1] up to overshoot; of a training view with its exposure."""
         degree = self.active_sh_degree(max(self.step - 1, 0))
-        colors, _, _ = self._rasterize(view, degree, self._background())
-        return self._exposed(colors[0], view)
+        image, _ = self._rasterize(view, degree, self._background())
+        return self._exposed(image, view)
 
     def evaluate(self, split: str = "test", lpips_net: str | None = None) -> dict[str, Any]:
         """Return the means of the chosen metrics over the views of "test" or "train", and what belongs to them.
@@ -277,43 +279,36 @@ class Trainer:
         background = self._background()
         if self.config.random_bkgd:
             generator = torch.Generator().manual_seed(derive_seed(self.config.seed, step))
-            background = torch.rand(1, 3, generator=generator).to(self.backend.device)
-        colors, _, info = self._rasterize(view, degree, background)
-        return (*leave_out(self._exposed(colors[0], view), self._target(view), view.mask), info)
+            background = torch.rand(3, generator=generator).to(self.backend.device)
+        image, info = self._rasterize(view, degree, background)
+        return (*leave_out(self._exposed(image, view), self._target(view), view.mask), info)
 
     def _exposed(self, image: Tensor, view: View) -> Tensor:
         return image if self.exposure is None else self.exposure.apply(image, view.name)
 
-    def _rasterize(self, view: View, degree: int, background: Tensor | None) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        device = self.backend.device
-        splats = self.splats
-        return self.backend.rasterization(
-            means=splats["means"],
-            quats=splats["quats"],
-            scales=torch.exp(splats["scales"]),
-            opacities=torch.sigmoid(splats["opacities"]),
-            colors=self.backend.sh_colors(splats["sh0"], splats["shN"]),
-            viewmats=view.viewmat[None].to(device),
-            Ks=view.K[None].to(device),
+    def _rasterize(self, view: View, degree: int, background: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+        return self.backend.render(
+            self.splats,
+            view.viewmat,
+            view.K,
+            background,
+            antialiased=self.config.antialiased,
             width=view.width,
             height=view.height,
+            sh_degree=degree,
             near_plane=self.near_plane,
             far_plane=self.config.far_plane,
-            sh_degree=degree,
-            packed=False,
             absgrad=self.config.absgrad,
-            rasterize_mode="antialiased" if self.config.antialiased else "classic",
-            backgrounds=background,
         )
 
     def _background(self) -> Tensor | None:
-        """Return the scene's background [1, 3]; None for black, which needs no compositing."""
+        """Return the scene's background [3]; None for black, which needs no compositing."""
         if not any(self.scene.background):
             return None
-        return torch.tensor([self.scene.background], dtype=torch.float32, device=self.backend.device)
+        return torch.tensor(self.scene.background, dtype=torch.float32, device=self.backend.device)
 
     def _target(self, view: View) -> Tensor:
-        return view.image.to(self.backend.device).float() / 255.0
+        return view.image.to(self.backend.device).float().div_(255.0)
 
     def _loss(self, image: Tensor, target: Tensor) -> Tensor:
         loss = self.backend.loss(image, target, self.config.ssim_lambda)
@@ -329,7 +324,7 @@ class Trainer:
         pending = self.splats["means"].grad is not None
         for optimizer in self.optimizers.values():
             if self.config.visible_adam:
-                optimizer.step((info["radii"] > 0).all(dim=-1).any(dim=0))  # type: ignore[arg-type]
+                optimizer.step(self._visible(info))  # type: ignore[call-overload]
             else:
                 optimizer.step()
             optimizer.zero_grad(set_to_none=True)
@@ -337,15 +332,30 @@ class Trainer:
             self.exposure.step()
         return pending and self.splats["means"].grad is None
 
+    def _visible(self, info: dict[str, Any]) -> Tensor:
+        """Return which Gaussians the image shows [N]."""
+        if info["gaussian_ids"] is None:
+            return (info["radii"] > 0).all(dim=-1).any(dim=0)  # type: ignore[no-any-return]
+        visible = torch.zeros(len(self.splats["means"]), dtype=torch.bool, device=self.backend.device)
+        visible[info["gaussian_ids"]] = True
+        return visible
+
     def _densify(self, strategy: Any, step: int, info: dict[str, Any]) -> None:
-        with self._seeded(step) if step % strategy.refine_every == 0 else nullcontext():
+        due = step % strategy.refine_every == 0
+        if due:
+            release_memory()  # of gradients, while copies of all parameters and moments are made
+        with self._seeded(step) if due else nullcontext():
             args = (self.splats, self.optimizers, self.strategy_state, step)
-            strategy.step_post_backward(*args, info, packed=False)
+            strategy.step_post_backward(*args, info, packed=info["gaussian_ids"] is not None)
             reset_opacity_if_missed(strategy, *args)
+        if sorts_rows(strategy, step):
+            sort_rows(self.splats, self.optimizers, self.strategy_state)
 
     def _move(self, mcmc: Mcmc, step: int, updated: bool) -> None:
         # The noise belongs to the update: alone it is a random walk.
         if updated or mcmc.moves(step):
+            if mcmc.moves(step):
+                release_memory()
             rate = self.optimizers["means"].param_groups[0]["lr"] if updated else 0.0
             with self._seeded(step):
                 mcmc.after_update(self.splats, self.optimizers, step, rate)

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from skipgs_plug.fallback_raster.optimizer import Adam
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.scene import Scene
 from skipgs_plug.trainer.selective_adam import SelectiveAdam
@@ -53,7 +54,7 @@ def neighbour_distance(points: Tensor) -> Tensor:
 def create_optimizers(
     splats: nn.ParameterDict, config: TrainConfig, scene_scale: float
 ) -> dict[str, torch.optim.Optimizer]:
-    """Return one Adam per parameter, learning rates as in gsplat's simple_trainer."""
+    """Return one Adam per parameter, learning rates as in gsplat's simple_trainer; on the CPU it runs on all cores."""
     rates = {
         "means": config.means_lr * scene_scale,
         "scales": config.scales_lr,
@@ -67,6 +68,8 @@ def create_optimizers(
         group = [{"params": [splats[name]], "lr": rate, "name": name}]
         if config.visible_adam:
             optimizers[name] = SelectiveAdam(group, eps=ADAM_EPS)
-        else:
+        elif splats[name].is_cuda:
             optimizers[name] = torch.optim.Adam(group, eps=ADAM_EPS, fused=True)
+        else:
+            optimizers[name] = Adam(group, eps=ADAM_EPS)
     return optimizers
