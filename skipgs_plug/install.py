@@ -1,16 +1,24 @@
-"""How to get the optional packages, as a command that works wherever this package came from."""
+"""Commands to tell the user: to get the optional packages, to go on; they work wherever this package came from."""
 
 from __future__ import annotations
 
 import json
 import re
 import shlex
+import shutil
+import sys
 from importlib import metadata
 from pathlib import Path
 from urllib.parse import urlparse
 from urllib.request import url2pathname
 
 NAME = "skipgs_plug"
+PROGRAM = "skipgs-plug"
+
+
+def program() -> str:
+    """Return what the command of this package is called with: its name, or Python where it is not on the path."""
+    return PROGRAM if shutil.which(PROGRAM) else f"{shlex.quote(sys.executable)} -m {NAME}"
 
 
 def install_command(extra: str = "full") -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from skipgs_plug import cli
-from skipgs_plug.install import install_command
+from skipgs_plug.install import install_command, program
 
 tomllib = pytest.importorskip("tomllib")  # Python 3.11
 
@@ -84,3 +84,12 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it() -> None:
     ended = run_without({"tyro"}, code)
     assert ended.returncode == 2
     assert f"needs the package tyro; run: {install_command('view')}" in ended.stderr
+
+
+def test_commands_to_go_on_with_work_without_the_script_on_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.which", lambda name: f"/bin/{name}")
+    assert program() == "skipgs-plug"
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    command = f"{program()} --help"
+    ended = subprocess.run(command, shell=True, cwd=PROJECT.parent, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0 and "skipgs-plug" in ended.stdout

@@ -10,6 +10,7 @@ from skipgs_plug import SkipGate
 from skipgs_plug.commands.signals import stop_on_signal
 from skipgs_plug.core.report import write_report
 from skipgs_plug.files import WriteError, keep_going
+from skipgs_plug.install import program
 from skipgs_plug.trainer import InputError, Trainer
 from skipgs_plug.trainer.autosave import Autosave
 from skipgs_plug.trainer.curve import LossCurve
@@ -142,7 +143,7 @@ class Session:
             print(self._gate.summary())
         print(f"{self._described(stats)}; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s")
         if ply is not None:
-            print(f"{ply}\nNext: skipgs-plug view {folder.root}")
+            print(f"{ply}\nNext: {program()} view {folder.root}")
 
     def _described(self, stats: dict[str, Any]) -> str:
         net = self._options.lpips_net

@@ -11,6 +11,7 @@ from pathlib import Path
 import tyro
 from tqdm.auto import tqdm
 
+from skipgs_plug.install import program
 from skipgs_plug.photos.gather import gather
 from skipgs_plug.photos.reconstruct import Matching, Reconstruction
 from skipgs_plug.photos.scene_folder import check_target, write_scene
@@ -46,7 +47,7 @@ def main(argv: list[str]) -> int:
 def run(args: Args) -> int:
     """Reconstruct and print what was placed; see `Args`."""
     scene = reconstruct(args)
-    print(f"Scene: {scene}. Next: skipgs-plug train {scene} --out runs/{scene.resolve().name}")
+    print(f"Scene: {scene}. Next: {program()} train {scene} --out runs/{scene.resolve().name}")
     return 0
 
 

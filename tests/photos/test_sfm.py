@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from skipgs_plug.cli import main
+from skipgs_plug.install import program
 from skipgs_plug.photos.progress import counted
 from skipgs_plug.photos.reconstruct import key_pairs
 from skipgs_plug.trainer import load_scene
@@ -65,11 +66,11 @@ def test_a_video_is_trained_on_with_one_command(fern, tmp_path, capsys):
     iio.imwrite(video, frames, plugin="FFMPEG", fps=10, quality=9, macro_block_size=2)
     train = ["train", str(video), "--out", str(run), "--no-progress", "--data-factor", "4"]
     assert main([*train, "--max-steps", "6"]) == 2
-    assert "add --sfm to find that out first, or run: skipgs-plug sfm" in capsys.readouterr().err
+    assert f"add --sfm to find that out first, or run: {program()} sfm" in capsys.readouterr().err
     assert not run.exists()
     assert main([*train, "--max-steps", "6", "--sfm"]) == 0
     shown = capsys.readouterr().out
-    assert "photographs placed" in shown and f"Next: skipgs-plug view {run}" in shown
+    assert "photographs placed" in shown and f"Next: {program()} view {run}" in shown
     assert (run / "scene/sparse/0").is_dir() and (run / "ply/point_cloud_5.ply").is_file()
     assert main([*train, "--max-steps", "8", "--sfm", "--resume"]) == 0
     assert "placed" not in capsys.readouterr().out  # the scene is there
