@@ -78,8 +78,8 @@ EXACT_IMAGES = 3  # per size, on which the loss is computed with PyTorch and in 
 
 PHASES = {
     "project": ("project_forward", "list_visible", "sh_forward"),
-    "bin and sort": ("sort_and_pack", "count_pairs", "scan_pairs", "fill_pairs"),
-    "blend": ("blend_forward_3",),
+    "bin": ("pack_and_count", "scan_pairs", "fill_pairs"),
+    "sort and blend": ("blend_forward_3",),
     "blend backward": ("blend_backward_3", "reduce_pairs"),
     "project backward": ("project_backward", "sh_backward"),
 }
@@ -209,7 +209,7 @@ def growth(points: dict[int, tuple[int, str, int | None]], repeats: int) -> dict
         print(f"{x:>9,} {rows[-1]['ms']:8.1f} ms {rows[-1]['peak_mib']:7.1f} MiB above start", flush=True)
     measures = {
         "time": [row["ms"] for row in rows],
-        "sort": [row["phases_ms"]["bin and sort"] for row in rows],
+        "bin": [row["phases_ms"]["bin"] for row in rows],
         "memory": [max(row["peak_mib"], 1.0) for row in rows],
     }
     found = {name: exponents([row["x"] for row in rows], values) for name, values in measures.items()}

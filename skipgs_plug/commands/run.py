@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -41,7 +41,7 @@ class Args:
 
     adapter: tyro.conf.Positional[str]
     """Name of the trainer: inria, fastgs, taming, ...; or auto, to recognise it by its script."""
-    gate: tyro.conf.OmitArgPrefixes[GateOptions] = dataclasses.field(default_factory=GateOptions)
+    gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
     resume_gate: str = "auto"
     """State the gate goes on from: auto (the one beside the checkpoint the script loads), off (afresh), or a path."""
     no_gate: bool = False
@@ -102,7 +102,7 @@ def run_gated(
     checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
     for_cpu = (*(f"torch.cuda.{name}" for name in CUDA_REPLACED), ADAM_REPLACED)
     adapter.replaced = (*REPLACED, *(for_cpu if args.cpu else ()))
-    settings = args.gate.given() | ({"enabled": False} if args.no_gate else {})
+    settings = args.gate_options.given() | ({"enabled": False} if args.no_gate else {})
     gates: list[SkipGate] = []
 
     def attach() -> dict[str, Any]:

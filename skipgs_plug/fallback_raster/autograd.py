@@ -11,16 +11,16 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .binning import Bins, bin_gaussians, pack_colors
-from .blend import backward_worker, forward_worker, reduce_pairs
-from .constants import BLOCK, MAX_CHANNELS, PAIR, blocks, tiles
-from .launch import floats, ints, scratch, zeros
-from .project import list_visible, project_backward, project_forward
+from .constants import blocks
+from .launch import floats, ints, zeros
+from .project import project_backward, project_forward
+from .rendering import blend, blend_adjoint
+from .rows import all_rows, visible_rows
 from .sh import sh_backward, sh_forward
 from .shortcuts import SHORTCUTS, active_shortcuts
 
 
-def _saved(ctx: Any, **shapes: torch.Size) -> tuple[Tensor, ...]:
+def check_shapes(tensors: tuple[Tensor, ...], **shapes: torch.Size) -> tuple[Tensor, ...]:
     """The saved tensors, if those that came from outside still have the sizes that the forward pass saw.
 
     Torch notices what is changed in place, but not that `.data` was replaced, as code that densifies does.
@@ -28,14 +28,13 @@ def _saved(ctx: Any, **shapes: torch.Size) -> tuple[Tensor, ...]:
     Raises:
         RuntimeError: A tensor has another size now.
     """
-    tensors = ctx.saved_tensors
     for tensor, (name, shape) in zip(tensors, shapes.items(), strict=False):
         if tensor.shape != shape:
             raise RuntimeError(
                 f"{name} had shape {list(shape)} when it was rendered and has {list(tensor.shape)} now: call "
                 "backward() before the number of Gaussians changes."
             )
-    return tensors  # type: ignore[no-any-return]
+    return tensors
 
 
 class Project(torch.autograd.Function):
@@ -66,13 +65,13 @@ class Project(torch.autograd.Function):
         n = len(means)
         means2d, sigmas, depths, conics = floats(n, 2), floats(n, 2), floats(n), floats(n, 3)
         compensations, radii = floats(n if antialiased else 0), ints(n, 2)
+        seen, block_count = ints(n), ints(blocks(n))
         project_forward(
             means, quats, scales, opacities, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
-            n, float(width), float(height), near_plane, far_plane, eps2d, radius_clip, int(antialiased),
+            floats(0), seen, block_count, n, float(width), float(height), near_plane, far_plane, eps2d, radius_clip,
+            int(antialiased), 0, 1, active_shortcuts(),
         )  # fmt: skip
-        visible, block_start = ints(n), ints(blocks(n) + 1)
-        list_visible(radii, visible, block_start, n)
-        visible = visible[: int(block_start[-1])]
+        visible, block_start = visible_rows(seen, block_count)
         ctx.save_for_backward(means, quats, scales, viewmat, K, visible, block_start)
         ctx.shapes = {"means": means.shape, "quats": quats.shape, "scales": scales.shape, "viewmats": viewmat.shape}
         ctx.size = (width, height, eps2d)
@@ -90,7 +89,7 @@ class Project(torch.autograd.Function):
         v_compensations: Tensor | None,
         *_: Any,
     ) -> Any:
-        means, quats, scales, viewmat, K, visible, block_start = _saved(ctx, **ctx.shapes)
+        means, quats, scales, viewmat, K, visible, block_start = check_shapes(ctx.saved_tensors, **ctx.shapes)
         width, height, eps2d = ctx.size
         with_pose = ctx.needs_input_grad[4]
         v_means, v_quats, v_scales = (floats(*t.shape) for t in (means, quats, scales))
@@ -102,9 +101,10 @@ class Project(torch.autograd.Function):
             floats(0) if v is None else v.contiguous() for v in (v_depths, v_compensations)
         )  # fmt: skip
         project_backward(
-            means, quats, scales, viewmat, K, visible, block_start, v_means2d, v_depths, v_conics, v_compensations,
-            v_means, v_quats, v_scales, v_poses, n, float(width), float(height), eps2d,
-            int(v_depths.numel() > 0), int(v_compensations.numel() > 0), int(with_pose), active_shortcuts(),
+            means, quats, scales, floats(0), viewmat, K, visible, block_start, v_means2d, v_depths, v_conics,
+            v_compensations, floats(0), v_means, v_quats, v_scales, floats(0), v_poses,
+            n, float(width), float(height), eps2d,
+            int(v_depths.numel() > 0), int(v_compensations.numel() > 0), int(with_pose), 0, active_shortcuts(),
         )  # fmt: skip
         v_viewmat = None
         if with_pose:
@@ -133,13 +133,12 @@ class SphericalHarmonics(torch.autograd.Function):
         n = len(means)
         colors = floats(n, 3)
         if not active_shortcuts() & SHORTCUTS["visible_only"]:
-            visible = torch.arange(n, dtype=torch.int32, device="cpu")
-            block_start = torch.arange(0, BLOCK * (blocks(n) + 1), BLOCK, dtype=torch.int32, device="cpu").clamp(max=n)
+            visible, block_start = all_rows(n)
         ctx.layout = (3 * base.shape[1], 3 * base.shape[1], 3) if rest is None else (3, 3 * rest.shape[1], 0)
         ctx.degree = degree
         ctx.joined = rest is None
         rest = base if rest is None else rest
-        sh_forward(means, camera, base, rest, visible, block_start, colors, n, *ctx.layout, degree)
+        sh_forward(means, camera, base, rest, visible, block_start, colors, n, *ctx.layout, degree, 1)
         ctx.save_for_backward(means, base, rest, camera, colors, visible, block_start)
         ctx.shapes = {"means": means.shape, "colors": base.shape, "the higher bands of colors": rest.shape}
         return colors
@@ -147,7 +146,7 @@ class SphericalHarmonics(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> Any:  # type: ignore[override]
-        means, base, rest, camera, colors, visible, block_start = _saved(ctx, **ctx.shapes)
+        means, base, rest, camera, colors, visible, block_start = check_shapes(ctx.saved_tensors, **ctx.shapes)
         v_means, v_base = floats(*means.shape), floats(*base.shape)
         v_rest = v_base if ctx.joined else floats(*rest.shape)
         v_cameras = zeros(blocks(len(means)), 3)
@@ -175,25 +174,15 @@ class Blend(torch.autograd.Function):
         depths: Tensor,  # [R]
         sigmas: Tensor,  # [R, 2]
         visible: Tensor,  # [M]
+        block_start: Tensor,  # [ceil(R / BLOCK) + 1]
         width: int,
         height: int,
         absolute: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        bins = bin_gaussians(visible, means2d, depths, conics, opacities, sigmas, colors, width, height)
-        channels = colors.shape[1]
-        tiles_x, tiles_y = tiles(width, height)
-        image, transmittance = floats(height, width, channels), floats(height, width)
-        pixel_stop, tile_stop = ints(height, width), ints(tiles_x * tiles_y)
-        pair_blocks = ints(len(bins.tile_list))
-        for channel in range(0, channels, MAX_CHANNELS):
-            some = min(MAX_CHANNELS, channels - channel)
-            if channel > 0:
-                pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
-            forward_worker(some)(
-                bins.records, bins.tile_start, bins.tile_list, image, transmittance, pixel_stop, tile_stop,
-                pair_blocks, width, height, tiles_x, tiles_y, channels, channel, some, active_shortcuts(),
-            )  # fmt: skip
-        ctx.save_for_backward(means2d, conics, opacities, colors, transmittance, pixel_stop, tile_stop, pair_blocks)
+        image, transmittance, ctx.blended = blend(
+            means2d, conics, opacities, colors, depths, sigmas, visible, block_start, width, height
+        )
+        ctx.save_for_backward(means2d, conics, opacities, colors, transmittance)
         ctx.shapes = {
             "means2d": means2d.shape,
             "conics": conics.shape,
@@ -201,37 +190,16 @@ class Blend(torch.autograd.Function):
             "colors": colors.shape,
             "alphas": transmittance.shape,
         }
-        ctx.bins, ctx.absolute = bins, absolute
-        ctx.mark_non_differentiable(bins.tiles_per_gauss)
-        return image, transmittance, bins.tiles_per_gauss
+        ctx.absolute = absolute
+        tiles_per_gauss = ctx.blended.bins.tiles_per_gauss
+        ctx.mark_non_differentiable(tiles_per_gauss)
+        return image, transmittance, tiles_per_gauss
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor, _: Any) -> Any:  # type: ignore[override]
-        means2d, conics, opacities, colors, transmittance, pixel_stop, tile_stop, pair_blocks = _saved(
-            ctx, **ctx.shapes
+        means2d, conics, opacities, colors, transmittance = check_shapes(ctx.saved_tensors, **ctx.shapes)
+        gradients = blend_adjoint(
+            ctx.blended, means2d, conics, opacities, colors, transmittance, v_image, v_transmittance, ctx.absolute
         )
-        bins: Bins = ctx.bins
-        height, width, channels = v_image.shape
-        tiles_x, tiles_y = tiles(width, height)
-        v_image, v_transmittance = v_image.contiguous(), v_transmittance.contiguous()
-        v_means2d, v_conics, v_opacities, v_colors = (floats(*t.shape) for t in (means2d, conics, opacities, colors))
-        with_absolute = ctx.absolute is not None
-        absolute = ctx.absolute if with_absolute else floats(0)
-        v_pairs = scratch("v_pairs", len(bins.tile_list), PAIR)
-        for channel in range(0, channels, MAX_CHANNELS):
-            some = min(MAX_CHANNELS, channels - channel)
-            if channels > MAX_CHANNELS:
-                pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
-            backward_worker(some, with_absolute)(
-                bins.records, bins.tile_start, bins.tile_list, tile_stop, pair_blocks, transmittance, pixel_stop,
-                v_image, v_transmittance, v_pairs, width, height, tiles_x, tiles_y, channels, channel, some,
-                active_shortcuts(),
-            )  # fmt: skip
-            reduce_pairs(
-                bins.pair_start, bins.pair_slot, v_pairs, conics, opacities, v_means2d, v_conics, v_opacities,
-                absolute, v_colors, len(means2d), len(bins.tile_list), channels, channel, some, int(with_absolute),
-            )  # fmt: skip
-            # The gradient of the transmittance belongs to the first pass alone.
-            v_transmittance = torch.zeros_like(v_transmittance) if channels > MAX_CHANNELS else v_transmittance
-        return v_means2d, v_conics, v_opacities, v_colors, *[None] * 6
+        return *gradients, *[None] * 7

@@ -1,8 +1,9 @@
 """Which Gaussians touch which tile, front to back.
 
-Gaussians are sorted by depth once (N keys instead of one key per tile pair) and then counted into tiles in that
-order, so every tile's list comes out sorted and equal depths keep the order of the input. A tile is listed only
-where the ellipse at alpha = 1/255 really crosses it (exact bounds per row of tiles, `kernels/ellipse.h`).
+Rows are taken in their order twice, to count the pairs of each tile and to list them, and every tile then sorts its own
+list, only as far as its pixels take it (`kernels/sorted_tile.h`): behind the surface of a scene of a million Gaussians
+most of a list is never looked at. Equal depths keep the order of the input. A tile is listed only where the ellipse at
+alpha = 1/255 really crosses it (exact bounds per row of tiles, `kernels/ellipse.h`).
 """
 
 from dataclasses import dataclass
@@ -11,32 +12,16 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from .constants import MAX_CHANNELS, RECORD, tiles
-from .launch import FloatArray, IntArray, LongArray, floats, get_num_threads, ints, worker, zeros
+from .constants import BOX, MAX_CHANNELS, RECORD, tiles
+from .launch import FloatArray, IntArray, LongArray, floats, get_num_threads, ints, longs, worker, zeros
 from .shortcuts import active_shortcuts
 from .source import read_kernel
 
 # What 32-bit places in a list of pairs can count.
 MAX_PAIRS = 2**31 - 1
 
-
-# One core sorts while the others pack.
-@worker(read_kernel("sort_and_pack.h"), items="1 + (n + BLOCK - 1) / BLOCK", grain="1")
-def sort_and_pack(
-    depths: Annotated[FloatArray, "R"],
-    visible: Annotated[IntArray, "n"],
-    keys: Annotated[IntArray, "2 * n"],  # scratch
-    values: Annotated[IntArray, "2 * n"],  # out, the rows front to back in its second half
-    means2d: Annotated[FloatArray, "R, 2"],
-    conics: Annotated[FloatArray, "R, 3"],
-    opacities: Annotated[FloatArray, "R"],
-    sigmas: Annotated[FloatArray, "R, 2"],
-    colors: Annotated[FloatArray, "R, stride"],
-    records: Annotated[FloatArray, "R, RECORD"],  # out, only visible rows are written
-    n: int,
-    stride: int,
-    channels: int,
-) -> None: ...
+# Slices of the rows that each thread counts and lists.
+SLICES = 4
 
 
 @worker(read_kernel("pack_colors.h"), items="n", grain="BLOCK")
@@ -51,18 +36,28 @@ def pack_colors(
 ) -> None: ...
 
 
-@worker(read_kernel("count_pairs.h"), items="slices", grain="1")
-def count_pairs(
-    order: Annotated[IntArray, "n"],
-    records: Annotated[FloatArray, "R, RECORD"],
+@worker(read_kernel("pack_and_count.h"), items="slices", grain="1")
+def pack_and_count(
+    visible: Annotated[IntArray, "n"],
+    means2d: Annotated[FloatArray, "R, 2"],
+    conics: Annotated[FloatArray, "R, 3"],
+    opacities: Annotated[FloatArray, "R"],
+    sigmas: Annotated[FloatArray, "R, 2"],
+    colors: Annotated[FloatArray, "R, stride"],
+    records: Annotated[FloatArray, "R, RECORD"],  # out, only visible rows are written
+    boxes: Annotated[IntArray, "n, BOX"],  # out
     counts: Annotated[IntArray, "slices, tiles_x, tiles_y"],  # out
-    tiles_per_gauss: Annotated[IntArray, "R"],  # out, zeros before
+    totals: Annotated[LongArray, "slices + 1"],  # out, pairs of each slice
+    tiles_per_gauss: Annotated[IntArray, "R if dense else 0"],  # out, zeros before
     n: int,
+    stride: int,
+    channels: int,
     slices: int,
     width: float,
     height: float,
     tiles_x: int,
     tiles_y: int,
+    dense: int,
     shortcuts: int,
 ) -> None: ...
 
@@ -70,11 +65,8 @@ def count_pairs(
 @worker(read_kernel("scan_pairs.h"), items="1", grain="1")
 def scan_pairs(
     counts: Annotated[IntArray, "slices, tiles"],  # in: counts; out: where each slice starts in each tile's list
+    totals: Annotated[LongArray, "slices + 1"],  # in: pairs of each slice; out: running sum
     tile_start: Annotated[IntArray, "tiles + 1"],  # out
-    tiles_per_gauss: Annotated[IntArray, "rows"],
-    pair_start: Annotated[IntArray, "rows + 1"],  # out, running sum
-    total: Annotated[LongArray, "1"],  # out, number of pairs
-    rows: int,
     slices: int,
     tiles: int,
 ) -> None: ...
@@ -82,19 +74,34 @@ def scan_pairs(
 
 @worker(read_kernel("fill_pairs.h"), items="slices", grain="1")
 def fill_pairs(
-    order: Annotated[IntArray, "n"],
+    visible: Annotated[IntArray, "n"],
+    depths: Annotated[FloatArray, "R"],
     records: Annotated[FloatArray, "R, RECORD"],
+    boxes: Annotated[IntArray, "n, BOX"],
     counts: Annotated[IntArray, "slices, tiles_x, tiles_y"],  # next free place
-    pair_start: Annotated[IntArray, "R + 1"],
-    tile_list: Annotated[IntArray, "P"],  # out, rows
-    pair_slot: Annotated[IntArray, "P"],  # out, for each Gaussian its places in tile_list
+    totals: Annotated[LongArray, "slices + 1"],
+    pair_start: Annotated[IntArray, "n + 1"],  # out
+    pair_row: Annotated[IntArray, "P"],  # out
+    unsorted: Annotated[LongArray, "P"],  # out, depth and number of each pair
     n: int,
     slices: int,
     width: float,
-    height: float,
     tiles_x: int,
     tiles_y: int,
     shortcuts: int,
+) -> None: ...
+
+
+@worker(read_kernel("sort_tiles.h"), items="tiles", grain="2")
+def sort_tiles(
+    records: Annotated[FloatArray, "R, RECORD"],
+    tile_start: Annotated[IntArray, "tiles + 1"],
+    pair_row: Annotated[IntArray, "P"],
+    unsorted: Annotated[LongArray, "P"],
+    buffer: Annotated[LongArray, "P"],  # scratch
+    tile_list: Annotated[IntArray, "P"],  # out
+    tile_place: Annotated[IntArray, "P"],  # out
+    tiles: int,
 ) -> None: ...
 
 
@@ -105,10 +112,12 @@ class Bins:
     Attributes:
         visible: [M] int32, rows of the visible Gaussians.
         records: [R, RECORD] float32, what the blend reads of each of them.
-        tile_start: [tiles + 1] int32, begin of each tile's part of `tile_list`, row-major.
-        tile_list: [P] int32, rows, front to back in every tile.
-        pair_start: [R + 1] int32, begin of each row's part of `pair_slot`.
-        pair_slot: [P] int32, places in `tile_list`.
+        tile_start: [tiles + 1] int32, begin of each tile's part of the lists, row-major.
+        tile_list: [P] int32, rows, front to back in every tile as far as it is sorted.
+        tile_place: [P] int32, number of the pair; pairs are numbered by row and tile.
+        pair_start: [M + 1] int32, number of each visible Gaussian's first pair.
+        pair_row: [P] int32, row of each pair.
+        unsorted: [P] int64, depth and number of the pairs of each tile.
         tiles_per_gauss: [R] int32, number of tiles of every row.
     """
 
@@ -116,9 +125,19 @@ class Bins:
     records: Tensor
     tile_start: Tensor
     tile_list: Tensor
+    tile_place: Tensor
     pair_start: Tensor
-    pair_slot: Tensor
+    pair_row: Tensor
+    unsorted: Tensor
     tiles_per_gauss: Tensor
+
+    def sort(self) -> None:
+        """Sorts the lists of all tiles to their ends."""
+        buffer = longs(len(self.unsorted))
+        sort_tiles(
+            self.records, self.tile_start, self.pair_row, self.unsorted, buffer, self.tile_list, self.tile_place,
+            len(self.tile_start) - 1,
+        )  # fmt: skip
 
 
 def bin_gaussians(
@@ -131,8 +150,11 @@ def bin_gaussians(
     colors: Tensor,  # [R, D]
     width: int,
     height: int,
+    dense: bool = True,
 ) -> Bins:
-    """Sorts the visible Gaussians of one image by depth and lists them per tile, with their first channels.
+    """Lists the visible Gaussians of one image per tile, not yet sorted by depth, with their first channels.
+
+    `tiles_per_gauss` is empty unless `dense`.
 
     Raises:
         ValueError: There are more (tile, Gaussian) pairs than can be listed.
@@ -140,28 +162,27 @@ def bin_gaussians(
     n = visible.numel()
     tiles_x, tiles_y = tiles(width, height)
     rows, channels = colors.shape
-    keys, values = ints(2, 2 * n)
-    records = floats(rows, RECORD)
-    sort_and_pack(
-        depths, visible, keys, values, means2d, conics, opacities, sigmas, colors, records,
-        n, channels, min(channels, MAX_CHANNELS),
+    # Any number of slices gives the same lists; some per thread keep all busy.
+    slices = 1 if n < 1024 or get_num_threads() == 1 else SLICES * get_num_threads()
+    records, boxes, counts = floats(rows, RECORD), ints(n, BOX), ints(slices, tiles_x * tiles_y)
+    tile_start, pair_start = ints(tiles_x * tiles_y + 1), ints(n + 1)
+    tiles_per_gauss, totals = zeros(rows if dense else 0, dtype=torch.int32), longs(slices + 1)
+    pack_and_count(
+        visible, means2d, conics, opacities, sigmas, colors, records, boxes, counts, totals, tiles_per_gauss,
+        n, channels, min(channels, MAX_CHANNELS), slices, float(width), float(height), tiles_x, tiles_y,
+        int(dense), active_shortcuts(),
     )  # fmt: skip
-    order = values[n:]
-
-    # Any number of slices gives the same lists; one per thread keeps all busy.
-    slices = 1 if n < 1024 else get_num_threads()
-    counts = ints(slices, tiles_x * tiles_y)
-    tile_start, pair_start = ints(tiles_x * tiles_y + 1), ints(rows + 1)
-    tiles_per_gauss, total = zeros(rows, dtype=torch.int32), zeros(1, dtype=torch.int64)
-    image = (float(width), float(height), tiles_x, tiles_y, active_shortcuts())
-    count_pairs(order, records, counts, tiles_per_gauss, n, slices, *image)
-    scan_pairs(counts, tile_start, tiles_per_gauss, pair_start, total, rows, slices, tiles_x * tiles_y)
-    pairs = int(total)
+    scan_pairs(counts, totals, tile_start, slices, tiles_x * tiles_y)
+    pairs = int(totals[-1])
     if pairs > MAX_PAIRS:
         raise ValueError(
             f"{n:,} visible Gaussians cover {pairs:,} tiles of an image of {width}x{height} pixels in all, and at most "
             f"{MAX_PAIRS:,} can be listed: render a smaller image, or fewer or smaller Gaussians."
         )
-    tile_list, pair_slot = ints(pairs), ints(pairs)
-    fill_pairs(order, records, counts, pair_start, tile_list, pair_slot, n, slices, *image)
-    return Bins(visible, records, tile_start, tile_list, pair_start, pair_slot, tiles_per_gauss)
+    pair_row, unsorted = ints(pairs), longs(pairs)
+    fill_pairs(
+        visible, depths, records, boxes, counts, totals, pair_start, pair_row, unsorted,
+        n, slices, float(width), tiles_x, tiles_y, active_shortcuts(),
+    )  # fmt: skip
+    lists = ints(pairs), ints(pairs)
+    return Bins(visible, records, tile_start, *lists, pair_start, pair_row, unsorted, tiles_per_gauss)

@@ -4,18 +4,19 @@ Cut-offs as in gsplat and Inria's rasterizer: alpha is at most 0.999, a contribu
 pixel is finished when the next Gaussian would bring its transmittance to 1e-4 or less.
 
 A tile is 4 x 4 blocks of 4 x 4 pixels, and a block is one value: small Gaussians fill more of a square than of a row.
-Which blocks a Gaussian reaches is found for all 16 at once, from the least exponent in each. The forward pass then
-takes block after block, so that its pixels stay in registers while the Gaussians pass.
+Which blocks a Gaussian reaches is found for four Gaussians at once (`kernels/reached_blocks.h`). The forward pass then
+takes block after block, so that its pixels stay in registers while the Gaussians pass, four of them side by side.
 
-The adjoint walks the same lists back to front, Gaussian after Gaussian, so that here its sums stay in registers.
-It needs, beside the colour, the moments of v_sigma about the centre: of 1, dx, dy, dx^2, dx dy and dy^2. Each
-(tile, Gaussian) pair writes its sums to its own place and `reduce_pairs` adds a Gaussian's pairs in a fixed order and
-makes gradients of them: no atomics, and bit-equal for any thread count.
+The adjoint walks the same lists back to front, Gaussian after Gaussian, so that here its sums stay in registers, and
+visits only blocks in which the forward pass blended the Gaussian. It needs, beside the colour, the moments of v_sigma
+about the centre: of 1, dx, dy, dx^2, dx dy and dy^2. Each (tile, Gaussian) pair writes its sums to its own place, in
+the order of rows, and `reduce_pairs` adds a Gaussian's pairs in a fixed order and makes gradients of them: no atomics,
+and bit-equal for any thread count.
 """
 
 from typing import Annotated
 
-from .launch import FloatArray, IntArray, Worker, worker
+from .launch import ByteArray, FloatArray, IntArray, LongArray, Worker, worker
 from .source import read_kernel
 
 
@@ -30,12 +31,16 @@ def _forward(channels: int) -> Worker:
     def blend_forward(
         records: Annotated[FloatArray, "R, RECORD"],
         tile_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],
-        tile_list: Annotated[IntArray, "P"],
+        pair_row: Annotated[IntArray, "P"],
+        unsorted: Annotated[LongArray, "P"],
+        buffer: Annotated[LongArray, "0 if sorted else P"],  # scratch
+        tile_list: Annotated[IntArray, "P"],  # sorted, or sorted here as far as necessary; as the next
+        tile_place: Annotated[IntArray, "P"],
         image: Annotated[FloatArray, "height, width, stride"],  # out
         transmittance: Annotated[FloatArray, "height, width"],  # out, behind the last Gaussian blended
-        pixel_stop: Annotated[IntArray, "height, width"],  # out, place in tile_list at which the pixel was finished
+        pixel_stop: Annotated[IntArray, "height, width"],  # out, place in tile_list behind the last Gaussian blended
         tile_stop: Annotated[IntArray, "tiles_x, tiles_y"],  # out, their maximum
-        pair_blocks: Annotated[IntArray, "P"],  # out, blocks that it reaches, as bits; not written beyond tile_stop
+        pair_blocks: Annotated[IntArray, "P"],  # out, blocks where it was blended, as bits; nothing beyond tile_stop
         width: int,
         height: int,
         tiles_x: int,
@@ -43,6 +48,7 @@ def _forward(channels: int) -> Worker:
         stride: int,  # channels of the image
         channel: int,  # the first of this pass
         channels: int,
+        sorted: int,  # whether the lists are
         shortcuts: int,
     ) -> None: ...
 
@@ -61,13 +67,15 @@ def _backward(channels: int, absgrad: bool) -> Worker:
         records: Annotated[FloatArray, "R, RECORD"],
         tile_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],
         tile_list: Annotated[IntArray, "P"],
+        tile_place: Annotated[IntArray, "P"],
         tile_stop: Annotated[IntArray, "tiles_x, tiles_y"],
         pair_blocks: Annotated[IntArray, "P"],
         transmittance: Annotated[FloatArray, "height, width"],
         pixel_stop: Annotated[IntArray, "height, width"],
         v_image: Annotated[FloatArray, "height, width, stride"],
         v_transmittance: Annotated[FloatArray, "height, width"],  # gradient of the final transmittance
-        v_pairs: Annotated[FloatArray, "P, PAIR"],  # out
+        v_pairs: Annotated[FloatArray, "P, PAIR"],  # out, where `written` says so
+        written: Annotated[ByteArray, "padded(P)"],  # out, zeros before
         width: int,
         height: int,
         tiles_x: int,
@@ -97,23 +105,25 @@ def backward_worker(channels: int, absgrad: bool) -> Worker:
     return _BACKWARD[min(width for width in _WIDTHS if width >= channels), absgrad]
 
 
-@worker(read_kernel("reduce_pairs.h"), items="rows", grain="BLOCK")
+@worker(read_kernel("reduce_pairs.h"), items="(rows + BLOCK - 1) / BLOCK", grain="1")
 def reduce_pairs(
-    pair_start: Annotated[IntArray, "rows + 1"],
-    pair_slot: Annotated[IntArray, "pairs"],
+    visible: Annotated[IntArray, "M"],
+    block_start: Annotated[IntArray, "blocks(rows) + 1"],  # where each block of rows begins in `visible`
+    pair_start: Annotated[IntArray, "M + 1"],
     v_pairs: Annotated[FloatArray, "pairs, PAIR"],
+    written: Annotated[ByteArray, "padded(pairs)"],
     conics: Annotated[FloatArray, "rows, 3"],
     opacities: Annotated[FloatArray, "rows"],
-    # Out; added to from the second pass over the channels on, as the next two.
+    # Out, all rows where `dense`, else visible ones; added to from the second pass over the channels on, as the next.
     v_means2d: Annotated[FloatArray, "rows, 2"],
     v_conics: Annotated[FloatArray, "rows, 3"],
     v_opacities: Annotated[FloatArray, "rows"],
     v_absolute: Annotated[FloatArray, "rows if absgrad else 0, 2"],  # out, added to
     v_colors: Annotated[FloatArray, "rows, stride"],  # out
     rows: int,
-    pairs: int,
     stride: int,
     channel: int,
     channels: int,
     absgrad: int,
+    dense: int,
 ) -> None: ...

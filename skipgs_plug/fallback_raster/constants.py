@@ -11,12 +11,19 @@ BLOCK = 512
 # Floats of a Gaussian as the blend reads it: centre x, y; the conic as a sum of squares, so that with
 # p = r[2] dx + r[3] dy and w = r[4] dy, alpha = exp2(r[5] - p^2 - w^2); half height and half width in pixels of the
 # ellipse at ALPHA_MIN; up to four channels of colour; where p^2 + w^2 is least, dx / dy along a row and dy / dx along a
-# column; p^2 + w^2 at ALPHA_MIN; one unused, which makes it a cache line.
+# column; p^2 + w^2 at ALPHA_MIN; 1 / r[2]. Together a cache line.
 RECORD = 16
+
+# Numbers of the box of tiles around a Gaussian: its first and last column, its first and last row, and which of its
+# tiles the Gaussian meets, as bits, where they are at most 2 x 2; -1 where they are more.
+BOX = 5
 
 # Sums of a (tile, Gaussian) pair in the adjoint: the six moments; up to four channels of colour; |v_x|, |v_y|; the rest
 # makes it a cache line.
 PAIR = 16
+
+# Most ranges of depth into which a tile deals its pairs before it sorts one after the other.
+BUCKETS = 4096
 
 # Channels that one pass blends; wider colours take several passes.
 MAX_CHANNELS = 4

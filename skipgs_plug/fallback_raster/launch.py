@@ -33,7 +33,7 @@ from torch import Tensor
 from skipgs_plug.install import install_command
 
 from . import guard
-from .cache import load_or_rebuild
+from .cache import load_or_rebuild, say_unwritable
 from .cores import usable_cores
 from .guard import Sizes
 from .memory import LARGE, SUPPORTED, Pool
@@ -99,6 +99,11 @@ def release_memory() -> None:
         _memory.release()
 
 
+def longs(*shape: int) -> Tensor:
+    """An int64 tensor with undefined content."""
+    return guard.poison(torch.empty(shape, dtype=torch.int64, device="cpu"))
+
+
 def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     """A tensor of zeros."""
     return torch.zeros(shape, dtype=dtype, device="cpu")
@@ -129,6 +134,10 @@ class LongArray:
     """Marks a worker's parameter as a contiguous int64 tensor, passed flat."""
 
 
+class ByteArray:
+    """Marks a worker's parameter as a contiguous uint8 tensor, passed flat."""
+
+
 class _Kind(NamedTuple):
     """What a parameter is in Python, in Warp and in C++."""
 
@@ -142,6 +151,7 @@ _KINDS: dict[type, _Kind] = {
     FloatArray: _Kind(torch.float32, "wp.uint64", "float"),
     IntArray: _Kind(torch.int32, "wp.uint64", "int"),
     LongArray: _Kind(torch.int64, "wp.uint64", "long long"),
+    ByteArray: _Kind(torch.uint8, "wp.uint64", "unsigned char"),
     int: _Kind(None, "wp.int32", ""),
     float: _Kind(None, "wp.float32", ""),
 }
@@ -249,11 +259,12 @@ class Worker:
         inputs = [0] * len(declared)
         # Warp compiles for blocks of one thread on the CPU.
         folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(1)
-        command = load_or_rebuild(
-            folder,
-            lambda: wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False),
-            kernel.module.unload,
-        )
+
+        def load() -> Any:
+            with say_unwritable():
+                return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
+
+        command = load_or_rebuild(folder, load, kernel.module.unload)
         # Every call fills a block of parameters of its own, which the threads share.
         bounds, *parameters = command.params
         fields = [(name, type(parameter)) for name, parameter in zip(declared, parameters, strict=True)]
@@ -271,8 +282,8 @@ def worker(
 ) -> Callable[[Callable[..., None]], Worker]:
     """Turns a stub function into a `Worker`.
 
-    The stub's parameters are annotated `FloatArray`, `IntArray`, `LongArray`, `int` or `float`; arrays also
-    `Annotated[FloatArray, "n, 3"]` with the sizes that `guard.Sizes` checks.
+    The stub's parameters are annotated `FloatArray`, `IntArray`, `LongArray`, `ByteArray`, `int` or `float`; arrays
+    also `Annotated[FloatArray, "n, 3"]` with the sizes that `guard.Sizes` checks.
 
     Args:
         code: C++ that handles items `[first, last)`; array parameters of the stub are pointers of their name. It knows
@@ -311,7 +322,7 @@ def _warp() -> Any:
         raise ImportError(f"The CPU rasterizer needs NVIDIA Warp: {install_command()}.") from error
     wp.config.quiet = True
     wp.config.log_level = wp.LOG_ERROR
-    with _quiet_stderr():
+    with _quiet_stderr(), say_unwritable():
         wp.init()
     return wp
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from .arguments import check_tensors, refuse_unsupported
 from .autograd import Blend, Project, SphericalHarmonics
 from .constants import TILE, tiles
+from .rows import all_rows
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
@@ -170,7 +171,7 @@ def rasterization(
             t[camera_ids, gaussian_ids] for t in (means2d, depths, conics, opacities, radii, sigmas)
         )
         counts = torch.bincount(camera_ids, minlength=n_cameras).tolist()
-        visible = [torch.arange(count, dtype=torch.int32, device="cpu") for count in counts]
+        visible, block_starts = map(list, zip(*map(all_rows, counts), strict=True))
     absolute = None
     if absgrad:
         absolute = torch.zeros_like(means2d)
@@ -182,6 +183,7 @@ def rasterization(
         _render_camera(
             projection,
             visible[camera],
+            block_starts[camera],
             features[camera] if features else None,
             None if absolutes is None else absolutes[camera],
             None if backgrounds is None else backgrounds[camera],
@@ -217,6 +219,7 @@ def rasterization(
 def _render_camera(
     projection: tuple[Tensor, ...],  # means2d [R, 2], conics [R, 3], opacities [R], depths [R], sigmas [R, 2]
     visible: Tensor,  # [M]
+    block_start: Tensor,  # [ceil(R / BLOCK) + 1]
     features: Tensor | None,  # [R, D], None where only depth is wanted
     absolute: Tensor | None,  # [R, 2]
     background: Tensor | None,  # [D]
@@ -232,7 +235,7 @@ def _render_camera(
         channels.append(depths.unsqueeze(1))
     image, transmittance, tiles_per_gauss = Blend.apply(
         means2d, conics, opacities, torch.cat(channels, 1) if len(channels) > 1 else channels[0],
-        depths, sigmas, visible, width, height, absolute,
+        depths, sigmas, visible, block_start, width, height, absolute,
     )  # fmt: skip
     alpha = (1.0 - transmittance).unsqueeze(-1)
     if background is not None and features is not None:

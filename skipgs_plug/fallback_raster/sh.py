@@ -19,12 +19,13 @@ def sh_forward(
     rest: Annotated[FloatArray, "n, rest_stride"],
     visible: Annotated[IntArray, "M"],
     block_start: Annotated[IntArray, "blocks(n) + 1"],  # where each block of rows begins in `visible`
-    colors: Annotated[FloatArray, "n, 3"],  # out, zero where not visible
+    colors: Annotated[FloatArray, "n, 3"],  # out, zero where not visible and `dense`
     n: int,
     base_stride: int,
     rest_stride: int,
     rest_offset: int,
     degree: int,  # 0 to 3
+    dense: int,
 ) -> None: ...
 
 

@@ -15,6 +15,7 @@ SHORTCUTS = {
     "zero_gradient": 8,  # leave blocks and tiles whose incoming gradient is zero in the backward pass
     "visible_only": 16,  # evaluate SH and its adjoint only for Gaussians on screen
     "contributed_only": 32,  # run the adjoint of SH and projection only for Gaussians that received a gradient
+    "spheres": 64,  # leave out 16 Gaussians at once that lie outside the image even as spheres
 }
 
 _active = sum(SHORTCUTS.values())

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from skipgs_plug.install import install_command
 from skipgs_plug.trainer.errors import InputError
@@ -23,12 +23,63 @@ class Backend:
     rasterization: Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
     loss: Callable[[Tensor, Tensor, float], Tensor]  # (image, target [..., H, W, C], ssim_lambda) -> scalar
 
-    def sh_colors(self, sh0: Tensor, shN: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        """Return SH coefficients [N, 1, 3] and [N, K - 1, 3] as `rasterization` takes them.
+    def render(
+        self,
+        splats: Mapping[str, Tensor] | nn.ParameterDict,
+        viewmat: Tensor,  # [4, 4]
+        K: Tensor,  # [3, 3]
+        background: Tensor | None,  # [3]
+        antialiased: bool = False,
+        **options: Any,
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """Render raw parameters, as `create_splats` names them, into one camera.
 
-        The CPU rasterizer reads the two as they are; joining them costs more than evaluating them.
+        The CPU rasterizer takes them as they are and touches only rows that are visible; its dictionary has a row for
+        each of these, as gsplat's packed mode.
+
+        Args:
+            splats: logarithms of scales, logits of opacities, SH coefficients in two parts.
+            viewmat: world to camera.
+            K: intrinsics in pixels.
+            background: colour behind everything; None for black, which needs no compositing.
+            antialiased: compensate opacities for the blur.
+            options: `width height sh_degree near_plane far_plane absgrad` of `rasterization`.
+
+        Returns:
+            Image [H, W, 3] and the dictionary of `rasterization`.
         """
-        return (sh0, shN) if self.name == "warp" else torch.cat([sh0, shN], dim=1)
+        viewmat, K = viewmat.to(self.device), K.to(self.device)
+        if self.name == "warp":
+            from skipgs_plug.fallback_raster.splats import rasterize_splats
+
+            image, _, info = rasterize_splats(
+                splats["means"],
+                splats["quats"],
+                splats["scales"],
+                splats["opacities"],
+                splats["sh0"],
+                splats["shN"],
+                viewmat,
+                K,
+                background=background,
+                antialiased=antialiased,
+                **options,
+            )
+            return image, info
+        images, _, info = self.rasterization(
+            means=splats["means"],
+            quats=splats["quats"],
+            scales=torch.exp(splats["scales"]),
+            opacities=torch.sigmoid(splats["opacities"]),
+            colors=torch.cat([splats["sh0"], splats["shN"]], dim=1),
+            viewmats=viewmat[None],
+            Ks=K[None],
+            packed=False,
+            rasterize_mode="antialiased" if antialiased else "classic",
+            backgrounds=None if background is None else background[None],
+            **options,
+        )
+        return images[0], info
 
     @contextmanager
     def exclusive_cores(self) -> Iterator[None]:

@@ -34,9 +34,9 @@ def one_per_point(scene: Scene, config: TrainConfig) -> dict[str, Tensor]:
     rgb = scene.points_rgb.float() / 255.0
     return {
         "means": scene.points.clone(),
-        "scales": torch.log(neighbour_distance(scene.points) * config.init_scale)[:, None].repeat(1, 3),
+        "scales": torch.log(neighbour_distance(scene.points) * config.recipe.init_scale)[:, None].repeat(1, 3),
         "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        "opacities": torch.logit(torch.full((n,), config.init_opa)),
+        "opacities": torch.logit(torch.full((n,), config.recipe.init_opa)),
         "sh0": ((rgb - 0.5) / SH_C0)[:, None, :],
         "shN": torch.zeros(n, (config.sh_degree + 1) ** 2 - 1, 3),
     }

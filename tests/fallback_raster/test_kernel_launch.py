@@ -13,7 +13,7 @@ from skipgs_plug.fallback_raster import adam, binning, blend, guard, l1_ssim_los
 from skipgs_plug.fallback_raster.compat import statistics
 from skipgs_plug.fallback_raster.compat.inria import GaussianRasterizationSettings
 from skipgs_plug.fallback_raster.compat.rendering import render, splats
-from skipgs_plug.fallback_raster.launch import FloatArray, IntArray, LongArray, Worker, worker
+from skipgs_plug.fallback_raster.launch import ByteArray, FloatArray, IntArray, LongArray, Worker, worker
 from skipgs_plug.fallback_raster.source import KERNELS, PRELUDE, read_kernel
 
 WORKERS = {
@@ -23,7 +23,7 @@ WORKERS = {
     for found in (value.values() if isinstance(value, dict) else [value])
     if isinstance(found, Worker)
 }
-DTYPES = {FloatArray: torch.float32, IntArray: torch.int32, LongArray: torch.int64}
+DTYPES = {FloatArray: torch.float32, IntArray: torch.int32, LongArray: torch.int64, ByteArray: torch.uint8}
 EXAMPLES: dict[type, Any] = {kind: torch.zeros(0, dtype=dtype) for kind, dtype in DTYPES.items()} | {int: 0, float: 0.0}
 
 
@@ -60,7 +60,7 @@ def square_one(kind: type) -> torch.Tensor:
 
 
 def test_a_number_beyond_32_bits_is_refused() -> None:
-    with pytest.raises(OverflowError, match="list_visible: n = 2147483648"):
+    with pytest.raises(OverflowError, match="list_visible: blocks = 2147483648"):
         project.list_visible(*[EXAMPLES[kind] for kind in project.list_visible._kinds.values()][:-1], 2**31)
 
 
@@ -140,7 +140,7 @@ def test_messages_of_the_compiler_name_our_file(capfd: pytest.CaptureFixture[str
     assert text != broken
     kinds = project.list_visible._kinds
 
-    def stub(radii: IntArray, visible: IntArray, block_start: IntArray, n: int) -> None: ...
+    def stub(seen: IntArray, block_count: IntArray, visible: IntArray, block_start: IntArray, blocks: int) -> None: ...
 
     found = worker(broken, items="1", grain=1, name="broken")(stub)
     with pytest.raises(Exception, match="build failed"):

@@ -75,6 +75,7 @@ def gather(f: Footprint, values: Tensor | None = None) -> Statistics:
     bins = bin_gaussians(
         visible, means2d, depths, conics, opacities, sigmas, zeros(len(f), 1), f.width, f.height
     )  # fmt: skip
+    bins.sort()
     tiles_x, tiles_y = tiles(f.width, f.height)
     size = (f.height, f.width)
     picture = zeros(*size) if values is None else values.detach().to(torch.float32).reshape(size).contiguous()

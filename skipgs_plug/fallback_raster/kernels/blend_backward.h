@@ -2,11 +2,11 @@
 #include "blend_tile.h"
 for (int t = first; t < last; ++t) {
     const Tile tile(t, tile_start, tiles_x, width, height);
-    const int x0 = tile.x0, y0 = tile.y0, begin = tile.begin, end = tile.end;
+    const int x0 = tile.x0, y0 = tile.y0, begin = tile.begin;
 
     // behind = (what lies behind the current Gaussian) . v_image, less what alpha and background receive.
-    v16 T[16], behind[16], v[16][D];
-    i16 stop[16];
+    alignas(64) v16 T[16], behind[16], v[16][D];
+    alignas(64) i16 stop[16];
     const int tile_end = tile_stop[t];
     for (int b = 0; b < 16; ++b) {
         T[b] = (v16)1.0f;
@@ -32,15 +32,16 @@ for (int t = first; t < last; ++t) {
         if (any(wanted) || !(shortcuts & ZERO_GRADIENT)) open |= 1u << b;
     }
     const int used = open ? tile_end : begin;
-    clear(v_pairs + (long long)PAIR * used, (long long)PAIR * (end - used));
 
     for (int k = used - 1; k >= begin; --k) {
         __builtin_prefetch(records + (long long)RECORD * tile_list[larger(k - 8, begin)]);
+        unsigned todo = pair_blocks[k] & open;
+        if (!todo) continue;
         const float* r = records + (long long)RECORD * tile_list[k];
         v16 m[8], abs_x = (v16)0.0f, abs_y = (v16)0.0f, v_color[D];
         for (int j = 0; j < 8; ++j) m[j] = (v16)0.0f;
         for (int c = 0; c < D; ++c) v_color[c] = (v16)0.0f;
-        for (unsigned todo = pair_blocks[k] & open; todo; todo &= todo - 1) {
+        for (; todo; todo &= todo - 1) {
             const int b = __builtin_ctz(todo);
             const Falloff seen(tile, b, r);
 
@@ -70,7 +71,8 @@ for (int t = first; t < last; ++t) {
                 abs_y += vabs(v_sigma * (r[3] * seen.p + r[4] * seen.w));
             }
         }
-        float* out = v_pairs + (long long)PAIR * k;
+        float* out = v_pairs + (long long)PAIR * tile_place[k];
+        written[tile_place[k]] = 1;
         for (int c = 0; c < D && c < 2; ++c) m[6 + c] = v_color[c];
         *(v8*)out = sum8(m);
         for (int c = 2; c < 4; ++c) out[6 + c] = c < D ? sum(v_color[c < D ? c : 0]) : 0.0f;

@@ -1,75 +1,96 @@
 // Front-to-back compositing, one tile at a time.
 #include "blend_tile.h"
+#include "reached_blocks.h"
+#include "sorted_tile.h"
 for (int t = first; t < last; ++t) {
     const Tile tile(t, tile_start, tiles_x, width, height);
     const int x0 = tile.x0, y0 = tile.y0, begin = tile.begin, end = tile.end;
+    SortedTile list(begin, sorted ? begin : end, unsorted, buffer, tile_list, tile_place, pair_row, records);
 
-    v16 T[16], C[16][D];
-    i16 stop[16];
+    alignas(64) v16 P[16], T[16], C[16][D];
+    alignas(64) i16 stop[16];
     unsigned open = 0;  // blocks with an unfinished pixel
     for (int b = 0; b < 16; ++b) {
         const i16 inside = (lane_x + 4 * (b & 3) < (float)tile.columns) & (lane_y + 4 * (b >> 2) < (float)tile.rows);
-        // The sign of T marks pixels that take no more: finished ones and those outside the image.
-        T[b] = inside ? (v16)1.0f : (v16)-1.0f;
+        P[b] = inside ? (v16)1.0f : (v16)0.0f;
+        T[b] = (v16)1.0f;
         for (int c = 0; c < D; ++c) C[b][c] = (v16)0.0f;
-        stop[b] = inside ? (i16)end : (i16)begin;
+        stop[b] = (i16)begin;
         if (any(inside)) open |= 1u << b;
     }
-    // First pixel of each block.
-    const v16 corner_x = 4.0f * lane_x + (x0 + 0.5f), corner_y = 4.0f * lane_y + (y0 + 0.5f);
     for (int base = begin; base < end && open; base += 64) {
+        alignas(64) float chunk[65 * RECORD];  // their records, and one that no pixel sees
         unsigned long long live[16] = {};  // by block, the Gaussians of these 64 that reach it
         const int count = smaller(64, end - base);
+        list.sort(base - begin + 64);
+        const int listed = sorted ? end : begin + list.done;
+        clear(chunk + 64 * RECORD, RECORD);
+        chunk[64 * RECORD + 5] = -100.0f;
         for (int j = 0; j < count; j += 16) {
-            int reached[16] = {};
-            for (int i = 0; i < 16 && j + i < count; ++i) {
-                __builtin_prefetch(records + (long long)RECORD * tile_list[smaller(base + j + i + 16, end - 1)]);
-                const float* r = records + (long long)RECORD * tile_list[base + j + i];
-                const v16 left = corner_x - r[0], right = left + 3.0f, top = corner_y - r[1], bottom = top + 3.0f;
-                // A convex function is least at the point nearest to the centre or on an edge that faces it.
-                const v16 near_x = vmax(left, vmin(right, (v16)0.0f)), near_y = vmax(top, vmin(bottom, (v16)0.0f));
-                const v16 at_y = vmax(top, vmin(bottom, r[13] * near_x));
-                const v16 at_x = vmax(left, vmin(right, r[12] * near_y));
-                const v16 p = r[2] * near_x + r[3] * at_y, w = r[4] * at_y;
-                const v16 q = r[2] * at_x + r[3] * near_y, u = r[4] * near_y;
-                // A little more than exact: every pixel is tested again.
-                const i16 near = vmin(p * p + w * w, q * q + u * u) <= r[14] + 0.01f;
-                reached[i] = shortcuts & BLOCK_BOUNDS ? bits(near) : 65535;
-                pair_blocks[base + j + i] = reached[i];
+            alignas(64) int reached[16] = {};
+            for (int i = 0; i < 16 && j + i < count; i += 4) {
+                const float* r[4];
+                for (int g = 0; g < 4; ++g) {
+                    const int k = base + j + i + g;
+                    r[g] = records + (long long)RECORD * tile_list[smaller(k, listed - 1)];
+                    store(chunk + RECORD * (j + i + g), load(r[g]));
+                }
+                const i16 blocks = shortcuts & BLOCK_BOUNDS ? reached_blocks(r, tile.x0, tile.y0) : (i16)65535;
+                for (int g = 0; g < 4 && j + i + g < count; ++g) reached[i + g] = blocks[4 * g];
             }
             const i16 of_gaussian = *(const i16*)reached;
             for (int b = 0; b < 16; ++b) live[b] |= (unsigned long long)bits(of_gaussian & (1 << b)) << j;
         }
+        const unsigned visited = open;
         for (unsigned todo = open; todo; todo &= todo - 1) {
             const int b = __builtin_ctz(todo);
-            // Exponent that a Gaussian needs to count; none suffices in a finished pixel.
-            v16 transmitted = T[b], color[D], least = transmitted > 0.0f ? (v16)LOG2_ALPHA_MIN : (v16)1e30f;
+            // Several Gaussians at a time, step by step: a processor looks too few instructions ahead to find the next
+            // Gaussian behind the long chain of one. What chains them is short: nothing is selected on the way of the
+            // product, which goes on in finished pixels, below TRANSMITTANCE_MIN.
+            v16 product = P[b], transmitted = T[b], color[D];
+            i16 stopped = stop[b];
+            unsigned long long blended = 0;
             for (int c = 0; c < D; ++c) color[c] = C[b][c];
-            for (unsigned long long rest = live[b]; rest; rest &= rest - 1) {
-                const int k = base + __builtin_ctzll(rest);
-                const float* r = records + (long long)RECORD * tile_list[k];
-                const Falloff seen(tile, b, r);
-
-                const v16 alpha = vmin((v16)ALPHA_MAX, exp2(seen.log2_alpha));
-                const v16 next = transmitted - alpha * transmitted;
-                const i16 taken = seen.log2_alpha >= least, finished = taken & (next <= TRANSMITTANCE_MIN);
-                const i16 hit = taken & ~finished;
-                // Selected, not multiplied by zero: a NaN colour stays in the pixels that it touches.
-                const v16 weight = alpha * transmitted;
-                for (int c = 0; c < D; ++c) color[c] = hit ? color[c] + weight * r[8 + c] : color[c];
-                transmitted = hit ? next : transmitted;
-                if (any(finished)) {
-                    transmitted = finished ? -transmitted : transmitted;
-                    least = finished ? (v16)1e30f : least;
-                    stop[b] = finished ? (i16)k : stop[b];
-                    if ((shortcuts & SATURATION) && !any(transmitted > 0.0f)) {
-                        open &= ~(1u << b);
-                        break;
-                    }
+            for (unsigned long long rest = live[b]; rest;) {
+                int place[BATCH];
+                const float* r[BATCH];
+                v16 t[BATCH], alpha[BATCH];
+                for (int i = 0; i < BATCH; ++i) {
+                    place[i] = rest ? __builtin_ctzll(rest) : 64;
+                    r[i] = chunk + RECORD * place[i];
+                    rest &= rest - 1;
                 }
+                for (int i = 0; i < BATCH; ++i) t[i] = Falloff(tile, b, r[i]).log2_alpha;
+                exp2s(t, alpha);
+                for (int i = 0; i < BATCH; ++i)
+                    alpha[i] = t[i] >= LOG2_ALPHA_MIN ? vmin((v16)ALPHA_MAX, alpha[i]) : (v16)0.0f;
+                for (int i = 0; i < BATCH; ++i) {
+                    const v16 weight = alpha[i] * product;
+                    product = product - weight;
+                    const i16 hit = (t[i] >= LOG2_ALPHA_MIN) & (product > TRANSMITTANCE_MIN);
+                    // Selected, not multiplied by zero: a NaN colour stays in the pixels that it touches.
+                    for (int c = 0; c < D; ++c) color[c] = hit ? color[c] + weight * r[i][8 + c] : color[c];
+                    transmitted = hit ? product : transmitted;
+                    stopped = hit ? (i16)(base + place[i] + 1) : stopped;
+                    blended |= (unsigned long long)any(hit) << (place[i] & 63);
+                }
+                if ((shortcuts & SATURATION) && !any(product > TRANSMITTANCE_MIN)) {
+                    open &= ~(1u << b);
+                    break;
+                }
+                product = vmax(product, (v16)1e-20f);  // subnormal numbers are slow
             }
+            P[b] = product;
             T[b] = transmitted;
+            stop[b] = stopped;
+            live[b] = blended;
             for (int c = 0; c < D; ++c) C[b][c] = color[c];
+        }
+        // The blocks in which it was blended: what the adjoint visits.
+        for (int j = 0; j < count; j += 16) {
+            i16 of_block;
+            for (int b = 0; b < 16; ++b) of_block[b] = visited >> b & 1 ? (int)(live[b] >> j) & 65535 : 0;
+            for (int i = 0; i < 16 && j + i < count; ++i) pair_blocks[base + j + i] = bits(of_block & (1 << i));
         }
     }
     int tile_end = begin;
@@ -79,7 +100,7 @@ for (int t = first; t < last; ++t) {
         for (int x = 0; x < tile.columns; ++x) {
             const long long at = (long long)(y0 + y) * width + x0 + x;
             const int b = y / 4 * 4 + x / 4, l = y % 4 * 4 + x % 4;
-            transmittance[at] = fabsf(T[b][l]);
+            transmittance[at] = T[b][l];
             pixel_stop[at] = stop[b][l];
             for (int c = 0; c < channels; ++c) image[at * stride + channel + c] = C[b][c][l];
         }

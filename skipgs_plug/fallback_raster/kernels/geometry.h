@@ -58,6 +58,21 @@ static constexpr auto splat_axes = [](const float* V, const float* K, float widt
     }
 };
 
+// Whether the sphere of radius `longest` around a centre reaches no pixel: the rows of T are at most as long as those of J
+// times `longest`, and a radius is 3.33 standard deviations at most, rounded up. A hundredth more pays for rounding.
+static constexpr auto beyond = [](const float* K, float width, float height, float eps2d, v16 x, v16 y, v16 z,
+                                  v16 longest) INLINE -> i16 {
+    const float fx = K[0], cx = K[2], fy = K[4], cy = K[5];
+    const v16 iz = 1.0f / z;
+    const float margin_x = 0.15f * width / fx, margin_y = 0.15f * height / fy;
+    const v16 ux = vmin((v16)((width - cx) / fx + margin_x), vmax((v16)(-cx / fx - margin_x), x * iz));
+    const v16 uy = vmin((v16)((height - cy) / fy + margin_y), vmax((v16)(-cy / fy - margin_y), y * iz));
+    const v16 u = fx * x * iz + cx, v = fy * y * iz + cy, size = longest * iz;
+    const v16 reach_x = 3.37f * vsqrt(fx * fx * size * size * (1.0f + ux * ux) + eps2d) + 1.5f + 1e-5f * vabs(u);
+    const v16 reach_y = 3.37f * vsqrt(fy * fy * size * size * (1.0f + uy * uy) + eps2d) + 1.5f + 1e-5f * vabs(v);
+    return (u + reach_x < 0.0f) | (u - reach_x > width) | (v + reach_y < 0.0f) | (v - reach_y > height);
+};
+
 // 2D covariance T T^t without (sharp) and with eps2d on its diagonal, and its inverse.
 static constexpr auto covariances = [](const v16 (&T0)[3], const v16 (&T1)[3], float eps2d, v16& sharp_xx,
                                        v16& sharp_yy, v16& cov_xx, v16& cov_yy, v16& sharp_det, v16& det, v16& slope,

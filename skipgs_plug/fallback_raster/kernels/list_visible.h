@@ -1,8 +1,7 @@
-// Rows with a radius, and where each block of rows begins among them.
+// The visible rows of all blocks one after the other, and where each block begins among them.
 int m = 0;
-for (int i = 0; i < n; ++i) {
-    if (i % BLOCK == 0) block_start[i / BLOCK] = m;
-    visible[m] = i;
-    m += radii[2 * i] > 0;
+for (int b = 0; b < blocks; ++b) {
+    block_start[b] = m;
+    for (int i = 0; i < block_count[b]; ++i) visible[m++] = seen[(long long)BLOCK * b + i];
 }
-block_start[(n + BLOCK - 1) / BLOCK] = m;
+block_start[blocks] = m;

@@ -1,12 +1,13 @@
-// Adjoint of project_forward for one block of rows.
+// Adjoint of project_forward for one block of rows. Where `raw`, v_means holds the part of the colours already.
 #include "geometry.h"
 const int block = first;
 v16 pose[12] = {};
 // Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
 const int row_begin = BLOCK * block, rows = smaller(BLOCK, n - row_begin);
-clear(v_means + 3ll * row_begin, 3 * rows);
+if (!raw) clear(v_means + 3ll * row_begin, 3 * rows);
 clear(v_quats + 4ll * row_begin, 4 * rows);
 clear(v_scales + 3ll * row_begin, 3 * rows);
+if (raw) clear(v_opacities + row_begin, rows);
 const int end = block_start[block + 1];
 for (int base = block_start[block]; base < end; base += 16) {
     const int lanes = end - base < 16 ? end - base : 16;
@@ -14,20 +15,33 @@ for (int base = block_start[block]; base < end; base += 16) {
     for (int l = 0; l < 16; ++l) row[l] = visible[base + (l < lanes ? l : lanes - 1)];
     v16 v_u = gather(v_means2d, row, 2, 0), v_v = gather(v_means2d, row, 2, 1), v_depth = (v16)0.0f, v_comp = (v16)0.0f;
     if (with_depth) v_depth = gather(v_depths, row, 1, 0);
-    if (antialiased) v_comp = gather(v_compensations, row, 1, 0);
+    if (antialiased && !raw) v_comp = gather(v_compensations, row, 1, 0);
+    v16 v_alpha = (v16)0.0f, opacity = (v16)0.0f;
+    if (raw) {
+        v_alpha = gather(v_activated, row, 1, 0);
+        opacity = sigmoid(gather(opacities, row, 1, 0));
+        if (antialiased) v_comp = v_alpha * opacity;
+    }
     v16 va = gather(v_conics, row, 3, 0), vb = 0.5f * gather(v_conics, row, 3, 1), vc = gather(v_conics, row, 3, 2);
     // Most blocks of a close-up hold no Gaussian that received a gradient; their zeros are in place already.
     const i16 received = (v_u != 0.0f) | (v_v != 0.0f) | (v_depth != 0.0f) | (va != 0.0f) | (vb != 0.0f) | (vc != 0.0f)
-                       | (v_comp != 0.0f);
+                       | (v_comp != 0.0f) | (v_alpha != 0.0f);
     if ((shortcuts & CONTRIBUTED_ONLY) && !any(received)) continue;
     v16 world[3], x, y, z, qw, qx, qy, qz, q_scale, q_norm, R[3][3];
     v16 iz, ux, uy, J00, J02, J11, J12, WM[3][3], T0[3], T1[3];
     v16 sharp_xx, sharp_yy, cov_xx, cov_yy, sharp_det, det, slope, conic_a, conic_b, conic_c;
-    const v16 S[3] = {gather(scales, row, 3, 0), gather(scales, row, 3, 1), gather(scales, row, 3, 2)};
+    v16 S[3] = {gather(scales, row, 3, 0), gather(scales, row, 3, 1), gather(scales, row, 3, 2)};
+    if (raw)
+        for (int j = 0; j < 3; ++j) S[j] = vexp(S[j]);
     centres(viewmat, means, row, world, x, y, z);
     rotations(quats, row, qw, qx, qy, qz, q_scale, q_norm, R);
     splat_axes(viewmat, K, width, height, x, y, z, R, S, iz, ux, uy, J00, J02, J11, J12, WM, T0, T1);
     covariances(T0, T1, eps2d, sharp_xx, sharp_yy, cov_xx, cov_yy, sharp_det, det, slope, conic_a, conic_b, conic_c);
+
+    if (raw) {
+        const v16 v_opacity = antialiased ? v_alpha * vsqrt(sharp_det / det) : v_alpha;
+        scatter(v_opacities, row, 1, 0, v_opacity * opacity * (1.0f - opacity), lanes);
+    }
 
     // Extreme cameras (a principal point 1e5 images away) leave float's range: a huge gradient is better than
     // infinity, and infinity less infinity is NaN. No gradient of a usual scene comes near these bounds.
@@ -97,9 +111,12 @@ for (int base = block_start[block]; base < end; base += 16) {
         }
     }
 
-    for (int i = 0; i < 3; ++i) scatter(v_means, row, 3, i, v_mean[i], lanes);
-    for (int j = 0; j < 3; ++j)
-        scatter(v_scales, row, 3, j, v_M[0][j] * R[0][j] + v_M[1][j] * R[1][j] + v_M[2][j] * R[2][j], lanes);
+    for (int i = 0; i < 3; ++i)
+        scatter(v_means, row, 3, i, raw ? gather(v_means, row, 3, i) + v_mean[i] : v_mean[i], lanes);
+    for (int j = 0; j < 3; ++j) {
+        const v16 v_scale = v_M[0][j] * R[0][j] + v_M[1][j] * R[1][j] + v_M[2][j] * R[2][j];
+        scatter(v_scales, row, 3, j, raw ? v_scale * S[j] : v_scale, lanes);
+    }
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) v_M[i][j] *= 2.0f * S[j];
     v16 v_qw = qx * (v_M[2][1] - v_M[1][2]) + qy * (v_M[0][2] - v_M[2][0]) + qz * (v_M[1][0] - v_M[0][1]);

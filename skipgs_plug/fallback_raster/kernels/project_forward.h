@@ -1,20 +1,43 @@
-// Centre, depth, inverse covariance and extent on the image plane of rows [first, last).
+// Centre, depth, inverse covariance and extent on the image plane of one block of rows, and which of them are visible.
 #include "geometry.h"
-for (int base = first; base < last; base += 16) {
-    const int lanes = last - base < 16 ? last - base : 16;
+const int block = first, row_begin = BLOCK * block, row_end = smaller(row_begin + BLOCK, n);
+int found = row_begin;
+for (int base = row_begin; base < row_end; base += 16) {
+    const int lanes = smaller(16, row_end - base);
     int row[16];
     for (int l = 0; l < 16; ++l) row[l] = base + (l < lanes ? l : lanes - 1);
     v16 world[3], x, y, z, qw, qx, qy, qz, q_scale, q_norm, R[3][3];
     v16 iz, ux, uy, J00, J02, J11, J12, WM[3][3], T0[3], T1[3];
     v16 sharp_xx, sharp_yy, cov_xx, cov_yy, sharp_det, det, slope, conic_a, conic_b, conic_c;
-    const v16 S[3] = {gather(scales, row, 3, 0), gather(scales, row, 3, 1), gather(scales, row, 3, 2)};
+    v16 S[3] = {gather(scales, row, 3, 0), gather(scales, row, 3, 1), gather(scales, row, 3, 2)};
     centres(viewmat, means, row, world, x, y, z);
+    // What lies outside even as a sphere of its longest axis needs no rotation. Neighbours in space that are neighbours
+    // in memory are left out 16 at a time. Written so that NaN goes on to the full test.
+    v16 longest = vmax(vmax(vabs(S[0]), vabs(S[1])), vabs(S[2]));
+    if (raw) longest = vexp(vmax(vmax(S[0], S[1]), S[2]));
+    i16 outside = (z < near_plane) | (z > far_plane);
+    if (shortcuts & SPHERES) outside |= beyond(K, width, height, eps2d, x, y, z, longest);
+    if (!any(~outside)) {
+        if (dense) {
+            clear((float*)radii + 2ll * base, 2 * lanes);
+            clear(means2d + 2ll * base, 2 * lanes);
+            clear(depths + base, lanes);
+            clear(conics + 3ll * base, 3 * lanes);
+            clear(sigmas + 2ll * base, 2 * lanes);
+            if (antialiased) clear(compensations + base, lanes);
+        }
+        continue;
+    }
+    if (raw)
+        for (int j = 0; j < 3; ++j) S[j] = vexp(S[j]);
     rotations(quats, row, qw, qx, qy, qz, q_scale, q_norm, R);
     splat_axes(viewmat, K, width, height, x, y, z, R, S, iz, ux, uy, J00, J02, J11, J12, WM, T0, T1);
     covariances(T0, T1, eps2d, sharp_xx, sharp_yy, cov_xx, cov_yy, sharp_det, det, slope, conic_a, conic_b, conic_c);
 
     v16 compensation = vsqrt(sharp_det / det);
-    v16 opacity = gather(opacities, row, 1, 0) * (antialiased ? compensation : (v16)1.0f);
+    v16 opacity = gather(opacities, row, 1, 0);
+    if (raw) opacity = sigmoid(opacity);
+    if (antialiased) opacity *= compensation;
     // Written so that a NaN anywhere fails the test and the Gaussian is left out.
     i16 visible = (z >= near_plane) & (z <= far_plane) & (det > 0.0f) & (opacity >= ALPHA_MIN);
     v16 reach = vmin((v16)3.33f, vsqrt(LN_4 * log2(255.0f * vmax(opacity, (v16)1e-3f))));
@@ -30,9 +53,12 @@ for (int base = first; base < last; base += 16) {
     const v16 none = (v16)0.0f;
     i16 rx = __builtin_convertvector(visible ? radius_x : none, i16);
     i16 ry = __builtin_convertvector(visible ? radius_y : none, i16);
+    if (!dense && !any(visible)) continue;
     for (int l = 0; l < lanes; ++l) {
         radii[2 * row[l]] = rx[l];
         radii[2 * row[l] + 1] = ry[l];
+        seen[found] = row[l];
+        found += rx[l] > 0;
     }
     scatter(means2d, row, 2, 0, visible ? u : none, lanes);
     scatter(means2d, row, 2, 1, visible ? v : none, lanes);
@@ -43,4 +69,6 @@ for (int base = first; base < last; base += 16) {
     scatter(sigmas, row, 2, 0, visible ? sigma_x : none, lanes);
     scatter(sigmas, row, 2, 1, visible ? sigma_y : none, lanes);
     if (antialiased) scatter(compensations, row, 1, 0, visible ? compensation : none, lanes);
+    if (raw) scatter(activated, row, 1, 0, visible ? opacity : none, lanes);
 }
+block_count[block] = found - row_begin;

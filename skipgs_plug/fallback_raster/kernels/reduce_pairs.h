@@ -1,10 +1,29 @@
-// Adds up the pairs of each row in a fixed order and turns their moments into gradients.
-for (int g = first; g < last; ++g) {
+// Adds up the pairs of each row of a block in a fixed order and turns their moments into gradients.
+const int row_begin = BLOCK * first, rows_here = smaller(BLOCK, rows - row_begin);
+const bool more = channel > 0;
+if (!more && dense) {
+    // Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
+    clear(v_means2d + 2ll * row_begin, 2 * rows_here);
+    clear(v_conics + 3ll * row_begin, 3 * rows_here);
+    clear(v_opacities + row_begin, rows_here);
+    clear(v_colors + (long long)stride * row_begin, (long long)stride * rows_here);
+}
+for (int i = block_start[first]; i < block_start[first + 1]; ++i) {
+    const int g = visible[i];
     v16 sums = (v16)0.0f;
-    for (int j = pair_start[g]; j < pair_start[g + 1]; ++j) {
-        // Pairs lie in the order of tiles: ask for the ones to come, also those of the next Gaussians.
-        __builtin_prefetch(v_pairs + (long long)PAIR * pair_slot[smaller(j + 16, pairs - 1)]);
-        sums += load(v_pairs + (long long)PAIR * pair_slot[j]);
+    bool received = false;
+    for (int p = pair_start[i]; p < pair_start[i + 1]; ++p)
+        if (written[p]) {
+            sums += load(v_pairs + (long long)PAIR * p);
+            received = true;
+        }
+    if (!received) {
+        if (dense || more) continue;
+        clear(v_means2d + 2ll * g, 2);
+        clear(v_conics + 3ll * g, 3);
+        clear(v_opacities + g, 1);
+        clear(v_colors + (long long)stride * g, stride);
+        continue;
     }
     float total[PAIR];
     store(total, sums);
@@ -12,7 +31,6 @@ for (int g = first; g < last; ++g) {
     const float v_center[2] = {-(a * total[1] + b * total[2]), -(b * total[1] + c * total[2])};
     const float v_conic[3] = {0.5f * total[3], total[4], 0.5f * total[5]};
     const float v_opacity = total[0] == 0.0f ? 0.0f : -total[0] / opacities[g];
-    const bool more = channel > 0;
     for (int j = 0; j < 2; ++j) v_means2d[2 * g + j] = v_center[j] + (more ? v_means2d[2 * g + j] : 0.0f);
     for (int j = 0; j < 3; ++j) v_conics[3 * g + j] = v_conic[j] + (more ? v_conics[3 * g + j] : 0.0f);
     v_opacities[g] = v_opacity + (more ? v_opacities[g] : 0.0f);

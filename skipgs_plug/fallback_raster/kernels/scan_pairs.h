@@ -1,4 +1,4 @@
-// Counts become places: where each tile's list begins, where each slice begins in it, where each row's pairs begin.
+// Counts become places: where each tile's list begins, where each slice begins in it, where each slice's pairs begin.
 // The total is counted in 64 bits; where 32 do not hold it, the places mean nothing and must not be used.
 long long all = 0;
 for (int t = 0; t < tiles; ++t) {
@@ -11,7 +11,10 @@ for (int t = 0; t < tiles; ++t) {
     }
 }
 tile_start[tiles] = (int)all;
-total[0] = all;
-unsigned next = 0;  // unsigned, because it wraps where the total is too large
-pair_start[0] = 0;
-for (int g = 0; g < rows; ++g) pair_start[g + 1] = (int)(next += tiles_per_gauss[g]);
+long long before = 0;
+for (int s = 0; s < slices; ++s) {
+    const long long pairs = totals[s];
+    totals[s] = before;
+    before += pairs;
+}
+totals[slices] = before;

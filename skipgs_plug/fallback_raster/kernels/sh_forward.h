@@ -1,7 +1,7 @@
-// Colours of the visible rows of one block, zero for the others.
+// Colours of the visible rows of one block; zero for the others where `dense`.
 #include "sh_basis.h"
 const int block = first;
-clear(colors + 3ll * BLOCK * block, 3 * smaller(BLOCK, n - BLOCK * block));
+if (dense) clear(colors + 3ll * BLOCK * block, 3 * smaller(BLOCK, n - BLOCK * block));
 for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
     const int g = visible[i];
     float basis[16], x, y, z, norm, shrink;

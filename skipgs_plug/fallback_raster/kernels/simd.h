@@ -128,6 +128,33 @@ static constexpr auto exp2 = [](v16 t) -> v16 {
     p = p * f + 1.000000072f;
     return (v16)((i16)p + ((i16)r << 23));
 };
+// e^x, with the product by log2(e) in two parts; saturates where float's range ends.
+static constexpr auto vexp = [](v16 x) INLINE -> v16 {
+#pragma clang fp contract(off)
+    const v16 magic = (v16)12582912.0f;
+    x = x < -87.0f ? (v16)-87.0f : (x > 88.0f ? (v16)88.0f : x);
+    const v16 r = x * 1.44269502f + magic, whole = r - magic;
+    const v16 f = __builtin_elementwise_fma(x, (v16)1.44269502f, -whole) + x * 1.92596303e-8f;
+    const v16 p = exp2(f);
+    return (v16)((i16)p + ((i16)r << 23));
+};
+static constexpr auto sigmoid = [](v16 x) INLINE -> v16 { return 1.0f / (1.0f + vexp(-x)); };
+
+// BATCH of them, step by step, so that their chains of instructions lie side by side.
+static constexpr int BATCH = 4;
+static constexpr auto exp2s = [](const v16* t, v16* result) INLINE {
+#pragma clang fp contract(fast)
+    constexpr float coefficients[] = {9.675540368e-3f, 5.550713310e-2f, 2.402211974e-1f, 6.931469671e-1f, 1.000000072f};
+    const v16 magic = (v16)12582912.0f;
+    v16 r[BATCH], f[BATCH], p[BATCH];
+    for (int i = 0; i < BATCH; ++i) r[i] = t[i] + magic;
+    for (int i = 0; i < BATCH; ++i) f[i] = r[i] - magic;
+    for (int i = 0; i < BATCH; ++i) f[i] = t[i] - f[i];
+    for (int i = 0; i < BATCH; ++i) p[i] = (v16)1.327645461e-3f;
+    for (float coefficient : coefficients)
+        for (int i = 0; i < BATCH; ++i) p[i] = p[i] * f[i] + coefficient;
+    for (int i = 0; i < BATCH; ++i) result[i] = (v16)((i16)p[i] + ((i16)r[i] << 23));
+};
 // log2(a) for positive, normal a: exponent bits plus the atanh series of the mantissa in [sqrt(1/2), sqrt(2)).
 static constexpr auto log2 = [](v16 a) -> v16 {
     i16 bits = (i16)a + (0x3f800000 - 0x3f3504f3);

@@ -1,0 +1,80 @@
+// The list of one tile, sorted front to back as far as somebody asks: behind what fills its pixels nobody does.
+//
+// Pairs are dealt into buckets of equal ranges of the depth's bits, and buckets are sorted when their turn comes. Equal
+// depths keep the order of the rows, which is that of the numbers in the lower half.
+static constexpr int LARGE = 8;  // pairs in a bucket above which it is dealt again
+struct SortedTile {
+    long long *dealt, *other;  // the tile's pairs in buckets, and as much room again
+    int *rows, *places;        // out: row and number of each pair
+    const int* pair_row;
+    const float* records;
+    int count, done, next, shift;  // pairs, those that are sorted, the next bucket, and bits of depth in one
+    int start[BUCKETS + 1];
+
+    SortedTile(int begin, int end, long long* unsorted, long long* buffer, int* tile_list, int* tile_place,
+               const int* pair_row, const float* records)
+        : dealt(buffer + begin), other(unsorted + begin), rows(tile_list + begin), places(tile_place + begin),
+          pair_row(pair_row), records(records), count(end - begin), done(0), next(0) {
+        // Twice as many buckets as pairs: most of them hold one or none.
+        int buckets = 64;
+        while (buckets < 2 * count && buckets < BUCKETS) buckets *= 2;
+        shift = deal(other, dealt, count, start, buckets);
+    }
+
+    // Sorts at least the first `wanted` pairs, or all.
+    void sort(int wanted) {
+        wanted = smaller(wanted, count);
+        if (done >= wanted) return;
+        int end = done;
+        for (int begin = done; end < wanted; begin = end) {
+            end = start[next++];
+            if (end - begin > LARGE && shift > 0) refine(begin, end);
+        }
+        // What is left to do is short: no pair moves farther than its bucket is long.
+        for (int i = done + 1; i < end; ++i) {
+            const long long pair = dealt[i];
+            int j = i;
+            for (; j > done && dealt[j - 1] > pair; --j) dealt[j] = dealt[j - 1];
+            dealt[j] = pair;
+        }
+        for (int i = done; i < end; ++i) places[i] = (int)dealt[i];
+        for (int i = done; i < end; ++i) {
+            rows[i] = pair_row[places[i]];
+            __builtin_prefetch(records + (long long)RECORD * rows[i]);
+        }
+        done = end;
+    }
+
+  private:
+    // Moves pairs into buckets of equal ranges; `bucket` [buckets + 1] gets the end of each, the result is the width of
+    // the ranges in bits.
+    static int deal(const long long* from, long long* to, int count, int* bucket, int buckets) {
+        int least = 0x7fffffff, most = 0, shift = 0;
+        for (int i = 0; i < count; ++i) {
+            const int key = (int)(from[i] >> 32);
+            least = smaller(least, key), most = larger(most, key);
+        }
+        while ((most - least) >> shift >= buckets) ++shift;
+        for (int b = 0; b <= buckets; ++b) bucket[b] = 0;
+        for (int i = 0; i < count; ++i) ++bucket[((int)(from[i] >> 32) - least) >> shift];
+        int sum = 0;
+        for (int b = 0; b <= buckets; ++b) {
+            const int pairs = bucket[b];
+            bucket[b] = sum;
+            sum += pairs;
+        }
+        for (int i = 0; i < count; ++i) to[bucket[((int)(from[i] >> 32) - least) >> shift]++] = from[i];
+        return shift;
+    }
+
+    // Deals a full bucket again, over its own range: eight bits less each time, so four times at most.
+    void refine(int begin, int end) {
+        int bucket[257];
+        const int buckets = end - begin > 32 ? 256 : 64;
+        const int width = deal(dealt + begin, other + begin, end - begin, bucket, buckets);
+        for (int i = begin; i < end; ++i) dealt[i] = other[i];
+        if (width > 0)
+            for (int b = 0, from = begin; b < buckets; from = begin + bucket[b++])
+                if (begin + bucket[b] - from > LARGE) refine(from, begin + bucket[b]);
+    }
+};

@@ -1,0 +1,223 @@
+"""The rasterizer as a trainer needs it: one camera, raw parameters, and nothing written for rows that no pixel needs.
+
+`rasterization` gives every intermediate tensor to its caller, with rows for all Gaussians. Here scales and opacities
+come as logarithms and logits, whose activations and adjoints happen in the kernels, intermediate rows are written for
+visible Gaussians only, and the gradients of the parameters are the only tensors of N rows that the backward fills.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from .arguments import check_tensors
+from .autograd import check_shapes
+from .constants import TILE, blocks, tiles
+from .launch import floats, ints, zeros
+from .project import project_backward, project_forward
+from .rendering import blend, blend_adjoint
+from .rows import visible_rows
+from .sh import sh_backward, sh_forward
+from .shortcuts import active_shortcuts
+
+EPS2D = 0.3  # added to the 2D covariance's diagonal, square pixels
+
+
+@dataclass
+class _Projected:
+    """Rows [N, ...] of which only the visible ones are written, and which these are."""
+
+    means2d: Tensor
+    depths: Tensor
+    conics: Tensor
+    sigmas: Tensor
+    compensations: Tensor
+    radii: Tensor
+    opacities: Tensor
+    visible: Tensor
+    block_start: Tensor
+
+
+def rasterize_splats(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    log_scales: Tensor,  # [N, 3]
+    logits: Tensor,  # [N]
+    sh0: Tensor,  # [N, 1, 3]
+    shN: Tensor,  # [N, K - 1, 3]
+    viewmat: Tensor,  # [4, 4]
+    K: Tensor,  # [3, 3]
+    width: int,
+    height: int,
+    sh_degree: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    background: Tensor | None = None,  # [3]
+    antialiased: bool = False,
+    absgrad: bool = False,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Renders raw parameters of 3DGS into one camera, as `rasterization` renders their activations.
+
+    Differentiable in means, quats, log_scales, logits, sh0 and shN; bit-equal for any number of threads.
+
+    Args:
+        means: Centres in world space.
+        quats: Rotations w, x, y, z of any length.
+        log_scales: Logarithms of the standard deviations in world units.
+        logits: Of the opacities.
+        sh0: Constant band of the colours.
+        shN: The other bands.
+        viewmat: World to camera.
+        K: Intrinsics in pixels.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        sh_degree: 0 to 3.
+        near_plane: Gaussians nearer than this are left out, world units.
+        far_plane: Gaussians farther than this are left out, world units.
+        background: Colour behind everything; black if None.
+        antialiased: Scale opacities by the area lost to the blur of 0.3 square pixels.
+        absgrad: Also add up |gradient| of the 2D means over pixels, in `info["means2d"].absgrad`.
+
+    Returns:
+        Image [H, W, 3], alpha [H, W, 1] and a dictionary as gsplat's packed mode has it, one row for each of M visible
+        Gaussians: gaussian_ids [M], radii [M, 2], means2d [M, 2], a leaf with a gradient after the backward pass;
+        width, height, n_cameras.
+
+    Raises:
+        ValueError: A shape, dtype or device does not fit, or the camera is not finite.
+    """
+    tensors = (means, quats, log_scales, logits, sh0, shN)
+    check_tensors(
+        means, quats, log_scales, logits, sh0, viewmat[None], K[None], sh_degree, shN,
+        None if background is None else background[None], width, height,
+    )  # fmt: skip
+    means, quats, log_scales, logits, sh0, shN = (t.to(torch.float32).contiguous() for t in tensors)
+    viewmat, K = viewmat.to(torch.float32).contiguous(), K.to(torch.float32).contiguous()
+    size = (width, height)
+    with torch.no_grad():
+        projected = _project(means, quats, log_scales, logits, viewmat, K, size, near_plane, far_plane, antialiased)
+        ids = projected.visible.to(torch.int64)
+        centres = projected.means2d[ids]
+    # A leaf that goes in with the parameters, so that its gradient comes out with theirs.
+    centres.requires_grad_(torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
+    absolute = None
+    if absgrad:
+        absolute = centres.absgrad = zeros(len(ids), 2)  # type: ignore[attr-defined]
+    image, transmittance = _Render.apply(
+        means, quats, log_scales, logits, sh0, shN, centres, absolute, projected, viewmat, K, size, sh_degree,
+        antialiased,
+    )  # fmt: skip
+    alpha = (1.0 - transmittance).unsqueeze(-1)
+    if background is not None:
+        image = image + transmittance.unsqueeze(-1) * background.to(torch.float32)
+    tile_width, tile_height = tiles(width, height)
+    info = {
+        "camera_ids": torch.zeros_like(ids),
+        "gaussian_ids": ids,
+        "radii": projected.radii[ids],
+        "means2d": centres,
+        "width": width,
+        "height": height,
+        "n_cameras": 1,
+        "tile_size": TILE,
+        "tile_width": tile_width,
+        "tile_height": tile_height,
+    }
+    return image, alpha, info
+
+
+class _Render(torch.autograd.Function):
+    """Image [H, W, 3] of projected Gaussians and the transmittance [H, W] behind it.
+
+    `absolute` [M, 2] receives the sum over pixels of |v_centres| when it is not None.
+    """
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        logits: Tensor,
+        sh0: Tensor,
+        shN: Tensor,
+        centres: Tensor,
+        absolute: Tensor | None,
+        projected: _Projected,
+        viewmat: Tensor,
+        K: Tensor,
+        size: tuple[int, int],
+        degree: int,
+        antialiased: bool,
+    ) -> tuple[Tensor, Tensor]:
+        p, n = projected, len(means)
+        camera = torch.linalg.inv(viewmat)[:3, 3].contiguous()
+        colors = floats(n, 3)
+        layout = (3, 3 * shN.shape[1], 0)
+        sh_forward(means, camera, sh0, shN, p.visible, p.block_start, colors, n, *layout, degree, 0)
+        image, transmittance, ctx.blended = blend(
+            p.means2d, p.conics, p.opacities, colors, p.depths, p.sigmas, p.visible, p.block_start, *size, dense=False
+        )
+        ctx.save_for_backward(means, quats, log_scales, logits, sh0, shN, transmittance)
+        ctx.shapes = {
+            name: tensor.shape
+            for name, tensor in zip(("means", "quats", "scales", "opacities", "sh0", "shN"), ctx.to_save, strict=False)
+        }
+        ctx.projected, ctx.colors, ctx.absolute = projected, colors, absolute
+        ctx.camera = camera, viewmat, K, size, antialiased
+        ctx.sh = layout, degree
+        return image, transmittance
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor) -> Any:  # type: ignore[override]
+        means, quats, log_scales, logits, sh0, shN, transmittance = check_shapes(ctx.saved_tensors, **ctx.shapes)
+        p, n = ctx.projected, len(means)
+        camera, viewmat, K, size, antialiased = ctx.camera
+        layout, degree = ctx.sh
+        absolute = None if ctx.absolute is None else zeros(n, 2)
+        v_means2d, v_conics, v_activated, v_colors = blend_adjoint(
+            ctx.blended, p.means2d, p.conics, p.opacities, ctx.colors, transmittance, v_image, v_transmittance, absolute
+        )
+        ids = p.visible.to(torch.int64)
+        if absolute is not None:
+            ctx.absolute += absolute[ids]
+        gradients = [floats(*t.shape) for t in (means, quats, log_scales, logits, sh0, shN)]
+        v_means, v_quats, v_scales, v_logits, v_sh0, v_shN = gradients
+        sh_backward(
+            means, camera, sh0, shN, p.visible, p.block_start, ctx.colors, v_colors, v_means, v_sh0, v_shN,
+            zeros(blocks(n), 3), n, *layout, degree, active_shortcuts(),
+        )  # fmt: skip
+        project_backward(
+            means, quats, log_scales, logits, viewmat, K, p.visible, p.block_start, v_means2d, floats(0), v_conics,
+            floats(0), v_activated, v_means, v_quats, v_scales, v_logits, floats(0),
+            n, *map(float, size), EPS2D, 0, int(antialiased), 0, 1, active_shortcuts(),
+        )  # fmt: skip
+        return *gradients, v_means2d[ids], *[None] * 7
+
+
+def _project(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    logits: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    size: tuple[int, int],
+    near_plane: float,
+    far_plane: float,
+    antialiased: bool,
+) -> _Projected:
+    n = len(means)
+    means2d, depths, conics, sigmas, opacities = floats(n, 2), floats(n), floats(n, 3), floats(n, 2), floats(n)
+    compensations, radii = floats(n if antialiased else 0), ints(n, 2)
+    seen, block_count = ints(n), ints(blocks(n))
+    project_forward(
+        means, quats, log_scales, logits, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
+        opacities, seen, block_count, n, *map(float, size), near_plane, far_plane, EPS2D, 0.0, int(antialiased),
+        1, 0, active_shortcuts(),
+    )  # fmt: skip
+    lists = visible_rows(seen, block_count)
+    return _Projected(means2d, depths, conics, sigmas, compensations, radii, opacities, *lists)

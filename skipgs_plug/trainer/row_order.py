@@ -1,0 +1,61 @@
+"""The order of the Gaussians' rows: neighbours in space are neighbours in memory.
+
+A camera sees part of a scene. The CPU rasterizer leaves out 16 rows at a time that lie outside its view, and what it
+gathers for a tile lies close together, when rows follow a Morton curve (Morton 1966) through space. Densification
+appends rows; from time to time all are put in order again, with the state of optimizers and strategy. PLY files and
+checkpoints hold the rows in the order of training.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+EVERY = 4  # refinements between two sorts; those in between add few rows at the end
+BITS = 10  # of a coordinate
+MARGIN = 0.02  # share of the centres at either end of an axis that does not count for the extent
+
+
+def sorts_rows(strategy: Any, step: int) -> bool:
+    """Whether rows are sorted after iteration `step`: at every fourth refinement and at the last."""
+    every = strategy.refine_every
+    if step % every or not strategy.refine_start_iter < step < strategy.refine_stop_iter:
+        return False
+    return step % (EVERY * every) == 0 or step + every >= strategy.refine_stop_iter
+
+
+@torch.no_grad()
+def sort_rows(
+    splats: nn.ParameterDict, optimizers: dict[str, torch.optim.Optimizer], strategy_state: dict[str, Any]
+) -> None:
+    """Put the rows of all parameters, of their moments and of the strategy's sums in the order of space.
+
+    Parameters stay the same objects; their values move.
+    """
+    order = morton_order(splats["means"])
+    n = len(order)
+    for name, param in splats.items():
+        state = optimizers[name].state.get(param, {})
+        for tensor in (param, *state.values()):
+            if isinstance(tensor, Tensor) and tensor.shape[:1] == (n,):
+                tensor.copy_(tensor[order])
+    for key, value in strategy_state.items():
+        if isinstance(value, Tensor) and value.shape[:1] == (n,):
+            strategy_state[key] = value[order]
+
+
+def morton_order(means: Tensor) -> Tensor:
+    """Return the rows [N] of `means` [N, 3] along a Morton curve; equal cells keep their order."""
+    n = len(means)
+    first = max(1, round(MARGIN * n))
+    low = torch.stack([means[:, axis].kthvalue(first).values for axis in range(3)])
+    high = torch.stack([means[:, axis].kthvalue(n + 1 - first).values for axis in range(3)])
+    extent = (high - low).max().clamp(min=1e-20)
+    cells = ((means - low) / extent * 2**BITS).clamp(0, 2**BITS - 1).to(torch.int64)
+    code = torch.zeros(n, dtype=torch.int64, device=means.device)
+    for bit in range(BITS):
+        for axis in range(3):
+            code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    return torch.argsort(code, stable=True)

@@ -1,0 +1,40 @@
+"""The lists of the tiles: front to back, equal depths in the order of the rows, however depths lie."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from skipgs_plug.fallback_raster.binning import bin_gaussians
+from skipgs_plug.fallback_raster.rows import all_rows
+
+DEPTHS = {
+    "spread": lambda n, g: 1.0 + 9.0 * torch.rand(n, generator=g),
+    "all equal": lambda n, g: torch.full((n,), 3.0),
+    "two values": lambda n, g: torch.randint(1, 3, (n,), generator=g).float(),
+    "one far away": lambda n, g: torch.cat([1.0 + 1e-4 * torch.rand(n - 1, generator=g), torch.tensor([1e9])]),
+    "clusters in clusters": lambda n, g: 1.0 + 10.0 ** -torch.randint(0, 8, (n,), generator=g).float(),
+    "subnormal to huge": lambda n, g: 10.0 ** (80.0 * torch.rand(n, generator=g) - 42.0),
+    "neighbouring floats": lambda n, g: (torch.randint(0, 40, (n,), generator=g).int() + 0x3F800000).view(
+        torch.float32
+    ),
+}
+
+
+@pytest.mark.parametrize("n", [1, 2, 9, 70, 5000, 20_000])
+@pytest.mark.parametrize("case", DEPTHS)
+def test_order(case: str, n: int) -> None:
+    generator = torch.Generator().manual_seed(n)
+    depths: Tensor = DEPTHS[case](n, generator)
+    one = torch.ones(n, 2)
+    visible, _ = all_rows(n)
+    conics = torch.tensor([1.0, 0.0, 1.0]).expand(n, 3).contiguous()
+    # All in one tile of an image of two.
+    bins = bin_gaussians(
+        visible, 6.0 * one, depths, conics, torch.full((n,), 0.9), one, torch.zeros(n, 3), width=32, height=16
+    )
+    bins.sort()
+    assert bins.tile_start.tolist() == [0, n, n]
+    assert torch.equal(bins.tile_list.long(), torch.argsort(depths, stable=True))
+    assert torch.equal(bins.tile_place, bins.tile_list)  # one pair each

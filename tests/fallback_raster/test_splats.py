@@ -1,0 +1,150 @@
+"""Raw parameters: `rasterize_splats` is `rasterization` of their activations, values, gradients and lists."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from raster_scenes import random_scene, relative_error
+from torch import Tensor
+
+from skipgs_plug.fallback_raster import get_num_threads, rasterization, set_num_threads
+from skipgs_plug.fallback_raster.splats import rasterize_splats
+
+NAMES = ("means", "quats", "log_scales", "logits", "sh0", "shN")
+OPTIONS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "antialiased": {"antialiased": True},
+    "absgrad": {"absgrad": True},
+    "background": {"background": torch.tensor([0.2, 0.9, 0.4])},
+    "degree 1 of 3": {"sh_degree": 1},
+}
+
+
+def raw_scene(n: int = 700, **options: Any) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Raw parameters, and the camera and image size."""
+    scene = random_scene(n=n, sh_degree=3, **options)
+    raw = {
+        "means": scene["means"],
+        "quats": scene["quats"],
+        "log_scales": scene["scales"].log(),
+        "logits": scene["opacities"].logit(),
+        "sh0": scene["colors"][:, :1].contiguous(),
+        "shN": scene["colors"][:, 1:].contiguous(),
+    }
+    camera = {"viewmat": scene["viewmats"][0], "K": scene["Ks"][0], "width": scene["width"], "height": scene["height"]}
+    return raw, camera
+
+
+def activated(raw: dict[str, Tensor], camera: dict[str, Any], **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """The same image by the public function, with torch's activations."""
+    background = options.get("background")
+    image, alpha, info = rasterization(
+        raw["means"],
+        raw["quats"],
+        raw["log_scales"].exp(),
+        raw["logits"].sigmoid(),
+        (raw["sh0"], raw["shN"]),
+        camera["viewmat"][None],
+        camera["K"][None],
+        camera["width"],
+        camera["height"],
+        sh_degree=options.get("sh_degree", 3),
+        packed=True,
+        absgrad=options.get("absgrad", False),
+        rasterize_mode="antialiased" if options.get("antialiased") else "classic",
+        backgrounds=None if background is None else background[None],
+    )
+    return image[0], alpha[0], info
+
+
+def results(function: Any, raw: dict[str, Tensor], camera: dict[str, Any], **options: Any) -> dict[str, Tensor]:
+    leaves = {name: raw[name].clone().requires_grad_() for name in NAMES}
+    image, alpha, info = function(leaves, camera, **options)
+    info["means2d"].retain_grad()
+    generator = torch.Generator().manual_seed(3)
+    upstream = [torch.randn(t.shape, generator=generator) for t in (image, alpha)]
+    torch.autograd.backward([image, alpha], upstream)
+    found = {"image": image.detach(), "alpha": alpha.detach(), "means2d": info["means2d"].grad}
+    found |= {name: leaf.grad for name, leaf in leaves.items()}
+    found |= {name: info[name] for name in ("gaussian_ids", "radii")}
+    return found | ({"absgrad": info["means2d"].absgrad} if options.get("absgrad") else {})
+
+
+def splatted(raw: dict[str, Tensor], camera: dict[str, Any], **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    return rasterize_splats(*(raw[name] for name in NAMES), **camera, **{"sh_degree": 3, **options})
+
+
+@pytest.mark.parametrize("case", OPTIONS)
+def test_raw_parameters_are_their_activations(case: str) -> None:
+    raw, camera = raw_scene()
+    truth = results(activated, raw, camera, **OPTIONS[case])
+    fast = results(splatted, raw, camera, **OPTIONS[case])
+    assert fast.keys() == truth.keys()
+    for name, value in truth.items():
+        assert fast[name].shape == value.shape
+        if name in ("gaussian_ids", "radii"):
+            assert torch.equal(fast[name], value)
+        else:
+            # One rounding of an activation more or less; a pixel at a cut-off may take another Gaussian.
+            assert relative_error(fast[name], value) < 2e-5, name
+
+
+def test_activations_keep_their_digits_over_their_whole_range() -> None:
+    """Scales from e^-16 to e^4 and opacities down to the threshold, one Gaussian each."""
+    n = 2000
+    raw, camera = raw_scene(n=n)
+    raw["log_scales"] += torch.linspace(-12.0, 5.0, n)[:, None]
+    raw["logits"] = torch.linspace(-5.5, 12.0, n)
+    truth = results(activated, raw, camera)
+    fast = results(splatted, raw, camera)
+    assert torch.equal(fast["gaussian_ids"], truth["gaussian_ids"])
+    for name in (*NAMES, "image"):
+        assert relative_error(fast[name], truth[name]) < 2e-5, name
+
+
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    raw, camera = raw_scene(n=3000)
+    before = get_num_threads()
+    found = []
+    for threads in (1, 2, 5):
+        set_num_threads(threads)
+        found.append(results(splatted, raw, camera, absgrad=True))
+    set_num_threads(before)
+    for other in found[1:]:
+        for name, value in found[0].items():
+            assert torch.equal(value, other[name]), name
+
+
+def test_rows_without_a_pixel_have_zero_gradients() -> None:
+    raw, camera = raw_scene()
+    raw["means"][::2, 2] -= 100.0  # far behind the camera
+    found = results(splatted, raw, camera)
+    unseen = torch.ones(len(raw["means"]), dtype=torch.bool)
+    unseen[found["gaussian_ids"]] = False
+    assert unseen[::2].all() and not unseen.all()
+    for name in NAMES:
+        assert not found[name][unseen].any() and found[name][~unseen].any()
+
+
+def test_without_gradients_the_centres_want_none() -> None:
+    raw, camera = raw_scene()
+    _, _, info = splatted(raw, camera)
+    assert not info["means2d"].requires_grad
+
+
+def test_a_parameter_that_grew_before_backward_is_an_error() -> None:
+    raw, camera = raw_scene()
+    leaf = raw["log_scales"].requires_grad_()
+    image, _, _ = splatted(raw, camera)
+    leaf.data = torch.cat([leaf.data, leaf.data])
+    with pytest.raises(RuntimeError, match=r"^scales had shape"):
+        image.sum().backward()
+
+
+def test_a_wrong_shape_names_the_argument() -> None:
+    raw, camera = raw_scene()
+    raw["logits"] = raw["logits"][:-1]
+    with pytest.raises(ValueError, match="opacities must have shape"):
+        splatted(raw, camera)
