@@ -21,7 +21,8 @@ for (int row = first; row < last;) {
     }
     // A run of rows is one line of floats.
     const long long begin = (long long)row * width;
-    while (row < last && (!only_seen || seen[row])) ++row;
+    if (only_seen) while (row < last && seen[row]) ++row;
+    else row = last;
     const long long end = (long long)row * width, whole = begin + (end - begin) / 16 * 16;
     for (long long i = begin; i < whole; i += 16) {
         v16 m = load(mean + i), s = load(square + i), x = load(values + i);
