@@ -83,7 +83,7 @@ class Trainer:
         self.near_plane = near_plane(config, scene)
         self.step = self.ran = 0
         self._since: int | None = None  # number after the previous iteration, set by `train`
-        self.splats = create_splats(scene, config, self.backend.device)
+        self.splats = create_splats(scene, config, self.backend.device, self.near_plane)
         self.optimizers = create_optimizers(self.splats, config, scene.scene_scale)
         self.mcmc = Mcmc(config, scene.scene_scale) if config.strategy == "mcmc" else None
         self.strategy: Any = None

@@ -43,14 +43,35 @@ def nearest_depth(views: list[View], points: torch.Tensor) -> float | None:
     Args:
         points: [M, 3], those that lie within a view's picture count for it, whether or not something hides them.
     """
-    points = points[:: -(-len(points) // MOST)].double()
+    points = points[:: -(-len(points) // MOST)]
     depths = []
     for view in views:
-        camera = points @ view.viewmat[:3, :3].double().T + view.viewmat[:3, 3].double()  # [M, 3]
-        camera = camera[camera[:, 2] > 0]
-        pixels = camera @ view.K.double().T
-        x, y = pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2]
-        seen = camera[(x >= 0) & (x < view.width) & (y >= 0) & (y < view.height), 2]
+        seen = depths_in_picture(view, points)
+        seen = seen[seen > 0]
         if len(seen) >= LEAST:
             depths.append(float(np.quantile(seen.numpy(), NEAREST)))
     return min(depths, default=None)
+
+
+def before_a_lens(views: list[View], points: torch.Tensor, near: float) -> torch.Tensor:
+    """Return which points [M] some view would show if they were not nearer than `near`, and no view shows.
+
+    Wrong matches. As Gaussians they would never be drawn in training, so nothing would move or prune them, and whoever
+    looks from near that camera with a nearer plane would see fog.
+    """
+    hidden = torch.zeros(len(points), dtype=torch.bool)
+    shown = torch.zeros(len(points), dtype=torch.bool)
+    for view in views:
+        depth = depths_in_picture(view, points)
+        shown |= depth >= near
+        hidden |= (depth > 0) & (depth < near)
+    return hidden & ~shown
+
+
+def depths_in_picture(view: View, points: torch.Tensor) -> torch.Tensor:
+    """Return the depth of each point [M] whose place in the picture lies within its borders; -1 for the others."""
+    camera = points.double() @ view.viewmat[:3, :3].double().T + view.viewmat[:3, 3].double()  # [M, 3]
+    pixels = camera @ view.K.double().T
+    x, y, depth = pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2], camera[:, 2]
+    within = (depth > 0) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
+    return torch.where(within, depth, -1.0)

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from skipgs_plug.trainer import InputError, TrainConfig
-from skipgs_plug.trainer.near_plane import NEAREST, SHARE, SHARE_OF_EXTENT, near_plane, nearest_depth
+from skipgs_plug.trainer import InputError, TrainConfig, Trainer
+from skipgs_plug.trainer.near_plane import NEAREST, SHARE, SHARE_OF_EXTENT, before_a_lens, near_plane, nearest_depth
 from skipgs_plug.trainer.scene import Scene, View
 
 
@@ -52,3 +52,18 @@ def test_settings_go_first_and_must_lie_before_the_far_plane() -> None:
     assert near_plane(TrainConfig(near_plane=0.7), scene()) == 0.7
     with pytest.raises(InputError, match=r"near plane 0\.4.* is not below far_plane=0.3"):
         near_plane(TrainConfig(far_plane=0.3), scene())
+
+
+def test_points_that_nothing_would_ever_draw_do_not_become_gaussians() -> None:
+    scene_ = scene()
+    left_lens, behind, right_lens = [0.5, 0.0, 0.1], [0.5, 0.0, -1.0], [-0.5, 0.0, 0.3]
+    scene_.points[:3] = torch.tensor([left_lens, behind, right_lens])
+    near = near_plane(TrainConfig(), scene_)
+    assert before_a_lens(scene_.train, scene_.points, near).nonzero().flatten().tolist() == [0, 2]
+    assert not before_a_lens(scene_.train, scene_.points, 0.05).any()
+    trainer = Trainer(TrainConfig(max_steps=3), scene_)
+    assert len(trainer.splats["means"]) == 998
+    other = scene()
+    other.train[1].viewmat[2, 3] = 3.0  # stands back: it shows what lies before the lens of the other
+    other.points[0] = torch.tensor([0.0, 0.0, 0.2])
+    assert not before_a_lens(other.train, other.points, 0.4).any()
