@@ -60,12 +60,14 @@ def before_a_lens(views: list[View], points: torch.Tensor, near: float) -> torch
     looks from near that camera with a nearer plane would see fog.
     """
     hidden = torch.zeros(len(points), dtype=torch.bool)
-    shown = torch.zeros(len(points), dtype=torch.bool)
     for view in views:
-        depth = depths_in_picture(view, points)
-        shown |= depth >= near
-        hidden |= (depth > 0) & (depth < near)
-    return hidden & ~shown
+        depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]
+        close = ((depth > 0) & (depth < near)).nonzero()[:, 0]  # few: only these are projected
+        hidden[close] |= depths_in_picture(view, points[close]) > 0
+    candidates = hidden.nonzero()[:, 0]
+    for view in views:
+        hidden[candidates] &= depths_in_picture(view, points[candidates]) < near
+    return hidden
 
 
 def depths_in_picture(view: View, points: torch.Tensor) -> torch.Tensor:
