@@ -58,7 +58,7 @@ class Run:
     def __init__(self, scene: Path, out: Path, gated: bool, save_every: int) -> None:
         self.out = out
         self._command = ["train", str(scene), "--out", str(out), *OPTIONS, "--save-every", str(save_every)]
-        self._command += GATED if gated else ["--no-gate"]
+        self._command += GATED if gated else []
         self.starts = 0
 
     def start(self, fault: tuple[str, int] | None = None) -> BaseProcess:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from skipgs_plug.scripts.checkpoints import SUFFIX, Checkpoints
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer, load_scene, save_packed
 from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.loaders.native import import_pycolmap
+from skipgs_plug.trainer.loaders.undistorted_cache import FOLDER as UNDISTORTED
 from skipgs_plug.trainer.ply import read_ply, read_points, write_ply
 from skipgs_plug.trainer.scene import check_view
 from skipgs_plug.trainer.synthetic import make_scene
@@ -59,8 +61,11 @@ def write_sources(root: Path) -> dict[str, Source]:
 
 
 def load(path: Path) -> None:
-    """Load a scene and check what the trainer relies on."""
-    scene = load_scene(path, test_every=0, init_num_pts=50)
+    """Load a scene, nothing of it from a cache, and check what the trainer relies on."""
+    try:
+        scene = load_scene(path, test_every=0, init_num_pts=50)
+    finally:
+        shutil.rmtree(path / UNDISTORTED, ignore_errors=True)
     assert scene.train and len(scene.points) >= 4 and scene.points.isfinite().all()
     assert 0 < scene.scene_scale < float("inf") and len(scene.points) == len(scene.points_rgb)
     for view in scene.train + scene.test:

@@ -26,6 +26,9 @@ FLAGS = (
     "--disable-component-update",
     "--disable-sync",
 )
+# Seconds until a browser that does not answer counts as hung: where WebGL runs on a CPU that others use too, one
+# picture takes a while. Tests that open one need `pytest.mark.timeout(600)`.
+PATIENCE = 180.0
 SOFTWARE_WEBGL = ("--enable-unsafe-swiftshader", "--use-angle=swiftshader")
 
 
@@ -66,7 +69,7 @@ class Browser:
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
-            answer = json.loads(self._socket.recv(timeout=60))
+            answer = json.loads(self._socket.recv(timeout=PATIENCE))
             if answer.get("id") == number:
                 assert "error" not in answer, answer
                 return answer["result"]  # type: ignore[no-any-return]
@@ -96,10 +99,10 @@ class Browser:
 
     def _end(self) -> None:
         self._process.terminate()
-        self._process.wait(timeout=30)
+        self._process.wait(timeout=PATIENCE)
 
 
-def wait_until(condition: Any, seconds: float = 60.0) -> None:
+def wait_until(condition: Any, seconds: float = PATIENCE) -> None:
     """Return when the condition holds; fail when it does not within `seconds`."""
     end = time.monotonic() + seconds
     while not condition():

@@ -109,12 +109,12 @@ def test_interrupt_leaves_a_checkpoint_that_resume_continues(
 
     stopped, whole = tmp_path / "stopped", tmp_path / "whole"
     monkeypatch.setattr(Trainer, "train_step", interrupted)
-    assert main(["train", packed, "--out", str(stopped), *SHORT]) == 130
+    assert main(["train", packed, "--out", str(stopped), "--gate", *SHORT]) == 130
     assert [p.name for p in (stopped / "ckpts").iterdir()] == ["ckpt_40_rank0.pt"]
     assert not (stopped / "ply").exists()
     monkeypatch.setattr(Trainer, "train_step", train_step)
-    assert main(["train", packed, "--out", str(stopped), "--resume", *SHORT]) == 0
-    assert main(["train", packed, "--out", str(whole), *SHORT]) == 0
+    assert main(["train", packed, "--out", str(stopped), "--gate", "--resume", *SHORT]) == 0
+    assert main(["train", packed, "--out", str(whole), "--gate", *SHORT]) == 0
     ends = [torch.load(run / "ckpts/ckpt_59_rank0.pt", weights_only=True) for run in (stopped, whole)]
     for name in ends[0]["splats"]:
         assert torch.equal(ends[0]["splats"][name], ends[1]["splats"][name])
@@ -123,9 +123,20 @@ def test_interrupt_leaves_a_checkpoint_that_resume_continues(
         assert reports[0][key] == reports[1][key]
 
 
-def test_ungated_run_writes_no_gate_report(tmp_path: Path, packed: str) -> None:
-    assert main(["train", packed, "--out", str(tmp_path / "run"), "--no-gate", *SHORT]) == 0
-    assert not (tmp_path / "run/skipgs.json").exists()
+@pytest.mark.parametrize(
+    ("options", "gated"),
+    [([], False), (["--gate"], True), (["--refine-share", "0.4"], True), (["--warmup", "4"], True)],
+)
+def test_a_gate_is_attached_when_asked_for(
+    tmp_path: Path, packed: str, options: list[str], gated: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["train", packed, "--out", str(tmp_path / "run"), *options, *SHORT]
+    assert main(command) == 0
+    assert ("gate active from 30" in capsys.readouterr().out) == gated
+    assert (tmp_path / "run/skipgs.json").exists() == gated
+    other = [word for word in command if word not in options] if gated else [*command, "--gate"]
+    assert main([*other, "--resume"]) == 2
+    assert f"begun with{'' if gated else 'out'} a gate; resume it with" in one_sentence(capsys)
 
 
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

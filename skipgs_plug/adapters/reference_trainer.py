@@ -58,7 +58,7 @@ class ReferenceTrainer(AbstractAdapter):
         hooks.on_detach("Trainer.registered['skipgs']", lambda: trainer.registered.pop("skipgs", None))
 
     def optimizers(self) -> Iterable[torch.optim.Optimizer]:
-        return self.trainer.optimizers.values()
+        return self.trainer.all_optimizers
 
     def timing(self) -> tuple[float, float] | None:
         return self.trainer.t_total, self.trainer.t_post

@@ -46,7 +46,7 @@ def as_long_as(name: str) -> Callable[[Trainer, Earlier], int]:
 
     def iterations(trainer: Trainer, earlier: Earlier) -> int:
         full = all_iterations(trainer, earlier)
-        return max(1, round(full * share_of_time(name, trainer, earlier)))
+        return max(1, round(full * share_of_time(name, earlier)))
 
     return iterations
 
@@ -55,20 +55,14 @@ def thinned_as_long_as(name: str) -> GateMaker:
     """Return what leaves out whole iterations, so many that the rest takes as long as policy `name` did."""
 
     def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
-        return gate_with(refine_share=share_of_time(name, trainer, earlier))(trainer, earlier)  # type: ignore[return-value]
+        return gate_with(refine_share=share_of_time(name, earlier))(trainer, earlier)  # type: ignore[return-value]
 
     return make
 
 
-def share_of_time(name: str, trainer: Trainer, earlier: Earlier) -> float:
-    """Return the refinement time of policy `name`, as a share of ungated's, at most 1.
-
-    On the CPU by the processor's time: that of the clock is also what other programs took meanwhile.
-    """
-    own, full = earlier[name], earlier[REFERENCE]
-    if trainer.backend.device.type == "cpu":
-        return min(1.0, own.processor_post / full.processor_post)
-    return min(1.0, own.t_post / full.t_post)
+def share_of_time(name: str, earlier: Earlier) -> float:
+    """Return the refinement time of policy `name`, as a share of ungated's, at most 1."""
+    return min(1.0, earlier[name].t_post / earlier[REFERENCE].t_post)
 
 
 def no_gate(trainer: Trainer, earlier: Earlier) -> None:

@@ -109,8 +109,6 @@ class RunRecord:
         floor: least share of backwards in force at the end; None without a gate.
         reasons: gated decisions by reason; empty without a gate.
         t_post, t_total: seconds of training, of refinement and in all.
-        processor_post: seconds of processor time of refinement, of all threads: what other programs on the machine
-            hardly change.
         phases: seconds of refinement in forward, loss, backward, optimizer, strategy.
         metrics: held-out, by the names of trainer.metrics.METRICS; num_GS.
         train_metrics: the same on the training views, without LPIPS.
@@ -130,7 +128,6 @@ class RunRecord:
     floor: float | None = None
     reasons: dict[str, int] = field(default_factory=dict)
     t_post: float = 0.0
-    processor_post: float = 0.0
     t_total: float = 0.0
     phases: dict[str, float] = field(default_factory=dict)
     metrics: dict[str, float] = field(default_factory=dict)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-import time
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -75,9 +74,7 @@ def refine(
         record.points.append(point(trainer, trainer.evaluate("test"), log))
         for part in range(1, PARTS + 1):
             with peak_memory(trainer, record):
-                before = time.process_time()
                 trainer.train(until=start + round(part * iterations / PARTS), progress=False)
-                record.processor_post += time.process_time() - before
             if part < PARTS:
                 record.points.append(point(trainer, trainer.evaluate("test"), log))
                 yield

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from skipgs_plug.bench import provenance
 from skipgs_plug.bench.policies import PolicySpec, check_policies, rounds
@@ -15,8 +15,10 @@ from skipgs_plug.bench.refine import DivergedError, densify, refine
 from skipgs_plug.bench.store import BenchFolder
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.backend import resolve_backend
+from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.metrics import LPIPS_WEIGHTS, require_lpips
 
+Clock = Literal["wall", "processor"]
 NOT_SETTINGS = ("data_dir", "result_dir", "seed", "backend")
 
 
@@ -27,9 +29,11 @@ class Bench:
         config: settings of training; its seed is replaced by each of `seeds`.
         say: called with one line per event.
         tensorboard: write TensorBoard scalars of every run that is missing.
+        clock: see `TrainClock`.
 
     Raises:
-        InputError: an unknown policy, no held-out views, or a folder made with other settings.
+        InputError: an unknown policy, no held-out views, processor time with a GPU, or a folder made with other
+            settings.
     """
 
     def __init__(
@@ -42,13 +46,15 @@ class Bench:
         say: Callable[[str], None] = print,
         progress: bool = True,
         tensorboard: bool = False,
+        clock: Clock = "wall",
     ) -> None:
         check_policies(policies)
         if not seeds or len(set(seeds)) < len(seeds):
             raise InputError("Give at least one seed, each once.")
-        if config.scaled(config.refine_stop_iter) >= config.max_steps:
+        stop = config.scaled(config.recipe.refine_stop_iter)
+        if stop >= config.max_steps:
             raise InputError(
-                f"Densification ends at iteration {config.scaled(config.refine_stop_iter):,} of {config.max_steps:,}, "
+                f"Densification ends at iteration {stop:,} of {config.max_steps:,}, "
                 "which leaves nothing to refine; lower --refine-stop-iter."
             )
         if not scene.test:
@@ -57,6 +63,9 @@ class Bench:
         self.seeds, self.policies = list(seeds), list(policies)
         self.say, self.progress, self.tensorboard = say, progress, tensorboard
         self.backend = resolve_backend(config.backend)
+        self.clock = clock
+        if clock == "processor" and self.backend.device.type != "cpu":
+            raise InputError("A GPU works while no thread is running: --clock processor is for the CPU; leave it out.")
         self.lpips_net = available_lpips()
         self.commit = provenance.commit()
         self.settings = {
@@ -64,13 +73,14 @@ class Bench:
             "scene": provenance.scene_facts(scene, config),
             "machine": provenance.machine(self.backend),
             "lpips": self.lpips_net,
+            "clock": clock,
         }
         folder.require_settings(self.settings)
 
     @property
     def refine_stop_iter(self) -> int:
         """First iteration of refinement."""
-        return self.config.scaled(self.config.refine_stop_iter)
+        return self.config.scaled(self.config.recipe.refine_stop_iter)
 
     def run(self) -> list[RunRecord]:
         """Return one record per seed and policy, by seed, in the order of `policies`."""
@@ -130,7 +140,9 @@ class Bench:
                     yield RunRecord(seed, name, "diverged", str(error))
 
     def _trainer(self, seed: int) -> Trainer:
-        return Trainer(dataclasses.replace(self.config, seed=seed), self.scene, self.backend)
+        trainer = Trainer(dataclasses.replace(self.config, seed=seed), self.scene, self.backend)
+        trainer.clock = TrainClock(self.backend.device, processor=self.clock == "processor")
+        return trainer
 
     def _densified(self, trainer: Trainer) -> dict[str, Any]:
         seed, path = trainer.config.seed, self.folder.snapshot(trainer.config.seed)

@@ -14,7 +14,7 @@ from skipgs_plug.bench.decisions import write_decisions
 from skipgs_plug.bench.plots import write_plots
 from skipgs_plug.bench.policies import POLICIES, check_policies
 from skipgs_plug.bench.result import build_result
-from skipgs_plug.bench.runner import Bench
+from skipgs_plug.bench.runner import Bench, Clock
 from skipgs_plug.bench.store import BenchFolder
 from skipgs_plug.bench.summary import Row, row_from_dict
 from skipgs_plug.bench.table import legend, markdown, notes, tables
@@ -53,6 +53,8 @@ class Args:
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
     tensorboard: bool = False
     """Log gsplat's scalars and the gate's counters of every run to OUT/tb; the clock stands meanwhile."""
+    clock: Clock = "wall"
+    """Seconds by the clock on the wall, or for which the processor worked for us: for a machine that others use too."""
     no_progress: bool = False
     """No progress bars."""
 
@@ -69,8 +71,10 @@ def run(args: Args, command: str) -> list[Row]:
     config = dataclasses.replace(args.train, data_dir=args.scene, result_dir=args.out)
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
     folder = BenchFolder(args.out)
-    progress, tensorboard = not args.no_progress, args.tensorboard
-    bench = Bench(scene, config, folder, args.seeds, args.policies, progress=progress, tensorboard=tensorboard)
+    progress, tensorboard, clock = not args.no_progress, args.tensorboard, args.clock
+    bench = Bench(
+        scene, config, folder, args.seeds, args.policies, progress=progress, tensorboard=tensorboard, clock=clock
+    )
     print(
         f"{scene.name}: {len(args.seeds)} seeds x {len(args.policies)} policies, iterations to {config.max_steps:,}, "
         f"densification to {bench.refine_stop_iter:,}, backend {bench.backend.name}"

@@ -31,7 +31,7 @@ class GateOptions:
     """When an accumulated step is taken; default snr."""
 
     refine_share: float | Literal["auto"] | None = None
-    """Leave out whole iterations: the share of refinement that runs (0.4), or auto; default: the paper's gate."""
+    """Leave out whole iterations: the share of refinement that runs (0.4), or auto; else the paper's gate."""
     tolerance: float | None = None
     """Decibels that the rest of refinement may be worth when auto ends it; default 0.05."""
     compensate: bool | None = None

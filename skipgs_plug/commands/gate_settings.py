@@ -30,9 +30,9 @@ class GateSettings:
         before = state["settings"]
         if (before is None) != (self._settings is None):
             raise InputError(
-                "The run was begun without the gate; resume it with --no-gate."
+                "The run was begun without a gate; resume it without --gate and settings of it."
                 if before is None
-                else "The run was begun with the gate; resume it without --no-gate."
+                else "The run was begun with a gate; resume it with --gate, or the settings of it that were given."
             )
         for name, value in (self._settings or {}).items():
             if before.get(name) != value:

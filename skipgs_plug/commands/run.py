@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -19,6 +19,8 @@ from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster.compat import FAMILIES, serve
+from skipgs_plug.fallback_raster.optimizer import REPLACED as ADAM_REPLACED
+from skipgs_plug.fallback_raster.optimizer import instead_of_torchs_adam
 from skipgs_plug.scripts import children
 from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
 from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED
@@ -39,7 +41,7 @@ class Args:
 
     adapter: tyro.conf.Positional[str]
     """Name of the trainer: inria, fastgs, taming, ...; or auto, to recognise it by its script."""
-    gate: tyro.conf.OmitArgPrefixes[GateOptions] = dataclasses.field(default_factory=GateOptions)
+    gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
     resume_gate: str = "auto"
     """State the gate goes on from: auto (the one beside the checkpoint the script loads), off (afresh), or a path."""
     no_gate: bool = False
@@ -98,8 +100,9 @@ def run_gated(
     """Attach a gate to what `execute(attach)` runs, and write skipgs.json where `rank` is 0."""
     adapter = get_adapter(args.adapter)()
     checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
-    adapter.replaced = (*REPLACED, *(f"torch.cuda.{name}" for name in CUDA_REPLACED if args.cpu))
-    settings = args.gate.given() | ({"enabled": False} if args.no_gate else {})
+    for_cpu = (*(f"torch.cuda.{name}" for name in CUDA_REPLACED), ADAM_REPLACED)
+    adapter.replaced = (*REPLACED, *(for_cpu if args.cpu else ()))
+    settings = args.gate_options.given() | ({"enabled": False} if args.no_gate else {})
     gates: list[SkipGate] = []
 
     def attach() -> dict[str, Any]:
@@ -152,5 +155,5 @@ def cpu_instead_of_cuda(args: Args, command: Sequence[str]) -> Iterator[None]:
     if family not in FAMILIES:
         names = sorted((set(FAMILIES) | set(FAMILY_OF)) - {"inria_accelerated", *FAMILY_OF.values()})
         raise SkipGSError(f"--cpu has no stand-ins for {args.adapter!r}; it has for {', '.join(names)}.")
-    with serve(family), cuda_on_cpu(), exclusive_cores():
+    with serve(family), cuda_on_cpu(), exclusive_cores(), instead_of_torchs_adam():
         yield

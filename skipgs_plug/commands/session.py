@@ -112,7 +112,7 @@ class Session:
             self._log.iteration(iteration)
         every = self._options.eval_every
         if every and iteration.completes(every) and iteration.step + 1 < self._trainer.max_steps:
-            from tqdm import tqdm
+            from tqdm.auto import tqdm
 
             tqdm.write(f"Iteration {iteration.step:,}: {self._described(self._evaluate([]))}")
         self._autosave.iteration(iteration)
@@ -142,13 +142,14 @@ class Session:
             print(self._gate.summary())
         print(f"{self._described(stats)}; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s")
         if ply is not None:
-            print(ply)
+            print(f"{ply}\nNext: skipgs-plug view {folder.root}")
 
     def _described(self, stats: dict[str, Any]) -> str:
         net = self._options.lpips_net
         where = f"{stats['views']} held-out views" if self._split == "val" else "TRAINING views (none held out)"
         lpips = f", LPIPS ({net}) {stats[f'lpips_{net}']:.4f}" if net else ""
+        fitted = f" ({stats['cc_psnr']:.2f} with colours fitted to each)" if "cc_psnr" in stats else ""
         return (
-            f"PSNR {stats['psnr']:.2f} dB, SSIM {stats['ssim']:.4f} (torchmetrics padding){lpips} on {where}; "
+            f"PSNR {stats['psnr']:.2f} dB{fitted}, SSIM {stats['ssim']:.4f} (torchmetrics padding){lpips} on {where}; "
             f"{stats['num_GS']:,} Gaussians"
         )

@@ -45,6 +45,17 @@ def main(argv: list[str]) -> int:
 
 def run(args: Args) -> int:
     """Reconstruct and print what was placed; see `Args`."""
+    scene = reconstruct(args)
+    print(f"Scene: {scene}. Next: skipgs-plug train {scene} --out runs/{scene.resolve().name}")
+    return 0
+
+
+def reconstruct(args: Args) -> Path:
+    """Write the scene, whole or not at all, and print what was placed; returns its folder.
+
+    Raises:
+        InputError: the photographs cannot be read or placed, or the folder holds something.
+    """
     if args.frames < 3:
         raise InputError(f"--frames {args.frames} is too few to reconstruct from; give at least 3, better 100.")
     scene = args.scene.expanduser()
@@ -77,8 +88,7 @@ def run(args: Args) -> int:
     print(f"{written} of {count} photographs placed ({matching} matching), {points:,} points, ", end="")
     print(f"mean reprojection error {error:.2f} px.")
     print_unplaced(unplaced, matching)
-    print(f"Scene: {scene}. Next: skipgs-plug train {scene} --out runs/{scene.resolve().name}")
-    return 0
+    return scene
 
 
 def print_unplaced(reasons: dict[str, str], matching: str) -> None:

@@ -1,8 +1,9 @@
-"""`skipgs-plug train SCENE --out RUN`: the reference trainer, gated unless told otherwise."""
+"""`skipgs-plug train SCENE --out RUN`: the reference trainer, with a gate when asked for one."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,16 +11,19 @@ from typing import Annotated, Any
 import tyro
 
 from skipgs_plug import SkipGate
+from skipgs_plug.commands import sfm
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.commands.gate_settings import GateSettings
 from skipgs_plug.commands.session import Session, SessionOptions
+from skipgs_plug.photos.gather import are_photographs
 from skipgs_plug.trainer import InputError, MissingFileError, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.config import REFERENCE_STEPS
 from skipgs_plug.trainer.curve import LossCurve
+from skipgs_plug.trainer.loaders import is_scene
 from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.metrics import require_lpips
 from skipgs_plug.trainer.resume import first_sound, lengths
-from skipgs_plug.trainer.run_folder import RunFolder
+from skipgs_plug.trainer.run_folder import SCENE, RunFolder
 
 
 @dataclass
@@ -34,18 +38,23 @@ class Options(TrainConfig):
 
 @dataclass
 class Args:
-    """Train a COLMAP, nerfstudio or Blender folder or a packed .npz."""
+    """Train a COLMAP, nerfstudio or Blender folder or a packed .npz: the 3DGS recipe, every iteration of it.
+
+    --refine-share 0.4 (or auto) refines in fewer iterations with larger, shrinking steps.
+    """
 
     scene: tyro.conf.Positional[str]
-    """Folder with sparse/0, transforms.json or transforms_train.json, or packed .npz."""
+    """Folder with sparse/0, transforms.json or transforms_train.json, packed .npz; with --sfm: photographs, a video."""
     out: str
     """Run folder to write."""
+    sfm: bool = False
+    """Find out first where the photographs were taken, as the command sfm does, and keep the scene in OUT/scene."""
     max_steps: int | None = None
     """Training iterations; default: 30,000, or with --resume those of the run, which a larger number extends."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
-    gate: tyro.conf.OmitArgPrefixes[GateOptions] = dataclasses.field(default_factory=GateOptions)
-    no_gate: bool = False
-    """Train without the gate."""
+    gate: bool = False
+    """Attach the paper's gate. Any of its settings, --refine-share among them, attaches a gate as well."""
+    gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
     resume: bool = False
     """Continue from the last checkpoint in --out, or write what a finished run lacks."""
     session: Annotated[SessionOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=SessionOptions)
@@ -65,10 +74,13 @@ def run(args: Args) -> int:
     folder = RunFolder(args.out)
     found = folder.checkpoints()
     check(args, found)
+    if args.sfm:
+        args = dataclasses.replace(args, scene=str(scene_of_photographs(args, folder)))
     checkpoints, config = configure(args, found)
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
     trainer = Trainer(config, scene)
-    gate = None if args.no_gate else SkipGate(trainer, **args.gate.given())
+    settings = args.gate_options.given()
+    gate = SkipGate(trainer, **settings) if args.gate or settings else None
     trainer.register_state("gate_settings", GateSettings(gate))
     curve = LossCurve(trainer)
     with exclusive(folder.root):
@@ -82,7 +94,7 @@ def run(args: Args) -> int:
             f"{scene.name}: {len(scene.train)} training views, {len(scene.test)} held out, "
             f"{len(scene.points):,} points, backend {trainer.backend.name}, "
             f"iterations {trainer.step:,} to {trainer.max_steps:,}"
-            + (f", gate active from {trainer.refine_stop_iter:,}" if gate is not None else ", no gate")
+            + (f", gate active from {gate.config.start_iter:,}" if gate is not None else "")
         )
         return Session(args.session, folder, trainer, gate, curve).run()
 
@@ -91,14 +103,32 @@ def check(args: Args, checkpoints: list[Path]) -> None:
     """Refuse what can be refused before anything is read.
 
     Raises:
-        InputError: LPIPS cannot be computed, or --resume does not fit what --out holds.
+        InputError: LPIPS cannot be computed, --resume does not fit what --out holds, or --sfm what SCENE is.
     """
+    given = Path(args.scene).expanduser()
+    if args.sfm and not are_photographs(given):
+        what = "is a scene already" if is_scene(given) else "is neither a video nor a folder with photographs"
+        raise InputError(f"{args.scene} {what}; leave out --sfm or give photographs.")
+    if not args.sfm and are_photographs(given):
+        raise InputError(
+            f"{args.scene} holds photographs and nothing that says where they were taken; add --sfm to find that out "
+            f"first, or run: skipgs-plug sfm {args.scene} SCENE."
+        )
     if args.session.lpips_net is not None:
         require_lpips(args.session.lpips_net)
     if checkpoints and not args.resume:
         raise InputError(f"{args.out} already holds a run; add --resume to continue it or give another --out.")
     if args.resume and not checkpoints:
         raise MissingFileError(f"{args.out} holds no checkpoint (ckpts/ckpt_*_rank0.pt); start without --resume.")
+
+
+def scene_of_photographs(args: Args, folder: RunFolder) -> Path:
+    """Return the scene of the run's photographs, which is made in its folder unless it is there."""
+    scene = folder.root / SCENE
+    if not is_scene(scene):
+        with exclusive(folder.root):
+            sfm.reconstruct(sfm.Args(Path(args.scene), scene, no_progress=args.session.no_progress))
+    return scene
 
 
 def configure(args: Args, checkpoints: list[Path]) -> tuple[list[Path], TrainConfig]:
@@ -111,4 +141,7 @@ def configure(args: Args, checkpoints: list[Path]) -> tuple[list[Path], TrainCon
         checkpoints, run = first_sound(checkpoints, lengths)
     if args.max_steps is not None:
         run["max_steps"] = args.max_steps
-    return checkpoints, dataclasses.replace(args.train, data_dir=args.scene, result_dir=args.out, **run)
+    # What looks at the run later may do so from another folder.
+    paths = (args.scene, args.train.init_ply)
+    scene, start = (os.path.abspath(Path(path).expanduser()) if path else "" for path in paths)
+    return checkpoints, dataclasses.replace(args.train, data_dir=scene, init_ply=start, result_dir=args.out, **run)

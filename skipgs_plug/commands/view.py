@@ -8,7 +8,8 @@ import tyro
 from torch import Tensor
 
 from skipgs_plug.trainer.backend import resolve_backend
-from skipgs_plug.trainer.scene import BLACK, View
+from skipgs_plug.trainer.exposure import fit_colours
+from skipgs_plug.trainer.scene import View
 from skipgs_plug.view.draw import Painter
 from skipgs_plug.view.model import open_model
 from skipgs_plug.view.page import Page, Splats
@@ -39,12 +40,12 @@ def main(argv: list[str]) -> int:
 def run(args: Args) -> int:
     """Serve the page; see `Args`."""
     model = open_model(args.model, args.scene, args.data_factor)
-    painter = Painter(
-        resolve_backend(args.backend), model.scene.background if model.scene else BLACK, model.antialiased
-    )
+    painter = Painter(resolve_backend(args.backend), model.background, model.near_plane, model.antialiased)
 
     def draw(splats: Splats, view: View) -> Tensor:
-        return painter.draw(splats, view.viewmat, view.K, view.width, view.height)[0]
+        image = painter.draw(splats, view.viewmat, view.K, view.width, view.height)[0]
+        # Models know nothing of the exposure of photographs, which they are compared with here.
+        return fit_colours(image, view.image / 255.0, view.mask).clamp(0, 1) if model.exposure else image
 
     by_step = {snapshot.step: snapshot for snapshot in model.snapshots}
     steps = [step for step in by_step if step is not None]

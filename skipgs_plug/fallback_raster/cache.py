@@ -1,4 +1,4 @@
-"""Warp's cache of compiled kernels, when it is damaged.
+"""Warp's cache of compiled kernels, when it is damaged or cannot be written.
 
 Warp loads whatever object file it finds, and code with a few wrong bytes is native code that does anything. A checksum
 beside each object file tells; what does not fit or does not load is thrown away and compiled again.
@@ -8,11 +8,31 @@ import hashlib
 import os
 import shutil
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from skipgs_plug.files import WriteError
+
 _SUM = "sha256"
+
+
+@contextmanager
+def say_unwritable() -> Iterator[None]:
+    """Turns the failure to write a kernel inside the block into a sentence.
+
+    Raises:
+        WriteError: Names the file and the way out.
+    """
+    try:
+        yield
+    except OSError as error:
+        why = os.strerror(error.errno) if error.errno else str(error)
+        raise WriteError(
+            f"The CPU rasterizer cannot keep its compiled kernels in {error.filename or 'Warp'}: {why}; "
+            "set WARP_CACHE_PATH to a folder that can be written."
+        ) from error
 
 
 def load_or_rebuild(folder: Path, load: Callable[[], Any], forget: Callable[[], None]) -> Any:
@@ -25,6 +45,9 @@ def load_or_rebuild(folder: Path, load: Callable[[], Any], forget: Callable[[], 
 
     Returns:
         What `load` returns.
+
+    Raises:
+        WriteError: It has to be compiled, and the folder cannot be written.
     """
     if any(_checksum(path) != _expected(path) for path in folder.glob("*.o") if _expected(path) is not None):
         shutil.rmtree(folder, ignore_errors=True)

@@ -38,7 +38,7 @@ LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 # The loss: pixels of the window of SSIM; rows and vectors of 16 floats of a tile; channels that the buffers which
 # extend a row beyond the image have room for.
 WINDOW = 11
-BAND = 32
+BAND = 64
 CHUNK = 8
 LOSS_CHANNELS = 32
 

@@ -33,13 +33,15 @@ from torch import Tensor
 from skipgs_plug.install import install_command
 
 from . import guard
-from .cache import load_or_rebuild
+from .cache import load_or_rebuild, say_unwritable
 from .cores import usable_cores
 from .guard import Sizes
+from .memory import LARGE, SUPPORTED, Pool
 from .source import PRELUDE, SHARED, declare
 
 _lock = threading.RLock()
 _scratch = threading.local()
+_memory = Pool()
 _num_threads = usable_cores()
 _pool: ThreadPoolExecutor | None = None
 _busy = False  # threads of the pool may still be at work
@@ -76,12 +78,25 @@ def set_num_threads(n: int) -> None:
 
 def floats(*shape: int) -> Tensor:
     """A float32 tensor with undefined content, whatever the default dtype and device of the process."""
-    return guard.poison(torch.empty(shape, dtype=torch.float32, device="cpu"))
+    return _empty(shape, torch.float32)
 
 
 def ints(*shape: int) -> Tensor:
     """An int32 tensor with undefined content."""
-    return guard.poison(torch.empty(shape, dtype=torch.int32, device="cpu"))
+    return _empty(shape, torch.int32)
+
+
+def _empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    if not SUPPORTED or math.prod(shape) * dtype.itemsize < LARGE:
+        return guard.poison(torch.empty(shape, dtype=dtype, device="cpu"))
+    with _lock:
+        return guard.poison(_memory.empty(shape, dtype))
+
+
+def release_memory() -> None:
+    """Gives memory back to the system that tensors of the rasterizer lay in and none lies in now."""
+    with _lock:
+        _memory.release()
 
 
 def longs(*shape: int) -> Tensor:
@@ -244,11 +259,12 @@ class Worker:
         inputs = [0] * len(declared)
         # Warp compiles for blocks of one thread on the CPU.
         folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(1)
-        command = load_or_rebuild(
-            folder,
-            lambda: wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False),
-            kernel.module.unload,
-        )
+
+        def load() -> Any:
+            with say_unwritable():
+                return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
+
+        command = load_or_rebuild(folder, load, kernel.module.unload)
         # Every call fills a block of parameters of its own, which the threads share.
         bounds, *parameters = command.params
         fields = [(name, type(parameter)) for name, parameter in zip(declared, parameters, strict=True)]
@@ -306,7 +322,7 @@ def _warp() -> Any:
         raise ImportError(f"The CPU rasterizer needs NVIDIA Warp: {install_command()}.") from error
     wp.config.quiet = True
     wp.config.log_level = wp.LOG_ERROR
-    with _quiet_stderr():
+    with _quiet_stderr(), say_unwritable():
         wp.init()
     return wp
 

@@ -13,6 +13,7 @@ from PIL import Image, ImageOps
 
 from skipgs_plug.photos.video import VIDEO_SUFFIXES, sharpest_frames
 from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.loaders import is_scene
 from skipgs_plug.trainer.loaders.images import ORIENTATION, decode
 
 AS_THEY_ARE = (".jpg", ".jpeg", ".png")
@@ -35,6 +36,16 @@ class Gathered:
     folder: Path
     names: list[str]
     one_camera: bool
+
+
+def are_photographs(source: Path) -> bool:
+    """Whether this is a video, or a folder with photographs and without cameras."""
+    if source.is_file():
+        return source.suffix.lower() in VIDEO_SUFFIXES
+    if not source.is_dir() or is_scene(source):
+        return False
+    known = AS_THEY_ARE + CONVERTED + UNREADABLE
+    return any(path.suffix.lower() in known and not path.name.startswith(".") for path in source.rglob("*"))
 
 
 def gather(source: Path, folder: Path, frames: int, progress: Callable[[int], None]) -> Gathered:

@@ -26,7 +26,7 @@ def check_target(scene: Path, source: Path) -> None:
     if scene.exists() and (scene.is_file() or any(scene.iterdir())):
         raise InputError(f"{scene} exists and is not an empty folder; give another SCENE.")
     if source.is_dir() and scene.resolve().is_relative_to(source.resolve()):
-        raise InputError(f"{scene} lies in the folder of the photographs; give a SCENE outside of it.")
+        raise InputError(f"{scene} lies in the folder of the photographs; give one outside of it.")
 
 
 def write_scene(undistorted: Path, scene: Path, progress: Callable[[int], None]) -> int:

@@ -32,8 +32,10 @@ REFINEMENT_HEADING = (
     "ended early",
     "rest foreseen to be worth, dB",
 )
+FITTED = "the same, colours fitted, dB"
 RESULTS = (
     "held-out PSNR, dB",
+    FITTED,
     "worst view, dB",
     "SSIM",
     "Gaussians",
@@ -153,6 +155,7 @@ def results(caption: str, runs: Sequence[RunSource]) -> Table:
             skipped = 100 * run.gate["backwards_skipped"] / run.gate["gated_iterations"]
         values = (
             (run.metrics.get("psnr"), ".2f"),
+            (run.metrics.get("cc_psnr"), ".2f"),
             (worst, ".2f"),
             (run.metrics.get("ssim"), ".4f"),
             (run.metrics.get("num_GS"), ","),
@@ -162,6 +165,7 @@ def results(caption: str, runs: Sequence[RunSource]) -> Table:
         )
         columns.append(["-" if value is None else format(value, form) for value, form in values])
     rows = [[name, *cells] for name, *cells in zip(RESULTS, *columns, strict=True)]
+    rows = [row for row in rows if row[0] != FITTED or set(row[1:]) != {"-"}]  # of runs with exposure alone
     return Table(caption, ("", *unique_names(runs)), rows)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from skipgs_plug.trainer.errors import InputError
 
@@ -28,6 +28,7 @@ INTEGERS = {  # least and greatest value
     "refine_stop_iter": (0, MANY),
     "refine_every": (1, MANY),
     "reset_every": (1, MANY),
+    "cap_max": (4, MANY),
 }
 NUMBERS = {
     "ssim_lambda": (0.0, 1.0),
@@ -45,8 +46,28 @@ NUMBERS = {
     "grow_scale3d": (0.0, 1e6),
     "prune_opa": (0.0, 1.0),
     "prune_scale3d": (0.0, 1e6),
+    "noise_lr": (0.0, 1e12),
+    "opacity_reg": (0.0, 1e6),
+    "scale_reg": (0.0, 1e6),
 }
-FROM_OTHERS = ("schedule_steps", "near_plane")  # None: follows from other settings or the scene
+
+
+class Recipe(NamedTuple):
+    """Settings whose defaults belong to the strategy."""
+
+    init_opa: float
+    init_scale: float
+    refine_stop_iter: int
+    opacity_reg: float
+    scale_reg: float
+
+
+RECIPES = {"default": Recipe(0.1, 1.0, 15_000, 0.0, 0.0), "mcmc": Recipe(0.5, 0.1, 25_000, 0.01, 0.01)}  # gsplat's
+BELONGS_TO = {
+    **dict.fromkeys(("grow_grad2d", "grow_scale3d", "prune_scale3d", "reset_every", "absgrad"), "default"),
+    **dict.fromkeys(("cap_max", "noise_lr"), "mcmc"),
+}
+FROM_OTHERS = ("schedule_steps", "near_plane", *Recipe._fields)  # None: follows from other settings or the scene
 
 
 @dataclass
@@ -88,10 +109,10 @@ class TrainConfig:
     """Highest spherical-harmonics degree."""
     sh_degree_interval: int = 1000
     """Iterations between two raises of the SH degree."""
-    init_opa: float = 0.1
-    """Initial opacity."""
-    init_scale: float = 1.0
-    """Initial scale, in units of the mean distance to the three nearest points."""
+    init_opa: float | None = None
+    """Initial opacity; default 0.1, with mcmc 0.5."""
+    init_scale: float | None = None
+    """Initial scale, in units of the mean distance to the three nearest points; default 1, with mcmc 0.1."""
 
     means_lr: float = 1.6e-4
     """Learning rate of positions, times scene scale; decays to 1 % over max_steps."""
@@ -108,6 +129,8 @@ class TrainConfig:
     visible_adam: bool = False
     """Update only Gaussians that the view shows, without bias correction (gsplat's SelectiveAdam)."""
 
+    exposure: bool = False
+    """Learn an affine colour correction for each training photograph, for cameras that change their exposure."""
     antialiased: bool = False
     """Compensate opacities for the 2D low-pass filter (Mip-Splatting)."""
     random_bkgd: bool = False
@@ -117,10 +140,12 @@ class TrainConfig:
     far_plane: float = 1e10
     """Far clipping plane, world units."""
 
+    strategy: Literal["default", "mcmc"] = "default"
+    """Densification: gsplat's DefaultStrategy (clone, split, prune) or MCMCStrategy (move, up to cap_max)."""
     refine_start_iter: int = 500
     """First densification."""
-    refine_stop_iter: int = 15_000
-    """End of densification; the gate becomes active here."""
+    refine_stop_iter: int | None = None
+    """End of densification; a gate becomes active here. Default 15,000, with mcmc 25,000."""
     refine_every: int = 100
     """Iterations between densifications."""
     reset_every: int = 3000
@@ -135,6 +160,14 @@ class TrainConfig:
     """Gaussians larger than this, times scene scale, are pruned after the first opacity reset."""
     absgrad: bool = False
     """Densify by absolute gradients (AbsGS); wants grow_grad2d of about 0.0008."""
+    cap_max: int = 1_000_000
+    """Most Gaussians (mcmc)."""
+    noise_lr: float = 5e5
+    """Noise on positions, times their learning rate (mcmc)."""
+    opacity_reg: float | None = None
+    """Weight of the mean opacity in the loss; default 0, with mcmc 0.01."""
+    scale_reg: float | None = None
+    """Weight of the mean scale, in units of the scene scale, in the loss; default 0, with mcmc 0.01."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -153,8 +186,19 @@ class TrainConfig:
                 continue
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value <= greatest:
                 raise InputError(f"{name}={value!r} is outside {least:g}..{greatest:g}.")
+        if self.strategy not in RECIPES:
+            raise InputError(f"strategy={self.strategy!r} is unknown; choose {' or '.join(RECIPES)}.")
+        for name, strategy in BELONGS_TO.items():
+            if strategy != self.strategy and getattr(self, name) != type(self).__dataclass_fields__[name].default:
+                raise InputError(f"{name} belongs to strategy {strategy}, and this is {self.strategy}; leave it out.")
         if self.near_plane is not None and self.near_plane >= self.far_plane:
             raise InputError(f"near_plane={self.near_plane:g} is not below far_plane={self.far_plane:g}.")
+
+    @property
+    def recipe(self) -> Recipe:
+        """Settings in force where the defaults belong to the strategy."""
+        given = {name: getattr(self, name) for name in Recipe._fields}
+        return RECIPES[self.strategy]._replace(**{name: value for name, value in given.items() if value is not None})
 
     @property
     def schedule(self) -> int:

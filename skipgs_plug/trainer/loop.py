@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from skipgs_plug.fallback_raster.launch import release_memory
 from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.exposure import Exposure
 from skipgs_plug.trainer.mask import leave_out
+from skipgs_plug.trainer.mcmc import Mcmc
 from skipgs_plug.trainer.model import create_optimizers, create_splats
 from skipgs_plug.trainer.near_plane import near_plane
 from skipgs_plug.trainer.order import ViewOrder, derive_seed
@@ -61,7 +65,9 @@ class Trainer:
         step: next iteration, 0-based.
         ran: iterations that ran, which is fewer where a gate leaves some out; every view has its turn among these.
         splats: raw parameters `means scales quats opacities sh0 shN`.
+        strategy: gsplat's DefaultStrategy, or None where `mcmc` densifies.
         optimizers: one per parameter, by the same names.
+        exposure: colour correction of each photograph, with an optimizer of its own; None unless asked for.
         refine_stop_iter: end of densification in iterations of this run.
         near_plane: near clipping plane, world units.
         on_step: called after every iteration, outside the clock.
@@ -79,18 +85,31 @@ class Trainer:
         self._since: int | None = None  # number after the previous iteration, set by `train`
         self.splats = create_splats(scene, config, self.backend.device)
         self.optimizers = create_optimizers(self.splats, config, scene.scene_scale)
-        self.strategy = create_strategy(config)
-        self.strategy.check_sanity(self.splats, self.optimizers)
-        self.strategy_state: dict[str, Any] = self.strategy.initialize_state(scene_scale=scene.scene_scale)
-        self.refine_stop_iter: int = self.strategy.refine_stop_iter
+        self.mcmc = Mcmc(config, scene.scene_scale) if config.strategy == "mcmc" else None
+        self.strategy: Any = None
+        self.strategy_state: dict[str, Any] = {}
+        if self.mcmc is None:
+            self.strategy = create_strategy(config)
+            self.strategy.check_sanity(self.splats, self.optimizers)
+            self.strategy_state = self.strategy.initialize_state(scene_scale=scene.scene_scale)
+        self.refine_stop_iter = config.scaled(config.recipe.refine_stop_iter)
         self.view_names = [view.name for view in scene.train]
         self.clock = TrainClock(self.backend.device)
         self.registered: dict[str, Stateful] = {}
+        self.exposure = Exposure(self.view_names, self.backend.device) if config.exposure else None
+        if self.exposure is not None:
+            self.register_state("exposure", self.exposure)
         self.on_step: Callable[[Iteration], None] | None = None
         self.stop_requested = False
         self._order = ViewOrder(len(scene.train), config.seed)
+        self._recipe = config.recipe
         self._sh_interval = config.scaled(config.sh_degree_interval)
         self._warm = False
+
+    @property
+    def all_optimizers(self) -> list[torch.optim.Optimizer]:
+        """Those of the Gaussians' parameters, and that of the exposure."""
+        return [*self.optimizers.values(), *([] if self.exposure is None else [self.exposure.optimizer])]
 
     @property
     def phase_seconds(self) -> dict[str, float]:
@@ -109,7 +128,7 @@ class Trainer:
 
     def train(self, until: int | None = None, progress: bool = True) -> None:
         """Run iterations up to `until` (exclusive; default max_steps), fewer when `stop_requested` is set."""
-        from tqdm import tqdm
+        from tqdm.auto import tqdm
 
         until = self.max_steps if until is None else min(until, self.max_steps)
         bar = tqdm(total=until, initial=self.step, desc="Training", disable=not progress, mininterval=0.5)
@@ -147,18 +166,20 @@ class Trainer:
         self.clock.start()
         image, target, info = self._forward(view, self.active_sh_degree(step), step)
         self.clock.mark("forward")
-        if densifying:
+        if densifying and self.strategy is not None:
             self.strategy.step_pre_backward(self.splats, self.optimizers, self.strategy_state, step, info)
-        loss = self.backend.loss(image, target, self.config.ssim_lambda)
+        loss = self._loss(image, target)
         value = float(loss.detach())
         self.clock.mark("loss")
         self.backward(loss, view.name, step)
         self.clock.mark("backward")
-        self._optimizer_step(info)
+        updated = self._optimizer_step(info)
         self.clock.mark("optimizer")
+        if self.mcmc is not None:
+            self._move(self.mcmc, step, updated)
         # A gate may have left this iteration without gradients, which densification averages.
-        if densifying and info["means2d"].grad is not None:
-            self._densify(step, info)
+        elif densifying and info["means2d"].grad is not None:
+            self._densify(self.strategy, step, info)
         self.clock.mark("strategy")
         self.clock.stop(after_densification=not densifying)
 
@@ -185,10 +206,12 @@ class Trainer:
         loss.backward()
 
     def set_learning_rate(self, step: float) -> None:
-        """Set the positions' learning rate to that of iteration `step`; the others are constant."""
-        decay = MEANS_LR_END ** min(step / self.config.schedule, 1.0)
-        rate = self.config.means_lr * self.scene.scene_scale * decay
+        """Set the learning rates of positions and exposure to those of iteration `step`; the others are constant."""
+        progress = min(step / self.config.schedule, 1.0)
+        rate = self.config.means_lr * self.scene.scene_scale * MEANS_LR_END**progress
         self.optimizers["means"].param_groups[0]["lr"] = rate
+        if self.exposure is not None:
+            self.exposure.set_learning_rate(progress)
 
     def active_sh_degree(self, step: int) -> int:
         """Return the SH degree that iteration `step` renders with."""
@@ -196,10 +219,10 @@ class Trainer:
 
     @torch.no_grad()
     def render(self, view: View) -> Tensor:
-        """Return the image [H, W, 3] of a view, in [0, 1] up to overshoot."""
+        """Return the image [H, W, 3] of a view, in [0, 1] up to overshoot; of a training view with its exposure."""
         degree = self.active_sh_degree(max(self.step - 1, 0))
         image, _ = self._rasterize(view, degree, self._background())
-        return image
+        return self._exposed(image, view)
 
     def evaluate(self, split: str = "test", lpips_net: str | None = None) -> dict[str, Any]:
         """Return the means of the chosen metrics over the views of "test" or "train", and what belongs to them.
@@ -210,7 +233,7 @@ class Trainer:
         views = {"test": self.scene.test, "train": self.scene.train}[split]
         if not views:
             raise InputError(f"Scene {self.scene.name} has no {split} views; lower test_every to hold some out.")
-        wanted = metrics.chosen(lpips_net)
+        wanted = metrics.chosen(lpips_net, fitted=self.exposure is not None and split == "test")
         with self.backend.exclusive_cores():
             rows = [self._measure(wanted, view) for view in views]
         means = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
@@ -258,7 +281,10 @@ class Trainer:
             generator = torch.Generator().manual_seed(derive_seed(self.config.seed, step))
             background = torch.rand(3, generator=generator).to(self.backend.device)
         image, info = self._rasterize(view, degree, background)
-        return (*leave_out(image, self._target(view), view.mask), info)
+        return (*leave_out(self._exposed(image, view), self._target(view), view.mask), info)
+
+    def _exposed(self, image: Tensor, view: View) -> Tensor:
+        return image if self.exposure is None else self.exposure.apply(image, view.name)
 
     def _rasterize(self, view: View, degree: int, background: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
         return self.backend.render(
@@ -282,15 +308,29 @@ class Trainer:
         return torch.tensor(self.scene.background, dtype=torch.float32, device=self.backend.device)
 
     def _target(self, view: View) -> Tensor:
-        return view.image.to(self.backend.device).float() / 255.0
+        return view.image.to(self.backend.device).float().div_(255.0)
 
-    def _optimizer_step(self, info: dict[str, Any]) -> None:
+    def _loss(self, image: Tensor, target: Tensor) -> Tensor:
+        loss = self.backend.loss(image, target, self.config.ssim_lambda)
+        recipe = self._recipe
+        if recipe.opacity_reg > 0.0:
+            loss = loss + recipe.opacity_reg * torch.sigmoid(self.splats["opacities"]).mean()
+        if recipe.scale_reg > 0.0:
+            loss = loss + recipe.scale_reg / self.scene.scene_scale * torch.exp(self.splats["scales"]).mean()
+        return loss
+
+    def _optimizer_step(self, info: dict[str, Any]) -> bool:
+        """Step; returns whether positions were updated, which a gate may leave out or put off."""
+        pending = self.splats["means"].grad is not None
         for optimizer in self.optimizers.values():
             if self.config.visible_adam:
                 optimizer.step(self._visible(info))  # type: ignore[call-overload]
             else:
                 optimizer.step()
             optimizer.zero_grad(set_to_none=True)
+        if self.exposure is not None:
+            self.exposure.step()
+        return pending and self.splats["means"].grad is None
 
     def _visible(self, info: dict[str, Any]) -> Tensor:
         """Return which Gaussians the image shows [N]."""
@@ -300,22 +340,40 @@ class Trainer:
         visible[info["gaussian_ids"]] = True
         return visible
 
-    def _densify(self, step: int, info: dict[str, Any]) -> None:
-        # gsplat draws split noise from the global generator; seeding it by step makes resuming exact and
-        # leaves the caller's random state alone.
-        with torch.random.fork_rng(enabled=step % self.strategy.refine_every == 0):
-            if step % self.strategy.refine_every == 0:
-                torch.manual_seed(derive_seed(self.config.seed, step))
+    def _densify(self, strategy: Any, step: int, info: dict[str, Any]) -> None:
+        due = step % strategy.refine_every == 0
+        if due:
+            release_memory()  # of gradients, while copies of all parameters and moments are made
+        with self._seeded(step) if due else nullcontext():
             args = (self.splats, self.optimizers, self.strategy_state, step)
-            self.strategy.step_post_backward(*args, info, packed=info["gaussian_ids"] is not None)
-            reset_opacity_if_missed(self.strategy, *args)
-        if sorts_rows(self.strategy, step):
+            strategy.step_post_backward(*args, info, packed=info["gaussian_ids"] is not None)
+            reset_opacity_if_missed(strategy, *args)
+        if sorts_rows(strategy, step):
             sort_rows(self.splats, self.optimizers, self.strategy_state)
+
+    def _move(self, mcmc: Mcmc, step: int, updated: bool) -> None:
+        # The noise belongs to the update: alone it is a random walk.
+        if updated or mcmc.moves(step):
+            if mcmc.moves(step):
+                release_memory()
+            rate = self.optimizers["means"].param_groups[0]["lr"] if updated else 0.0
+            with self._seeded(step):
+                mcmc.after_update(self.splats, self.optimizers, step, rate)
+
+    @contextmanager
+    def _seeded(self, step: int) -> Iterator[None]:
+        """Let gsplat, which draws from the global generator, draw what belongs to this iteration.
+
+        So resuming is exact, and the caller's random state is left alone.
+        """
+        with torch.random.fork_rng():
+            torch.manual_seed(derive_seed(self.config.seed, step))
+            yield
 
     def _warm_up(self, view: View) -> None:
         """Compile kernels before the clock runs: one forward and backward whose gradients are dropped."""
         image, target, _ = self._forward(view, self.config.sh_degree, 0)
-        self.backend.loss(image, target, self.config.ssim_lambda).backward()
-        for optimizer in self.optimizers.values():
+        self._loss(image, target).backward()
+        for optimizer in self.all_optimizers:
             optimizer.zero_grad(set_to_none=True)
         self._warm = True

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.exposure import fit_colours
+from skipgs_plug.trainer.mask import leave_out
 
 SSIM_FLAVOUR = "torchmetrics: 11x11 Gaussian window, reflect padding, border cropped"
 LPIPS_WEIGHTS = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
@@ -31,6 +33,7 @@ class Metric:
         unit: shown after the label.
         tag: name in TensorBoard, where gsplat names no flavour; the key itself if empty.
         net: LPIPS backbone, which must be asked for; None for a metric of every evaluation.
+        fitted: of the render after `fit_colours`, for models that were trained with exposure.
     """
 
     name: str
@@ -41,6 +44,7 @@ class Metric:
     unit: str = ""
     tag: str = ""
     net: str | None = None
+    fitted: bool = False
 
     @property
     def heading(self) -> str:
@@ -99,11 +103,28 @@ def batch(image: Tensor) -> Tensor:
     return image.permute(2, 0, 1)[None]
 
 
+def after_fit(
+    measure: Callable[[Tensor, Tensor, Tensor | None], float],
+) -> Callable[[Tensor, Tensor, Tensor | None], float]:
+    """Return the metric of a render whose colours were fitted to the target's."""
+
+    def fitted(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+        image, target = leave_out(fit_colours(render, target, mask), target, mask)
+        return measure(image, target, mask)
+
+    return fitted
+
+
+FITTED = "after the affine map of colours, fitted per image, that is closest to the target"
+
 METRICS = {
     metric.name: metric
     for metric in (
         Metric("psnr", "PSNR", 2, "mean of per-image PSNR, float render clamped to [0, 1]", psnr, unit="dB"),
         Metric("ssim", "SSIM", 4, SSIM_FLAVOUR, ssim),
+        # As gsplat calls them.
+        Metric("cc_psnr", "PSNR, colours fitted,", 2, FITTED, after_fit(psnr), unit="dB", fitted=True),
+        Metric("cc_ssim", "SSIM, colours fitted", 4, f"{SSIM_FLAVOUR}; {FITTED}", after_fit(ssim), fitted=True),
         *(
             Metric(
                 f"lpips_{net}", f"LPIPS {net}", 4, f"torchmetrics, backbone {net}, inputs normalised to [-1, 1]",
@@ -115,9 +136,9 @@ METRICS = {
 }  # fmt: skip
 
 
-def chosen(lpips_net: str | None = None) -> list[Metric]:
-    """Return the metrics of every evaluation, and LPIPS with a backbone if one is named."""
-    return [metric for metric in METRICS.values() if metric.net in (None, lpips_net)]
+def chosen(lpips_net: str | None = None, fitted: bool = False) -> list[Metric]:
+    """Return the metrics of every evaluation, LPIPS with a backbone if one is named, and those of fitted colours."""
+    return [metric for metric in METRICS.values() if metric.net in (None, lpips_net) and metric.fitted <= fitted]
 
 
 def measure(metrics: Sequence[Metric], render: Tensor, target: Tensor, mask: Tensor | None = None) -> dict[str, float]:

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from skipgs_plug.fallback_raster.optimizer import Adam
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.scene import Scene
 from skipgs_plug.trainer.selective_adam import SelectiveAdam
@@ -33,9 +34,9 @@ def one_per_point(scene: Scene, config: TrainConfig) -> dict[str, Tensor]:
     rgb = scene.points_rgb.float() / 255.0
     return {
         "means": scene.points.clone(),
-        "scales": torch.log(neighbour_distance(scene.points) * config.init_scale)[:, None].repeat(1, 3),
+        "scales": torch.log(neighbour_distance(scene.points) * config.recipe.init_scale)[:, None].repeat(1, 3),
         "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        "opacities": torch.logit(torch.full((n,), config.init_opa)),
+        "opacities": torch.logit(torch.full((n,), config.recipe.init_opa)),
         "sh0": ((rgb - 0.5) / SH_C0)[:, None, :],
         "shN": torch.zeros(n, (config.sh_degree + 1) ** 2 - 1, 3),
     }
@@ -53,7 +54,7 @@ def neighbour_distance(points: Tensor) -> Tensor:
 def create_optimizers(
     splats: nn.ParameterDict, config: TrainConfig, scene_scale: float
 ) -> dict[str, torch.optim.Optimizer]:
-    """Return one Adam per parameter, learning rates as in gsplat's simple_trainer."""
+    """Return one Adam per parameter, learning rates as in gsplat's simple_trainer; on the CPU it runs on all cores."""
     rates = {
         "means": config.means_lr * scene_scale,
         "scales": config.scales_lr,
@@ -67,6 +68,8 @@ def create_optimizers(
         group = [{"params": [splats[name]], "lr": rate, "name": name}]
         if config.visible_adam:
             optimizers[name] = SelectiveAdam(group, eps=ADAM_EPS)
-        else:
+        elif splats[name].is_cuda:
             optimizers[name] = torch.optim.Adam(group, eps=ADAM_EPS, fused=True)
+        else:
+            optimizers[name] = Adam(group, eps=ADAM_EPS)
     return optimizers

@@ -15,6 +15,7 @@ from skipgs_plug.trainer.files import write_json
 from skipgs_plug.trainer.loop import Trainer
 
 CHECKPOINT = re.compile(r"ckpt_(\d+)_rank0\.pt")
+SCENE = "scene"  # folder in a run, of the scene that was made of photographs for it
 KEPT = 2  # checkpoints; the older one serves when the last is damaged
 FOLDERS = ("", "ckpts", "ply", "stats", "renders")
 

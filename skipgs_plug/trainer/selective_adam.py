@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.fallback_raster.adam import adam_rows
+from skipgs_plug.fallback_raster.optimizer import moments
 
 
 class SelectiveAdam(torch.optim.Adam):
@@ -26,11 +27,7 @@ class SelectiveAdam(torch.optim.Adam):
             for param in group["params"]:
                 if param.grad is None:
                     continue
-                state = self.state[param]
-                if not state:
-                    state["step"] = torch.tensor(0.0)
-                    state["exp_avg"] = torch.zeros_like(param)
-                    state["exp_avg_sq"] = torch.zeros_like(param)
+                state = moments(self, param)
                 state["step"] += 1
-                moments = state["exp_avg"], state["exp_avg_sq"]
-                adam_rows(visibility, param, *moments, group["lr"], group["betas"], group["eps"])
+                means = state["exp_avg"], state["exp_avg_sq"]
+                adam_rows(visibility, param, *means, group["lr"], group["betas"], group["eps"])

@@ -26,7 +26,7 @@ def create_strategy(config: TrainConfig) -> Any:
         grow_scale3d=config.grow_scale3d,
         prune_scale3d=config.prune_scale3d,
         refine_start_iter=config.scaled(config.refine_start_iter),
-        refine_stop_iter=config.scaled(config.refine_stop_iter),
+        refine_stop_iter=config.scaled(config.recipe.refine_stop_iter),
         refine_every=config.scaled_interval(config.refine_every, MIN_REFINE_EVERY),
         reset_every=reset_interval(config),
         absgrad=config.absgrad,
@@ -41,7 +41,7 @@ def reset_interval(config: TrainConfig) -> int:
     MIN_RESET_EVERY iterations; the schedule of 30,000 iterations stays as it is, and so does an interval that was
     asked to be shorter.
     """
-    stop = config.scaled(config.refine_stop_iter)
+    stop = config.scaled(config.recipe.refine_stop_iter)
     every = config.scaled_interval(config.reset_every, MIN_RESET_EVERY)
     if every < MIN_RESET_EVERY:
         return every

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from skipgs_plug.trainer.backend import Backend
 
-NEAR_PLANE = 0.01
 DEPTH_QUANTILES = (0.02, 0.98)
 
 
@@ -19,12 +18,16 @@ class Painter:
 
     Args:
         background: colour in [0, 1] behind the model.
+        near_plane: in scene units.
         antialiased: as the model was trained.
     """
 
-    def __init__(self, backend: Backend, background: tuple[float, float, float], antialiased: bool = False) -> None:
+    def __init__(
+        self, backend: Backend, background: tuple[float, float, float], near_plane: float, antialiased: bool = False
+    ) -> None:
         self._backend = backend
         self._background = background
+        self._near_plane = near_plane
         self._mode = "antialiased" if antialiased else "classic"
 
     @torch.no_grad()
@@ -51,7 +54,7 @@ class Painter:
                 Ks=K[None].to(device),
                 width=width,
                 height=height,
-                near_plane=NEAR_PLANE,
+                near_plane=self._near_plane,
                 sh_degree=round((1 + raw["shN"].shape[1]) ** 0.5) - 1,
                 render_mode="RGB+ED",
                 rasterize_mode=self._mode,

@@ -12,14 +12,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.loaders import load_scene
+from skipgs_plug.trainer.near_plane import near_plane
 from skipgs_plug.trainer.ply import read_ply
-from skipgs_plug.trainer.scene import Scene
+from skipgs_plug.trainer.run_folder import SCENE
+from skipgs_plug.trainer.scene import BLACK, Scene
 
 # Where trainers leave their models: ours and gsplat's, then Inria's and those of its family. The last one of an
 # iteration counts: it is the format that is quickest to read.
 PLACES = ("ckpts/ckpt_*_rank0.pt", "point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
+LOADING = ("test_every", "init_num_pts", "init_ply")  # settings that change what a scene is loaded as
+NEAR_PLANE = 0.01  # of a PLY alone
 NUMBER = re.compile(r"(?:ckpt|point_cloud|iteration)_(\d+)")
 
 
@@ -47,12 +52,24 @@ class Snapshot:
 
 @dataclass
 class Model:
-    """Snapshots by iteration, the scene if it is known, and the settings that change how a model looks."""
+    """Snapshots by iteration, the scene if it is known, and the settings that change how a model looks.
+
+    Attributes:
+        near_plane: that it was trained with, or what suits the scene.
+        exposure: whether photographs differ from the model by an exposure of their own.
+    """
 
     name: str
     snapshots: list[Snapshot]
     scene: Scene | None
+    near_plane: float = NEAR_PLANE
     antialiased: bool = False
+    exposure: bool = False
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """Colour in [0, 1] behind it."""
+        return self.scene.background if self.scene else BLACK
 
 
 def open_model(path: str | Path, scene: str | None = None, data_factor: int | None = None) -> Model:
@@ -81,11 +98,19 @@ def open_model(path: str | Path, scene: str | None = None, data_factor: int | No
     factor = data_factor or config.get("data_factor", 1)
     loaded = None
     if source:
+        if not scene and not Path(source).exists() and (path / SCENE).is_dir():
+            source = path / SCENE  # the run was moved together with it
         if not scene and not Path(source).exists():
             raise MissingFileError(f"{path} was trained on {source}, which does not exist here; add --scene.")
-        splits = {name: config[name] for name in ("test_every", "init_num_pts") if name in config}
-        loaded = load_scene(source, factor, **splits)
-    return Model(path.stem, snapshots, loaded, bool(config.get("antialiased", False)))
+        loaded = load_scene(source, factor, **{name: config[name] for name in LOADING if name in config})
+    return Model(
+        path.stem,
+        snapshots,
+        loaded,
+        near_plane(TrainConfig(near_plane=config.get("near_plane")), loaded) if loaded else NEAR_PLANE,
+        bool(config.get("antialiased", False)),
+        bool(config.get("exposure", False)),
+    )
 
 
 def find_snapshots(folder: Path) -> list[Snapshot]:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skipgs_plug.trainer.mask import leave_out
 from skipgs_plug.trainer.metrics import psnr
 from skipgs_plug.trainer.scene import Scene, View
 from skipgs_plug.view.draw import to_bytes
@@ -108,13 +109,14 @@ class Page:
             return
         view = self._views[self._choice.value]
         image = self._draw(self._splats, view).cpu()
-        truth = view.image.float() / 255
-        error = (image - truth).abs() * ERROR_GAIN
+        shown, truth = leave_out(image, view.image.float() / 255, view.mask)
+        error = (shown - truth).abs() * ERROR_GAIN
         pictures = (view.image.numpy(), to_bytes(image), to_bytes(error))
         for handle, picture in zip(self._pictures, pictures, strict=True):
             handle.image = picture
         kind = "held out" if view.name in self._held_out else "trained on"
-        self._quality.content = f"PSNR **{psnr(image, truth):.2f} dB** ({kind})"
+        kind += "" if view.mask is None else ", without what its mask leaves out"
+        self._quality.content = f"PSNR **{psnr(shown, truth, view.mask):.2f} dB** ({kind})"
 
     def measure(self) -> None:
         """Measure every held-out view of the model that is shown, colour its camera, and list the worst."""
@@ -122,7 +124,7 @@ class Page:
             return
         quality = {}
         for view in self._scene.test:
-            quality[view.name] = psnr(self._draw(self._splats, view).cpu(), view.image.float() / 255)
+            quality[view.name] = psnr(self._draw(self._splats, view).cpu(), view.image.float() / 255, view.mask)
         worst = sorted(quality, key=lambda name: quality[name])
         low, high = quality[worst[0]], quality[worst[-1]]
         for name, value in quality.items():

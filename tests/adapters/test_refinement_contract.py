@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 from cases import CASES, run
-from lookalikes import step_trainer
+from lookalikes import inria, step_trainer
 from lookalikes.splats import Log, log, new_log
 
 from skipgs_plug import SkipGate
@@ -120,6 +120,26 @@ def test_interrupted_and_resumed_leaves_out_the_same(case, begun):
     assert begun == numbers
     if case.module.ADAPTER not in ("nerfstudio",):  # its schedulers are not in the look-alike's checkpoint
         assert same(log.current, whole.current)
+
+
+def test_a_progress_bar_that_is_moved_on_by_hand_counts_all_iterations(monkeypatch):
+    bars = []
+
+    class Bar:
+        def __init__(self, numbers, **_):
+            self.total, self.at, self.closed = len(numbers), 0, False
+            bars.append(self)
+
+        def update(self, count):
+            self.at += count
+
+        def close(self):
+            self.closed = True
+
+    monkeypatch.setattr(inria, "tqdm", Bar)
+    gate = run(next(case for case in CASES if case.module is inria), refine_share=SHARE)[1]
+    assert gate.report()["iterations_skipped"] > 0
+    assert [(bar.total, bar.at, bar.closed) for bar in bars] == [(60, 60, True)]
 
 
 @each

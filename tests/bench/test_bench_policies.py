@@ -1,9 +1,6 @@
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
-import torch
 
 from skipgs_plug.bench.policies import POLICIES, check_policies, rounds
 from skipgs_plug.bench.record import RunRecord
@@ -35,14 +32,11 @@ def test_policies_run_in_turns_with_those_that_copy_from_the_same_rounds():
     assert len(firsts) == 12  # every order of four and three
 
 
-@pytest.mark.parametrize(("device", "clock"), [("cpu", "processor_post"), ("cuda", "t_post")])
-def test_shortened_takes_the_time_of_the_gate(scene, monkeypatch, device, clock):
+def test_shortened_takes_the_time_of_the_gate(scene):
     trainer = Trainer(TrainConfig(max_steps=2000), scene)
-    monkeypatch.setattr(trainer, "backend", SimpleNamespace(device=torch.device(device)))
 
     def shortened(gate_seconds: float) -> int:
-        seconds = {"gate": gate_seconds, "ungated": 100.0}
-        earlier = {name: RunRecord(0, name, **{clock: seconds[name]}) for name in seconds}
+        earlier = {name: RunRecord(0, name, t_post=t) for name, t in {"gate": gate_seconds, "ungated": 100.0}.items()}
         return POLICIES["shortened"].iterations(trainer, earlier)
 
     assert shortened(60.0) == 600

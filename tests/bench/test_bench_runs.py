@@ -8,9 +8,11 @@ import pytest
 import torch
 from bench_fixtures import MAX_STEPS, SEEDS, early_floor, make_bench
 
+from skipgs_plug.bench import runner
 from skipgs_plug.bench.policies import POLICIES, PolicySpec
 from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.bench.refine import PARTS, compressed, densify, peak_memory
+from skipgs_plug.bench.store import BenchFolder
 from skipgs_plug.bench.summary import summarise
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.backend import resolve_backend
@@ -267,3 +269,9 @@ def test_densify_stops_where_refinement_begins(scene):
     trainer = Trainer(TrainConfig(max_steps=20), scene)
     densify(trainer, progress=False)
     assert trainer.step == trainer.refine_stop_iter == 10
+
+
+def test_processor_time_is_for_the_cpu(monkeypatch, tmp_path, scene):
+    monkeypatch.setattr(runner, "resolve_backend", lambda name: SimpleNamespace(device=torch.device("cuda")))
+    with pytest.raises(InputError, match="--clock processor is for the CPU"):
+        runner.Bench(scene, TrainConfig(max_steps=40), BenchFolder(tmp_path), [0], ["ungated"], clock="processor")

@@ -21,7 +21,7 @@ def record(policy: str, seed: int, t_post: float, backwards: int = 100, psnr: fl
     phases = {"forward": 0.4 * t_post, "loss": 0.1 * t_post, "backward": 0.4 * t_post, "optimizer": 0.1 * t_post}
     return RunRecord(
         seed, policy, iterations=100, iterations_run=100, backwards=backwards, t_post=t_post,
-        t_total=T_DENSIFY + t_post, processor_post=t_post, phases={**phases, "strategy": 0.0},
+        t_total=T_DENSIFY + t_post, phases={**phases, "strategy": 0.0},
         metrics={"psnr": psnr, "ssim": 0.5, "num_GS": 10}, train_metrics={"psnr": psnr + 2, "ssim": 0.6},
         points=[Point(0, 0.0, {"psnr": 19.0}), Point(100, t_post, {"psnr": psnr})],
         trace=Trace(0, [0], [0.1], [None], "w"),

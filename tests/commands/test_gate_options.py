@@ -40,5 +40,5 @@ def test_there_is_one_for_every_setting() -> None:
 def test_what_is_given_reaches_the_gate(args, own) -> None:
     options = [word for name, value in GIVEN.items() for word in (f"--{name.replace('_', '-')}", str(value))]
     config = (tyro.conf.FlagCreatePairsOff,)
-    assert tyro.cli(args, args=[*own, *options], config=config).gate.given() == GIVEN
-    assert tyro.cli(args, args=own, config=config).gate.given() == {}
+    assert tyro.cli(args, args=[*own, *options], config=config).gate_options.given() == GIVEN
+    assert tyro.cli(args, args=own, config=config).gate_options.given() == {}

@@ -182,7 +182,6 @@ def test_a_run_is_extended(tmp_path: Path, packed: str, whole: Path, capsys: pyt
     ("options", "sentence"),
     [
         (["--threshold", "0.1"], r"gate.threshold=0.0, not 0.1"),
-        (["--no-gate"], r"begun with the gate"),
         (["--sh0-lr", "0.1"], r"sh0_lr=0.0025, not 0.1"),
     ],
 )

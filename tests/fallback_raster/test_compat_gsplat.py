@@ -10,7 +10,8 @@ pytest.importorskip("gsplat")
 
 from skipgs_plug.fallback_raster import rasterization
 from skipgs_plug.fallback_raster.compat import serve
-from skipgs_plug.fallback_raster.compat.gsplat_script import compute_relocation, quat_scale_to_covar_preci
+from skipgs_plug.fallback_raster.compat.relocation import compute_relocation
+from skipgs_plug.fallback_raster.compat.strategy_operations import quat_scale_to_covar_preci
 
 
 def binomials(n_max):

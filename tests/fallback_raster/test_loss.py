@@ -72,7 +72,7 @@ def beyond_one(shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
 
 
 PICTURES = [noisy, unrelated, nearly_constant, offset_constant, offset_colours, half_black, beyond_one]
-# Around one vector (16 floats), one band (32 rows), one chunk (128 floats), and the window (11).
+# Around one vector (16 floats), one band (64 rows), one chunk (128 floats), and the window (11).
 SHAPES = [
     (1, 1, 3),
     (1, 40, 3),
@@ -82,7 +82,8 @@ SHAPES = [
     (32, 16, 1),
     (33, 47, 3),
     (70, 90, 4),
-    (2, 35, 17, 3),
+    (2, 67, 17, 3),
+    (14, 13, 32),
 ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -15,7 +16,8 @@ from raster_scenes import leaves, random_scene
 
 from skipgs_plug.fallback_raster import binning, get_num_threads, l1_ssim_loss, launch, rasterization, set_num_threads
 from skipgs_plug.fallback_raster.adam import adam_rows
-from skipgs_plug.fallback_raster.cache import load_or_rebuild
+from skipgs_plug.fallback_raster.cache import load_or_rebuild, say_unwritable
+from skipgs_plug.files import WriteError
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -233,6 +235,17 @@ def test_a_damaged_kernel_cache_is_rebuilt_and_compiling_prints_nothing(tmp_path
     compiled.write_bytes(bytes(damaged))
     render()
     assert compiled.read_bytes() == good
+
+
+def test_a_cache_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    code = "import sys\nfrom skipgs_plug.commands.doctor import check_backend\ncheck_backend('warp')"
+    said = run("-c", code, WARP_CACHE_PATH=str(tmp_path / "file/cache"))
+    assert len(said.splitlines()) == 1 and "Errno" not in said
+    assert "Not a directory; set WARP_CACHE_PATH to a folder that can be written." in said
+    folder = tmp_path / "kernel"
+    with pytest.raises(WriteError, match=f"compiled kernels in {folder}: Read-only file system"), say_unwritable():
+        raise OSError(errno.EROFS, "Read-only file system", str(folder))
 
 
 def test_what_does_not_load_is_compiled_again_once(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from skipgs_plug.cli import main
 from skipgs_plug.photos.progress import counted
 from skipgs_plug.photos.reconstruct import key_pairs
 from skipgs_plug.trainer import load_scene
+from skipgs_plug.view.model import open_model
 
 # imageio-ffmpeg leaves the pipes of a decoder that has ended to the garbage collector.
 LEAVES_PIPES = "ignore:unclosed file:ResourceWarning"
@@ -55,6 +56,43 @@ def test_a_video_becomes_a_scene(fern, tmp_path, capsys):
     assert re.search(r"[78] of 8 photographs placed \(sequential matching\)", captured.out) and captured.err == ""
     names = sorted(path.name for path in (tmp_path / "scene/images").iterdir())
     assert set(names) <= {f"frame_{i:06d}.jpg" for i in range(8)} and len(names) >= 7
+
+
+@pytest.mark.filterwarnings(LEAVES_PIPES)
+def test_a_video_is_trained_on_with_one_command(fern, tmp_path, capsys):
+    frames = np.stack([np.array(Image.open(path).convert("RGB"))[:188] for path in fern[:6]])
+    video, run = tmp_path / "walk.mp4", tmp_path / "runs/walk"
+    iio.imwrite(video, frames, plugin="FFMPEG", fps=10, quality=9, macro_block_size=2)
+    train = ["train", str(video), "--out", str(run), "--no-progress", "--data-factor", "4"]
+    assert main([*train, "--max-steps", "6"]) == 2
+    assert "add --sfm to find that out first, or run: skipgs-plug sfm" in capsys.readouterr().err
+    assert not run.exists()
+    assert main([*train, "--max-steps", "6", "--sfm"]) == 0
+    shown = capsys.readouterr().out
+    assert "photographs placed" in shown and f"Next: skipgs-plug view {run}" in shown
+    assert (run / "scene/sparse/0").is_dir() and (run / "ply/point_cloud_5.ply").is_file()
+    assert main([*train, "--max-steps", "8", "--sfm", "--resume"]) == 0
+    assert "placed" not in capsys.readouterr().out  # the scene is there
+    run = run.rename(tmp_path / "moved")
+    model = open_model(run)
+    assert model.scene is not None and len(model.scene.train) >= 4
+
+
+def test_photographs_are_told_from_scenes(fern, tmp_path, capsys):
+    photos = tmp_path / "photos"
+    (photos / "first day").mkdir(parents=True)
+    out = ["--out", str(tmp_path / "run")]
+    assert main(["train", str(photos), *out, "--sfm"]) == 2
+    assert "is neither a video nor a folder with photographs; leave out --sfm" in capsys.readouterr().err
+    (photos / "first day/one.JPG").write_bytes(b"")
+    assert main(["train", str(photos), *out]) == 2
+    assert "holds photographs and nothing that says where they were taken; add --sfm" in capsys.readouterr().err
+    (photos / "transforms.json").write_text("{}")
+    assert main(["train", str(photos), *out, "--sfm"]) == 2
+    assert "is a scene already; leave out --sfm" in capsys.readouterr().err
+    assert main(["train", str(photos), *out]) == 2
+    assert "transforms.json" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(

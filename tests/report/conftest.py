@@ -29,14 +29,14 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory) -> str:
 def train_folder(scene_file: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder of `skipgs-plug train`."""
     folder = tmp_path_factory.mktemp("train") / "gated"
-    assert main(["train", scene_file, "--out", str(folder), "--max-steps", "40", "--no-progress"]) == 0
+    assert main(["train", scene_file, "--out", str(folder), "--gate", "--max-steps", "40", "--no-progress"]) == 0
     return folder
 
 
 @pytest.fixture(scope="session")
 def ungated_folder(scene_file: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("train") / "ungated"
-    command = ["train", scene_file, "--out", str(folder), "--max-steps", "40", "--no-gate", "--no-progress"]
+    command = ["train", scene_file, "--out", str(folder), "--max-steps", "40", "--no-progress"]
     assert main(command) == 0
     return folder
 

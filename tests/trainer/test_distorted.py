@@ -82,12 +82,10 @@ def assert_straight(view: View) -> None:
 @pytest.mark.parametrize("model", LENSES)
 def test_colmap(tmp_path: Path, model: str, caplog: pytest.LogCaptureFixture) -> None:
     folder = write_lens(tmp_path / "scan", model)
-    before = sorted(folder.rglob("*"))
     scene = load_scene(folder, test_every=0)
     for view in scene.train:
         assert_straight(view)
-    assert f"lens distortion ({model}) is removed on load" in caplog.text
-    assert sorted(folder.rglob("*")) == before
+    assert f"lens distortion ({model}) is removed" in caplog.text
     mask = scene.train[0].mask
     assert mask is not None and scene.train[1].mask is None
     wrong = mask.numpy() != right_half(pinhole_rays(scene.train[0]))

@@ -26,7 +26,7 @@ def test_training_improves_held_out_views(tiny_scene: Scene) -> None:
 
 def test_schedule_scales_together_and_intervals_have_a_floor() -> None:
     full, tenth = TrainConfig(), TrainConfig(max_steps=REFERENCE_STEPS // 10)
-    assert full.scaled(full.refine_stop_iter) == 15_000 and tenth.scaled(tenth.refine_stop_iter) == 1500
+    assert full.scaled(full.recipe.refine_stop_iter) == 15_000 and tenth.scaled(tenth.recipe.refine_stop_iter) == 1500
     assert tenth.scaled(tenth.sh_degree_interval) == 100
     assert tenth.scaled_interval(100, least=100) == 100 and full.scaled_interval(100, least=100) == 100
     assert tenth.scaled_interval(30, least=100) == 30
@@ -83,7 +83,7 @@ def test_opacities_are_reset_though_gsplat_1_5_3_does_not(trainer: Trainer) -> N
 )
 def test_short_runs_reset_opacities_in_time_to_recover(max_steps: int, resets: list[int]) -> None:
     config = TrainConfig(max_steps=max_steps)
-    stop, every = config.scaled(config.refine_stop_iter), reset_interval(config)
+    stop, every = config.scaled(config.recipe.refine_stop_iter), reset_interval(config)
     assert [step for step in range(1, stop) if step % every == 0] == resets
 
 

@@ -17,13 +17,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from browser import Browser, wait_until
+from browser import PATIENCE, Browser, wait_until
 from PIL import Image
 
 from skipgs_plug.trainer import TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.ply import read_ply, write_ply
 from skipgs_plug.view.gaussians import to_gaussians
 from skipgs_plug.view.live import LiveView
+
+pytestmark = pytest.mark.timeout(600)
 
 
 @pytest.fixture
@@ -42,7 +44,7 @@ def serve(*arguments: str) -> Iterator[str]:
         line = process.stdout.readline()
         yield re.search(r"http://\S+", line).group(0) + "/"
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=60) == 0
+        assert process.wait(timeout=PATIENCE) == 0
     finally:
         process.kill()
         process.wait()
@@ -63,11 +65,12 @@ def test_a_run_is_shown_with_its_errors_and_checkpoints(run_folder, browser, tmp
     stats = json.loads((folder / "stats/val_step39.json").read_text())
     with serve(str(folder), "--port", "18411") as url:
         browser.open(url)
-        wait_until(lambda: f"mean {stats['psnr']:.2f} dB" in browser.text())
-        text = browser.text()
-        assert "Iteration 39" in text and f"{stats['num_GS']:,} Gaussians" in text and "(held out)" in text
-        pictures = browser.evaluate("[...document.images].filter(i => i.naturalWidth == 33).length")
-        assert pictures == 3  # render, photograph, error
+        # The page is filled in several messages, in any order.
+        gaussians = f"{stats['num_GS']:,} Gaussians"
+        for expected in ("Iteration 39", gaussians, "held out", "mask", f"mean {stats['psnr']:.2f} dB"):
+            wait_until(lambda expected=expected: expected in browser.text())
+        pictures = "[...document.images].filter(i => i.naturalWidth == 33).length"
+        wait_until(lambda: browser.evaluate(pictures) == 3)  # render, photograph, error
         picture = tmp_path / "page.png"
 
         def drawn() -> bool:

@@ -10,8 +10,11 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from skipgs_plug.cli import main
-from skipgs_plug.trainer import load_scene
-from skipgs_plug.view.draw import colour_depth, depth_range
+from skipgs_plug.trainer import TrainConfig, Trainer, load_scene
+from skipgs_plug.trainer.backend import resolve_backend
+from skipgs_plug.trainer.ply import read_ply
+from skipgs_plug.view.draw import Painter, colour_depth, depth_range
+from skipgs_plug.view.model import open_model
 from skipgs_plug.view.path import camera_path
 
 # imageio-ffmpeg leaves the pipes of a coder that has ended to the garbage collector.
@@ -90,6 +93,38 @@ def test_a_run_whose_scene_has_gone_says_so(run_folder, tmp_path, capsys):
     (tmp_path / "cfg.yml").write_text("data_dir: /gone/scene\n")
     assert main(["render", str(tmp_path), str(tmp_path / "out")]) == 2
     assert "was trained on /gone/scene, which does not exist here; add --scene" in capsys.readouterr().err
+
+
+def test_a_model_is_shown_with_the_settings_of_its_training(scene_file, ply, tmp_path, monkeypatch):
+    """Also from another folder than that in which it was trained."""
+    monkeypatch.chdir(scene_file.parent)
+    options = ["--near-plane", "0.3", "--exposure", "--init-ply", str(ply)]
+    assert main(["train", scene_file.name, "--out", str(tmp_path / "run"), "--max-steps", "3", *options]) == 0
+    monkeypatch.chdir(tmp_path)
+    model = open_model(tmp_path / "run")
+    assert (model.near_plane, model.exposure, model.antialiased) == (0.3, True, False)
+    assert len(model.scene.points) == len(read_ply(ply)["means"])
+    alone, with_scene = open_model(ply), open_model(ply, str(scene_file))
+    assert alone.near_plane == 0.01 and not with_scene.exposure
+    assert with_scene.near_plane == Trainer(TrainConfig(), load_scene(scene_file)).near_plane
+
+
+def test_nothing_nearer_than_the_near_plane_is_drawn(scene_file):
+    view = load_scene(scene_file).train[0]
+    pose = torch.linalg.inv(view.viewmat)
+    splats = {
+        "means": (pose[:3, 3] + 0.2 * pose[:3, 2])[None],
+        "quats": torch.tensor([[1.0, 0, 0, 0]]),
+        "scales": torch.full((1, 3), -3.0),
+        "opacities": torch.full((1,), 5.0),
+        "sh0": torch.ones(1, 1, 3),
+        "shN": torch.zeros(1, 0, 3),
+    }
+    drawn = []
+    for near in (0.01, 0.3):
+        painter = Painter(resolve_backend("warp"), (0.0, 0.0, 0.0), near)
+        drawn.append(float(painter.draw(splats, view.viewmat, view.K, view.width, view.height)[0].max()))
+    assert drawn[0] > 0.5 and drawn[1] == 0
 
 
 def test_the_path_begins_and_ends_at_the_views_and_moves_evenly(scene_file):

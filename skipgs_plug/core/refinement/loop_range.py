@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import functools
+import inspect
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping
 from types import CodeType
 from typing import Any, Protocol
@@ -101,7 +105,7 @@ def replace_range(patches: Patches, names: dict[str, Any], functions: tuple[str,
         frame = sys._getframe(1)
         if not owner.wants_loop or frame.f_code.co_name not in functions or type(numbers) is not range:
             return numbers
-        if numbers.step != 1:
+        if numbers.step != 1 or not is_looped_over(frame.f_code, frame.f_lineno):
             return numbers
         # The training loop has not begun, so these names hold no iteration's tensors.
         return LoopRange(numbers, owner, (frame.f_code, {**frame.f_globals, **frame.f_locals}))
@@ -114,6 +118,46 @@ def replace_range(patches: Patches, names: dict[str, Any], functions: tuple[str,
 
     names["range"] = loop_range
     patches.add_undo(f"{names.get('__name__', '__main__')}.range", undo)
+
+
+@functools.cache
+def is_looped_over(code: CodeType, line: int) -> bool:
+    """Whether a loop of the function may run over what this line makes.
+
+    `progress_bar = tqdm(range(a, b))` that is moved on by hand counts all iterations; in `for step in progress_bar` it
+    counts those that run.
+    """
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(code)))
+    except (OSError, TypeError, SyntaxError):
+        return True
+    line -= code.co_firstlineno - 1
+    made: set[str] = set()
+    given: list[tuple[set[str], set[str]]] = []  # names that assignments set, and those they read
+    looped: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.For, ast.AsyncFor, ast.comprehension)):
+            looped |= _names(node.iter)
+        elif isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            given.append((set().union(*map(_names, targets)), _names(node.value)))
+            if node.lineno <= line <= (node.end_lineno or node.lineno):
+                if not all(isinstance(target, ast.Name) for target in targets):
+                    return True  # an attribute: another function may loop over it
+                made |= given[-1][0]
+    if not made:
+        return True
+    grown = -1
+    while grown != len(looped):
+        grown = len(looped)
+        for targets_, read in given:
+            if targets_ & looped:
+                looped |= read
+    return bool(made & looped)
+
+
+def _names(node: ast.AST) -> set[str]:
+    return {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
 
 
 def line_of(code: CodeType) -> int:

@@ -166,7 +166,7 @@ class Refinement:
         return True
 
     def expected(self, loop: LoopRange) -> int:
-        """How many numbers the loop will run, as far as is known: nobody counts another range with a progress bar."""
+        """How many numbers the loop will run, as far as is known. Ranges that no loop runs over are never asked."""
         numbers = loop.numbers
         before = len(range(numbers.start, min(max(self._start, numbers.start), numbers.stop)))
         return before + round((len(numbers) - before) * (self.share or 1.0))

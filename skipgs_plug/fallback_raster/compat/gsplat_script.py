@@ -12,11 +12,10 @@ from torch import Tensor
 
 from .. import rasterization
 from ..install import install_as_gsplat
-from ..torch_reference_projection import rotation_matrices
 from .lpips import AbsentLpips
 from .packages import usable
-from .relocation import compute_relocation
 from .scene_manager import SceneManager
+from .strategy_operations import strategy_on_cpu
 
 
 @contextmanager
@@ -31,13 +30,9 @@ def gsplat_on_cpu() -> Iterator[None]:
     """
     with _no_cuda_toolkit():
         import gsplat.rendering
-        import gsplat.strategy.ops
     import torchmetrics.image.lpip
 
-    replaced: list[tuple[Any, str, Any]] = [
-        (gsplat.strategy.ops, "compute_relocation", compute_relocation),
-        (gsplat.strategy.ops, "quat_scale_to_covar_preci", quat_scale_to_covar_preci),
-    ]
+    replaced: list[tuple[Any, str, Any]] = []
     if not usable("torchvision"):
         replaced.append((torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", AbsentLpips))
     if tuple(map(int, gsplat.__version__.split(".")[:2])) < (1, 5):
@@ -46,7 +41,7 @@ def gsplat_on_cpu() -> Iterator[None]:
         pycolmap = importlib.import_module("pycolmap")
         if not hasattr(pycolmap, "SceneManager"):
             replaced.append((pycolmap, "SceneManager", SceneManager))
-    with install_as_gsplat():
+    with install_as_gsplat(), strategy_on_cpu():
         before = [(owner, name, getattr(owner, name, None)) for owner, name, _ in replaced]
         for owner, name, stand_in in replaced:
             setattr(owner, name, stand_in)
@@ -80,23 +75,3 @@ def rasterization_1_4(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[s
     """With one radius per Gaussian, as gsplat's strategies read it before 1.5."""
     image, alpha, info = rasterization(*args, **kwargs)
     return image, alpha, info | {"radii": info["radii"].amax(dim=-1)}
-
-
-def quat_scale_to_covar_preci(
-    quats: Tensor,
-    scales: Tensor,
-    compute_covar: bool = True,
-    compute_preci: bool = True,
-    triu: bool = False,
-) -> tuple[Tensor | None, Tensor | None]:
-    """Covariance and its inverse, of Gaussians. [N, 4], [N, 3] -> two of [N, 3, 3] or None
-
-    Raises:
-        NotImplementedError: `triu` is set; the strategies do not.
-    """
-    if triu:
-        raise NotImplementedError("The CPU stand-in returns whole matrices: leave triu False.")
-    rotation = rotation_matrices(quats)
-    roots = (rotation * scales[:, None, :], rotation / scales[:, None, :])
-    covariance, precision = (root @ root.transpose(-1, -2) for root in roots)
-    return covariance if compute_covar else None, precision if compute_preci else None

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..adam import adam_rows
+from ..optimizer import moments
 
 
 class SparseGaussianAdam(torch.optim.Adam):
@@ -28,9 +29,6 @@ class SparseGaussianAdam(torch.optim.Adam):
             (param,) = group["params"]
             if param.grad is None:
                 continue
-            state = self.state[param]
-            if not state:
-                state["step"] = torch.tensor(0.0)
-                state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(param), torch.zeros_like(param)
-            moments = state["exp_avg"], state["exp_avg_sq"]
-            adam_rows(visibility.reshape(N), param, *moments, group["lr"], (0.9, 0.999), group["eps"])
+            state = moments(self, param)
+            means = state["exp_avg"], state["exp_avg_sq"]
+            adam_rows(visibility.reshape(N), param, *means, group["lr"], (0.9, 0.999), group["eps"])

@@ -1,29 +1,48 @@
-// One step for the rows that are seen.
-const long long block_end = (long long)last * width;
+// One step for all rows, or for those that are seen.
+//
+// Rounded as torch rounds its fused Adam: one multiply-add for either mean, everything else operation by operation.
+// A mean below the smallest normal number counts as zero: arithmetic on such numbers takes 40 times as long, and the
+// mean of a row without gradients would stay among them for ever.
+const auto advance = [&](v16 g, v16& m, v16& s, v16& x) INLINE {
+#pragma clang fp contract(off)
+    const v16 towards = g - m, kept = keep2 * s, added = take2 * g;
+    {
+#pragma clang fp contract(fast)
+        m = m + take1 * towards;
+        s = kept + added * g;
+    }
+    m = vabs(m) < 1.17549435e-38f ? (v16)0.0f : m;
+    x = x + -rate * m / (vsqrt(s) / root + eps);
+};
 for (int row = first; row < last;) {
-    if (!seen[row]) {
+    if (only_seen && !seen[row]) {
         ++row;
         continue;
     }
-    // A run of visible rows is one line of floats. What a vector holds beyond its end is written back as it was.
+    // A run of rows is one line of floats.
     const long long begin = (long long)row * width;
-    while (row < last && seen[row]) ++row;
-    const long long end = (long long)row * width;
-    for (long long i = begin; i < end; i += 16) {
-        if (i + 16 > block_end) {  // a whole vector would reach into rows of another core
-            for (long long j = i; j < end; ++j) {
-                const float g = gradient[j];
-                mean[j] = keep1 * mean[j] + take1 * g;
-                square[j] = keep2 * square[j] + take2 * g * g;
-                values[j] -= rate * mean[j] / (__builtin_elementwise_sqrt(square[j]) + eps);
-            }
-            break;
-        }
-        const i16 own = lane < (float)(end - i < 16 ? end - i : 16);
-        const v16 g = load(gradient + i), m = load(mean + i), s = load(square + i), x = load(values + i);
-        const v16 new_m = keep1 * m + take1 * g, new_s = keep2 * s + take2 * g * g;
-        store(mean + i, own ? new_m : m);
-        store(square + i, own ? new_s : s);
-        store(values + i, own ? x - rate * new_m / (vsqrt(new_s) + eps) : x);
+    while (row < last && (!only_seen || seen[row])) ++row;
+    const long long end = (long long)row * width, whole = begin + (end - begin) / 16 * 16;
+    for (long long i = begin; i < whole; i += 16) {
+        v16 m = load(mean + i), s = load(square + i), x = load(values + i);
+        advance(load(gradient + i), m, s, x);
+        store(mean + i, m);
+        store(square + i, s);
+        store(values + i, x);
+    }
+    if (whole == end) continue;
+    v16 g = (v16)0.0f, m = g, s = g, x = g;
+    const int rest = end - whole;
+    for (int j = 0; j < rest; ++j) {
+        g[j] = gradient[whole + j];
+        m[j] = mean[whole + j];
+        s[j] = square[whole + j];
+        x[j] = values[whole + j];
+    }
+    advance(g, m, s, x);
+    for (int j = 0; j < rest; ++j) {
+        mean[whole + j] = m[j];
+        square[whole + j] = s[j];
+        values[whole + j] = x[j];
     }
 }

@@ -16,6 +16,13 @@ from skipgs_plug.trainer.loaders.packed import load_packed
 from skipgs_plug.trainer.ply import read_start
 from skipgs_plug.trainer.scene import Scene
 
+TRANSFORMS = ("transforms_train.json", "transforms.json")
+
+
+def is_scene(folder: Path) -> bool:
+    """Whether `load_scene` recognises what a folder holds."""
+    return (folder / "sparse").is_dir() or any((folder / name).is_file() for name in TRANSFORMS)
+
 
 def load_scene(
     path: str | Path,
@@ -24,7 +31,9 @@ def load_scene(
     init_num_pts: int = 100_000,
     init_ply: str | Path | None = None,
 ) -> Scene:
-    """Load a COLMAP, nerfstudio or Blender folder or a packed .npz. Writes nothing.
+    """Load a COLMAP, nerfstudio or Blender folder or a packed .npz.
+
+    Writes nothing but `undistorted_cache` in a scene whose cameras are distorted, if it can.
 
     Args:
         path: folder with `sparse/0` or `sparse`, with `transforms_train.json`, with `transforms.json`, or .npz file.

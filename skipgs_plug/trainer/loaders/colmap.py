@@ -13,6 +13,7 @@ from skipgs_plug.trainer.loaders.colmap_files import check_lengths
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.paths import find_image
 from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, find_mask, load_photograph, model_name
+from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene, split_views
 
 log = logging.getLogger(__name__)
@@ -24,6 +25,7 @@ def load_colmap(path: Path, data_factor: int, test_every: int) -> Scene:
     reconstruction = read_model(model)
     folder, factor = image_folder(path, data_factor)
     masks = path / "masks"
+    cache = UndistortedCache(path)
     views, bare, distorted = [], 0, set()
     for image in reconstruction.images.values():
         if not image.has_pose:
@@ -34,11 +36,12 @@ def load_colmap(path: Path, data_factor: int, test_every: int) -> Scene:
         camera = reconstruction.cameras[image.camera_id]
         if model_name(camera) not in PINHOLE_MODELS:
             distorted.add(model_name(camera))
-        views.append(load_photograph(name, find_image(folder, name), camera, pose_of(image, name, model), factor, mask))
+        pose, image_path = pose_of(image, name, model), find_image(folder, name)
+        views.append(load_photograph(name, image_path, camera, pose, cache, factor, mask))
     if not views:
         raise InputError(f"{model} registers no image; run COLMAP again with more overlap between photographs.")
     if distorted:
-        log.warning("%s: lens distortion (%s) is removed on load.", path, ", ".join(sorted(distorted)))
+        log.warning("%s: lens distortion (%s) is removed, and the result kept.", path, ", ".join(sorted(distorted)))
     if masks.is_dir() and bare:
         log.warning("%s: %d of %d views have no mask there and count whole.", masks, bare, len(views))
     return assemble(path, model, views, reconstruction, test_every)

@@ -17,6 +17,7 @@ from skipgs_plug.trainer.loaders.json_file import read_number, read_object, read
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.paths import find_image, inside
 from skipgs_plug.trainer.loaders.photograph import MAX_SIDE, PINHOLE_MODELS, load_photograph, model_name
+from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
 from skipgs_plug.trainer.ply import read_points
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene, split_views
 
@@ -38,6 +39,7 @@ def load_nerfstudio(
     frames = content.get("frames")
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames) or not frames:
         raise InputError(f"{source} lists no frames; run ns-process-data again.")
+    cache = UndistortedCache(path)
     views, distorted = [], set()
     for frame in frames:
         file_path = read_string(frame.get("file_path"), "file_path of a frame", source)
@@ -49,11 +51,11 @@ def load_nerfstudio(
         if mask is not None:
             mask = inside(path, read_string(mask, f"mask_path of {name!r}", source))
         image_path, factor = reduced_image(path, name, full, data_factor)
-        views.append(load_photograph(name, image_path, camera, viewmat, factor, mask))
+        views.append(load_photograph(name, image_path, camera, viewmat, cache, factor, mask))
         if model_name(camera) not in PINHOLE_MODELS:
             distorted.add(model_name(camera))
     if distorted:
-        log.warning("%s: lens distortion (%s) is removed on load.", source, ", ".join(sorted(distorted)))
+        log.warning("%s: lens distortion (%s) is removed, and the result kept.", source, ", ".join(sorted(distorted)))
     train, test = own_split(content, views, source) or split_views(views, test_every)
     points, colours = cloud or read_cloud(path, content, source)
     return assemble_scene(source, path.resolve().name, train, test, points, colours)

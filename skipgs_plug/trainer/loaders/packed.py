@@ -39,7 +39,7 @@ def save_packed(scene: Scene, path: str | Path) -> None:
     """Write the scene, images as lossless PNG bytes (masks as their alpha), split and background included."""
     views = scene.train + scene.test
     encoded = [encode_png(view) for view in views]
-    content = {
+    content: dict[str, Any] = {
         "version": np.int64(VERSION),
         "name": np.array(scene.name),
         "n_train": np.int64(len(scene.train)),

@@ -1,4 +1,4 @@
-"""One View of a photograph, its mask and its calibrated camera; lens distortion is removed in memory."""
+"""One View of a photograph, its mask and its calibrated camera, without lens distortion."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from skipgs_plug.trainer.errors import InputError, reason
 from skipgs_plug.trainer.loaders.images import read_image, read_mask
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.paths import inside
+from skipgs_plug.trainer.loaders.undistorted_cache import Straight, UndistortedCache
 from skipgs_plug.trainer.scene import View
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
@@ -21,7 +22,13 @@ MAX_SIDE = 1 << 20
 
 
 def load_photograph(
-    name: str, image_path: Path, camera: Any, viewmat: np.ndarray, factor: int = 1, mask_path: Path | None = None
+    name: str,
+    image_path: Path,
+    camera: Any,
+    viewmat: np.ndarray,
+    cache: UndistortedCache,
+    factor: int = 1,
+    mask_path: Path | None = None,
 ) -> View:
     """Read a photograph; alpha below one half and black pixels of the mask do not count in the loss.
 
@@ -30,30 +37,40 @@ def load_photograph(
         image_path: at any scale of the size that the camera was calibrated for.
         camera: pycolmap.Camera of any model that pycolmap can undistort.
         viewmat: world to camera [4, 4].
+        cache: keeps what is undistorted.
         factor: shrink by this in memory.
         mask_path: picture of the same shape, black where pixels are left out.
     """
     check_camera(camera, image_path)
+    if model_name(camera) in PINHOLE_MODELS:
+        pixels, mask = read_photograph(image_path, camera, factor, mask_path)
+        K = np.array(camera.calibration_matrix(), dtype=np.float64)
+        # The downscaled image has a rounded size: scale by what was really loaded, not by the factor.
+        K[0] *= pixels.shape[1] / camera.width
+        K[1] *= pixels.shape[0] / camera.height
+    else:
+        key = cache.key(image_path, mask_path, camera, factor)
+        kept = cache.read(key)
+        if kept is None:
+            kept = undistort(*read_photograph(image_path, camera, factor, mask_path), camera, image_path)
+            cache.write(key, kept)
+        pixels, mask, K = kept
+    return View(name, pixels, torch.from_numpy(K).float(), torch.from_numpy(viewmat).float(), mask)
+
+
+def read_photograph(image_path: Path, camera: Any, factor: int, mask_path: Path | None) -> tuple[Tensor, Tensor | None]:
+    """Return pixels [H, W, 3] and mask [H, W], as they were taken."""
     size = (camera.width, camera.height)
     pixels, alpha = read_image(image_path, image_path, None, factor, size)
     mask = None if alpha is None else alpha >= 128
     if mask_path is not None:
         drawn = read_mask(mask_path, pixels, size)
         mask = drawn if mask is None else mask & drawn
-    if model_name(camera) in PINHOLE_MODELS:
-        K = np.array(camera.calibration_matrix(), dtype=np.float64)
-        # The downscaled image has a rounded size: scale by what was really loaded, not by the factor.
-        K[0] *= pixels.shape[1] / camera.width
-        K[1] *= pixels.shape[0] / camera.height
-    else:
-        pixels, mask, K = undistort(pixels, mask, camera, image_path)
-    return View(name, pixels, torch.from_numpy(K).float(), torch.from_numpy(viewmat).float(), mask)
+    return pixels, mask
 
 
-def undistort(
-    pixels: Tensor, mask: Tensor | None, camera: Any, image_path: Path
-) -> tuple[Tensor, Tensor | None, np.ndarray]:
-    """Resample image and mask as a pinhole camera sees them, cut so that no pixel is without a source; returns K."""
+def undistort(pixels: Tensor, mask: Tensor | None, camera: Any, image_path: Path) -> Straight:
+    """Resample image and mask as a pinhole camera sees them, cut so that no pixel is without a source."""
     pycolmap = import_pycolmap()
     try:
         fitted = pycolmap.Camera(camera.todict())
@@ -71,7 +88,7 @@ def undistort(
             f"Image {image_path}: its camera, a {model_name(camera)}, cannot be undistorted ({reason(error)}); "
             "run: colmap image_undistorter."
         ) from error
-    return straight, mask, K
+    return Straight(straight, mask, K)
 
 
 def check_camera(camera: Any, source: Path) -> None:

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import torch
 from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from tqdm import tqdm
 
 ADAPTER, FIRST, START, LAST = "inria", 1, 20, 60
 
@@ -25,6 +26,7 @@ def training(dataset, opt, pipe, checkpoint=None):
     if checkpoint:
         model_params, first_iter = checkpoint
         gaussians.restore(model_params, opt)
+    progress_bar = tqdm(range(first_iter, opt.last), disable=None)
     first_iter += 1
     for iteration in range(first_iter, opt.last + 1):
         if iteration % 4 == 0:  # a viewer is connected
@@ -38,6 +40,10 @@ def training(dataset, opt, pipe, checkpoint=None):
         loss.backward()
         with torch.no_grad():
             loss.item()
+            if iteration % 10 == 0:  # progress bar
+                progress_bar.update(10)
+            if iteration == opt.last:
+                progress_bar.close()
             if iteration % 10 == 0:  # evaluation
                 render(scene.getTrainCameras()[1], gaussians, pipe, None)
             if iteration < opt.densify_until_iter:

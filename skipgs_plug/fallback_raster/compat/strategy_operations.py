@@ -1,0 +1,59 @@
+"""The two operations of gsplat's MCMCStrategy that it has in CUDA only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from torch import Tensor
+
+from ..torch_reference_projection import rotation_matrices
+from .relocation import compute_relocation
+
+
+@contextmanager
+def strategy_on_cpu() -> Iterator[None]:
+    """Let gsplat's MCMCStrategy run without CUDA inside the block.
+
+    Raises:
+        ImportError: gsplat is not installed.
+    """
+    import gsplat.strategy.ops as ops
+
+    stand_ins = {
+        "compute_relocation": compute_relocation,
+        "quat_scale_to_covar_preci": quat_scale_to_covar_preci,
+    }
+    originals = {name: getattr(ops, name) for name in stand_ins}
+    for name, stand_in in stand_ins.items():
+        setattr(ops, name, stand_in)
+    try:
+        yield
+    finally:
+        for name, original in originals.items():
+            setattr(ops, name, original)
+
+
+def quat_scale_to_covar_preci(
+    quats: Tensor,
+    scales: Tensor,
+    compute_covar: bool = True,
+    compute_preci: bool = True,
+    triu: bool = False,
+) -> tuple[Tensor | None, Tensor | None]:
+    """Covariance and its inverse, of Gaussians. [N, 4], [N, 3] -> two of [N, 3, 3] or None
+
+    Raises:
+        NotImplementedError: `triu` is set; the strategies do not.
+    """
+    if triu:
+        raise NotImplementedError("The CPU stand-in returns whole matrices: leave triu False.")
+    rotation = rotation_matrices(quats)
+    covariance = precision = None
+    if compute_covar:
+        root = rotation * scales[:, None, :]
+        covariance = root @ root.transpose(-1, -2)
+    if compute_preci:
+        root = rotation / scales[:, None, :]
+        precision = root @ root.transpose(-1, -2)
+    return covariance, precision

@@ -1,0 +1,60 @@
+"""Densification by gsplat's MCMCStrategy: a fixed number of Gaussians that move to where they are needed."""
+
+from __future__ import annotations
+
+import contextlib
+
+import torch
+from torch import nn
+
+from skipgs_plug.install import install_command
+from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.trainer.errors import InputError
+
+MIN_MOVE_EVERY = 25  # unlike the default strategy it averages nothing over views
+
+
+class Mcmc:
+    """In the units of the scene: the same scene at twice the size trains alike.
+
+    Nothing of it has to travel in checkpoints: what it draws is a function of seed and iteration.
+    """
+
+    def __init__(self, config: TrainConfig, scene_scale: float) -> None:
+        try:
+            from gsplat import MCMCStrategy
+        except ImportError as error:
+            raise InputError(
+                f"Densification needs gsplat and it cannot be imported ({error}); run: {install_command()}."
+            ) from error
+        self._stop = config.scaled(config.recipe.refine_stop_iter)
+        self._every = config.scaled_interval(config.refine_every, MIN_MOVE_EVERY)
+        self._start = config.scaled(config.refine_start_iter)
+        self._strategy = MCMCStrategy(
+            cap_max=config.cap_max,
+            # It multiplies noise by covariances and by the rate of positions, which follows the scale of the scene.
+            noise_lr=config.noise_lr / scene_scale**2,
+            refine_start_iter=self._start,
+            refine_stop_iter=self._stop,
+            refine_every=self._every,
+            min_opacity=config.prune_opa,
+        )
+        self._constants = self._strategy.initialize_state()
+
+    def moves(self, step: int) -> bool:
+        """Whether dead Gaussians are moved, and new ones added, after iteration `step`."""
+        return self._start < step < self._stop and step % self._every == 0
+
+    def after_update(
+        self, splats: nn.ParameterDict, optimizers: dict[str, torch.optim.Optimizer], step: int, rate: float
+    ) -> None:
+        """Move and add if it is time to, and noise positions in proportion to `rate`, their learning rate."""
+        on_cpu = splats["means"].device.type == "cpu"
+        with _strategy_on_cpu() if on_cpu else contextlib.nullcontext():
+            self._strategy.step_post_backward(splats, optimizers, self._constants, step, {}, lr=rate)
+
+
+def _strategy_on_cpu() -> contextlib.AbstractContextManager[None]:
+    from skipgs_plug.fallback_raster.compat.strategy_operations import strategy_on_cpu
+
+    return strategy_on_cpu()

@@ -1,0 +1,92 @@
+"""Which ranges of a training function the gate may leave numbers out of, and what progress bars count."""
+
+import pytest
+
+from skipgs_plug.core.intercept import Patches
+from skipgs_plug.core.refinement.loop_range import LoopRange, replace_range
+
+
+class Bar:
+    """A progress bar: it asks for the length once, and may be looped over."""
+
+    def __init__(self, numbers):
+        self.numbers, self.total = numbers, len(numbers)
+
+    def __iter__(self):
+        return iter(self.numbers)
+
+
+class Every3rd:
+    """Owner of a loop in which every third number runs."""
+
+    wants_loop = True
+
+    def runs(self, loop, number):
+        return number % 3 == 0
+
+    def expected(self, loop):
+        return sum(number % 3 == 0 for number in loop.numbers)
+
+
+def moved_on_by_hand(end):
+    bar = Bar(
+        range(0, end),
+    )
+    ran = []
+    for number in range(0, end):
+        ran.append(number)
+    return bar, ran
+
+
+def looped_over(end):
+    bar = Bar(range(0, end))
+    ran = []
+    for number in bar:
+        ran.append(number)
+    return bar, ran
+
+
+def looped_over_by_another_name(end):
+    numbers = range(0, end)
+    bar = Bar(numbers)
+    named = enumerate(bar)
+    return bar, [number for _, number in named]
+
+
+class Trainer:
+    def kept(self, end):
+        self.bar = Bar(range(0, end))
+        return self.bar, list(self.bar)
+
+
+def made_without_source():
+    scope = {"Bar": Bar}
+    exec("def unreadable(end):\n    bar = Bar(range(0, end))\n    return bar, list(bar)", scope)
+    return scope["unreadable"]
+
+
+def train(function, end=30):
+    patches = Patches()
+    code = getattr(function, "__func__", function)
+    replace_range(patches, code.__globals__, (function.__name__,), Every3rd())
+    try:
+        return function(end)
+    finally:
+        patches.restore()
+
+
+def test_a_bar_that_is_moved_on_by_hand_counts_all_iterations():
+    bar, ran = train(moved_on_by_hand)
+    assert type(bar.numbers) is range and bar.total == 30
+    assert ran == list(range(0, 30, 3))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [looped_over, looped_over_by_another_name, Trainer().kept, made_without_source()],
+    ids=["bar", "another name", "attribute", "no source"],
+)
+def test_a_bar_that_may_be_looped_over_counts_those_that_run(function):
+    bar, ran = train(function)
+    assert type(bar.numbers) is LoopRange and bar.total == 10
+    assert ran == list(range(0, 30, 3))
