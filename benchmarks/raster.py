@@ -227,7 +227,6 @@ def growth(part: str, points: dict[int, tuple[int, str, int | None]], repeats: i
     rows.sort(key=lambda row: row["x"])
     measures = {
         "time": [row["ms"] for row in rows],
-        "bin": [row["phases_ms"]["bin"] for row in rows],
         "memory": [max(row["peak_mib"], 1.0) for row in rows],
     }
     found = {name: exponents([row["x"] for row in rows], values) for name, values in measures.items()}
@@ -264,13 +263,14 @@ def part_order(quick: bool, repeats: int, only: str | None) -> list[dict[str, An
     scenes = {name: {**scene, **{key: scene[key][order] for key in PARAMETERS}} for name, order in orders.items()}
     times: dict[tuple[str, str], list[float]] = {}
     images: dict[tuple[str, str], Tensor] = {}
-    for seed in range(repeats + 2):  # in turns
-        for name, ordered in scenes.items():
-            there, back, fast = one_pass(ordered, seed)
-            times.setdefault((name, "activated"), []).append(there + back)
-            images[name, "activated"] = fast["image"][0]
-            seconds, images[name, "raw"] = raw_pass(ordered, seed)
-            times.setdefault((name, "raw"), []).append(seconds)
+    with threads(cores()):
+        for seed in range(repeats + 2):  # in turns
+            for name, ordered in scenes.items():
+                there, back, fast = one_pass(ordered, seed)
+                times.setdefault((name, "activated"), []).append(there + back)
+                images[name, "activated"] = fast["image"][0]
+                seconds, images[name, "raw"] = raw_pass(ordered, seed)
+                times.setdefault((name, "raw"), []).append(seconds)
     rows = []
     for (name, entrance), seconds in times.items():
         error = (images[name, entrance] - images["file", "activated"]).abs().max().item()
