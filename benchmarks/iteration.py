@@ -8,6 +8,8 @@ medians over iterations, each on another view. Writes `benchmarks/results/iterat
 """
 
 import dataclasses
+import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ WARM_UP = 6  # the SH degree has reached its maximum and every buffer its size
 # Milliseconds of OpenSplat 15b7e80 on the CPU (two-core AVX-512 server, idle) for one iteration at SH degree 0, the
 # fastest CPU trainer found.
 PEER = {1_000: 427, 3_000: 522, 10_000: 680, 30_000: 1072, 100_000: 1903}
+LARGE = (1_000_000, 3_000_000)  # of which no peer was timed
 
 
 def resampled(scene: Scene, n: int) -> Scene:
@@ -79,20 +82,21 @@ def plot(rows: list[dict[str, Any]]) -> None:
         values = [row["phases_ms"][phase] for row in rows]
         axis.bar(labels, values, 0.6, bottom=bottom, label=phase)
         bottom = [b + v for b, v in zip(bottom, values, strict=True)]
-    axis.plot(labels, [row["peer_ms"] for row in rows], "k_", markersize=24, label="OpenSplat CPU (SH 0)")
+    axis.plot(labels, [row["peer_ms"] or math.nan for row in rows], "k_", markersize=24, label="OpenSplat CPU (SH 0)")
     axis.set(yscale="log", ylabel=f"ms per iteration, {most} threads", xlabel="Gaussians", ylim=(1, None))
     axis.grid(axis="y", alpha=0.3)
     axis.legend()
     figure.savefig(FILE.with_suffix(".png"), dpi=120)
 
 
-def main(scene: Path = SCENES / "fern", quick: bool = False, iterations: int = 15) -> None:
+def main(scene: Path = SCENES / "fern", quick: bool = False, iterations: int = 15, only: int | None = None) -> None:
     """Measure the training iteration.
 
     Args:
         scene: The folder of "fern".
         quick: Two sizes only, SH degree 3, all cores.
         iterations: Timed iterations per row.
+        only: Rows with this number of Gaussians, and the others as measured before.
     """
     about = provenance() | {"iterations": iterations, "quick": quick}
     print(f"{about['cpu']}, {about['cores']} cores, commit {about['commit']}")
@@ -102,21 +106,28 @@ def main(scene: Path = SCENES / "fern", quick: bool = False, iterations: int = 1
     rows = []
     for count in sorted({cores()} if quick else {1, cores()}, reverse=True):
         for sh_degree in (3,) if quick else (0, 3):
-            for n in (1_000, 10_000) if quick else PEER:
+            for n in (1_000, 10_000) if quick else (*PEER, *LARGE):
+                if only not in (None, n):
+                    continue
                 with threads(count):
                     row: dict[str, Any] = {"gaussians": n, "sh_degree": sh_degree, "threads": count}
                     row |= measure(resampled(fern, n), sh_degree, iterations)
-                row["peer_ms"] = PEER[n]
+                row["peer_ms"] = PEER.get(n)
                 rows.append(row)
                 print(
                     f"{n:9,} {sh_degree:2} {count:7} {row['ms']:7.1f}  "
                     + " ".join(f"{row['phases_ms'][p]:9.2f}" for p in PHASES)
-                    + f" {PEER[n]:6} {PEER[n] / row['ms']:5.1f}x",
+                    + (f" {PEER[n]:6} {PEER[n] / row['ms']:5.1f}x" if n in PEER else ""),
                     flush=True,
                 )
+            if only is not None:
+                continue
             series = [r for r in rows if r["threads"] == count and r["sh_degree"] == sh_degree]
             growth = exponents([r["gaussians"] for r in series], [r["ms"] for r in series])
             print(f"  grows with Gaussians^{growth['fitted']:.2f}, at most ^{growth['steepest']:.2f}")
+    if only is not None:
+        rows += [r for r in json.loads(FILE.read_text())["fern"]["rows"] if r["gaussians"] != only]
+        rows.sort(key=lambda r: (-r["threads"], r["sh_degree"], r["gaussians"]))
     write_part(FILE, "fern", rows, about)
     plot(rows)
 

@@ -2,6 +2,7 @@
 
     python benchmarks/raster.py                        # everything, about two minutes on two cores
     python benchmarks/raster.py --parts scenes --quick
+    python benchmarks/raster.py --parts gaussians --only 3000000    # one row; the others stay as measured before
 
 A pass is `rasterization`, a mean-L1 loss and the backward to means, scales, quats, opacities and colours; times are
 medians over repeats with fresh inputs after two warm-up passes. Every part prints a table and replaces its entry in
@@ -45,11 +46,13 @@ from torch import Tensor
 
 from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
 from skipgs_plug.fallback_raster.shortcuts import SHORTCUTS, without_shortcuts
+from skipgs_plug.fallback_raster.splats import rasterize_splats
 from skipgs_plug.trainer.loss import l1_ssim_loss as convolved_loss
+from skipgs_plug.trainer.row_order import morton_order
 from skipgs_plug.trainer.scalars import peak_memory
 
 FILE = RESULTS / "raster.json"
-Part = Literal["scenes", "threads", "gaussians", "pixels", "sh_terms", "shortcuts", "loss"]
+Part = Literal["scenes", "threads", "gaussians", "pixels", "sh_terms", "order", "shortcuts", "loss"]
 
 # Milliseconds of other CPU implementations on two cores of an AVX-512 server, idle: OpenSplat 15b7e80 (C++, one
 # thread; its sort and conic gradient are wrong) and 3dgs-warp-scratch 5069396 (scale gradient wrong).
@@ -129,7 +132,7 @@ def scene_maker(kind: str, n: int, size: str, sh_degree: int | None = None) -> C
     return lambda seed: frustum_scene(n, width, height, seed, sh_degree)
 
 
-def part_scenes(quick: bool, repeats: int) -> list[dict[str, Any]]:
+def part_scenes(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
     """The scenes that other implementations were timed on, on all cores and on one."""
     counts = sorted({1, cores()}, reverse=True)
     peaks = {}
@@ -144,7 +147,7 @@ def part_scenes(quick: bool, repeats: int) -> list[dict[str, Any]]:
     print(f" {'peer':>6} {'faster':>6}  phases (ms)")
     rows = []
     for (kind, n, size), peer in PEERS.items():
-        if quick and size not in ("504x378", "324x210"):
+        if (quick and size not in ("504x378", "324x210")) or only not in (None, f"{kind},{n},{size}"):
             continue
         make = scene_maker(kind, n, size)
         pairs = blended_pairs(make(0))
@@ -165,10 +168,15 @@ def part_scenes(quick: bool, repeats: int) -> list[dict[str, Any]]:
                 + ", ".join(f"{name} {ms:.1f}" for name, ms in row["phases_ms"].items()),
                 flush=True,
             )
+    if only is not None:
+        measured = {",".join(map(str, key)): key for key in PEERS}[only]
+        before = json.loads(FILE.read_text())["scenes"]["rows"]
+        rows += [row for row in before if (row["kind"], row["gaussians"], row["size"]) != measured]
+        rows.sort(key=lambda row: list(PEERS).index((row["kind"], row["gaussians"], row["size"])))
     return rows
 
 
-def part_threads(quick: bool, repeats: int) -> list[dict[str, Any]]:
+def part_threads(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
     """How one scene speeds up with the number of threads."""
     make = scene_maker("random", 10_000 if quick else 50_000, "504x378")
     rows: list[dict[str, Any]] = []
@@ -181,35 +189,44 @@ def part_threads(quick: bool, repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
-def part_gaussians(quick: bool, repeats: int) -> dict[str, Any]:
-    """Time and memory from 1,000 to 1,000,000 Gaussians on 504x378 pixels."""
-    counts = (1_000, 10_000, 100_000) if quick else (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
-    return growth({n: (n, "504x378", None) for n in counts}, repeats)
+def part_gaussians(quick: bool, repeats: int, only: str | None) -> dict[str, Any]:
+    """Time and memory from 1,000 to 3,000,000 Gaussians on 504x378 pixels."""
+    counts = (1_000, 10_000, 100_000)
+    if not quick:
+        counts += (3_000, 30_000, 300_000, 1_000_000, 3_000_000)
+    return growth("gaussians", {n: (n, "504x378", None) for n in sorted(counts)}, repeats, only)
 
 
-def part_pixels(quick: bool, repeats: int) -> dict[str, Any]:
+def part_pixels(quick: bool, repeats: int, only: str | None) -> dict[str, Any]:
     """Time and memory from 128x128 to 1920x1080 pixels with 10,000 Gaussians."""
     sizes = ((128, 128), (256, 256), (504, 378), (1008, 756), (1920, 1080))[: 3 if quick else 5]
-    return growth({w * h: (10_000, f"{w}x{h}", None) for w, h in sizes}, repeats)
+    return growth("pixels", {w * h: (10_000, f"{w}x{h}", None) for w, h in sizes}, repeats, only)
 
 
-def part_sh_terms(quick: bool, repeats: int) -> dict[str, Any]:
+def part_sh_terms(quick: bool, repeats: int, only: str | None) -> dict[str, Any]:
     """Time and memory for SH degree 0 to 3 with 100,000 Gaussians on 504x378 pixels."""
     n = 10_000 if quick else 100_000
-    return growth({(degree + 1) ** 2: (n, "504x378", degree) for degree in range(4)}, repeats)
+    points = {(degree + 1) ** 2: (n, "504x378", degree) for degree in range(4)}
+    return growth("sh_terms", points, repeats, only)
 
 
-def growth(points: dict[int, tuple[int, str, int | None]], repeats: int) -> dict[str, Any]:
-    """Measures each point in a process of its own, because the peak memory of a process never falls."""
+def growth(part: str, points: dict[int, tuple[int, str, int | None]], repeats: int, only: str | None) -> dict[str, Any]:
+    """Measures each point in a process of its own, because the peak memory of a process never falls.
+
+    `only` names one point; the others are those measured before.
+    """
     rows = []
+    if only is not None:
+        rows = [row for row in json.loads(FILE.read_text())[part]["rows"]["points"] if row["x"] != int(only)]
+        points = {int(only): points[int(only)]}
     for x, point in points.items():
         command = [sys.executable, __file__, "--point", json.dumps(point), "--repeats", str(repeats)]
         out = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
         rows.append({"x": x, **json.loads(out.splitlines()[-1])})
         print(f"{x:>9,} {rows[-1]['ms']:8.1f} ms {rows[-1]['peak_mib']:7.1f} MiB above start", flush=True)
+    rows.sort(key=lambda row: row["x"])
     measures = {
         "time": [row["ms"] for row in rows],
-        "bin": [row["phases_ms"]["bin"] for row in rows],
         "memory": [max(row["peak_mib"], 1.0) for row in rows],
     }
     found = {name: exponents([row["x"] for row in rows], values) for name, values in measures.items()}
@@ -233,7 +250,50 @@ def measure_point(point: str, repeats: int) -> None:
     print(json.dumps({**result, "peak_mib": (peak - before) / 2**20}))
 
 
-def part_shortcuts(quick: bool, repeats: int) -> list[dict[str, Any]]:
+def part_order(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
+    """What the order of the rows costs where a camera sees part of a scene, by either entrance, SH degree 3."""
+    size = "324x210" if quick else "162x105"
+    scene = garden_scene(GARDEN_DOWNSCALE[size], 0, sh_degree=3)
+    n = len(scene["means"])
+    orders = {
+        "file": torch.arange(n),
+        "shuffled": torch.randperm(n, generator=torch.Generator().manual_seed(0)),
+        "space": morton_order(scene["means"]),
+    }
+    scenes = {name: {**scene, **{key: scene[key][order] for key in PARAMETERS}} for name, order in orders.items()}
+    times: dict[tuple[str, str], list[float]] = {}
+    images: dict[tuple[str, str], Tensor] = {}
+    with threads(cores()):
+        for seed in range(repeats + 2):  # in turns
+            for name, ordered in scenes.items():
+                there, back, fast = one_pass(ordered, seed)
+                times.setdefault((name, "activated"), []).append(there + back)
+                images[name, "activated"] = fast["image"][0]
+                seconds, images[name, "raw"] = raw_pass(ordered, seed)
+                times.setdefault((name, "raw"), []).append(seconds)
+    rows = []
+    for (name, entrance), seconds in times.items():
+        error = (images[name, entrance] - images["file", "activated"]).abs().max().item()
+        rows.append({"order": name, "parameters": entrance, "ms": median_ms(seconds[2:]), "image_difference": error})
+        print(f"{name:>9} {entrance:>9} {rows[-1]['ms']:7.1f} ms  image differs by {error:.1e}", flush=True)
+    return rows
+
+
+def raw_pass(scene: dict[str, Any], seed: int) -> tuple[float, Tensor]:
+    """Seconds of forward and backward pass with raw parameters, and the image."""
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.rand(scene["height"], scene["width"], 3, generator=generator)
+    raw = [scene["means"], scene["quats"], scene["scales"].log(), scene["opacities"].logit()]
+    raw += [scene["colors"][:, :1].contiguous(), scene["colors"][:, 1:].contiguous()]
+    raw = [tensor.clone().requires_grad_() for tensor in raw]
+    start = time.perf_counter()
+    camera = (scene["viewmats"][0], scene["Ks"][0], scene["width"], scene["height"], scene["sh_degree"])
+    image, _, _ = rasterize_splats(*raw, *camera)
+    (image - target).abs().mean().backward()
+    return time.perf_counter() - start, image.detach()
+
+
+def part_shortcuts(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
     """Time with and without each shortcut, in turns, and by how much it changes the result."""
     scene = garden_scene(GARDEN_DOWNSCALE["324x210" if quick else "648x420"], 0, sh_degree=3)
     left = slice(0, scene["width"] // 2)  # half of the image has no gradient
@@ -264,7 +324,7 @@ def part_shortcuts(quick: bool, repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
-def part_loss(quick: bool, repeats: int) -> list[dict[str, Any]]:
+def part_loss(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
     """Value and gradient of the fused L1 + SSIM against PyTorch's convolutions: time, and error beside float64.
 
     PyTorch takes seconds for a large image, so it and the float64 truth see only the first images, on one thread.
@@ -329,12 +389,13 @@ def loss_figures(
     }
 
 
-PARTS: dict[str, Callable[[bool, int], Any]] = {
+PARTS: dict[str, Callable[[bool, int, str | None], Any]] = {
     "scenes": part_scenes,
     "threads": part_threads,
     "gaussians": part_gaussians,
     "pixels": part_pixels,
     "sh_terms": part_sh_terms,
+    "order": part_order,
     "shortcuts": part_shortcuts,
     "loss": part_loss,
 }
@@ -387,9 +448,10 @@ def plot(results: dict[str, Any]) -> None:
 
 
 def main(
-    parts: tuple[Part, ...] = ("scenes", "threads", "gaussians", "pixels", "sh_terms", "shortcuts", "loss"),
+    parts: tuple[Part, ...] = ("scenes", "threads", "gaussians", "pixels", "sh_terms", "order", "shortcuts", "loss"),
     quick: bool = False,
     repeats: int = 7,
+    only: str | None = None,
     point: str | None = None,
 ) -> None:
     """Measure the rasterizer.
@@ -398,6 +460,8 @@ def main(
         parts: Which tables to measure.
         quick: Fewer and smaller scenes.
         repeats: Timed passes per row.
+        only: One row of a part, and the others as measured before: "garden,138766,162x105" of scenes, the number of
+            Gaussians, pixels or terms of a growth series.
         point: For the benchmark's own use: one point of a growth series, as JSON.
     """
     if point is not None:
@@ -406,7 +470,7 @@ def main(
     for part in parts:
         about = provenance() | {"repeats": repeats, "quick": quick}
         print(f"\n{part}: {about['cpu']}, {about['cores']} cores, commit {about['commit']}")
-        plot(write_part(FILE, part, PARTS[part](quick, repeats), about))
+        plot(write_part(FILE, part, PARTS[part](quick, repeats, only), about))
 
 
 if __name__ == "__main__":

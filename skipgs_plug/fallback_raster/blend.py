@@ -41,6 +41,7 @@ def _forward(channels: int) -> Worker:
         pixel_stop: Annotated[IntArray, "height, width"],  # out, place in tile_list behind the last Gaussian blended
         tile_stop: Annotated[IntArray, "tiles_x, tiles_y"],  # out, their maximum
         pair_blocks: Annotated[IntArray, "P"],  # out, blocks where it was blended, as bits; nothing beyond tile_stop
+        blended_pairs: Annotated[ByteArray, "padded(P)"],  # out, zeros before; whether there is such a block, by place
         width: int,
         height: int,
         tiles_x: int,
@@ -74,8 +75,8 @@ def _backward(channels: int, absgrad: bool) -> Worker:
         pixel_stop: Annotated[IntArray, "height, width"],
         v_image: Annotated[FloatArray, "height, width, stride"],
         v_transmittance: Annotated[FloatArray, "height, width"],  # gradient of the final transmittance
-        v_pairs: Annotated[FloatArray, "P, PAIR"],  # out, where `written` says so
-        written: Annotated[ByteArray, "padded(P)"],  # out, zeros before
+        pair_number: Annotated[IntArray, "P"],  # blended pairs up to this one
+        v_pairs: Annotated[FloatArray, "Q, PAIR"],  # out
         width: int,
         height: int,
         tiles_x: int,
@@ -110,8 +111,9 @@ def reduce_pairs(
     visible: Annotated[IntArray, "M"],
     block_start: Annotated[IntArray, "blocks(rows) + 1"],  # where each block of rows begins in `visible`
     pair_start: Annotated[IntArray, "M + 1"],
-    v_pairs: Annotated[FloatArray, "pairs, PAIR"],
-    written: Annotated[ByteArray, "padded(pairs)"],
+    pair_number: Annotated[IntArray, "P"],
+    blended_pairs: Annotated[ByteArray, "padded(P)"],
+    v_pairs: Annotated[FloatArray, "Q, PAIR"],
     conics: Annotated[FloatArray, "rows, 3"],
     opacities: Annotated[FloatArray, "rows"],
     # Out, all rows where `dense`, else visible ones; added to from the second pass over the channels on, as the next.

@@ -101,7 +101,7 @@ def release_memory() -> None:
 
 def longs(*shape: int) -> Tensor:
     """An int64 tensor with undefined content."""
-    return guard.poison(torch.empty(shape, dtype=torch.int64, device="cpu"))
+    return _empty(shape, torch.int64)
 
 
 def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:

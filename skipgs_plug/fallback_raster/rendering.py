@@ -21,7 +21,8 @@ class Blended:
         block_start: [blocks + 1] int32, where each block of rows begins among the visible ones.
         pixel_stop: [H, W] int32, place in the list behind the last Gaussian blended.
         tile_stop: [tiles] int32, the maximum over each tile.
-        pair_blocks: [P] int32, blocks of a tile in which a pair was blended, as bits.
+        pair_blocks: [P] int32, blocks of a tile in which a pair was blended, as bits, by place in the lists.
+        blended_pairs: [P, padded] uint8, whether a pair was blended, by its number.
         dense: Whether rows that are not visible get gradients, zeros.
     """
 
@@ -30,6 +31,7 @@ class Blended:
     pixel_stop: Tensor
     tile_stop: Tensor
     pair_blocks: Tensor
+    blended_pairs: Tensor
     dense: bool
 
 
@@ -52,6 +54,7 @@ def blend(
     size = (width, height, *tiles(width, height))
     image, transmittance = floats(height, width, channels), floats(height, width)
     pixel_stop, tile_stop, pair_blocks = ints(height, width), ints(size[2] * size[3]), ints(pairs)
+    blended_pairs = zeros(padded(pairs), dtype=torch.uint8)
     in_one = channels <= MAX_CHANNELS
     if not in_one:
         bins.sort()
@@ -62,11 +65,12 @@ def blend(
             pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
         forward_worker(some)(
             bins.records, bins.tile_start, bins.pair_row, bins.unsorted, buffer, bins.tile_list, bins.tile_place,
-            image, transmittance, pixel_stop, tile_stop, pair_blocks,
+            image, transmittance, pixel_stop, tile_stop, pair_blocks, blended_pairs,
             *size, channels, channel, some, int(not in_one), active_shortcuts(),
         )  # fmt: skip
     bins.unsorted, bins.pair_row = longs(0), ints(0)  # no longer needed
-    return image, transmittance, Blended(bins, block_start, pixel_stop, tile_stop, pair_blocks, dense)
+    blended = Blended(bins, block_start, pixel_stop, tile_stop, pair_blocks, blended_pairs, dense)
+    return image, transmittance, blended
 
 
 def blend_adjoint(
@@ -89,20 +93,21 @@ def blend_adjoint(
     with_absolute = absolute is not None
     absolute = floats(0) if absolute is None else absolute
     pairs = len(bins.tile_list)
-    v_pairs = scratch("v_pairs", pairs, PAIR)
+    # Behind the surface most pairs are not blended: they have no sums.
+    pair_number = blended.blended_pairs[:pairs].cumsum(0, dtype=torch.int32)
+    v_pairs = scratch("v_pairs", int(pair_number[-1]) if pairs else 0, PAIR)
     for channel in range(0, channels, MAX_CHANNELS):
         some = min(MAX_CHANNELS, channels - channel)
         if channels > MAX_CHANNELS:
             pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
-        written = zeros(padded(pairs), dtype=torch.uint8)
         backward_worker(some, with_absolute)(
             bins.records, bins.tile_start, bins.tile_list, bins.tile_place, blended.tile_stop, blended.pair_blocks,
-            transmittance, blended.pixel_stop, v_image, v_transmittance, v_pairs, written,
+            transmittance, blended.pixel_stop, v_image, v_transmittance, pair_number, v_pairs,
             *size, channels, channel, some, active_shortcuts(),
         )  # fmt: skip
         reduce_pairs(
-            bins.visible, blended.block_start, bins.pair_start, v_pairs, written, conics, opacities, v_means2d,
-            v_conics, v_opacities, absolute, v_colors,
+            bins.visible, blended.block_start, bins.pair_start, pair_number, blended.blended_pairs, v_pairs, conics,
+            opacities, v_means2d, v_conics, v_opacities, absolute, v_colors,
             len(means2d), channels, channel, some, int(with_absolute), int(blended.dense),
         )  # fmt: skip
         # The gradient of the transmittance belongs to the first pass alone.

@@ -136,18 +136,9 @@ def test_defaults_of_the_process_change_nothing(default: Any) -> None:
 
 def test_pairs_are_counted_beyond_32_bits() -> None:
     counts = torch.full((2, 4), 2**30, dtype=torch.int32)
-    total = torch.zeros(1, dtype=torch.int64)
-    binning.scan_pairs(
-        counts,
-        torch.zeros(5, dtype=torch.int32),
-        torch.zeros(1, dtype=torch.int32),
-        torch.zeros(2, dtype=torch.int32),
-        total,
-        1,
-        2,
-        4,
-    )
-    assert int(total) == 2**33
+    totals = torch.tensor([2**32, 2**32, 0])
+    binning.scan_pairs(counts, totals, torch.zeros(5, dtype=torch.int32), 2, 4)
+    assert totals.tolist() == [0, 2**32, 2**33]
 
 
 def test_too_many_pairs_are_one_sentence_before_anything_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,9 +215,9 @@ LISTED = """
 import torch
 from skipgs_plug.fallback_raster.project import list_visible
 
-radii = torch.tensor([[1, 1], [0, 0], [2, 2]], dtype=torch.int32)
+seen, block_count = torch.tensor([0, 2, 7], dtype=torch.int32), torch.tensor([2], dtype=torch.int32)
 visible, block_start = torch.empty(3, dtype=torch.int32), torch.empty(2, dtype=torch.int32)
-list_visible(radii, visible, block_start, 3)
+list_visible(seen, block_count, visible, block_start, 1)
 assert visible[:2].tolist() == [0, 2] and block_start.tolist() == [0, 2]
 """
 

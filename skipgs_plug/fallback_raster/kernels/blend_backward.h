@@ -31,12 +31,11 @@ for (int t = first; t < last; ++t) {
         // A block without incoming gradient adds exact zeros.
         if (any(wanted) || !(shortcuts & ZERO_GRADIENT)) open |= 1u << b;
     }
-    const int used = open ? tile_end : begin;
-
-    for (int k = used - 1; k >= begin; --k) {
+    for (int k = tile_end - 1; k >= begin; --k) {
         __builtin_prefetch(records + (long long)RECORD * tile_list[larger(k - 8, begin)]);
+        __builtin_prefetch(pair_number + tile_place[larger(k - 16, begin)]);
+        if (!pair_blocks[k]) continue;
         unsigned todo = pair_blocks[k] & open;
-        if (!todo) continue;
         const float* r = records + (long long)RECORD * tile_list[k];
         v16 m[8], abs_x = (v16)0.0f, abs_y = (v16)0.0f, v_color[D];
         for (int j = 0; j < 8; ++j) m[j] = (v16)0.0f;
@@ -71,8 +70,7 @@ for (int t = first; t < last; ++t) {
                 abs_y += vabs(v_sigma * (r[3] * seen.p + r[4] * seen.w));
             }
         }
-        float* out = v_pairs + (long long)PAIR * tile_place[k];
-        written[tile_place[k]] = 1;
+        float* out = v_pairs + (long long)PAIR * (pair_number[tile_place[k]] - 1);
         for (int c = 0; c < D && c < 2; ++c) m[6 + c] = v_color[c];
         *(v8*)out = sum8(m);
         for (int c = 2; c < 4; ++c) out[6 + c] = c < D ? sum(v_color[c < D ? c : 0]) : 0.0f;

@@ -13,8 +13,8 @@ for (int i = block_start[first]; i < block_start[first + 1]; ++i) {
     v16 sums = (v16)0.0f;
     bool received = false;
     for (int p = pair_start[i]; p < pair_start[i + 1]; ++p)
-        if (written[p]) {
-            sums += load(v_pairs + (long long)PAIR * p);
+        if (blended_pairs[p]) {
+            sums += load(v_pairs + (long long)PAIR * (pair_number[p] - 1));
             received = true;
         }
     if (!received) {
