@@ -80,7 +80,7 @@ def time_against_error(rows: Sequence[Row]) -> Figure:
     axes[0].set_xlabel("refinement time T_post (s)")
     axes[0].set_ylabel("held-out PSNR (dB)")
     axes[0].set_title(f"Time and quality, {seeds_text(rows)}", loc="left", fontsize=11)
-    figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=7 if paired else 4,
+    figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=5 if paired else 3,
                   loc="outside lower center")  # fmt: skip
     if paired:
         scatter(axes[1], rows, "t_post_saved", "psnr_gain")
