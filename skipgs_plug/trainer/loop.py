@@ -353,9 +353,10 @@ class Trainer:
 
     def _move(self, mcmc: Mcmc, step: int, updated: bool) -> None:
         # The noise belongs to the update: alone it is a random walk.
-        if updated or mcmc.moves(step):
-            if mcmc.moves(step):
-                release_memory()
+        moves = mcmc.moves(step)
+        if moves:
+            release_memory()  # as in `_densify`
+        if updated or moves:
             rate = self.optimizers["means"].param_groups[0]["lr"] if updated else 0.0
             with self._seeded(step):
                 mcmc.after_update(self.splats, self.optimizers, step, rate)

@@ -7,9 +7,8 @@ import contextlib
 import torch
 from torch import nn
 
-from skipgs_plug.install import install_command
 from skipgs_plug.trainer.config import TrainConfig
-from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.strategy import gsplat_class
 
 MIN_MOVE_EVERY = 25  # unlike the default strategy it averages nothing over views
 
@@ -21,16 +20,10 @@ class Mcmc:
     """
 
     def __init__(self, config: TrainConfig, scene_scale: float) -> None:
-        try:
-            from gsplat import MCMCStrategy
-        except ImportError as error:
-            raise InputError(
-                f"Densification needs gsplat and it cannot be imported ({error}); run: {install_command()}."
-            ) from error
         self._stop = config.scaled(config.recipe.refine_stop_iter)
         self._every = config.scaled_interval(config.refine_every, MIN_MOVE_EVERY)
         self._start = config.scaled(config.refine_start_iter)
-        self._strategy = MCMCStrategy(
+        self._strategy = gsplat_class("MCMCStrategy")(
             cap_max=config.cap_max,
             # It multiplies noise by covariances and by the rate of positions, which follows the scale of the scene.
             noise_lr=config.noise_lr / scene_scale**2,

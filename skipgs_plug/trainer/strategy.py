@@ -14,13 +14,7 @@ from skipgs_plug.trainer.errors import InputError
 
 def create_strategy(config: TrainConfig) -> Any:
     """Return a gsplat DefaultStrategy for this config (pure torch, runs without CUDA)."""
-    try:
-        from gsplat import DefaultStrategy
-    except ImportError as error:
-        raise InputError(
-            f"Densification needs gsplat and it cannot be imported ({error}); run: {install_command()}."
-        ) from error
-    return DefaultStrategy(
+    return gsplat_class("DefaultStrategy")(
         prune_opa=config.prune_opa,
         grow_grad2d=config.grow_grad2d,
         grow_scale3d=config.grow_scale3d,
@@ -31,6 +25,21 @@ def create_strategy(config: TrainConfig) -> Any:
         reset_every=reset_interval(config),
         absgrad=config.absgrad,
     )
+
+
+def gsplat_class(name: str) -> Any:
+    """Return a strategy of gsplat by its name.
+
+    Raises:
+        InputError: gsplat cannot be imported.
+    """
+    try:
+        import gsplat
+    except ImportError as error:
+        raise InputError(
+            f"Densification needs gsplat and it cannot be imported ({error}); run: {install_command()}."
+        ) from error
+    return getattr(gsplat, name)
 
 
 def reset_interval(config: TrainConfig) -> int:

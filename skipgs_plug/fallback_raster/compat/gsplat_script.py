@@ -15,6 +15,7 @@ from ..install import install_as_gsplat
 from .lpips import AbsentLpips
 from .packages import usable
 from .scene_manager import SceneManager
+from .stand_ins import stand_ins
 from .strategy_operations import strategy_on_cpu
 
 
@@ -41,18 +42,8 @@ def gsplat_on_cpu() -> Iterator[None]:
         pycolmap = importlib.import_module("pycolmap")
         if not hasattr(pycolmap, "SceneManager"):
             replaced.append((pycolmap, "SceneManager", SceneManager))
-    with install_as_gsplat(), strategy_on_cpu():
-        before = [(owner, name, getattr(owner, name, None)) for owner, name, _ in replaced]
-        for owner, name, stand_in in replaced:
-            setattr(owner, name, stand_in)
-        try:
-            yield
-        finally:
-            for owner, name, original in before:
-                if original is None:
-                    delattr(owner, name)
-                else:
-                    setattr(owner, name, original)
+    with install_as_gsplat(), strategy_on_cpu(), stand_ins(replaced):
+        yield
 
 
 @contextmanager

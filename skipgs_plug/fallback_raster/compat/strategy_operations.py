@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..torch_reference_projection import rotation_matrices
 from .relocation import compute_relocation
+from .stand_ins import stand_ins
 
 
 @contextmanager
@@ -20,18 +21,9 @@ def strategy_on_cpu() -> Iterator[None]:
     """
     import gsplat.strategy.ops as ops
 
-    stand_ins = {
-        "compute_relocation": compute_relocation,
-        "quat_scale_to_covar_preci": quat_scale_to_covar_preci,
-    }
-    originals = {name: getattr(ops, name) for name in stand_ins}
-    for name, stand_in in stand_ins.items():
-        setattr(ops, name, stand_in)
-    try:
+    functions = (compute_relocation, quat_scale_to_covar_preci)
+    with stand_ins([(ops, function.__name__, function) for function in functions]):
         yield
-    finally:
-        for name, original in originals.items():
-            setattr(ops, name, original)
 
 
 def quat_scale_to_covar_preci(
