@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from interrupted import whole_and_resumed
 
 from skipgs_plug import SkipGate
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
@@ -86,12 +87,7 @@ def test_resumed_equals_uninterrupted(tmp_path: Path, changing: Scene, stop: int
             SkipGate(trainer, **settings)
         return trainer
 
-    whole, first, second = made(), made(), made()
-    whole.train(progress=False)
-    first.train(until=stop, progress=False)
-    first.save_checkpoint(tmp_path / "c.pt")
-    second.load_checkpoint(tmp_path / "c.pt")
-    second.train(progress=False)
+    whole, second = whole_and_resumed(made, stop, tmp_path / "c.pt")
     assert all(torch.equal(whole.splats[name], second.splats[name]) for name in whole.splats)
     states = [trainer.exposure.state_dict() for trainer in (whole, second)]
     assert states[0].keys() == {"affine", "step", "exp_avg", "exp_avg_sq"}

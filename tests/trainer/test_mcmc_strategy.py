@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from always import Always
+from interrupted import whole_and_resumed
 
 from skipgs_plug import SkipGate
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
@@ -61,12 +62,7 @@ def test_resumed_equals_uninterrupted(tmp_path: Path, scene: Scene, stop: int, s
             SkipGate(trainer, **settings)
         return trainer
 
-    whole, first, second = made(), made(), made()
-    whole.train(progress=False)
-    first.train(until=stop, progress=False)
-    first.save_checkpoint(tmp_path / "c.pt")
-    second.load_checkpoint(tmp_path / "c.pt")
-    second.train(progress=False)
+    whole, second = whole_and_resumed(made, stop, tmp_path / "c.pt")
     assert all(torch.equal(whole.splats[name], second.splats[name]) for name in whole.splats)
 
 
