@@ -3,10 +3,10 @@
 Refinement runs in cycles of steps that shrink to nothing, so that a cycle leaves a finished model behind; they end at
 1/8, 1/4 and all of what may run. In the first two, the losses of a few watched views at the end of a cycle say what it
 brought to views that are not trained on. What a doubling of the iterations brings hardly ever grows with the next
-doubling, so the second cycle's gain times the doublings that are left bounds what the rest would still bring; when that is
-less than the tolerance, refinement ends. Watched views that get worse still lose what only training gave them, which
-says nothing of the others. In the last cycle all views are trained. Watched views never get back wholly what they
-missed, so there are few, not for long, and none where a twelfth of the views is less than three.
+doubling, so the second cycle's gain times the doublings that are left bounds what the rest would still bring; when
+that is less than the tolerance, refinement ends. Watched views that get worse still lose what only training gave them,
+which says nothing of the others. In the last cycle all views are trained. Watched views never get back wholly what
+they missed, so there are few, not for long, and none where a twelfth of the views is less than three.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LEAST_VISITS = 10  # of each view: with fewer, larger steps did not make up for 
 LEAST_SHARE = 0.4
 ALL = 0.95
 WATCHED_SHARE = 1 / 12  # of the views
-LEAST_WATCHED, MOST_WATCHED = 3, 12  # with fewer than three nothing is watched: they cannot tell a twentieth of a decibel
+LEAST_WATCHED, MOST_WATCHED = 3, 12  # fewer than three cannot tell a twentieth of a decibel: none then
 
 
 def needed_share(iterations: int, n_views: int) -> float:
