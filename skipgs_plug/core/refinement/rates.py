@@ -11,6 +11,10 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 
 Optimizers = Callable[[], Iterable[torch.optim.Optimizer]]
 
+# The image is linear in the colours, so they bear longer steps than what moves or shapes a Gaussian.
+COLOUR_FACTOR = 2.0
+COLOUR_NAMES = frozenset({"f_dc", "f_rest", "sh0", "shN", "features_dc", "features_rest"})
+
 
 def path_factor(share: float, progress: float, peak: float | None = None) -> float:
     """Factor on learning rates at some progress through refinement, when a share of the iterations runs.
@@ -27,8 +31,17 @@ def path_factor(share: float, progress: float, peak: float | None = None) -> flo
     return (2.0 / share if peak is None else peak) * (1.0 - progress)
 
 
+def is_colour(group: dict[str, Any]) -> bool:
+    """Whether a group of an optimizer holds SH coefficients: by its name, or without one by the shape [N, K, 3]."""
+    if "name" in group:
+        return group["name"] in COLOUR_NAMES
+    return all(param.ndim == 3 and param.shape[-1] == 3 for param in group["params"])
+
+
 class ScaledRates:
     """Multiplies the learning rates of optimizers that step in this thread, and puts them back afterwards.
+
+    Those of SH coefficients are multiplied by `COLOUR_FACTOR` on top.
 
     PyTorch's own hooks around `step` are used, so fused, sparse and selective optimizers are reached alike, the
     trainer's schedule is never disturbed, and a checkpoint holds the trainer's rates.
@@ -37,11 +50,11 @@ class ScaledRates:
         only: Gives the optimizers that are meant; None for all that step, of which the trainer alone knows.
 
     Attributes:
-        factor: in force; 1 touches nothing.
+        factor: in force; None touches nothing.
     """
 
     def __init__(self, only: Optimizers | None = None) -> None:
-        self.factor = 1.0
+        self.factor: float | None = None
         self._only = only
         self._thread = threading.get_ident()
         self._depth: dict[int, int] = {}  # a step can call the step of its base class
@@ -67,7 +80,7 @@ class ScaledRates:
             handle.remove()
 
     def _scale(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        if self.factor == 1.0 or threading.get_ident() != self._thread:
+        if self.factor is None or threading.get_ident() != self._thread:
             return
         if self._only is not None and not any(optimizer is one for one in self._only()):
             return
@@ -77,7 +90,7 @@ class ScaledRates:
             return
         self._before[key] = [(group, group["lr"]) for group in optimizer.param_groups]
         for group in optimizer.param_groups:
-            group["lr"] = group["lr"] * self.factor
+            group["lr"] = group["lr"] * (self.factor * COLOUR_FACTOR if is_colour(group) else self.factor)
 
     def _put_back(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         key = id(optimizer)

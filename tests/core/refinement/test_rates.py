@@ -31,6 +31,27 @@ def test_the_path_is_conserved():
     assert path_factor(0.4, 0.5, peak=3.0) == 1.5
 
 
+@pytest.mark.parametrize(
+    "group, shape, times",
+    [
+        ({"name": "f_rest"}, (5, 15, 3), 2.0),
+        ({"name": "sh0"}, (5, 1, 3), 2.0),
+        ({"name": "features_dc"}, (5, 3), 2.0),
+        ({"name": "offset"}, (5, 10, 3), 1.0),  # Scaffold-GS: positions of the Gaussians of an anchor
+        ({"name": "xyz"}, (5, 3), 1.0),
+        ({}, (5, 15, 3), 2.0),
+        ({}, (5, 3), 1.0),
+    ],
+)
+def test_colours_take_steps_twice_as_long(group, shape, times, rates):
+    value = torch.nn.Parameter(torch.zeros(shape))
+    optimizer = torch.optim.SGD([{"params": [value], **group}], lr=0.1)
+    value.grad = torch.ones(shape)
+    rates.factor = 3.0
+    optimizer.step()
+    torch.testing.assert_close(value.detach(), torch.full(shape, -0.3 * times))
+
+
 class OwnStep(torch.optim.Adam):
     """Like the sparse optimizers of trainers: a step of its own, with arguments, that calls the base's."""
 
@@ -55,7 +76,7 @@ def test_a_step_is_as_long_as_the_factor_says_and_the_rate_comes_back(kind, rate
     before = scaled.param_groups[0]["lr"]
     scaled.step(*arguments)
     assert scaled.param_groups[0]["lr"] is before
-    rates.factor = 1.0
+    rates.factor = None
     plain.step(*arguments)
     torch.testing.assert_close(1.0 - value.detach(), 4.0 * (1.0 - other.detach()), rtol=1e-5, atol=0)
 
