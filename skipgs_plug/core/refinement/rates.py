@@ -11,9 +11,8 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 
 Optimizers = Callable[[], Iterable[torch.optim.Optimizer]]
 
-# The image is linear in the colours, so they bear longer steps than what moves or shapes a Gaussian.
-COLOUR_FACTOR = 2.0
 COLOUR_NAMES = frozenset({"f_dc", "f_rest", "sh0", "shN", "features_dc", "features_rest"})
+OPACITY_NAMES = frozenset({"opacity", "opacities"})
 
 
 def path_factor(share: float, progress: float, peak: float | None = None) -> float:
@@ -31,17 +30,26 @@ def path_factor(share: float, progress: float, peak: float | None = None) -> flo
     return (2.0 / share if peak is None else peak) * (1.0 - progress)
 
 
-def is_colour(group: dict[str, Any]) -> bool:
-    """Whether a group of an optimizer holds SH coefficients: by its name, or without one by the shape [N, K, 3]."""
+def group_factor(group: dict[str, Any], factor: float) -> float:
+    """Factor on the learning rate of a group of an optimizer, where `factor` is that of all.
+
+    The image is linear in the colours, so SH coefficients bear twice as long steps. Opacities are never raised: their
+    rate is large as it is, and steps beyond it flicker. Both are known by the group's name; in groups without one,
+    by shape: [N, K, 3] are SH coefficients, [N, 1] opacities.
+    """
     if "name" in group:
-        return group["name"] in COLOUR_NAMES
-    return all(param.ndim == 3 and param.shape[-1] == 3 for param in group["params"])
+        colour, opacity = group["name"] in COLOUR_NAMES, group["name"] in OPACITY_NAMES
+    else:
+        shapes = [tuple(param.shape[1:]) for param in group["params"]]
+        colour = all(len(shape) == 2 and shape[1] == 3 for shape in shapes)
+        opacity = all(shape == (1,) for shape in shapes)
+    if colour:
+        return 2.0 * factor
+    return min(factor, 1.0) if opacity else factor
 
 
 class ScaledRates:
     """Multiplies the learning rates of optimizers that step in this thread, and puts them back afterwards.
-
-    Those of SH coefficients are multiplied by `COLOUR_FACTOR` on top.
 
     PyTorch's own hooks around `step` are used, so fused, sparse and selective optimizers are reached alike, the
     trainer's schedule is never disturbed, and a checkpoint holds the trainer's rates.
@@ -50,7 +58,7 @@ class ScaledRates:
         only: Gives the optimizers that are meant; None for all that step, of which the trainer alone knows.
 
     Attributes:
-        factor: in force; None touches nothing.
+        factor: in force, see `group_factor`; None touches nothing.
     """
 
     def __init__(self, only: Optimizers | None = None) -> None:
@@ -90,7 +98,7 @@ class ScaledRates:
             return
         self._before[key] = [(group, group["lr"]) for group in optimizer.param_groups]
         for group in optimizer.param_groups:
-            group["lr"] = group["lr"] * (self.factor * COLOUR_FACTOR if is_colour(group) else self.factor)
+            group["lr"] = group["lr"] * group_factor(group, self.factor)
 
     def _put_back(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         key = id(optimizer)
