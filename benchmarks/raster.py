@@ -245,7 +245,8 @@ def measure_point(point: str, repeats: int) -> None:
             ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5")
     before = peak_memory(torch.device("cpu")) or 0
-    result = measure(scene_maker("random", n, size, sh_degree), repeats)
+    with threads(cores()):
+        result = measure(scene_maker("random", n, size, sh_degree), repeats)
     peak = peak_memory(torch.device("cpu")) or 0
     print(json.dumps({**result, "peak_mib": (peak - before) / 2**20}))
 

@@ -191,7 +191,7 @@ class Blend(torch.autograd.Function):
             "alphas": transmittance.shape,
         }
         ctx.absolute = absolute
-        tiles_per_gauss = ctx.blended.bins.tiles_per_gauss
+        tiles_per_gauss = ctx.blended.near.bins.tiles_per_gauss
         ctx.mark_non_differentiable(tiles_per_gauss)
         return image, transmittance, tiles_per_gauss
 

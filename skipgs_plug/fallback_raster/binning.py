@@ -40,16 +40,21 @@ def pack_colors(
 def pack_and_count(
     visible: Annotated[IntArray, "n"],
     means2d: Annotated[FloatArray, "R, 2"],
+    depths: Annotated[FloatArray, "R"],
     conics: Annotated[FloatArray, "R, 3"],
     opacities: Annotated[FloatArray, "R"],
     sigmas: Annotated[FloatArray, "R, 2"],
     colors: Annotated[FloatArray, "R, stride"],
-    records: Annotated[FloatArray, "R, RECORD"],  # out, only visible rows are written
-    boxes: Annotated[IntArray, "n, BOX"],  # out
+    ranges: Annotated[IntArray, "tiles_x * tiles_y if limited else 0, 2"],
+    records: Annotated[FloatArray, "R, RECORD"],  # out, only rows with pairs are written
+    listed: Annotated[IntArray, "n"],  # out, places in `visible` that have pairs, from where their slice begins
+    listed_count: Annotated[IntArray, "slices"],  # out
+    boxes: Annotated[IntArray, "n, BOX"],  # out, of those
     counts: Annotated[IntArray, "slices, tiles_x, tiles_y"],  # out
     totals: Annotated[LongArray, "slices + 1"],  # out, pairs of each slice
     tiles_per_gauss: Annotated[IntArray, "R if dense else 0"],  # out, zeros before
     n: int,
+    rows: int,
     stride: int,
     channels: int,
     slices: int,
@@ -58,6 +63,7 @@ def pack_and_count(
     tiles_x: int,
     tiles_y: int,
     dense: int,
+    limited: int,
     shortcuts: int,
 ) -> None: ...
 
@@ -77,7 +83,10 @@ def fill_pairs(
     visible: Annotated[IntArray, "n"],
     depths: Annotated[FloatArray, "R"],
     records: Annotated[FloatArray, "R, RECORD"],
+    listed: Annotated[IntArray, "n"],
+    listed_count: Annotated[IntArray, "slices"],
     boxes: Annotated[IntArray, "n, BOX"],
+    ranges: Annotated[IntArray, "tiles_x * tiles_y if limited else 0, 2"],
     counts: Annotated[IntArray, "slices, tiles_x, tiles_y"],  # next free place
     totals: Annotated[LongArray, "slices + 1"],
     pair_start: Annotated[IntArray, "n + 1"],  # out
@@ -88,6 +97,7 @@ def fill_pairs(
     width: float,
     tiles_x: int,
     tiles_y: int,
+    limited: int,
     shortcuts: int,
 ) -> None: ...
 
@@ -111,7 +121,7 @@ class Bins:
 
     Attributes:
         visible: [M] int32, rows of the visible Gaussians.
-        records: [R, RECORD] float32, what the blend reads of each of them.
+        records: [R, RECORD] float32, what the blend reads of each of them that has pairs.
         tile_start: [tiles + 1] int32, begin of each tile's part of the lists, row-major.
         tile_list: [P] int32, rows, front to back in every tile as far as it is sorted.
         tile_place: [P] int32, number of the pair; pairs are numbered by row and tile.
@@ -151,10 +161,13 @@ def bin_gaussians(
     width: int,
     height: int,
     dense: bool = True,
+    ranges: Tensor | None = None,  # [tiles, 2] int32
+    records: Tensor | None = None,  # [R, RECORD]
 ) -> Bins:
     """Lists the visible Gaussians of one image per tile, not yet sorted by depth, with their first channels.
 
-    `tiles_per_gauss` is empty unless `dense`.
+    With `ranges`, only at depths, as bits of float32, that lie between the two numbers of the tile; `records` may be
+    given where they hold the records of other lists. `tiles_per_gauss` is empty unless `dense`, and counts all tiles.
 
     Raises:
         ValueError: There are more (tile, Gaussian) pairs than can be listed.
@@ -164,13 +177,18 @@ def bin_gaussians(
     rows, channels = colors.shape
     # Any number of slices gives the same lists; some per thread keep all busy.
     slices = 1 if n < 1024 or get_num_threads() == 1 else SLICES * get_num_threads()
-    records, boxes, counts = floats(rows, RECORD), ints(n, BOX), ints(slices, tiles_x * tiles_y)
+    limited = ranges is not None
+    ranges = ints(0) if ranges is None else ranges
+    records = floats(rows, RECORD) if records is None else records
+    listed, listed_count = ints(n), ints(slices)
+    boxes, counts = ints(n, BOX), ints(slices, tiles_x * tiles_y)
     tile_start, pair_start = ints(tiles_x * tiles_y + 1), ints(n + 1)
     tiles_per_gauss, totals = zeros(rows if dense else 0, dtype=torch.int32), longs(slices + 1)
     pack_and_count(
-        visible, means2d, conics, opacities, sigmas, colors, records, boxes, counts, totals, tiles_per_gauss,
-        n, channels, min(channels, MAX_CHANNELS), slices, float(width), float(height), tiles_x, tiles_y,
-        int(dense), active_shortcuts(),
+        visible, means2d, depths, conics, opacities, sigmas, colors, ranges, records, listed, listed_count, boxes,
+        counts, totals, tiles_per_gauss,
+        n, rows, channels, min(channels, MAX_CHANNELS), slices, float(width), float(height), tiles_x, tiles_y,
+        int(dense), int(limited), active_shortcuts(),
     )  # fmt: skip
     scan_pairs(counts, totals, tile_start, slices, tiles_x * tiles_y)
     pairs = int(totals[-1])
@@ -181,8 +199,8 @@ def bin_gaussians(
         )
     pair_row, unsorted = ints(pairs), longs(pairs)
     fill_pairs(
-        visible, depths, records, boxes, counts, totals, pair_start, pair_row, unsorted,
-        n, slices, float(width), tiles_x, tiles_y, active_shortcuts(),
+        visible, depths, records, listed, listed_count, boxes, ranges, counts, totals, pair_start, pair_row, unsorted,
+        n, slices, float(width), tiles_x, tiles_y, int(limited), active_shortcuts(),
     )  # fmt: skip
     lists = ints(pairs), ints(pairs)
     return Bins(visible, records, tile_start, *lists, pair_start, pair_row, unsorted, tiles_per_gauss)

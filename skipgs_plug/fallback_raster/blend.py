@@ -42,6 +42,8 @@ def _forward(channels: int) -> Worker:
         tile_stop: Annotated[IntArray, "tiles_x, tiles_y"],  # out, their maximum
         pair_blocks: Annotated[IntArray, "P"],  # out, blocks where it was blended, as bits; nothing beyond tile_stop
         blended_pairs: Annotated[ByteArray, "padded(P)"],  # out, zeros before; whether there is such a block, by place
+        product_left: Annotated[FloatArray, "height if unfinished or continued else 0, width"],  # in and out
+        still_open: Annotated[IntArray, "tiles_x * tiles_y if unfinished or continued else 0"],  # out
         width: int,
         height: int,
         tiles_x: int,
@@ -50,6 +52,9 @@ def _forward(channels: int) -> Worker:
         channel: int,  # the first of this pass
         channels: int,
         sorted: int,  # whether the lists are
+        before: int,  # pairs of the lists in front of these, where an earlier pass ended
+        continued: int,  # whether there was one
+        unfinished: int,  # whether there may be a later one
         shortcuts: int,
     ) -> None: ...
 
@@ -67,9 +72,11 @@ def _backward(channels: int, absgrad: bool) -> Worker:
     def blend_backward(
         records: Annotated[FloatArray, "R, RECORD"],
         tile_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],
+        tile_stop: Annotated[IntArray, "tiles_x, tiles_y"],
+        far_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],  # of the second part of each list, if there is one
+        far_stop: Annotated[IntArray, "tiles_x, tiles_y"],
         tile_list: Annotated[IntArray, "P"],
         tile_place: Annotated[IntArray, "P"],
-        tile_stop: Annotated[IntArray, "tiles_x, tiles_y"],
         pair_blocks: Annotated[IntArray, "P"],
         transmittance: Annotated[FloatArray, "height, width"],
         pixel_stop: Annotated[IntArray, "height, width"],
@@ -84,6 +91,7 @@ def _backward(channels: int, absgrad: bool) -> Worker:
         stride: int,
         channel: int,
         channels: int,
+        parts: int,
         shortcuts: int,
     ) -> None: ...
 
@@ -111,6 +119,9 @@ def reduce_pairs(
     visible: Annotated[IntArray, "M"],
     block_start: Annotated[IntArray, "blocks(rows) + 1"],  # where each block of rows begins in `visible`
     pair_start: Annotated[IntArray, "M + 1"],
+    far_visible: Annotated[IntArray, "F"],  # those with pairs in the second part of the lists
+    far_block_start: Annotated[IntArray, "blocks(rows) + 1"],
+    far_pair_start: Annotated[IntArray, "F + 1"],
     pair_number: Annotated[IntArray, "P"],
     blended_pairs: Annotated[ByteArray, "padded(P)"],
     v_pairs: Annotated[FloatArray, "Q, PAIR"],
@@ -128,4 +139,5 @@ def reduce_pairs(
     channels: int,
     absgrad: int,
     dense: int,
+    parts: int,
 ) -> None: ...

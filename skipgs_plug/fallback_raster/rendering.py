@@ -9,7 +9,48 @@ from .binning import Bins, bin_gaussians, pack_colors
 from .blend import backward_worker, forward_worker, reduce_pairs
 from .constants import MAX_CHANNELS, PAIR, padded, tiles
 from .launch import floats, ints, longs, scratch, zeros
+from .near_first import bin_the_rest, near_ranges
 from .shortcuts import active_shortcuts
+
+
+@dataclass
+class Pass:
+    """Lists of one image, and what of them was blended.
+
+    Attributes:
+        bins: The lists, sorted as far as the pixels took them.
+        block_start: [blocks + 1] int32, where each block of rows begins among those of `bins`.
+        tile_stop: [tiles] int32, place in the list behind the last Gaussian that a pixel of the tile took.
+        pair_blocks: [P] int32, blocks of a tile in which a pair was blended, as bits, by place in the lists.
+        blended_pairs: [P, padded] uint8, whether a pair was blended, by its number.
+    """
+
+    bins: Bins
+    block_start: Tensor
+    tile_stop: Tensor
+    pair_blocks: Tensor
+    blended_pairs: Tensor
+
+    def after(self, near: "Pass") -> "Pass":
+        """This one as the second part of one list of pairs whose first part is `near`."""
+        first, own, pairs = near.bins, self.bins, len(near.bins.tile_list)
+        bins = Bins(
+            own.visible,
+            own.records,
+            own.tile_start + pairs,
+            torch.cat([first.tile_list, own.tile_list]),
+            torch.cat([first.tile_place, own.tile_place + pairs]),
+            own.pair_start + pairs,
+            own.pair_row,
+            own.unsorted,
+            own.tiles_per_gauss,
+        )
+        count = pairs + len(own.tile_list)
+        blended_pairs = zeros(padded(count), dtype=torch.uint8)
+        blended_pairs[:pairs] = near.blended_pairs[:pairs]
+        blended_pairs[pairs:count] = self.blended_pairs[: len(own.tile_list)]
+        pair_blocks = torch.cat([near.pair_blocks, self.pair_blocks])
+        return Pass(bins, self.block_start, self.tile_stop + pairs, pair_blocks, blended_pairs)
 
 
 @dataclass
@@ -17,21 +58,15 @@ class Blended:
     """What the adjoint of a blend needs beside its inputs and the transmittance.
 
     Attributes:
-        bins: The lists, sorted as far as the pixels took them.
-        block_start: [blocks + 1] int32, where each block of rows begins among the visible ones.
+        near: The lists that were blended first, all there are if they were deep enough.
+        last: Those behind them, with the pairs of both; else `near`.
         pixel_stop: [H, W] int32, place in the list behind the last Gaussian blended.
-        tile_stop: [tiles] int32, the maximum over each tile.
-        pair_blocks: [P] int32, blocks of a tile in which a pair was blended, as bits, by place in the lists.
-        blended_pairs: [P, padded] uint8, whether a pair was blended, by its number.
         dense: Whether rows that are not visible get gradients, zeros.
     """
 
-    bins: Bins
-    block_start: Tensor
+    near: Pass
+    last: Pass
     pixel_stop: Tensor
-    tile_stop: Tensor
-    pair_blocks: Tensor
-    blended_pairs: Tensor
     dense: bool
 
 
@@ -49,11 +84,39 @@ def blend(
     dense: bool = True,
 ) -> tuple[Tensor, Tensor, Blended]:
     """Image [H, W, D] and the transmittance [H, W] behind it."""
-    bins = bin_gaussians(visible, means2d, depths, conics, opacities, sigmas, colors, width, height, dense)
+    channels, size = colors.shape[1], (width, height, *tiles(width, height))
+    ranges = None
+    if channels <= MAX_CHANNELS:
+        ranges = near_ranges(visible, means2d, depths, conics, opacities, width, height)
+    rows = means2d, depths, conics, opacities, sigmas, colors, width, height
+    bins = bin_gaussians(visible, *rows, dense, ranges)
+    image, transmittance, pixel_stop = floats(height, width, channels), floats(height, width), ints(height, width)
+    limited = ranges is not None
+    product_left, still_open = floats(height if limited else 0, width), ints(size[2] * size[3] if limited else 0)
+    pixels = image, transmittance, pixel_stop, product_left, still_open
+
+    near = _blend_lists(bins, block_start, colors, pixels, size, 0, False, limited)
+    last = near
+    if ranges is not None:
+        rest = bin_the_rest(bins, ranges, still_open, block_start, *rows)
+        if rest is not None:
+            last = _blend_lists(*rest, colors, pixels, size, len(bins.tile_list), True, False).after(near)
+    return image, transmittance, Blended(near, last, pixel_stop, dense)
+
+
+def _blend_lists(
+    bins: Bins,
+    block_start: Tensor,
+    colors: Tensor,
+    pixels: tuple[Tensor, ...],
+    size: tuple[int, int, int, int],
+    before: int,  # pairs in front of these lists
+    continued: bool,  # whether others were blended
+    unfinished: bool,  # whether others may follow
+) -> Pass:
     channels, pairs = colors.shape[1], len(bins.tile_list)
-    size = (width, height, *tiles(width, height))
-    image, transmittance = floats(height, width, channels), floats(height, width)
-    pixel_stop, tile_stop, pair_blocks = ints(height, width), ints(size[2] * size[3]), ints(pairs)
+    image, transmittance, pixel_stop, product_left, still_open = pixels
+    tile_stop, pair_blocks = ints(size[2] * size[3]), ints(pairs)
     blended_pairs = zeros(padded(pairs), dtype=torch.uint8)
     in_one = channels <= MAX_CHANNELS
     if not in_one:
@@ -65,12 +128,12 @@ def blend(
             pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
         forward_worker(some)(
             bins.records, bins.tile_start, bins.pair_row, bins.unsorted, buffer, bins.tile_list, bins.tile_place,
-            image, transmittance, pixel_stop, tile_stop, pair_blocks, blended_pairs,
-            *size, channels, channel, some, int(not in_one), active_shortcuts(),
+            image, transmittance, pixel_stop, tile_stop, pair_blocks, blended_pairs, product_left, still_open,
+            *size, channels, channel, some, int(not in_one), before, int(continued), int(unfinished),
+            active_shortcuts(),
         )  # fmt: skip
     bins.unsorted, bins.pair_row = longs(0), ints(0)  # no longer needed
-    blended = Blended(bins, block_start, pixel_stop, tile_stop, pair_blocks, blended_pairs, dense)
-    return image, transmittance, blended
+    return Pass(bins, block_start, tile_stop, pair_blocks, blended_pairs)
 
 
 def blend_adjoint(
@@ -85,30 +148,31 @@ def blend_adjoint(
     absolute: Tensor | None,  # [R, 2]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Gradients of means2d, conics, opacities and colors; `absolute` receives the sum over pixels of |v_means2d|."""
-    bins = blended.bins
+    near, last = blended.near, blended.last
+    bins, lists, parts = near.bins, last.bins, 1 if last is near else 2
     height, width, channels = v_image.shape
     size = (width, height, *tiles(width, height))
     v_image, v_transmittance = v_image.contiguous(), v_transmittance.contiguous()
     v_means2d, v_conics, v_opacities, v_colors = (floats(*t.shape) for t in (means2d, conics, opacities, colors))
     with_absolute = absolute is not None
     absolute = floats(0) if absolute is None else absolute
-    pairs = len(bins.tile_list)
+    pairs = len(lists.tile_list)
     # Behind the surface most pairs are not blended: they have no sums.
-    pair_number = blended.blended_pairs[:pairs].cumsum(0, dtype=torch.int32)
+    pair_number = last.blended_pairs[:pairs].cumsum(0, dtype=torch.int32)
     v_pairs = scratch("v_pairs", int(pair_number[-1]) if pairs else 0, PAIR)
     for channel in range(0, channels, MAX_CHANNELS):
         some = min(MAX_CHANNELS, channels - channel)
         if channels > MAX_CHANNELS:
             pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
         backward_worker(some, with_absolute)(
-            bins.records, bins.tile_start, bins.tile_list, bins.tile_place, blended.tile_stop, blended.pair_blocks,
-            transmittance, blended.pixel_stop, v_image, v_transmittance, pair_number, v_pairs,
-            *size, channels, channel, some, active_shortcuts(),
+            bins.records, bins.tile_start, near.tile_stop, lists.tile_start, last.tile_stop, lists.tile_list,
+            lists.tile_place, last.pair_blocks, transmittance, blended.pixel_stop, v_image, v_transmittance,
+            pair_number, v_pairs, *size, channels, channel, some, parts, active_shortcuts(),
         )  # fmt: skip
         reduce_pairs(
-            bins.visible, blended.block_start, bins.pair_start, pair_number, blended.blended_pairs, v_pairs, conics,
-            opacities, v_means2d, v_conics, v_opacities, absolute, v_colors,
-            len(means2d), channels, channel, some, int(with_absolute), int(blended.dense),
+            bins.visible, near.block_start, bins.pair_start, lists.visible, last.block_start, lists.pair_start,
+            pair_number, last.blended_pairs, v_pairs, conics, opacities, v_means2d, v_conics, v_opacities, absolute,
+            v_colors, len(means2d), channels, channel, some, int(with_absolute), int(blended.dense), parts,
         )  # fmt: skip
         # The gradient of the transmittance belongs to the first pass alone.
         v_transmittance = torch.zeros_like(v_transmittance) if channels > MAX_CHANNELS else v_transmittance

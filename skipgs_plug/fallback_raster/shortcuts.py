@@ -16,6 +16,7 @@ SHORTCUTS = {
     "visible_only": 16,  # evaluate SH and its adjoint only for Gaussians on screen
     "contributed_only": 32,  # run the adjoint of SH and projection only for Gaussians that received a gradient
     "spheres": 64,  # leave out 16 Gaussians at once that lie outside the image even as spheres
+    "near_first": 128,  # list what lies deep behind others only where pixels turn out to need it
 }
 
 _active = sum(SHORTCUTS.values())

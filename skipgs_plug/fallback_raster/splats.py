@@ -18,7 +18,7 @@ from .constants import TILE, blocks, tiles
 from .launch import floats, ints, zeros
 from .project import project_backward, project_forward
 from .rendering import blend, blend_adjoint
-from .rows import visible_rows
+from .rows import take_rows, visible_rows
 from .sh import sh_backward, sh_forward
 from .shortcuts import active_shortcuts
 
@@ -99,7 +99,7 @@ def rasterize_splats(
     with torch.no_grad():
         projected = _project(means, quats, log_scales, logits, viewmat, K, size, near_plane, far_plane, antialiased)
         ids = projected.visible.to(torch.int64)
-        centres = projected.means2d[ids]
+        centres = take_rows(projected.means2d, projected.visible)
     # A leaf that goes in with the parameters, so that its gradient comes out with theirs.
     centres.requires_grad_(torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
     absolute = None
@@ -116,7 +116,7 @@ def rasterize_splats(
     info = {
         "camera_ids": torch.zeros_like(ids),
         "gaussian_ids": ids,
-        "radii": projected.radii[ids],
+        "radii": take_rows(projected.radii, projected.visible),
         "means2d": centres,
         "width": width,
         "height": height,
@@ -181,9 +181,8 @@ class _Render(torch.autograd.Function):
         v_means2d, v_conics, v_activated, v_colors = blend_adjoint(
             ctx.blended, p.means2d, p.conics, p.opacities, ctx.colors, transmittance, v_image, v_transmittance, absolute
         )
-        ids = p.visible.to(torch.int64)
         if absolute is not None:
-            ctx.absolute += absolute[ids]
+            ctx.absolute += take_rows(absolute, p.visible)
         gradients = [floats(*t.shape) for t in (means, quats, log_scales, logits, sh0, shN)]
         v_means, v_quats, v_scales, v_logits, v_sh0, v_shN = gradients
         sh_backward(
@@ -195,7 +194,7 @@ class _Render(torch.autograd.Function):
             floats(0), v_activated, v_means, v_quats, v_scales, v_logits, floats(0),
             n, *map(float, size), EPS2D, 0, int(antialiased), 0, 1, active_shortcuts(),
         )  # fmt: skip
-        return *gradients, v_means2d[ids], *[None] * 7
+        return *gradients, take_rows(v_means2d, p.visible), *[None] * 7
 
 
 def _project(

@@ -348,8 +348,7 @@ class Trainer:
             args = (self.splats, self.optimizers, self.strategy_state, step)
             strategy.step_post_backward(*args, info, packed=info["gaussian_ids"] is not None)
             reset_opacity_if_missed(strategy, *args)
-        if sorts_rows(strategy, step):
-            sort_rows(self.splats, self.optimizers, self.strategy_state)
+        self._sort_rows(strategy, step)
 
     def _move(self, mcmc: Mcmc, step: int, updated: bool) -> None:
         # The noise belongs to the update: alone it is a random walk.
@@ -360,6 +359,11 @@ class Trainer:
             rate = self.optimizers["means"].param_groups[0]["lr"] if updated else 0.0
             with self._seeded(step):
                 mcmc.after_update(self.splats, self.optimizers, step, rate)
+        self._sort_rows(mcmc, step)
+
+    def _sort_rows(self, strategy: Any, step: int) -> None:
+        if sorts_rows(strategy, step):
+            sort_rows(self.splats, self.optimizers, self.strategy_state)
 
     @contextmanager
     def _seeded(self, step: int) -> Iterator[None]:

@@ -17,26 +17,31 @@ class Mcmc:
     """In the units of the scene: the same scene at twice the size trains alike.
 
     Nothing of it has to travel in checkpoints: what it draws is a function of seed and iteration.
+
+    Attributes:
+        refine_start_iter: first iteration of the moves, exclusive, as all three in iterations of this run.
+        refine_stop_iter: end of the moves, exclusive.
+        refine_every: iterations from one to the next.
     """
 
     def __init__(self, config: TrainConfig, scene_scale: float) -> None:
-        self._stop = config.scaled(config.recipe.refine_stop_iter)
-        self._every = config.scaled_interval(config.refine_every, MIN_MOVE_EVERY)
-        self._start = config.scaled(config.refine_start_iter)
+        self.refine_stop_iter = config.scaled(config.recipe.refine_stop_iter)
+        self.refine_every = config.scaled_interval(config.refine_every, MIN_MOVE_EVERY)
+        self.refine_start_iter = config.scaled(config.refine_start_iter)
         self._strategy = gsplat_class("MCMCStrategy")(
             cap_max=config.cap_max,
             # It multiplies noise by covariances and by the rate of positions, which follows the scale of the scene.
             noise_lr=config.noise_lr / scene_scale**2,
-            refine_start_iter=self._start,
-            refine_stop_iter=self._stop,
-            refine_every=self._every,
+            refine_start_iter=self.refine_start_iter,
+            refine_stop_iter=self.refine_stop_iter,
+            refine_every=self.refine_every,
             min_opacity=config.prune_opa,
         )
         self._constants = self._strategy.initialize_state()
 
     def moves(self, step: int) -> bool:
         """Whether dead Gaussians are moved, and new ones added, after iteration `step`."""
-        return self._start < step < self._stop and step % self._every == 0
+        return self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0
 
     def after_update(
         self, splats: nn.ParameterDict, optimizers: dict[str, torch.optim.Optimizer], step: int, rate: float

@@ -61,6 +61,28 @@ def random_scene(
     return {**scene, "width": width, "height": height, "sh_degree": sh_degree}
 
 
+def deep_scene(n: int, width: int = 70, height: int = 45, seed: int = 0, size: float = 1.0) -> dict[str, Any]:
+    """Many small opaque Gaussians behind one another, a few large ones among them, and a gap at one side."""
+    generator = torch.Generator().manual_seed(seed)
+    depth = 2 + 6 * torch.rand(n, generator=generator)
+    x = (2 * torch.rand(n, generator=generator) - 1) * 0.6 * depth
+    y = (2 * torch.rand(n, generator=generator) - 1) * 0.4 * depth
+    x = torch.where(depth < 5, x.clamp(min=-0.2 * depth), x)  # what is near leaves the left of the image free
+    scales = size * (0.06 * torch.rand(n, 3, generator=generator) + 0.03)
+    scales[::211] *= 20
+    return {
+        "means": torch.stack([x, y, depth], dim=1),
+        "scales": scales,
+        "quats": torch.randn(n, 4, generator=generator),
+        "opacities": 0.3 + 0.7 * torch.rand(n, generator=generator),
+        "colors": torch.rand(n, 3, generator=generator),
+        "viewmats": torch.eye(4)[None],
+        "Ks": torch.tensor([[[0.9 * width, 0, width / 2], [0, 0.9 * width, height / 2], [0, 0, 1]]]),
+        "width": width,
+        "height": height,
+    }
+
+
 def leaves(scene: dict[str, Any], dtype: torch.dtype, extra: tuple[str, ...] = ()) -> dict[str, Any]:
     """The scene with fresh tensors of `dtype` that collect gradients."""
     fresh = dict(scene)

@@ -7,18 +7,31 @@ from typing import Any
 import pytest
 import torch
 from compat_scenes import camera, gaussians
-from raster_scenes import leaves, random_scene
+from raster_scenes import deep_scene, leaves, random_scene
 
-from skipgs_plug.fallback_raster import adam, binning, blend, guard, l1_ssim_loss, loss, project, rasterization, sh
+from skipgs_plug.fallback_raster import (
+    adam,
+    binning,
+    blend,
+    guard,
+    l1_ssim_loss,
+    loss,
+    near_first,
+    project,
+    rasterization,
+    rows,
+    sh,
+)
 from skipgs_plug.fallback_raster.compat import statistics
 from skipgs_plug.fallback_raster.compat.inria import GaussianRasterizationSettings
 from skipgs_plug.fallback_raster.compat.rendering import render, splats
 from skipgs_plug.fallback_raster.launch import ByteArray, FloatArray, IntArray, LongArray, Worker, worker
 from skipgs_plug.fallback_raster.source import KERNELS, PRELUDE, read_kernel
+from skipgs_plug.fallback_raster.splats import rasterize_splats
 
 WORKERS = {
     found._name: found
-    for module in (adam, binning, blend, loss, project, sh, statistics)
+    for module in (adam, binning, blend, loss, near_first, project, rows, sh, statistics)
     for value in vars(module).values()
     for found in (value.values() if isinstance(value, dict) else [value])
     if isinstance(found, Worker)
@@ -31,7 +44,7 @@ def test_every_kernel_file_is_used_and_tested() -> None:
     texts = [PRELUDE, *(found._code for found in WORKERS.values())]
     unused = [path.name for path in KERNELS.glob("*.h") if not any(f'kernels/{path.name}"' in text for text in texts)]
     assert not unused
-    assert len(WORKERS) == 23
+    assert len(WORKERS) == 26
 
 
 @pytest.mark.parametrize("name", WORKERS)
@@ -80,6 +93,11 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker, list[A
             image.sum().backward()
         scene = leaves(random_scene(n=40, sh_degree=2), torch.float32)
         image, _, _ = rasterization(**scene, render_mode="RGB+D")
+        deep = deep_scene(6000, size=4.0)
+        rasterization(**deep)
+        raw = [deep[name] for name in ("means", "quats", "scales", "opacities")]
+        sh = [deep["colors"][:, None], torch.zeros(6000, 0, 3)]
+        rasterize_splats(*raw, *sh, deep["viewmats"][0], deep["Ks"][0], deep["width"], deep["height"], 0)
         l1_ssim_loss(image, torch.zeros_like(image)).backward()
         param = torch.nn.Parameter(torch.ones(5, 3))
         param.grad = torch.ones(5, 3)

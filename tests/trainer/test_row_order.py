@@ -49,9 +49,11 @@ def test_the_strategys_sums_move_with_their_rows(trainer: Trainer) -> None:
     assert trainer.strategy_state["scene_scale"] == pytest.approx(trainer.scene.scene_scale)
 
 
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
 def test_a_run_sorts_and_resumes_in_that_order(
-    tmp_path: Path, tiny_scene: Scene, tiny_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, tiny_scene: Scene, tiny_config: TrainConfig, monkeypatch: pytest.MonkeyPatch, strategy: str
 ) -> None:
+    tiny_config = dataclasses.replace(tiny_config, strategy=strategy)
     sorted_at: list[int] = []
 
     def noted(*args: object) -> None:
@@ -61,8 +63,8 @@ def test_a_run_sorts_and_resumes_in_that_order(
     monkeypatch.setattr(loop, "sort_rows", noted)
     whole = Trainer(tiny_config, tiny_scene)
     whole.train(progress=False)
-    assert sorted_at and all(sorts_rows(whole.strategy, step) for step in sorted_at)
-    assert not sorts_rows(whole.strategy, sorted_at[0] + 1)
+    assert sorted_at and all(sorts_rows(whole.strategy or whole.mcmc, step) for step in sorted_at)
+    assert not sorts_rows(whole.strategy or whole.mcmc, sorted_at[0] + 1)
     monkeypatch.undo()
     for stop in (sorted_at[0], sorted_at[0] + 1):
         first = Trainer(tiny_config, tiny_scene)

@@ -2,16 +2,15 @@
 #include "blend_tile.h"
 for (int t = first; t < last; ++t) {
     const Tile tile(t, tile_start, tiles_x, width, height);
-    const int x0 = tile.x0, y0 = tile.y0, begin = tile.begin;
+    const int x0 = tile.x0, y0 = tile.y0;
 
     // behind = (what lies behind the current Gaussian) . v_image, less what alpha and background receive.
     alignas(64) v16 T[16], behind[16], v[16][D];
     alignas(64) i16 stop[16];
-    const int tile_end = tile_stop[t];
     for (int b = 0; b < 16; ++b) {
         T[b] = (v16)1.0f;
         behind[b] = (v16)0.0f;
-        stop[b] = (i16)begin;
+        stop[b] = (i16)0;
         for (int c = 0; c < D; ++c) v[b][c] = (v16)0.0f;
     }
     for (int y = 0; y < tile.rows; ++y)
@@ -31,50 +30,54 @@ for (int t = first; t < last; ++t) {
         // A block without incoming gradient adds exact zeros.
         if (any(wanted) || !(shortcuts & ZERO_GRADIENT)) open |= 1u << b;
     }
-    for (int k = tile_end - 1; k >= begin; --k) {
-        __builtin_prefetch(records + (long long)RECORD * tile_list[larger(k - 8, begin)]);
-        __builtin_prefetch(pair_number + tile_place[larger(k - 16, begin)]);
-        if (!pair_blocks[k]) continue;
-        unsigned todo = pair_blocks[k] & open;
-        const float* r = records + (long long)RECORD * tile_list[k];
-        v16 m[8], abs_x = (v16)0.0f, abs_y = (v16)0.0f, v_color[D];
-        for (int j = 0; j < 8; ++j) m[j] = (v16)0.0f;
-        for (int c = 0; c < D; ++c) v_color[c] = (v16)0.0f;
-        for (; todo; todo &= todo - 1) {
-            const int b = __builtin_ctz(todo);
-            const Falloff seen(tile, b, r);
+    // The part of the list that was blended last comes first.
+    for (int part = parts - 1; part >= 0; --part) {
+        const int begin = part ? far_start[t] : tile.begin, tile_end = part ? far_stop[t] : tile_stop[t];
+        for (int k = tile_end - 1; k >= begin; --k) {
+            __builtin_prefetch(records + (long long)RECORD * tile_list[larger(k - 8, begin)]);
+            __builtin_prefetch(pair_number + tile_place[larger(k - 16, begin)]);
+            if (!pair_blocks[k]) continue;
+            unsigned todo = pair_blocks[k] & open;
+            const float* r = records + (long long)RECORD * tile_list[k];
+            v16 m[8], abs_x = (v16)0.0f, abs_y = (v16)0.0f, v_color[D];
+            for (int j = 0; j < 8; ++j) m[j] = (v16)0.0f;
+            for (int c = 0; c < D; ++c) v_color[c] = (v16)0.0f;
+            for (; todo; todo &= todo - 1) {
+                const int b = __builtin_ctz(todo);
+                const Falloff seen(tile, b, r);
 
-            const i16 hit = (seen.log2_alpha >= LOG2_ALPHA_MIN) & (stop[b] > k);
-            const v16 full = exp2(seen.log2_alpha);
-            const v16 alpha = vmin((v16)ALPHA_MAX, full);
-            const v16 passed = 1.0f / (1.0f - alpha);
-            v16 shade = r[8] * v[b][0];
-            for (int c = 1; c < D; ++c) shade += r[8 + c] * v[b][c];
-            // T is the transmittance behind the Gaussian, T / (1 - alpha) that before it.
-            const v16 share = hit ? alpha * passed : (v16)0.0f;
-            const v16 weight = share * T[b];
-            // Where alpha is clamped, neither opacity nor shape moves it.
-            const v16 v_sigma = (hit & (full <= ALPHA_MAX)) ? share * (behind[b] - T[b] * shade) : (v16)0.0f;
-            T[b] += weight;
-            behind[b] += hit ? weight * shade : (v16)0.0f;
-            for (int c = 0; c < D; ++c) v_color[c] += weight * v[b][c];
-            const v16 v_x = v_sigma * seen.dx, v_y = v_sigma * seen.dy;
-            m[0] += v_sigma;
-            m[1] += v_x;
-            m[2] += v_y;
-            m[3] += v_x * seen.dx;
-            m[4] += v_x * seen.dy;
-            m[5] += v_y * seen.dy;
-            if (ABSGRAD) {
-                abs_x += vabs(v_sigma * seen.p);
-                abs_y += vabs(v_sigma * (r[3] * seen.p + r[4] * seen.w));
+                const i16 hit = (seen.log2_alpha >= LOG2_ALPHA_MIN) & (stop[b] > k);
+                const v16 full = exp2(seen.log2_alpha);
+                const v16 alpha = vmin((v16)ALPHA_MAX, full);
+                const v16 passed = 1.0f / (1.0f - alpha);
+                v16 shade = r[8] * v[b][0];
+                for (int c = 1; c < D; ++c) shade += r[8 + c] * v[b][c];
+                // T is the transmittance behind the Gaussian, T / (1 - alpha) that before it.
+                const v16 share = hit ? alpha * passed : (v16)0.0f;
+                const v16 weight = share * T[b];
+                // Where alpha is clamped, neither opacity nor shape moves it.
+                const v16 v_sigma = (hit & (full <= ALPHA_MAX)) ? share * (behind[b] - T[b] * shade) : (v16)0.0f;
+                T[b] += weight;
+                behind[b] += hit ? weight * shade : (v16)0.0f;
+                for (int c = 0; c < D; ++c) v_color[c] += weight * v[b][c];
+                const v16 v_x = v_sigma * seen.dx, v_y = v_sigma * seen.dy;
+                m[0] += v_sigma;
+                m[1] += v_x;
+                m[2] += v_y;
+                m[3] += v_x * seen.dx;
+                m[4] += v_x * seen.dy;
+                m[5] += v_y * seen.dy;
+                if (ABSGRAD) {
+                    abs_x += vabs(v_sigma * seen.p);
+                    abs_y += vabs(v_sigma * (r[3] * seen.p + r[4] * seen.w));
+                }
             }
+            float* out = v_pairs + (long long)PAIR * (pair_number[tile_place[k]] - 1);
+            for (int c = 0; c < D && c < 2; ++c) m[6 + c] = v_color[c];
+            *(v8*)out = sum8(m);
+            for (int c = 2; c < 4; ++c) out[6 + c] = c < D ? sum(v_color[c < D ? c : 0]) : 0.0f;
+            out[10] = ABSGRAD ? r[2] * sum(abs_x) : 0.0f;
+            out[11] = ABSGRAD ? sum(abs_y) : 0.0f;
         }
-        float* out = v_pairs + (long long)PAIR * (pair_number[tile_place[k]] - 1);
-        for (int c = 0; c < D && c < 2; ++c) m[6 + c] = v_color[c];
-        *(v8*)out = sum8(m);
-        for (int c = 2; c < 4; ++c) out[6 + c] = c < D ? sum(v_color[c < D ? c : 0]) : 0.0f;
-        out[10] = ABSGRAD ? r[2] * sum(abs_x) : 0.0f;
-        out[11] = ABSGRAD ? sum(abs_y) : 0.0f;
     }
 }

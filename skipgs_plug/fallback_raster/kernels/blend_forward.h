@@ -4,6 +4,10 @@
 #include "sorted_tile.h"
 for (int t = first; t < last; ++t) {
     const Tile tile(t, tile_start, tiles_x, width, height);
+    if (continued && tile.begin == tile.end) {
+        tile_stop[t] = tile.begin;
+        continue;
+    }
     const int x0 = tile.x0, y0 = tile.y0, begin = tile.begin, end = tile.end;
     SortedTile list(begin, sorted ? begin : end, unsorted, buffer, tile_list, tile_place, pair_row, records);
 
@@ -17,6 +21,20 @@ for (int t = first; t < last; ++t) {
         for (int c = 0; c < D; ++c) C[b][c] = (v16)0.0f;
         stop[b] = (i16)begin;
         if (any(inside)) open |= 1u << b;
+    }
+    // What lies behind the lists of an earlier pass: its places count from `before` on.
+    if (continued) {
+        for (int y = 0; y < tile.rows; ++y)
+            for (int x = 0; x < tile.columns; ++x) {
+                const long long at = (long long)(y0 + y) * width + x0 + x;
+                const int b = y / 4 * 4 + x / 4, l = y % 4 * 4 + x % 4;
+                P[b][l] = product_left[at];
+                T[b][l] = transmittance[at];
+                stop[b][l] = pixel_stop[at] - before;
+                for (int c = 0; c < channels; ++c) C[b][c][l] = image[at * stride + channel + c];
+            }
+        for (int b = 0; b < 16; ++b)
+            if (!any(P[b] > TRANSMITTANCE_MIN)) open &= ~(1u << b);
     }
     for (int base = begin; base < end && open; base += 64) {
         alignas(64) float chunk[65 * RECORD];  // their records, and one that no pixel sees
@@ -97,6 +115,7 @@ for (int t = first; t < last; ++t) {
             }
         }
     }
+    if (unfinished) still_open[t] = open != 0;
     int tile_end = begin;
     for (int b = 0; b < 16; ++b) tile_end = larger(tile_end, __builtin_reduce_max(stop[b]));
     tile_stop[t] = tile_end;
@@ -105,7 +124,8 @@ for (int t = first; t < last; ++t) {
             const long long at = (long long)(y0 + y) * width + x0 + x;
             const int b = y / 4 * 4 + x / 4, l = y % 4 * 4 + x % 4;
             transmittance[at] = T[b][l];
-            pixel_stop[at] = stop[b][l];
+            pixel_stop[at] = stop[b][l] + before;
+            if (unfinished) product_left[at] = P[b][l];
             for (int c = 0; c < channels; ++c) image[at * stride + channel + c] = C[b][c][l];
         }
 }

@@ -1,15 +1,17 @@
 // Lists the pairs of each tile, as yet in the order of the rows: depth in the upper half, number of the pair in the lower.
 // Pairs are numbered by row and tile. Depths are positive, so their bits sort like integers.
 #include "ellipse.h"
+#include "tile_ranges.h"
 for (int s = first; s < last; ++s) {
     int* next = counts + (long long)s * tiles_x * tiles_y;
     int pair = (int)totals[s];
     const int begin = (int)((long long)s * n / slices), end = (int)((long long)(s + 1) * n / slices);
-    for (int i = begin; i < end; ++i) {
-        const int g = visible[i];
-        const long long key = (long long)((const int*)depths)[g] << 32;
-        pair_start[i] = pair;
-        const int* box = boxes + (long long)BOX * i;
+    int i = begin;
+    for (int k = begin; k < begin + listed_count[s]; ++k) {
+        while (i <= listed[k]) pair_start[i++] = pair;
+        const int* box = boxes + (long long)BOX * k;
+        const int g = visible[listed[k]], depth = ((const int*)depths)[g];
+        const long long key = (long long)depth << 32;
         if (box[4] >= 0) {
             int* corner = next + box[2] * tiles_x + box[0];
             for (int rest = box[4]; rest; rest &= rest - 1) {
@@ -23,11 +25,13 @@ for (int s = first; s < last; ++s) {
         for (int ty = ellipse.first_row; ty <= ellipse.last_row; ++ty) {
             int left, right;
             ellipse.columns(ty, left, right);
-            for (int tx = left; tx <= right; ++tx) {
+            for (int tile = ty * tiles_x + left; tile <= ty * tiles_x + right; ++tile) {
+                if (limited && !in_range(ranges, tile, depth)) continue;
                 pair_row[pair] = g;
-                unsorted[next[ty * tiles_x + tx]++] = key | (unsigned)pair++;
+                unsorted[next[tile]++] = key | (unsigned)pair++;
             }
         }
     }
+    while (i < end) pair_start[i++] = pair;
     if (s == slices - 1) pair_start[n] = pair;
 }

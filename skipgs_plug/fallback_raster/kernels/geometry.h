@@ -5,9 +5,9 @@
 // squares, |T0 x T1|^2 (Cauchy-Binet), so that needles and giants lose no digits and no matrix turns indefinite.
 
 // Centres of the rows in world space, p, and in camera space.
-static constexpr auto centres = [](const float* V, const float* means, const int* row, v16 (&p)[3], v16& x, v16& y,
-                                   v16& z) INLINE {
-    for (int i = 0; i < 3; ++i) p[i] = gather(means, row, 3, i);
+static constexpr auto centres = [](const float* V, const float* means, const int* row, int n, v16 (&p)[3], v16& x,
+                                   v16& y, v16& z) INLINE {
+    gather3(means, row, n, p);
     x = V[0] * p[0] + V[1] * p[1] + V[2] * p[2] + V[3];
     y = V[4] * p[0] + V[5] * p[1] + V[6] * p[2] + V[7];
     z = V[8] * p[0] + V[9] * p[1] + V[10] * p[2] + V[11];
@@ -17,8 +17,9 @@ static constexpr auto centres = [](const float* V, const float* means, const int
 static constexpr auto rotations = [](const float* quats, const int* row, v16& qw, v16& qx, v16& qy, v16& qz,
                                      v16& q_scale, v16& q_norm, v16 (&R)[3][3]) INLINE {
     // Scaled first so that its square neither overflows nor vanishes; zero stands for no rotation.
-    qw = gather(quats, row, 4, 0), qx = gather(quats, row, 4, 1);
-    qy = gather(quats, row, 4, 2), qz = gather(quats, row, 4, 3);
+    v16 q[4];
+    gather4(quats, row, q);
+    qw = q[0], qx = q[1], qy = q[2], qz = q[3];
     const v16 q_max = vmax(vmax(vabs(qw), vabs(qx)), vmax(vabs(qy), vabs(qz)));
     q_scale = q_max > 1e-20f ? 1.0f / q_max : (v16)0.0f;
     qw *= q_scale, qx *= q_scale, qy *= q_scale, qz *= q_scale;
@@ -36,8 +37,8 @@ static constexpr auto rotations = [](const float* quats, const int* row, v16& qw
 };
 
 // T = J W M, with all that it is made of.
-static constexpr auto splat_axes = [](const float* V, const float* K, float width, float height, v16 x, v16 y, v16 z,
-                                      const v16 (&R)[3][3], const v16 (&S)[3], v16& iz, v16& ux, v16& uy, v16& J00,
+static constexpr auto splat_axes = [](const float* V, const float* K, float width, float height, v16 x, v16 y, v16 iz,
+                                      const v16 (&R)[3][3], const v16 (&S)[3], v16& ux, v16& uy, v16& J00,
                                       v16& J02, v16& J11, v16& J12, v16 (&WM)[3][3], v16 (&T0)[3],
                                       v16 (&T1)[3]) INLINE {
     const float fx = K[0], cx = K[2], fy = K[4], cy = K[5];
@@ -46,7 +47,6 @@ static constexpr auto splat_axes = [](const float* V, const float* K, float widt
             WM[i][j] = (V[4 * i] * R[0][j] + V[4 * i + 1] * R[1][j] + V[4 * i + 2] * R[2][j]) * S[j];
 
     // The Jacobian is taken no further than 30 % of the half field of view outside the image.
-    iz = 1.0f / z;
     const float margin_x = 0.15f * width / fx, margin_y = 0.15f * height / fy;
     const v16 right = (v16)((width - cx) / fx + margin_x), left = (v16)(-cx / fx - margin_x);
     const v16 bottom = (v16)((height - cy) / fy + margin_y), top = (v16)(-cy / fy - margin_y);
@@ -60,17 +60,18 @@ static constexpr auto splat_axes = [](const float* V, const float* K, float widt
 
 // Whether the sphere of radius `longest` around a centre reaches no pixel: the rows of T are at most as long as those of J
 // times `longest`, and a radius is 3.33 standard deviations at most, rounded up. A hundredth more pays for rounding.
-static constexpr auto beyond = [](const float* K, float width, float height, float eps2d, v16 x, v16 y, v16 z,
+static constexpr auto beyond = [](const float* K, float width, float height, float eps2d, v16 x, v16 y, v16 iz,
                                   v16 longest) INLINE -> i16 {
     const float fx = K[0], cx = K[2], fy = K[4], cy = K[5];
-    const v16 iz = 1.0f / z;
     const float margin_x = 0.15f * width / fx, margin_y = 0.15f * height / fy;
     const v16 ux = vmin((v16)((width - cx) / fx + margin_x), vmax((v16)(-cx / fx - margin_x), x * iz));
     const v16 uy = vmin((v16)((height - cy) / fy + margin_y), vmax((v16)(-cy / fy - margin_y), y * iz));
     const v16 u = fx * x * iz + cx, v = fy * y * iz + cy, size = longest * iz;
-    const v16 reach_x = 3.37f * vsqrt(fx * fx * size * size * (1.0f + ux * ux) + eps2d) + 1.5f + 1e-5f * vabs(u);
-    const v16 reach_y = 3.37f * vsqrt(fy * fy * size * size * (1.0f + uy * uy) + eps2d) + 1.5f + 1e-5f * vabs(v);
-    return (u + reach_x < 0.0f) | (u - reach_x > width) | (v + reach_y < 0.0f) | (v - reach_y > height);
+    // By how much they are outside, squared: no roots.
+    const v16 over_x = vmax(-u, u - width) - (1.5f + 1e-5f * vabs(u)), over_y = vmax(-v, v - height) - (1.5f + 1e-5f * vabs(v));
+    const v16 spread_x = 3.37f * 3.37f * (fx * fx * size * size * (1.0f + ux * ux) + eps2d);
+    const v16 spread_y = 3.37f * 3.37f * (fy * fy * size * size * (1.0f + uy * uy) + eps2d);
+    return ((over_x > 0.0f) & (over_x * over_x > spread_x)) | ((over_y > 0.0f) & (over_y * over_y > spread_y));
 };
 
 // 2D covariance T T^t without (sharp) and with eps2d on its diagonal, and its inverse.
@@ -87,7 +88,8 @@ static constexpr auto covariances = [](const v16 (&T0)[3], const v16 (&T1)[3], f
     const v16 c1 = (T0[2] * unit) * T1[0] - (T0[0] * unit) * T1[2];
     const v16 c2 = (T0[0] * unit) * T1[1] - (T0[1] * unit) * T1[0];
     sharp_det = c0 * c0 + c1 * c1 + c2 * c2;
-    det = sharp_det + eps2d * (sharp_xx + sharp_yy) / cov_xx + eps2d * eps2d / cov_xx;
-    slope = cov_xy / cov_xx;
-    conic_c = 1.0f / det, conic_b = -slope / det, conic_a = 1.0f / cov_xx + slope * slope / det;
+    const v16 i_xx = unit * unit;  // divisions take as long as all the rest
+    det = sharp_det + (eps2d * (sharp_xx + sharp_yy) + eps2d * eps2d) * i_xx;
+    slope = cov_xy * i_xx;
+    conic_c = 1.0f / det, conic_b = -slope * conic_c, conic_a = i_xx + slope * slope * conic_c;
 };

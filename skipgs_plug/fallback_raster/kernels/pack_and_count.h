@@ -1,30 +1,36 @@
 // Records of the visible rows, the boxes of tiles around them, and the number of pairs of each tile, by slice of the rows.
+// Where `limited`, only pairs whose depths lie in the range of their tile count, and only rows that have some get a record.
 #include "ellipse.h"
+#include "tile_ranges.h"
 const int tiles = tiles_x * tiles_y;
+int least = limited ? NO_DEPTH : -NO_DEPTH, most = limited ? -NO_DEPTH : NO_DEPTH;
+for (int t = 0; limited && t < tiles; ++t) least = smaller(least, ranges[2 * t]), most = larger(most, ranges[2 * t + 1]);
 for (int s = first; s < last; ++s) {
     int* count = counts + (long long)s * tiles;
     for (int t = 0; t < tiles; ++t) count[t] = 0;
     long long of_slice = 0;
+    int found = 0;
     const int begin = (int)((long long)s * n / slices), end = (int)((long long)(s + 1) * n / slices);
     for (int i = begin; i < end; i += 16) {
         const int lanes = smaller(16, end - i);
         int row[16];
         for (int l = 0; l < 16; ++l) row[l] = visible[i + smaller(l, lanes - 1)];
-        v16 a = gather(conics, row, 3, 0), b = gather(conics, row, 3, 1), c = gather(conics, row, 3, 2);
+        const i16 depth = (i16)gather(depths, row, 1, 0);
+        const i16 near = (depth >= least) & (depth < most);
+        if (!dense && !any(near)) continue;
+        v16 conic[3], sigma[2], centre[2];
+        gather3(conics, row, rows, conic);
+        gather2(sigmas, row, sigma);
+        gather2(means2d, row, centre);
+        const v16 a = conic[0], b = conic[1], c = conic[2], mx = centre[0], my = centre[1];
         v16 log2_opacity = log2(vmax(gather(opacities, row, 1, 0), (v16)1e-20f));
         v16 reach = log2_opacity - LOG2_ALPHA_MIN;
         // a dx^2 + 2 b dx dy + c dy^2 = a (dx + b / a dy)^2 + dy^2 / sigma_y^2: no needle rounds to a negative value.
-        v16 along = vsqrt(0.5f * LOG2_E * a), across = vsqrt((v16)(0.5f * LOG2_E)) / gather(sigmas, row, 2, 1);
+        v16 along = vsqrt(0.5f * LOG2_E * a), across = vsqrt((v16)(0.5f * LOG2_E)) / sigma[1];
         // Half axes of the box around alpha >= ALPHA_MIN, a hair wider than exact: the blend tests every pixel itself.
         v16 half = vsqrt(vmax(2.0f * reach / LOG2_E, (v16)0.0f)) * 1.0001f + 1e-3f;
-        v16 mx = gather(means2d, row, 2, 0), my = gather(means2d, row, 2, 1);
-        v16 half_w = half * gather(sigmas, row, 2, 0), half_h = half * gather(sigmas, row, 2, 1);
-        const v16 slope = b / a;
-        v16 value[RECORD] = {mx, my, along, along * slope, across, log2_opacity, half_h, half_w, {}, {}, {}, {},
-                             -slope, -b / c, reach, 1.0f / along};
-        for (int k = 0; k < channels; ++k) value[8 + k] = gather(colors, row, stride, k);
-        transpose(value);
-        for (int l = 0; l < lanes; ++l) store(records + (long long)RECORD * row[l], value[l]);
+        const v16 half_w = half * sigma[0], half_h = half * sigma[1];
+        const v16 slope = b / a, steepness = b / c;
 
         // Pixels whose centres the box holds. Clamped before they become integers: what lies far outside is beyond them.
         auto clamped = [](v16 x, float low, float high) -> i16 {
@@ -47,7 +53,7 @@ for (int s = first; s < last; ++s) {
             const v16 x0 = 16.0f * __builtin_convertvector(first_column + j % 2, v16) + 0.5f - mx, x1 = x0 + 15.0f;
             const v16 y0 = 16.0f * __builtin_convertvector(first_row + j / 2, v16) + 0.5f - my, y1 = y0 + 15.0f;
             const v16 near_x = vmax(x0, vmin(x1, (v16)0.0f)), near_y = vmax(y0, vmin(y1, (v16)0.0f));
-            const v16 at_y = vmax(y0, vmin(y1, -b / c * near_x)), at_x = vmax(x0, vmin(x1, -slope * near_y));
+            const v16 at_y = vmax(y0, vmin(y1, -steepness * near_x)), at_x = vmax(x0, vmin(x1, -slope * near_y));
             const v16 p = along * (near_x + slope * at_y), w = across * at_y;
             const v16 q = along * (at_x + slope * near_y), u = across * near_y;
             const i16 meets_it = (vmin(p * p + w * w, q * q + u * u) <= reach + 0.01f) | !(shortcuts & EXACT_TILES);
@@ -55,30 +61,62 @@ for (int s = first; s < last; ++s) {
             meets |= meets_it & in_box & (1 << j);
         }
         const i16 small = (last_column - first_column <= 1) & (last_row - first_row <= 1);
-        *(i16*)box[4] = empty ? (i16)0 : (small ? meets : (i16)-1);
-        for (int l = 0; l < lanes; ++l) {
-            int* own = boxes + (long long)BOX * (i + l);
+        meets = empty ? (i16)0 : (small ? meets : (i16)-1);
+        *(i16*)box[4] = meets;
+
+        // All tiles of a large ellipse are found with its record, to count them where `dense`.
+        const i16 wanted = (meets != 0) & (near | ((meets < 0) & (dense ? -1 : 0)));
+        if (dense) {
+            const i16 met = (meets & 1) + (meets >> 1 & 1) + (meets >> 2 & 1) + (meets >> 3 & 1);
+            scatter((float*)tiles_per_gauss, row, (v16)met, lanes);
+        }
+        if (any(wanted)) {
+            v16 value[RECORD] = {mx, my, along, along * slope, across, log2_opacity, half_h, half_w, {}, {}, {}, {},
+                                 -slope, -steepness, reach, 1.0f / along};
+            if (stride == 3 && channels == 3) gather3(colors, row, rows, value + 8);
+            else
+                for (int k = 0; k < channels; ++k) value[8 + k] = gather(colors, row, stride, k);
+            transpose(value);
+            for (unsigned rest = bits(wanted) & ((1u << lanes) - 1); rest; rest &= rest - 1) {
+                const int l = __builtin_ctz(rest);
+                store(records + (long long)RECORD * row[l], value[l]);
+            }
+        }
+        alignas(64) int key[16];
+        *(i16*)key = depth;
+        for (unsigned rest = bits(wanted) & ((1u << lanes) - 1); rest; rest &= rest - 1) {
+            const int l = __builtin_ctz(rest);
+            int* own = boxes + (long long)BOX * (begin + found);
             for (int j = 0; j < BOX; ++j) own[j] = box[j][l];
             int pairs = 0;
             if (own[4] >= 0) {
-                int* corner = count + own[2] * tiles_x + own[0];
-                for (int rest = own[4]; rest; rest &= rest - 1) {
-                    const int j = __builtin_ctz(rest);
-                    ++corner[(j >> 1) * tiles_x + (j & 1)];
+                const int corner = own[2] * tiles_x + own[0];
+                for (int todo = limited ? own[4] : 0; todo; todo &= todo - 1) {
+                    const int j = __builtin_ctz(todo);
+                    if (!in_range(ranges, corner + (j >> 1) * tiles_x + (j & 1), key[l])) own[4] &= ~(1 << j);
+                }
+                for (int todo = own[4]; todo; todo &= todo - 1) {
+                    const int j = __builtin_ctz(todo);
+                    ++count[corner + (j >> 1) * tiles_x + (j & 1)];
                 }
                 pairs = __builtin_popcount(own[4]);
             } else {
+                int met = 0;
                 const Ellipse ellipse(records + (long long)RECORD * row[l], own, width, shortcuts & EXACT_TILES);
                 for (int ty = ellipse.first_row; ty <= ellipse.last_row; ++ty) {
                     int left, right;
                     ellipse.columns(ty, left, right);
-                    for (int tx = left; tx <= right; ++tx) ++count[ty * tiles_x + tx];
-                    if (right >= left) pairs += right - left + 1;
+                    if (right >= left) met += right - left + 1;
+                    for (int tile = ty * tiles_x + left; tile <= ty * tiles_x + right; ++tile)
+                        if (!limited || in_range(ranges, tile, key[l])) ++count[tile], ++pairs;
                 }
+                if (dense) tiles_per_gauss[row[l]] = met;
             }
-            if (dense) tiles_per_gauss[row[l]] = pairs;
             of_slice += pairs;
+            listed[begin + found] = i + l;
+            found += pairs > 0;
         }
     }
+    listed_count[s] = found;
     totals[s] = of_slice;
 }

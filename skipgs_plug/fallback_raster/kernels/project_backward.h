@@ -4,16 +4,34 @@ const int block = first;
 v16 pose[12] = {};
 // Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
 const int row_begin = BLOCK * block, rows = smaller(BLOCK, n - row_begin);
-if (!raw) clear(v_means + 3ll * row_begin, 3 * rows);
-clear(v_quats + 4ll * row_begin, 4 * rows);
-clear(v_scales + 3ll * row_begin, 3 * rows);
-if (raw) clear(v_opacities + row_begin, rows);
-const int end = block_start[block + 1];
-for (int base = block_start[block]; base < end; base += 16) {
-    const int lanes = end - base < 16 ? end - base : 16;
+const bool empty = block_start[block] == block_start[block + 1];
+const auto clear_rows = [=](float* p, long long n) { empty ? clear_past_caches(p, n) : clear(p, n); };
+if (!raw) clear_rows(v_means + 3ll * row_begin, 3 * rows);
+clear_rows(v_quats + 4ll * row_begin, 4 * rows);
+clear_rows(v_scales + 3ll * row_begin, 3 * rows);
+if (raw) clear_rows(v_opacities + row_begin, rows);
+// Few of the rows that are visible received a gradient where most lie behind others; the zeros of the rest are in place.
+alignas(64) int received[BLOCK];
+int count = 0;
+for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
+    const int g = visible[i];
+    const auto word = [](const float* p) INLINE -> unsigned { return 2 * *(const unsigned*)p; };  // 0 for either zero
+    unsigned any = word(v_means2d + 2 * g) | word(v_means2d + 2 * g + 1);
+    for (int j = 0; j < 3; ++j) any |= word(v_conics + 3 * g + j);
+    if (with_depth) any |= word(v_depths + g);
+    if (raw) any |= word(v_activated + g);
+    else if (antialiased) any |= word(v_compensations + g);
+    received[count] = g;
+    count += any || !(shortcuts & CONTRIBUTED_ONLY);
+}
+for (int base = 0; base < count; base += 16) {
+    const int lanes = smaller(16, count - base);
     int row[16];
-    for (int l = 0; l < 16; ++l) row[l] = visible[base + (l < lanes ? l : lanes - 1)];
-    v16 v_u = gather(v_means2d, row, 2, 0), v_v = gather(v_means2d, row, 2, 1), v_depth = (v16)0.0f, v_comp = (v16)0.0f;
+    for (int l = 0; l < 16; ++l) row[l] = received[base + (l < lanes ? l : lanes - 1)];
+    v16 v_center[2], v_conic[3], v_depth = (v16)0.0f, v_comp = (v16)0.0f;
+    gather2(v_means2d, row, v_center);
+    gather3(v_conics, row, n, v_conic);
+    v16 v_u = v_center[0], v_v = v_center[1], va = v_conic[0], vb = 0.5f * v_conic[1], vc = v_conic[2];
     if (with_depth) v_depth = gather(v_depths, row, 1, 0);
     if (antialiased && !raw) v_comp = gather(v_compensations, row, 1, 0);
     v16 v_alpha = (v16)0.0f, opacity = (v16)0.0f;
@@ -22,25 +40,22 @@ for (int base = block_start[block]; base < end; base += 16) {
         opacity = sigmoid(gather(opacities, row, 1, 0));
         if (antialiased) v_comp = v_alpha * opacity;
     }
-    v16 va = gather(v_conics, row, 3, 0), vb = 0.5f * gather(v_conics, row, 3, 1), vc = gather(v_conics, row, 3, 2);
-    // Most blocks of a close-up hold no Gaussian that received a gradient; their zeros are in place already.
-    const i16 received = (v_u != 0.0f) | (v_v != 0.0f) | (v_depth != 0.0f) | (va != 0.0f) | (vb != 0.0f) | (vc != 0.0f)
-                       | (v_comp != 0.0f) | (v_alpha != 0.0f);
-    if ((shortcuts & CONTRIBUTED_ONLY) && !any(received)) continue;
     v16 world[3], x, y, z, qw, qx, qy, qz, q_scale, q_norm, R[3][3];
     v16 iz, ux, uy, J00, J02, J11, J12, WM[3][3], T0[3], T1[3];
     v16 sharp_xx, sharp_yy, cov_xx, cov_yy, sharp_det, det, slope, conic_a, conic_b, conic_c;
-    v16 S[3] = {gather(scales, row, 3, 0), gather(scales, row, 3, 1), gather(scales, row, 3, 2)};
+    v16 S[3];
+    gather3(scales, row, n, S);
     if (raw)
         for (int j = 0; j < 3; ++j) S[j] = vexp(S[j]);
-    centres(viewmat, means, row, world, x, y, z);
+    centres(viewmat, means, row, n, world, x, y, z);
+    iz = 1.0f / z;
     rotations(quats, row, qw, qx, qy, qz, q_scale, q_norm, R);
-    splat_axes(viewmat, K, width, height, x, y, z, R, S, iz, ux, uy, J00, J02, J11, J12, WM, T0, T1);
+    splat_axes(viewmat, K, width, height, x, y, iz, R, S, ux, uy, J00, J02, J11, J12, WM, T0, T1);
     covariances(T0, T1, eps2d, sharp_xx, sharp_yy, cov_xx, cov_yy, sharp_det, det, slope, conic_a, conic_b, conic_c);
 
     if (raw) {
         const v16 v_opacity = antialiased ? v_alpha * vsqrt(sharp_det / det) : v_alpha;
-        scatter(v_opacities, row, 1, 0, v_opacity * opacity * (1.0f - opacity), lanes);
+        scatter(v_opacities, row, v_opacity * opacity * (1.0f - opacity), lanes);
     }
 
     // Extreme cameras (a principal point 1e5 images away) leave float's range: a huge gradient is better than
@@ -111,12 +126,18 @@ for (int base = block_start[block]; base < end; base += 16) {
         }
     }
 
-    for (int i = 0; i < 3; ++i)
-        scatter(v_means, row, 3, i, raw ? gather(v_means, row, 3, i) + v_mean[i] : v_mean[i], lanes);
-    for (int j = 0; j < 3; ++j) {
-        const v16 v_scale = v_M[0][j] * R[0][j] + v_M[1][j] * R[1][j] + v_M[2][j] * R[2][j];
-        scatter(v_scales, row, 3, j, raw ? v_scale * S[j] : v_scale, lanes);
+    if (raw) {
+        v16 of_colors[3];
+        gather3(v_means, row, n, of_colors);
+        for (int i = 0; i < 3; ++i) v_mean[i] = of_colors[i] + v_mean[i];
     }
+    scatter3(v_means, row, v_mean[0], v_mean[1], v_mean[2], lanes);
+    v16 v_scale[3];
+    for (int j = 0; j < 3; ++j) {
+        v_scale[j] = v_M[0][j] * R[0][j] + v_M[1][j] * R[1][j] + v_M[2][j] * R[2][j];
+        if (raw) v_scale[j] *= S[j];
+    }
+    scatter3(v_scales, row, v_scale[0], v_scale[1], v_scale[2], lanes);
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) v_M[i][j] *= 2.0f * S[j];
     v16 v_qw = qx * (v_M[2][1] - v_M[1][2]) + qy * (v_M[0][2] - v_M[2][0]) + qz * (v_M[1][0] - v_M[0][1]);
@@ -128,10 +149,8 @@ for (int base = block_start[block]; base < end; base += 16) {
              - 2.0f * qz * (v_M[0][0] + v_M[1][1]);
     v16 along = qw * v_qw + qx * v_qx + qy * v_qy + qz * v_qz;
     v16 back = q_norm * q_scale;
-    scatter(v_quats, row, 4, 0, saturated((v_qw - along * qw) * back, 1e38f), lanes);
-    scatter(v_quats, row, 4, 1, saturated((v_qx - along * qx) * back, 1e38f), lanes);
-    scatter(v_quats, row, 4, 2, saturated((v_qy - along * qy) * back, 1e38f), lanes);
-    scatter(v_quats, row, 4, 3, saturated((v_qz - along * qz) * back, 1e38f), lanes);
+    scatter4(v_quats, row, saturated((v_qw - along * qw) * back, 1e38f), saturated((v_qx - along * qx) * back, 1e38f),
+             saturated((v_qy - along * qy) * back, 1e38f), saturated((v_qz - along * qz) * back, 1e38f), lanes);
 }
 if (with_pose)
     for (int i = 0; i < 12; ++i) v_poses[12 * block + i] = sum(pose[i]);

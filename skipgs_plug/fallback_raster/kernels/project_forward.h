@@ -9,14 +9,16 @@ for (int base = row_begin; base < row_end; base += 16) {
     v16 world[3], x, y, z, qw, qx, qy, qz, q_scale, q_norm, R[3][3];
     v16 iz, ux, uy, J00, J02, J11, J12, WM[3][3], T0[3], T1[3];
     v16 sharp_xx, sharp_yy, cov_xx, cov_yy, sharp_det, det, slope, conic_a, conic_b, conic_c;
-    v16 S[3] = {gather(scales, row, 3, 0), gather(scales, row, 3, 1), gather(scales, row, 3, 2)};
-    centres(viewmat, means, row, world, x, y, z);
+    v16 S[3];
+    gather3(scales, row, n, S);
+    centres(viewmat, means, row, n, world, x, y, z);
+    iz = 1.0f / z;
     // What lies outside even as a sphere of its longest axis needs no rotation. Neighbours in space that are neighbours
     // in memory are left out 16 at a time. Written so that NaN goes on to the full test.
     v16 longest = vmax(vmax(vabs(S[0]), vabs(S[1])), vabs(S[2]));
     if (raw) longest = vexp(vmax(vmax(S[0], S[1]), S[2]));
     i16 outside = (z < near_plane) | (z > far_plane);
-    if (shortcuts & SPHERES) outside |= beyond(K, width, height, eps2d, x, y, z, longest);
+    if (shortcuts & SPHERES) outside |= beyond(K, width, height, eps2d, x, y, iz, longest);
     if (!any(~outside)) {
         if (dense) {
             clear((float*)radii + 2ll * base, 2 * lanes);
@@ -31,10 +33,11 @@ for (int base = row_begin; base < row_end; base += 16) {
     if (raw)
         for (int j = 0; j < 3; ++j) S[j] = vexp(S[j]);
     rotations(quats, row, qw, qx, qy, qz, q_scale, q_norm, R);
-    splat_axes(viewmat, K, width, height, x, y, z, R, S, iz, ux, uy, J00, J02, J11, J12, WM, T0, T1);
+    splat_axes(viewmat, K, width, height, x, y, iz, R, S, ux, uy, J00, J02, J11, J12, WM, T0, T1);
     covariances(T0, T1, eps2d, sharp_xx, sharp_yy, cov_xx, cov_yy, sharp_det, det, slope, conic_a, conic_b, conic_c);
 
-    v16 compensation = vsqrt(sharp_det / det);
+    v16 compensation = (v16)1.0f;
+    if (antialiased) compensation = vsqrt(sharp_det / det);
     v16 opacity = gather(opacities, row, 1, 0);
     if (raw) opacity = sigmoid(opacity);
     if (antialiased) opacity *= compensation;
@@ -51,24 +54,17 @@ for (int base = row_begin; base < row_end; base += 16) {
     visible &= (u + radius_x > 0.0f) & (u - radius_x < width) & (v + radius_y > 0.0f) & (v - radius_y < height);
 
     const v16 none = (v16)0.0f;
-    i16 rx = __builtin_convertvector(visible ? radius_x : none, i16);
-    i16 ry = __builtin_convertvector(visible ? radius_y : none, i16);
+    for (unsigned rest = bits(visible) & ((1u << lanes) - 1); rest; rest &= rest - 1)
+        seen[found++] = base + __builtin_ctz(rest);
     if (!dense && !any(visible)) continue;
-    for (int l = 0; l < lanes; ++l) {
-        radii[2 * row[l]] = rx[l];
-        radii[2 * row[l] + 1] = ry[l];
-        seen[found] = row[l];
-        found += rx[l] > 0;
-    }
-    scatter(means2d, row, 2, 0, visible ? u : none, lanes);
-    scatter(means2d, row, 2, 1, visible ? v : none, lanes);
-    scatter(depths, row, 1, 0, visible ? z : none, lanes);
-    scatter(conics, row, 3, 0, visible ? conic_a : none, lanes);
-    scatter(conics, row, 3, 1, visible ? conic_b : none, lanes);
-    scatter(conics, row, 3, 2, visible ? conic_c : none, lanes);
-    scatter(sigmas, row, 2, 0, visible ? sigma_x : none, lanes);
-    scatter(sigmas, row, 2, 1, visible ? sigma_y : none, lanes);
-    if (antialiased) scatter(compensations, row, 1, 0, visible ? compensation : none, lanes);
-    if (raw) scatter(activated, row, 1, 0, visible ? opacity : none, lanes);
+    const i16 rx = __builtin_convertvector(visible ? radius_x : none, i16);
+    const i16 ry = __builtin_convertvector(visible ? radius_y : none, i16);
+    scatter2((float*)radii, row, (v16)rx, (v16)ry, lanes);
+    scatter2(means2d, row, visible ? u : none, visible ? v : none, lanes);
+    store_some(depths + base, visible ? z : none, lanes);
+    scatter3(conics, row, visible ? conic_a : none, visible ? conic_b : none, visible ? conic_c : none, lanes);
+    scatter2(sigmas, row, visible ? sigma_x : none, visible ? sigma_y : none, lanes);
+    if (antialiased) store_some(compensations + base, visible ? compensation : none, lanes);
+    if (raw) store_some(activated + base, visible ? opacity : none, lanes);
 }
 block_count[block] = found - row_begin;

@@ -8,15 +8,24 @@ if (!more && dense) {
     clear(v_opacities + row_begin, rows_here);
     clear(v_colors + (long long)stride * row_begin, (long long)stride * rows_here);
 }
+int j = parts > 1 ? far_block_start[first] : 0;
+const int far_end = parts > 1 ? far_block_start[first + 1] : 0;
 for (int i = block_start[first]; i < block_start[first + 1]; ++i) {
     const int g = visible[i];
     v16 sums = (v16)0.0f;
     bool received = false;
-    for (int p = pair_start[i]; p < pair_start[i + 1]; ++p)
-        if (blended_pairs[p]) {
-            sums += load(v_pairs + (long long)PAIR * (pair_number[p] - 1));
-            received = true;
-        }
+    const auto add = [&](int from, int to) INLINE {
+        for (int p = from; p < to; ++p)
+            if (blended_pairs[p]) {
+                sums += load(v_pairs + (long long)PAIR * (pair_number[p] - 1));
+                received = true;
+            }
+    };
+    add(pair_start[i], pair_start[i + 1]);
+    if (j < far_end && far_visible[j] == g) {
+        add(far_pair_start[j], far_pair_start[j + 1]);
+        ++j;
+    }
     if (!received) {
         if (dense || more) continue;
         clear(v_means2d + 2ll * g, 2);

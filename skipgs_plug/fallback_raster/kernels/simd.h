@@ -63,8 +63,26 @@ static constexpr auto sum8 = [](const v16* a) -> v8 {
 };
 static constexpr auto load = [](const float* p) -> v16 { return *(const v16*)p; };
 static constexpr auto store = [](float* p, v16 a) { *(v16*)p = a; };
+// The first `lanes` numbers; one that is chosen by a variable would go through memory each time.
+static constexpr auto store_some = [](float* p, v16 a, int lanes) INLINE {
+    if (lanes == 16) {
+        store(p, a);
+        return;
+    }
+    float all[16];
+    store(all, a);
+    for (int l = 0; l < lanes; ++l) p[l] = all[l];
+};
 static constexpr auto clear = [](float* p, long long n) {
     for (long long i = 0; i < n; ++i) p[i] = 0.0f;
+};
+// The same past the caches, for memory that nobody reads soon: what is written is not read from memory first.
+static constexpr auto clear_past_caches = [](float* p, long long n) {
+    typedef float whole __attribute__((ext_vector_type(16), aligned(64)));
+    long long i = 0;
+    for (; i < n && ((unsigned long long)(p + i) & 63); ++i) p[i] = 0.0f;
+    for (; i + 16 <= n; i += 16) __builtin_nontemporal_store((whole)0.0f, (whole*)(p + i));
+    for (; i < n; ++i) p[i] = 0.0f;
 };
 // 16 rows of an array of structures, column `c`; `row` names the row of each lane.
 static constexpr auto gather = [](const float* p, const int* row, int width, int c) -> v16 {
@@ -72,8 +90,88 @@ static constexpr auto gather = [](const float* p, const int* row, int width, int
     for (int l = 0; l < 16; ++l) a[l] = p[row[l] * width + c];
     return a;
 };
-static constexpr auto scatter = [](float* p, const int* row, int width, int c, v16 a, int lanes) {
-    for (int l = 0; l < lanes; ++l) p[row[l] * width + c] = a[l];
+static constexpr auto scatter = [](float* p, const int* row, v16 a, int lanes) {
+    float all[16];
+    store(all, a);
+    for (int l = 0; l < lanes; ++l) p[row[l]] = all[l];
+};
+// The columns of 16 rows of three or four numbers, and the other way round; `row` ascends. Rows move as a whole, four to a
+// vector, and 4 x 4 numbers are transposed inside each quarter: a third of the instructions of number by number.
+typedef float v4 __attribute__((ext_vector_type(4), aligned(4)));
+typedef float v2 __attribute__((ext_vector_type(2), aligned(4)));
+static constexpr auto quarters = [](const v16* a, v16* b) INLINE {
+    v16 low[2], high[2];
+    for (int i = 0; i < 2; ++i) {
+        low[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
+        high[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15,
+                                          31);
+    }
+    for (int i = 0; i < 2; ++i) {
+        const v16 *c = i ? high : low;
+        b[2 * i] = __builtin_shufflevector(c[0], c[1], 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
+        b[2 * i + 1] = __builtin_shufflevector(c[0], c[1], 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+    }
+};
+static constexpr auto fours = [](const float* p, const int* row, int width, v16* columns) INLINE {
+    v16 a[4];
+    for (int i = 0; i < 4; ++i) {
+        v4 r[4];
+        for (int k = 0; k < 4; ++k) r[k] = *(const v4*)(p + row[4 * k + i] * width);
+        const auto low = __builtin_shufflevector(r[0], r[1], 0, 1, 2, 3, 4, 5, 6, 7);
+        const auto high = __builtin_shufflevector(r[2], r[3], 0, 1, 2, 3, 4, 5, 6, 7);
+        a[i] = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    }
+    quarters(a, columns);
+};
+static constexpr auto gather4 = [](const float* p, const int* row, v16* columns) INLINE { fours(p, row, 4, columns); };
+// Of `n` rows in all: a fourth number is read along with a row, which is that of the next one.
+static constexpr auto gather3 = [](const float* p, const int* row, int n, v16* columns) INLINE {
+    if (row[15] + 1 < n) {
+        v16 all[4];
+        fours(p, row, 3, all);
+        for (int c = 0; c < 3; ++c) columns[c] = all[c];
+        return;
+    }
+    for (int c = 0; c < 3; ++c) columns[c] = gather(p, row, 3, c);
+};
+static constexpr auto gather2 = [](const float* p, const int* row, v16* columns) INLINE {
+    v16 half[2];
+    for (int i = 0; i < 2; ++i) {
+        v4 r[4];
+        for (int k = 0; k < 4; ++k) {
+            const v2 a = *(const v2*)(p + 2 * row[8 * i + 2 * k]), b = *(const v2*)(p + 2 * row[8 * i + 2 * k + 1]);
+            r[k] = __builtin_shufflevector(a, b, 0, 1, 2, 3);
+        }
+        const auto low = __builtin_shufflevector(r[0], r[1], 0, 1, 2, 3, 4, 5, 6, 7);
+        const auto high = __builtin_shufflevector(r[2], r[3], 0, 1, 2, 3, 4, 5, 6, 7);
+        half[i] = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    }
+    columns[0] = __builtin_shufflevector(half[0], half[1], 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+    columns[1] = __builtin_shufflevector(half[0], half[1], 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+};
+static constexpr auto scatter_rows = [](float* p, const int* row, int width, const v16* columns, int lanes) INLINE {
+    alignas(64) v16 a[4];
+    quarters(columns, a);
+    const float* moved = (const float*)a;
+    for (int l = 0; l < lanes; ++l) {
+        const float* from = moved + 16 * (l & 3) + 4 * (l >> 2);
+        float* to = p + row[l] * width;
+        *(v2*)to = *(const v2*)from;
+        if (width == 3) to[2] = from[2];
+        if (width == 4) *(v2*)(to + 2) = *(const v2*)(from + 2);
+    }
+};
+static constexpr auto scatter2 = [](float* p, const int* row, v16 x, v16 y, int lanes) INLINE {
+    const v16 columns[4] = {x, y, x, y};
+    scatter_rows(p, row, 2, columns, lanes);
+};
+static constexpr auto scatter3 = [](float* p, const int* row, v16 x, v16 y, v16 z, int lanes) INLINE {
+    const v16 columns[4] = {x, y, z, z};
+    scatter_rows(p, row, 3, columns, lanes);
+};
+static constexpr auto scatter4 = [](float* p, const int* row, v16 x, v16 y, v16 z, v16 w, int lanes) INLINE {
+    const v16 columns[4] = {x, y, z, w};
+    scatter_rows(p, row, 4, columns, lanes);
 };
 // Rows become columns in four rounds: rows `step` apart exchange the lanes that lie `step` apart.
 static constexpr auto transpose = [](v16* a) {
