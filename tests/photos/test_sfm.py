@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import signal
 import sqlite3
 import subprocess
 import time
@@ -155,6 +156,13 @@ def test_an_interrupt_ends_the_process_that_places_all_at_once(fern, tmp_path, m
         global_mapping.map_globally(tmp_path / "database.db", fern[0].parent, tmp_path / "work", interrupt)
     (process,) = started
     assert process.returncode not in (None, 0)  # killed, and waited for
+
+
+def test_a_terminated_run_leaves_nothing(photos, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(reconstruct.Reconstruction, "match", lambda *_: signal.raise_signal(signal.SIGTERM))
+    assert main(["sfm", str(photos), str(tmp_path / "scene"), "--no-progress"]) == 143
+    assert capsys.readouterr().err == "skipgs-plug: terminated.\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
 def test_the_largest_group_hangs_together():
