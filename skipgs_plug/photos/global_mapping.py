@@ -17,6 +17,7 @@ from typing import Any
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 
 STAGES = 6  # focal lengths, positions, three adjustments at most, points
+TRACKS = 500  # the longest ones of each photograph place it; points of the others are added afterwards
 LEAST_POINTS = 30  # that a placed photograph shows; COLMAP asks for as many where it places one after another
 SEED = 0
 GLANCE = 0.5  # seconds
@@ -81,6 +82,7 @@ def main(database: Path, photos: Path, output: Path) -> None:
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = SEED
     options.image_path = photos  # points get colours
+    options.mapper.track_required_tracks_per_view = TRACKS
     models = pycolmap.ReconstructionManager()
     opened = pycolmap.Database.open(database)
     pipeline = pycolmap.GlobalPipeline(options, opened, models)
