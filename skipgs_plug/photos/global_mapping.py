@@ -50,9 +50,11 @@ def map_globally(database: Path, photos: Path, output: Path, progress: Callable[
                 known = min(len(finished), STAGES)  # several models go through some stages each
                 progress(known - told)
                 told = known
-        finally:
+        except BaseException:
             process.kill()
-            reader.join()
+            raise
+    if process.returncode:
+        return []
     pycolmap = import_pycolmap()
     models = [pycolmap.Reconstruction(path) for path in sorted(output.iterdir()) if path.is_dir()]
     for model in models:
