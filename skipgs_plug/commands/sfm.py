@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,9 +92,9 @@ def reconstruct(args: Args) -> Path:
     finally:
         shutil.rmtree(work, ignore_errors=True)
     print(
-        f"{written} of {count} photographs placed ({matching} matching, {mapping} mapping), {points:,} points, ", end=""
+        f"{written} of {count} photographs placed ({matching} matching, {mapping} mapping), {points:,} points, "
+        f"mean reprojection error {error:.2f} px."
     )
-    print(f"mean reprojection error {error:.2f} px.")
     print_unplaced(unplaced, matching)
     return scene
 
@@ -114,18 +114,28 @@ def place(
         with bar("Placing photographs all at once", global_mapping.STAGES, **honest) as shown:
             models = reconstruction.map_globally(shown.update)
         if mapping == "auto" and not reconstruction.placed_enough(models):
-            placed = models[0].num_reg_images() if models else 0
-            print(f"All at once, {placed} of {count} photographs could be placed; placing them one after another.")
+            print(
+                f"All at once, {size(models)} of {count} photographs could be placed; placing them one after another."
+            )
             taken = "incremental"
     if taken == "incremental":
         with bar("Placing photographs", count) as shown:
-            models = reconstruction.map_incrementally(shown.update)
+            others = reconstruction.map_incrementally(shown.update)
+        if size(others) > size(models):
+            models = others
+        elif models:
+            taken = "global"
     if not models:
         raise InputError(
             f"None of the {count} photographs could be placed; take sharper ones that overlap by two thirds, and walk "
             "around the subject instead of turning on the spot."
         )
     return models, taken
+
+
+def size(models: Sequence[Any]) -> int:
+    """Return how many photographs the largest model holds."""
+    return models[0].num_reg_images() if models else 0
 
 
 def print_unplaced(reasons: dict[str, str], matching: str) -> None:
