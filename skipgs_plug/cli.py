@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import os
@@ -9,6 +10,8 @@ import sys
 import traceback
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, NamedTuple, Union
+
+from skipgs_plug.terminate import Terminated, terminable
 
 
 class Command(NamedTuple):
@@ -33,6 +36,7 @@ COMMANDS = {
 DESCRIPTION = "skipgs-plug COMMAND --help describes its options; --debug shows the traceback of an error."
 BAD_INPUT = 2
 INTERRUPTED = 130
+TERMINATED = 143
 UNREAD = 141
 OURS = ("SkipGSError", "InputError", "WriteError")
 
@@ -50,15 +54,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     if debug:
         arguments.remove("--debug")
     try:
-        return run(arguments)
-    except KeyboardInterrupt:
-        return interrupted()
+        # The script of another project sees signals as it would without us.
+        with contextlib.nullcontext() if arguments[:1] == ["run"] else terminable():
+            return run(arguments)
+    except KeyboardInterrupt as error:
+        return interrupted([error])
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes once more
         return UNREAD
     except Exception as error:
-        if any(isinstance(one, KeyboardInterrupt) for one in chain(error)):  # met while a module was being loaded
-            return interrupted()
+        causes = [one for one in chain(error) if isinstance(one, KeyboardInterrupt)]
+        if causes:  # met while a module was being loaded
+            return interrupted(causes)
         sentence = explain(error, COMMANDS[arguments[0]].extra if arguments and arguments[0] in COMMANDS else "run")
         if debug or sentence is None:
             traceback.print_exc()
@@ -131,9 +138,10 @@ def chain(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-def interrupted() -> int:
-    print("skipgs-plug: interrupted.", file=sys.stderr)
-    return INTERRUPTED
+def interrupted(causes: Sequence[BaseException]) -> int:
+    terminated = any(isinstance(cause, Terminated) for cause in causes)
+    print(f"skipgs-plug: {'terminated' if terminated else 'interrupted'}.", file=sys.stderr)
+    return TERMINATED if terminated else INTERRUPTED
 
 
 def fail(sentence: str) -> int:

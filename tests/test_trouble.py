@@ -91,21 +91,22 @@ def test_the_cure_is_where_the_package_came_from(
     assert shlex.split(install_command()) == ["pip", "install", requirement]
 
 
-def test_ctrl_c_while_torch_is_being_imported() -> None:
-    code = (
+@pytest.mark.parametrize(("name", "code", "said"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
+def test_a_signal_while_torch_is_being_imported(name: str, code: int, said: str) -> None:
+    script = (
         "import sys, signal\n"
         "from skipgs_plug.cli import main\n"
         "assert 'torch' not in sys.modules\n"
         "class Interrupt:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name == 'torch.nn': signal.raise_signal(signal.SIGINT)\n"
+        "        if name == 'torch.nn': signal.raise_signal(signal.Signals[sys.argv[1]])\n"
         "sys.meta_path.insert(0, Interrupt())\n"
         "sys.exit(main(['train', '--help']))\n"
     )
-    command = [sys.executable, "-c", code]
+    command = [sys.executable, "-c", script, name]
     tried = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    assert tried.returncode == 130
-    assert tried.stderr.strip() == "skipgs-plug: interrupted."
+    assert tried.returncode == code
+    assert tried.stderr.strip() == f"skipgs-plug: {said}."
 
 
 def test_ctrl_c_that_an_import_turned_into_another_error(monkeypatch: pytest.MonkeyPatch) -> None:

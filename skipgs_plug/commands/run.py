@@ -100,7 +100,7 @@ def run_gated(
     """Attach a gate to what `execute(attach)` runs, and write skipgs.json where `rank` is 0."""
     adapter = get_adapter(args.adapter)()
     checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
-    for_cpu = (*(f"torch.cuda.{name}" for name in CUDA_REPLACED), ADAM_REPLACED)
+    for_cpu = (*CUDA_REPLACED, ADAM_REPLACED)
     adapter.replaced = (*REPLACED, *(for_cpu if args.cpu else ()))
     settings = args.gate_options.given() | ({"enabled": False} if args.no_gate else {})
     gates: list[SkipGate] = []

@@ -5,15 +5,18 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections import defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 from tqdm.auto import tqdm
 
 from skipgs_plug.install import program
+from skipgs_plug.photos import global_mapping
 from skipgs_plug.photos.gather import gather
-from skipgs_plug.photos.reconstruct import Matching, Reconstruction
+from skipgs_plug.photos.reconstruct import Mapping, Matching, Reconstruction
 from skipgs_plug.photos.scene_folder import check_target, write_scene
 from skipgs_plug.photos.unplaced import explain_unplaced
 from skipgs_plug.trainer.errors import InputError
@@ -25,7 +28,8 @@ NAMES_SHOWN = 6
 class Args:
     """Reconstruct where photographs were taken (COLMAP, on the CPU) and write a scene for `skipgs-plug train`.
 
-    Photographs are matched each with each up to 100 of them, beyond that with their neighbours in the order of names.
+    Up to 100 photographs are matched each with each and placed one after another; more are matched with their
+    neighbours in the order of names and placed all at once.
     """
 
     photos: tyro.conf.Positional[Path]
@@ -36,6 +40,8 @@ class Args:
     """Frames to take from a video, each the sharpest of its group."""
     matching: Matching = "auto"
     """Which photographs are compared."""
+    mapping: Mapping = "auto"
+    """Placed one after another (incremental) or all at once (global)."""
     no_progress: bool = False
     """No progress bars."""
 
@@ -65,8 +71,8 @@ def reconstruct(args: Args) -> Path:
     scene.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=f".{scene.name}.", dir=scene.parent))
 
-    def bar(title: str, total: int | None = None) -> tqdm:
-        return tqdm(total=total, desc=title, disable=args.no_progress, unit="", leave=False)
+    def bar(title: str, total: int | None = None, **options: Any) -> tqdm:
+        return tqdm(total=total, desc=title, disable=args.no_progress, unit="", leave=False, **options)
 
     try:
         with bar("Reading photographs") as shown:
@@ -77,19 +83,59 @@ def reconstruct(args: Args) -> Path:
             reconstruction.extract(shown.update)
         with bar("Matching pairs") as shown:
             matching = reconstruction.match(args.matching, shown.update)
-        with bar("Placing photographs", count) as shown:
-            models = reconstruction.map(shown.update)
-        unplaced = explain_unplaced(gathered, models, reconstruction.database)
+        models, mapping = place(reconstruction, args.mapping, count, bar)
+        unplaced = explain_unplaced(gathered, models, reconstruction.links())
         error = models[0].compute_mean_reprojection_error()
         points = models[0].num_points3D()
         with bar("Writing the scene", count - len(unplaced)) as shown:
             written = write_scene(reconstruction.undistort(models[0]), scene, shown.update)
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    print(f"{written} of {count} photographs placed ({matching} matching), {points:,} points, ", end="")
-    print(f"mean reprojection error {error:.2f} px.")
+    print(
+        f"{written} of {count} photographs placed ({matching} matching, {mapping} mapping), {points:,} points, "
+        f"mean reprojection error {error:.2f} px."
+    )
     print_unplaced(unplaced, matching)
     return scene
+
+
+def place(
+    reconstruction: Reconstruction, mapping: Mapping, count: int, bar: Callable[..., tqdm]
+) -> tuple[list[Any], Mapping]:
+    """Return the models, largest first, and the mapping they come from.
+
+    Raises:
+        InputError: no two of the photographs could be placed.
+    """
+    models, taken = [], reconstruction.resolve(mapping)
+    if taken == "global":
+        # Stages take seconds or minutes each: no rest can be foretold, but the clock shows that it goes on.
+        honest = {"miniters": 0, "bar_format": "{desc}: {n_fmt} of {total_fmt} stages done, {elapsed}"}
+        with bar("Placing photographs all at once", global_mapping.STAGES, **honest) as shown:
+            models = reconstruction.map_globally(shown.update)
+        if mapping == "auto" and not reconstruction.placed_enough(models):
+            print(
+                f"All at once, {size(models)} of {count} photographs could be placed; placing them one after another."
+            )
+            taken = "incremental"
+    if taken == "incremental":
+        with bar("Placing photographs", count) as shown:
+            others = reconstruction.map_incrementally(shown.update)
+        if size(others) > size(models):
+            models = others
+        elif models:
+            taken = "global"
+    if not models:
+        raise InputError(
+            f"None of the {count} photographs could be placed; take sharper ones that overlap by two thirds, and walk "
+            "around the subject instead of turning on the spot."
+        )
+    return models, taken
+
+
+def size(models: Sequence[Any]) -> int:
+    """Return how many photographs the largest model holds."""
+    return models[0].num_reg_images() if models else 0
 
 
 def print_unplaced(reasons: dict[str, str], matching: str) -> None:

@@ -7,18 +7,22 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from skipgs_plug.photos import global_mapping
 from skipgs_plug.photos.gather import Gathered
+from skipgs_plug.photos.links import Links, largest_group, read_links
 from skipgs_plug.photos.progress import counted
-from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 
 EXHAUSTIVE_UP_TO = 100  # photographs; beyond, all pairs take longer than neighbours in order
 OVERLAP = 10  # neighbours on either side, then those 16, 32, ... away
 KEY_PHOTOGRAPHS = 40  # of a sequence, compared each with each
+ALL_AT_ONCE_BEYOND = 100  # photographs; up to there, placing one after another takes little and keeps more points
+ENOUGH = 0.9  # of the photographs that hang together, for a model of all at once to be taken
 FEATURE_SIZE = 1600  # larger sides are reduced for feature detection, which gains little above
 SEED = 0
 
 Matching = Literal["auto", "exhaustive", "sequential"]
+Mapping = Literal["auto", "incremental", "global"]
 Progress = Callable[[int], None]
 
 
@@ -64,12 +68,29 @@ class Reconstruction:
                 self._colmap.match_image_pairs(self.database, pairing_options=pairs, verification_options=verification)
         return matching
 
-    def map(self, progress: Progress) -> list[Any]:
-        """Place photographs and points; return the models, largest first.
+    def links(self) -> Links:
+        """Return what features and matches say, after `match`."""
+        return read_links(self.database)
 
-        Raises:
-            InputError: no two photographs could be placed.
+    def resolve(self, mapping: Mapping) -> Mapping:
+        """Return "global" or "incremental", by the number of photographs where nothing was asked for."""
+        if mapping != "auto":
+            return mapping
+        return "global" if len(self._photos.names) > ALL_AT_ONCE_BEYOND else "incremental"
+
+    def map_globally(self, progress: Progress) -> list[Any]:
+        """Place photographs all at once; return the models, largest first, none where that failed.
+
+        `progress` is called with the number of finished stages out of `global_mapping.STAGES`.
         """
+        return global_mapping.map_globally(self.database, self._photos.folder, self._work / "global", progress)
+
+    def placed_enough(self, models: Sequence[Any]) -> bool:
+        """Whether the largest model holds about all photographs that matches tie together."""
+        return bool(models) and models[0].num_reg_images() >= ENOUGH * len(largest_group(self.links().neighbours))
+
+    def map_incrementally(self, progress: Progress) -> list[Any]:
+        """Place photographs one after another; return the models, largest first, none where no two could be placed."""
         options = self._colmap.IncrementalPipelineOptions()
         options.random_seed = SEED
         options.min_model_size = 3
@@ -85,11 +106,6 @@ class Reconstruction:
             initial_image_pair_callback=lambda: progress(2),
             next_image_callback=lambda: progress(1),
         )
-        if not models:
-            raise InputError(
-                f"None of the {len(self._photos.names)} photographs could be placed; take sharper ones that overlap by "
-                "two thirds, and walk around the subject instead of turning on the spot."
-            )
         return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
     def undistort(self, model: Any) -> Path:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.errors import InputError, reason
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp")
 JUDGED_SIZE = 640  # sharpness is judged on frames of about this many pixels, where sensor noise does not count
@@ -52,7 +52,8 @@ def sharpest_frames(path: Path, wanted: int) -> Iterator[tuple[int, np.ndarray]]
             if score > best[0]:
                 best = (score, number, frame)
     except (RuntimeError, OSError) as error:
-        raise InputError(f"Video {path} cannot be decoded to its end; export it again as mp4 (H.264).") from error
+        why = f"cannot be decoded to its end ({reason(error)})"
+        raise InputError(f"Video {path} {why}; export it again as mp4 (H.264).") from error
     yield best[1], best[2]
 
 

@@ -49,20 +49,22 @@ def _nothing(*args: Any, **kwargs: Any) -> None:
     """Stands for a call that only matters where a device runs beside the host."""
 
 
-# Every name of torch.cuda that is replaced; all come back on exit.
+# Every name that is replaced; all come back on exit.
 REPLACED: dict[str, Any] = {
-    "Event": HostEvent,
-    "synchronize": _nothing,
-    "set_device": _nothing,
-    "reset_peak_memory_stats": _nothing,
-    "current_device": lambda: 0,
+    "torch.cuda.Event": HostEvent,
+    "torch.cuda.synchronize": _nothing,
+    "torch.cuda.set_device": _nothing,
+    "torch.cuda.reset_peak_memory_stats": _nothing,
+    "torch.cuda.current_device": lambda: 0,
     # Scripts assert that there is a device, and count them to decide on one process per device.
-    "is_available": lambda: True,
-    "device_count": lambda: 1,
-    "FloatTensor": torch.FloatTensor,
-    "IntTensor": torch.IntTensor,
-    "LongTensor": torch.LongTensor,
-    "BoolTensor": torch.BoolTensor,
+    "torch.cuda.is_available": lambda: True,
+    "torch.cuda.device_count": lambda: 1,
+    "torch.cuda.FloatTensor": torch.FloatTensor,
+    "torch.cuda.IntTensor": torch.IntTensor,
+    "torch.cuda.LongTensor": torch.LongTensor,
+    "torch.cuda.BoolTensor": torch.BoolTensor,
+    # torch's own optimizers ask here, and what they would do with a device goes beyond placement.
+    "torch.accelerator.current_accelerator": _nothing,
 }
 
 
@@ -72,10 +74,10 @@ def cuda_on_cpu() -> Iterator[None]:
     # Optimizers load dynamo, which lists the functions of torch.cuda once and trips over replaced ones.
     dynamo = importlib.import_module("torch._dynamo")
     missing = object()
-    before = {name: getattr(torch.cuda, name, missing) for name in REPLACED}
+    before = [(owner, name, getattr(owner, name, missing)) for owner, name, _ in _places()]
     load = torch.load
-    for name, stand_in in REPLACED.items():
-        setattr(torch.cuda, name, stand_in)
+    for owner, name, stand_in in _places():
+        setattr(owner, name, stand_in)
     torch.load = _load_on_cpu(load)
     try:
         # A compiler that believes in CUDA asks for its random state; uncompiled functions give the same.
@@ -83,11 +85,17 @@ def cuda_on_cpu() -> Iterator[None]:
             yield
     finally:
         torch.load = load
-        for name, original in before.items():
+        for owner, name, original in before:
             if original is missing:
-                delattr(torch.cuda, name)
+                delattr(owner, name)
             else:
-                setattr(torch.cuda, name, original)
+                setattr(owner, name, original)
+
+
+def _places() -> list[tuple[Any, str, Any]]:
+    """Module, name and stand-in of what is replaced, where this torch has the module (`accelerator`: from 2.6 on)."""
+    split = ((*name.split(".")[1:], stand_in) for name, stand_in in REPLACED.items())
+    return [(getattr(torch, module), name, stand_in) for module, name, stand_in in split if hasattr(torch, module)]
 
 
 @contextmanager

@@ -17,19 +17,9 @@ from typing import Any, NamedTuple
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.scripts.missing import what_brings
 
 Attach = Callable[[], dict[str, Any]]  # see `run_script`
-
-# For advice: parts of every checkout of the Inria family, CUDA extensions, packages not called as their module.
-OF_CHECKOUTS = frozenset({"arguments", "gaussian_renderer", "scene", "utils"})
-EXTENSIONS = ("diff_", "simple_knn", "fused_ssim")
-PACKAGES = {
-    "cv2": "opencv-python",
-    "PIL": "pillow",
-    "skimage": "scikit-image",
-    "sklearn": "scikit-learn",
-    "yaml": "pyyaml",
-}
 
 
 def run_script(command: Sequence[str], attach: Attach | None = None) -> int:
@@ -83,19 +73,6 @@ def source_of(command: Sequence[str]) -> Path:
         SkipGSError: There is none.
     """
     return _resolve(command).source
-
-
-def what_brings(module: str, script: Path) -> str:
-    """A sentence for a module that a script asks for and that is not there."""
-    top = module.partition(".")[0]
-    if top in OF_CHECKOUTS:
-        return f"{script.name} is not in its checkout: there is no {top} beside it; run the one in a whole checkout."
-    if top.startswith(EXTENSIONS):
-        return (
-            f"{top} is a CUDA extension that comes with the trainer: build it as the trainer's README says, or run on "
-            "the CPU with --cpu before '--'."
-        )
-    return f"{script.name} needs the module {module}: pip install {PACKAGES.get(top, top)}."
 
 
 class _Program(NamedTuple):

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+import shutil
+import signal
 import sqlite3
+import subprocess
 import time
 from pathlib import Path
 
@@ -14,6 +17,8 @@ from PIL import Image
 
 from skipgs_plug.cli import main
 from skipgs_plug.install import program
+from skipgs_plug.photos import global_mapping, reconstruct
+from skipgs_plug.photos.links import largest_group
 from skipgs_plug.photos.progress import counted
 from skipgs_plug.photos.reconstruct import key_pairs
 from skipgs_plug.trainer import load_scene
@@ -23,14 +28,15 @@ from skipgs_plug.view.model import open_model
 LEAVES_PIPES = "ignore:unclosed file:ResourceWarning"
 
 
-def test_photographs_become_a_scene(photos, tmp_path, capsys):
+@pytest.mark.parametrize("mapping", ["incremental", "global"])
+def test_photographs_become_a_scene(photos, tmp_path, capsys, mapping):
     scene = tmp_path / "scenes/fern"
-    assert main(["sfm", str(photos), str(scene)]) == 0
+    assert main(["sfm", str(photos), str(scene), "--mapping", mapping]) == 0
     captured = capsys.readouterr()
-    assert "8 of 10 photographs placed (exhaustive matching)" in captured.out
+    assert f"8 of 10 photographs placed (exhaustive matching, {mapping} mapping)" in captured.out
     assert re.search(r"blurred\.png: blurred", captured.out)
     assert re.search(r"elsewhere\.png: overlaps no other photograph", captured.out)
-    assert "Placing photographs" in captured.err  # progress
+    assert re.search(r"8/10" if mapping == "incremental" else r"[3-6] of 6 stages done, 00:", captured.err)  # progress
     assert sorted(path.name for path in scene.iterdir()) == ["images", "images_2", "images_4", "images_8", "sparse"]
     assert sorted(path.name for path in scene.parent.iterdir()) == ["fern"]
     loaded = load_scene(scene)
@@ -54,7 +60,10 @@ def test_a_video_becomes_a_scene(fern, tmp_path, capsys):
     command = ["sfm", str(video), str(tmp_path / "scene"), "--matching", "sequential", "--no-progress"]
     assert main(command) == 0
     captured = capsys.readouterr()
-    assert re.search(r"[78] of 8 photographs placed \(sequential matching\)", captured.out) and captured.err == ""
+    assert (
+        re.search(r"[78] of 8 photographs placed \(sequential matching, incremental mapping\)", captured.out)
+        and captured.err == ""
+    )
     names = sorted(path.name for path in (tmp_path / "scene/images").iterdir())
     assert set(names) <= {f"frame_{i:06d}.jpg" for i in range(8)} and len(names) >= 7
 
@@ -113,6 +122,53 @@ def test_bad_input_is_one_sentence(tmp_path, capsys, make, arguments, sentence):
     error = capsys.readouterr().err
     assert sentence in error and len(error.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir() if path.name != "nowhere"] == []
+
+
+def test_where_all_at_once_fails_photographs_are_placed_one_after_another(fern, tmp_path, capsys, monkeypatch):
+    photos, scene = tmp_path / "photos", tmp_path / "scene"
+    photos.mkdir()
+    for path in fern[:5]:
+        shutil.copy(path, photos)
+    monkeypatch.setattr(reconstruct, "ALL_AT_ONCE_BEYOND", 4)
+    monkeypatch.setattr(global_mapping, "LEAST_POINTS", 1_000_000)  # so that no photograph counts as placed
+    assert main(["sfm", str(photos), str(scene), "--no-progress"]) == 0
+    shown = capsys.readouterr().out
+    assert "All at once, 0 of 5 photographs could be placed; placing them one after another." in shown
+    assert "5 of 5 photographs placed (exhaustive matching, incremental mapping)" in shown
+    assert main(["sfm", str(photos), str(tmp_path / "other"), "--mapping", "global", "--no-progress"]) == 2
+    assert "None of the 5 photographs could be placed" in capsys.readouterr().err
+
+
+def test_an_interrupt_ends_the_process_that_places_all_at_once(fern, tmp_path, monkeypatch):
+    started = []
+
+    class Recorded(subprocess.Popen):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            started.append(self)
+
+    def interrupt(stages):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess, "Popen", Recorded)
+    (tmp_path / "database.db").touch()
+    with pytest.raises(KeyboardInterrupt):
+        global_mapping.map_globally(tmp_path / "database.db", fern[0].parent, tmp_path / "work", interrupt)
+    (process,) = started
+    assert process.returncode not in (None, 0)  # killed, and waited for
+
+
+def test_a_terminated_run_leaves_nothing(photos, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(reconstruct.Reconstruction, "match", lambda *_: signal.raise_signal(signal.SIGTERM))
+    assert main(["sfm", str(photos), str(tmp_path / "scene"), "--no-progress"]) == 143
+    assert capsys.readouterr().err == "skipgs-plug: terminated.\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_the_largest_group_hangs_together():
+    pairs = ["ab", "bc", "de", "cf"]
+    neighbours = {name: {one for pair in pairs if name in pair for one in pair} - {name} for name in "abcdefg"}
+    assert largest_group(neighbours) == set("abcf") and largest_group({}) == set()
 
 
 def test_progress_is_read_by_another_process(tmp_path):

@@ -92,10 +92,32 @@ def test_compiled_functions_run_uncompiled():
         assert doubled(torch.ones(2, device="cuda")).tolist() == [2.0, 2.0]
 
 
+def resolved(name: str, default: object) -> object:
+    _, module, attribute = name.split(".")
+    return getattr(getattr(torch, module, None), attribute, default)
+
+
+@pytest.mark.skipif(not hasattr(torch, "accelerator"), reason="this torch has no torch.accelerator")
+def test_torch_itself_finds_no_device(monkeypatch):
+    # As a build with CUDA says where there is no GPU, once `torch.cuda.is_available` is replaced.
+    monkeypatch.setattr(torch.accelerator, "current_accelerator", lambda check_available=False: torch.device("cuda"))
+    with cuda_on_cpu():
+        leaf = torch.ones(2, device="cuda", requires_grad=True)
+        optimizer = torch.optim.Adam([leaf])
+        leaf.sum().backward()
+        optimizer.step()
+        assert torch.accelerator.current_accelerator(check_available=True) is None
+    assert leaf[0] < 1 and torch.accelerator.current_accelerator().type == "cuda"
+
+
 @pytest.mark.parametrize("fails", [False, True])
 def test_everything_is_back_afterwards(fails):
     missing = object()
-    before = {name: getattr(torch.cuda, name, missing) for name in REPLACED}
+
+    def present() -> dict[str, object]:
+        return {name: resolved(name, missing) for name in REPLACED}
+
+    before = present()
     load = torch.load
     try:
         with cuda_on_cpu():
@@ -104,7 +126,7 @@ def test_everything_is_back_afterwards(fails):
                 raise KeyError("stop")
     except KeyError:
         pass
-    assert {name: getattr(torch.cuda, name, missing) for name in REPLACED} == before
+    assert present() == before
     assert torch.load is load
     if not torch.cuda.is_available():
         with pytest.raises((AssertionError, RuntimeError)):

@@ -1,9 +1,13 @@
-"""pycolmap and Pillow in one process: a PNG can be written after both are loaded."""
+"""What pycolmap does to the process that loads it: nothing to PNG files, nothing to SIGTERM."""
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+
+import pytest
 
 
 def test_png_after_pycolmap(tmp_path) -> None:
@@ -25,3 +29,17 @@ def test_the_order_that_crashes_is_refused_at_import() -> None:
         assert "ImportError: pycolmap was imported before Pillow" in done.stderr and done.returncode == 1
     else:
         assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(os.name != "posix", reason="SIGTERM ends no process elsewhere")
+def test_sigterm_stays_what_it_was() -> None:
+    code = (
+        "import os, signal\n"
+        "from skipgs_plug.trainer.loaders.native import import_pycolmap\n"
+        "{handler}import_pycolmap()\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    for handler, returned in (("", -signal.SIGTERM), ("signal.signal(signal.SIGTERM, lambda *_: print('mine'))\n", 0)):
+        command = [sys.executable, "-c", code.format(handler=handler)]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert (done.returncode, done.stderr, done.stdout) == (returned, "", "mine\n" if handler else "")

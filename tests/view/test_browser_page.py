@@ -35,20 +35,20 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
 
 
 @contextlib.contextmanager
-def serve(*arguments: str) -> Iterator[str]:
-    """Run the command; yields the address it prints, ends it as Ctrl-C does."""
+def serve(*arguments: str, end: signal.Signals = signal.SIGINT) -> Iterator[str]:
+    """Run the command; yields the address it prints, ends it by a signal, at which it has nothing to complain of."""
     command = [sys.executable, "-m", "skipgs_plug", "view", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stderr is not None
     try:
         line = process.stdout.readline()
         yield re.search(r"http://\S+", line).group(0) + "/"
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=PATIENCE) == 0
+        process.send_signal(end)
+        complaints = process.communicate(timeout=PATIENCE)[1]
+        assert process.returncode == 0 and complaints == ""
     finally:
         process.kill()
-        process.wait()
-        process.stdout.close()
+        process.communicate()
 
 
 def press(browser: Browser, selector: str, key: str) -> None:
@@ -63,7 +63,7 @@ def test_a_run_is_shown_with_its_errors_and_checkpoints(run_folder, browser, tmp
     earlier = {name: tensor[:100] for name, tensor in read_ply(folder / "ply/point_cloud_39.ply").items()}
     write_ply(earlier, folder / "ply/point_cloud_19.ply")
     stats = json.loads((folder / "stats/val_step39.json").read_text())
-    with serve(str(folder), "--port", "18411") as url:
+    with serve(str(folder), "--port", "18411", end=signal.SIGTERM) as url:
         browser.open(url)
         # The page is filled in several messages, in any order.
         gaussians = f"{stats['num_GS']:,} Gaussians"

@@ -1,12 +1,16 @@
-"""The one place that decides the order in which pycolmap and Pillow are loaded.
+"""The one place that loads pycolmap: after Pillow, and without its handler of SIGTERM.
 
 On Linux pycolmap brings a zlib whose functions Pillow's own are then bound to, some of them: after `import pycolmap`
 the first PNG that Pillow writes ends the process (deflateEnd frees what another deflateInit allocated). With Pillow
 loaded first, both work.
+
+Its logging library answers SIGTERM with a stack trace of the process; what Python had in place comes back.
 """
 
 from __future__ import annotations
 
+import contextlib
+import signal
 import sys
 from typing import Any
 
@@ -26,8 +30,13 @@ def import_pycolmap() -> Any:
     Raises:
         InputError: pycolmap is not installed.
     """
+    loaded = "pycolmap" in sys.modules
+    before = signal.getsignal(signal.SIGTERM)  # None: not from Python, and not ours to put back
     try:
         import pycolmap
     except ImportError as error:
         raise InputError(f"Cameras of photographs need pycolmap ({error}); run: {install_command()}.") from error
+    if not loaded and before is not None:
+        with contextlib.suppress(ValueError):  # another thread than the main one may not
+            signal.signal(signal.SIGTERM, before)
     return pycolmap

@@ -1,0 +1,60 @@
+"""What the database of a reconstruction says about photographs: their features and who shares some with whom."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from skipgs_plug.trainer.loaders.native import import_pycolmap
+
+LEAST_MATCHES = 15  # verified matches that make two photographs neighbours: COLMAP's own threshold for mapping
+
+
+@dataclass
+class Links:
+    """Features and verified pairs.
+
+    Attributes:
+        features: number of features, by photograph.
+        matched: photographs that share at least one verified match, by photograph.
+        neighbours: the same for matches enough to place one by the other.
+    """
+
+    features: dict[str, int]
+    matched: dict[str, set[str]]
+    neighbours: dict[str, set[str]]
+
+
+def read_links(database: Path) -> Links:
+    pycolmap = import_pycolmap()
+    connection = pycolmap.Database.open(database)
+    try:
+        names = {image.image_id: image.name for image in connection.read_all_images()}
+        features = {name: int(connection.num_keypoints_for_image(key)) for key, name in names.items()}
+        matched: dict[str, set[str]] = {name: set() for name in names.values()}
+        neighbours: dict[str, set[str]] = {name: set() for name in names.values()}
+        pairs, counts = connection.read_two_view_geometry_num_inliers()
+        for pair, count in zip(pairs, counts, strict=True):
+            first, second = (names[key] for key in pycolmap.pair_id_to_image_pair(pair))
+            for partners, least in ((matched, 1), (neighbours, LEAST_MATCHES)):
+                if count >= least:
+                    partners[first].add(second)
+                    partners[second].add(first)
+    finally:
+        connection.close()
+    return Links(features, matched, neighbours)
+
+
+def largest_group(neighbours: dict[str, set[str]]) -> set[str]:
+    """Return the largest set of photographs that hang together, from neighbour to neighbour."""
+    largest: set[str] = set()
+    left = set(neighbours)
+    while left:
+        group: set[str] = set()
+        reached = {left.pop()}
+        while reached:
+            group |= reached
+            reached = set().union(*(neighbours[name] for name in reached)) - group
+        left -= group
+        largest = max(largest, group, key=len)
+    return largest

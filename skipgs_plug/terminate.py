@@ -1,0 +1,32 @@
+"""SIGTERM ends a command as Ctrl-C does, so that it cleans up what it had begun."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM arrived."""
+
+
+def raise_terminated(number: int, frame: Any) -> None:
+    """Be the handler; a second SIGTERM ends the process at once."""
+    signal.signal(number, signal.SIG_DFL)
+    raise Terminated
+
+
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """Raise `Terminated` inside the block when SIGTERM arrives; the handler of before is put back afterwards."""
+    try:
+        previous = signal.signal(signal.SIGTERM, raise_terminated)
+    except ValueError:  # not in the main thread: whoever owns that handles signals
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
