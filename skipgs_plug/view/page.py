@@ -17,6 +17,7 @@ from skipgs_plug.trainer.metrics import psnr
 from skipgs_plug.trainer.scene import Scene, View
 from skipgs_plug.view.draw import to_bytes
 from skipgs_plug.view.gaussians import to_gaussians
+from skipgs_plug.view.upright import up_direction
 
 RADIUS = 5.0  # of the cameras on the page: half precision, near planes and mouse speeds suit such lengths
 FRUSTUM = 0.04  # height of a camera's frustum, in radii
@@ -154,8 +155,7 @@ class Page:
         self._pictures = (truth, render, error)
         self._table = gui.add_markdown("")
         poses = {name: torch.linalg.inv(view.viewmat.double()).numpy() for name, view in self._views.items()}
-        up = -np.mean([pose[:3, 1] for pose in poses.values()], axis=0)
-        self._server.scene.set_up_direction(up / max(float(np.linalg.norm(up)), 1e-9))
+        self._server.scene.set_up_direction(up_direction(np.stack(list(poses.values()))))
         self._poses = poses
         self._frustums = {name: self._add_frustum(view, poses[name]) for name, view in self._views.items()}
         first = scene.train[0]

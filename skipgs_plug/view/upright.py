@@ -1,0 +1,22 @@
+"""Which way is up in a scene, told from how its photographs were held."""
+
+from __future__ import annotations
+
+import numpy as np
+
+TRUST = 0.02  # in the mean of the cameras' own up, against that they were held level
+
+
+def up_direction(poses: np.ndarray) -> np.ndarray:
+    """Return the unit vector [3] that points up in a scene.
+
+    Cameras are tilted down or up but mostly held level, so up is perpendicular to their axes to the right. On half a
+    circle around a subject the mean of their own up leans to one side; where all look the same way, it alone says what
+    the axes to the right leave open. Both together are one least-squares problem.
+
+    Args:
+        poses: Camera to world, OpenCV axes (x right, y down), [V, 4, 4].
+    """
+    right, own = poses[:, :3, 0], -poses[:, :3, 1].mean(axis=0)
+    up = np.linalg.solve(right.T @ right / len(poses) + TRUST * np.eye(3), own)
+    return up / max(float(np.linalg.norm(up)), 1e-9)
