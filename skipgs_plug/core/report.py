@@ -82,7 +82,9 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
         f"{config.start_iter or 0:,}, {skipped:,} left out whole."
     ]
     foresight = counted["foresight"]
-    if foresight is not None:
+    if foresight is not None and not foresight["watched"]:
+        lines.append("  too few views to leave some out and judge by them: the whole share runs")
+    elif foresight is not None:
         worth = foresight["rest_worth_db"]
         judged = "not judged" if worth is None else f"worth at most {worth:.2f} dB when last judged"
         lines.append(

@@ -72,6 +72,7 @@ class ThinningState(TypedDict):
 class ForesightState(TypedDict):
     """As `Foresight.state_dict`."""
 
+    ends: list[float]
     cycle: int
     ended: bool
     gains: list[tuple[float, float]]

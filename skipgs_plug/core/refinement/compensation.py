@@ -25,7 +25,7 @@ class Compensation:
         """Iteration `step` begins; `floor` is the least share of real backwards in force."""
         self._rates.follow_thread()
         if step < self._start:
-            self._rates.factor = 1.0
+            self._rates.factor = None
             return
         progress = (step - self._start) / max(self._end - self._start, 1)
         self._rates.factor = path_factor(1.0 if floor is None else floor, progress, self._peak)

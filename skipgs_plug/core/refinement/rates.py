@@ -11,6 +11,9 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 
 Optimizers = Callable[[], Iterable[torch.optim.Optimizer]]
 
+COLOUR_NAMES = frozenset({"f_dc", "f_rest", "sh0", "shN", "features_dc", "features_rest"})
+OPACITY_NAMES = frozenset({"opacity", "opacities"})
+
 
 def path_factor(share: float, progress: float, peak: float | None = None) -> float:
     """Factor on learning rates at some progress through refinement, when a share of the iterations runs.
@@ -27,6 +30,24 @@ def path_factor(share: float, progress: float, peak: float | None = None) -> flo
     return (2.0 / share if peak is None else peak) * (1.0 - progress)
 
 
+def group_factor(group: dict[str, Any], factor: float) -> float:
+    """Factor on the learning rate of a group of an optimizer, where `factor` is that of all.
+
+    The image is linear in the colours, so SH coefficients bear twice as long steps. Opacities are never raised: their
+    rate is large as it is, and steps beyond it flicker. Both are known by the group's name; in groups without one,
+    by shape: [N, K, 3] are SH coefficients, [N, 1] opacities.
+    """
+    if "name" in group:
+        colour, opacity = group["name"] in COLOUR_NAMES, group["name"] in OPACITY_NAMES
+    else:
+        shapes = [tuple(param.shape[1:]) for param in group["params"]]
+        colour = all(len(shape) == 2 and shape[1] == 3 for shape in shapes)
+        opacity = all(shape == (1,) for shape in shapes)
+    if colour:
+        return 2.0 * factor
+    return min(factor, 1.0) if opacity else factor
+
+
 class ScaledRates:
     """Multiplies the learning rates of optimizers that step in this thread, and puts them back afterwards.
 
@@ -37,11 +58,11 @@ class ScaledRates:
         only: Gives the optimizers that are meant; None for all that step, of which the trainer alone knows.
 
     Attributes:
-        factor: in force; 1 touches nothing.
+        factor: in force, see `group_factor`; None touches nothing.
     """
 
     def __init__(self, only: Optimizers | None = None) -> None:
-        self.factor = 1.0
+        self.factor: float | None = None
         self._only = only
         self._thread = threading.get_ident()
         self._depth: dict[int, int] = {}  # a step can call the step of its base class
@@ -67,7 +88,7 @@ class ScaledRates:
             handle.remove()
 
     def _scale(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        if self.factor == 1.0 or threading.get_ident() != self._thread:
+        if self.factor is None or threading.get_ident() != self._thread:
             return
         if self._only is not None and not any(optimizer is one for one in self._only()):
             return
@@ -77,7 +98,7 @@ class ScaledRates:
             return
         self._before[key] = [(group, group["lr"]) for group in optimizer.param_groups]
         for group in optimizer.param_groups:
-            group["lr"] = group["lr"] * self.factor
+            group["lr"] = group["lr"] * group_factor(group, self.factor)
 
     def _put_back(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         key = id(optimizer)

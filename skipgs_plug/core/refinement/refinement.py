@@ -212,14 +212,15 @@ class Refinement:
                 raise SkipGSError('refine_share="auto" must know the training views; give views=, or a share.')
             self.share = needed_share(total, len(self._views))
         assert self.share is not None
-        if not self._scales:
-            self.thinning.share = self.share
-        elif self.foresight is None:
-            self.foresight = self._new_foresight()
         if self._auto and self._views is not None:
             self.watched = watched_views(self._views)
-        if self._scales and self._rates is None:
-            self._rates = ScaledRates(self.optimizers)
+        if not self._scales:
+            self.thinning.share = self.share
+        else:
+            if self.foresight is None:
+                self.foresight = Foresight(self._config.tolerance, CYCLE_ENDS if self.watched else ONE_CYCLE)
+            if self._rates is None:
+                self._rates = ScaledRates(self.optimizers)
         log.info(
             "Refinement: at most %.0f %% of iterations %d to %d run, %d of them in any case.",
             100 * (self.share or 1.0),
@@ -231,9 +232,6 @@ class Refinement:
     @property
     def _auto(self) -> bool:
         return self._config.refine_share == "auto"
-
-    def _new_foresight(self) -> Foresight:
-        return Foresight(self._config.tolerance, CYCLE_ENDS if self._auto else ONE_CYCLE)
 
     @property
     def _scales(self) -> bool:
@@ -302,6 +300,6 @@ class Refinement:
         self.thinning.load_state_dict(state["thinning"])
         self._recovery, self._recovered = state["recovery"]
         if state["foresight"] is not None:
-            self.foresight = self._new_foresight()
+            self.foresight = Foresight(self._config.tolerance)
             self.foresight.load_state_dict(state["foresight"])
         self._next, self._begun = state["next"], False

@@ -33,7 +33,7 @@ def test_a_scene_that_needs_nothing_ends_after_the_second_cycle():
 def test_a_scene_that_gains_to_the_end_gets_all():
     foresight, _ = follow(lambda view, done: 0.1 * (1.0 - 0.5 * done))
     assert not foresight.ended and foresight.cycle == len(CYCLE_ENDS) - 1
-    assert len(foresight.gains) == 2 and all(mean > 0.05 for mean, _ in foresight.gains)
+    assert len(foresight.gains) == 1 and foresight.gains[0][0] > 0.05
     foresight.progress(1.0)
     assert foresight.ended and not foresight.early
 
@@ -41,18 +41,18 @@ def test_a_scene_that_gains_to_the_end_gets_all():
 def test_doubt_counts_for_going_on():
     gains = {view: 0.002 * (i % 2) for i, view in enumerate(VIEWS)}
     foresight, done = follow(lambda view, done: 0.1 - gains[view] * (done > 0.125))
-    assert foresight.gains[0][1] > 0.02 and done == CYCLE_ENDS[2]  # where it had brought nothing any more
+    assert foresight.gains[0][1] > 0.02 and not foresight.ended and done > CYCLE_ENDS[1]
 
 
 def test_views_that_get_worse_say_nothing():
     foresight, _ = follow(lambda view, done: 0.1 * (1.0 + done))
-    assert not foresight.ended and all(mean < -0.05 for mean, _ in foresight.gains)
+    assert not foresight.ended and foresight.gains[0][0] < -0.05
 
 
 def test_progress_runs_from_zero_to_one_in_every_cycle():
     foresight = Foresight(0.05)
     seen = [foresight.progress(i / 80) for i in range(80)]
-    assert [i for i, (a, b) in enumerate(itertools.pairwise(seen), 1) if b < a] == [10, 20, 40]
+    assert [i for i, (a, b) in enumerate(itertools.pairwise(seen), 1) if b < a] == [10, 20]
     assert min(seen) == 0.0 and max(seen) < 1.0
 
 
@@ -90,8 +90,8 @@ def test_the_share_follows_from_the_visits():
 def test_watched_views_are_few_and_always_the_same():
     names = [f"{i:03}.jpg" for i in range(255)]
     assert watched_views(names) == watched_views(reversed(names)) and len(watched_views(names)) == 12
-    assert len(watched_views(names[:17])) == 3 and len(watched_views(names[:9])) == 2
-    assert watched_views(names[:3]) == frozenset()
+    assert len(watched_views(names[:46])) == 4
+    assert watched_views(names[:17]) == watched_views(names[:1]) == frozenset()
 
 
 def test_gain_in_decibels():

@@ -150,10 +150,10 @@ def test_a_state_of_another_share_is_refused():
 def test_auto_ends_where_nothing_is_gained_and_goes_on_with_what_hangs_on_numbers():
     ran = []
     with SkipGate(start_iter=100, refine_share="auto") as gate:
-        for step in gate.iterations(range(2100), views=[f"{i}.png" for i in range(20)]):
+        for step in gate.iterations(range(2100), views=[f"{i}.png" for i in range(40)]):
             ran.append(step)
             loss = torch.tensor(0.1, requires_grad=True)
-            gate.backward(loss * 1.0, view=f"{step % 20}.png", step=step)
+            gate.backward(loss * 1.0, view=f"{step % 40}.png", step=step)
             if step % 500 == 0:
                 pass
     report = gate.report()
@@ -162,6 +162,19 @@ def test_auto_ends_where_nothing_is_gained_and_goes_on_with_what_hangs_on_number
     assert report["foresight"]["ended_early"] and "ended early, in cycle 2" in gate.summary()
     assert report["foresight"]["rest_worth_db"] == 0.0
     assert report["reasons"]["over"] > 0 and report["reasons"]["watched"] > 0
+
+
+def test_auto_runs_the_whole_share_where_views_are_too_few_to_watch():
+    ran = []
+    with SkipGate(start_iter=100, refine_share="auto") as gate:
+        for step in gate.iterations(range(2100), views=[f"{i}.png" for i in range(20)]):
+            ran.append(step)
+            loss = torch.tensor(0.1, requires_grad=True)
+            gate.backward(loss * 1.0, view=f"{step % 20}.png", step=step)
+    report = gate.report()
+    assert report["iterations_run"] == 800 + 1 and report["foresight"]["watched"] == []
+    assert report["backwards_skipped"] == 1  # of the last iteration, when steps have shrunk to nothing
+    assert "too few views" in gate.summary()
 
 
 def test_auto_must_know_the_views():

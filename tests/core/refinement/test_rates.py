@@ -5,7 +5,7 @@ import threading
 import pytest
 import torch
 
-from skipgs_plug.core.refinement.rates import ScaledRates, path_factor
+from skipgs_plug.core.refinement.rates import ScaledRates, group_factor, path_factor
 
 
 def parameter(value=1.0):
@@ -29,6 +29,32 @@ def test_the_path_is_conserved():
         assert path == pytest.approx(steps, rel=0.01)
     assert path_factor(0.4, 1.0) == 0.0
     assert path_factor(0.4, 0.5, peak=3.0) == 1.5
+
+
+@pytest.mark.parametrize(
+    "group, shape, times",
+    [
+        ({"name": "f_rest"}, (5, 15, 3), 2.0),
+        ({"name": "sh0"}, (5, 1, 3), 2.0),
+        ({"name": "features_dc"}, (5, 3), 2.0),
+        ({"name": "offset"}, (5, 10, 3), 1.0),  # Scaffold-GS: positions of the Gaussians of an anchor
+        ({"name": "xyz"}, (5, 3), 1.0),
+        ({"name": "opacity"}, (5, 1), 1 / 3),  # as they are
+        ({"name": "opacities"}, (5,), 1 / 3),
+        ({}, (5, 15, 3), 2.0),
+        ({}, (5, 3), 1.0),
+        ({}, (5, 1), 1 / 3),
+        ({}, (5,), 1.0),
+    ],
+)
+def test_colours_take_longer_steps_and_opacities_no_longer_ones(group, shape, times, rates):
+    value = torch.nn.Parameter(torch.zeros(shape))
+    optimizer = torch.optim.SGD([{"params": [value], **group}], lr=0.1)
+    value.grad = torch.ones(shape)
+    rates.factor = 3.0
+    optimizer.step()
+    torch.testing.assert_close(value.detach(), torch.full(shape, -0.3 * times))
+    assert group_factor(optimizer.param_groups[0], 0.25) == (0.5 if times == 2.0 else 0.25)
 
 
 class OwnStep(torch.optim.Adam):
@@ -55,7 +81,7 @@ def test_a_step_is_as_long_as_the_factor_says_and_the_rate_comes_back(kind, rate
     before = scaled.param_groups[0]["lr"]
     scaled.step(*arguments)
     assert scaled.param_groups[0]["lr"] is before
-    rates.factor = 1.0
+    rates.factor = None
     plain.step(*arguments)
     torch.testing.assert_close(1.0 - value.detach(), 4.0 * (1.0 - other.detach()), rtol=1e-5, atol=0)
 
