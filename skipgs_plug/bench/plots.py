@@ -56,7 +56,7 @@ def looks_at_losses(run: RunRecord) -> bool:
 
 def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row]) -> Figure:
     """Mean held-out PSNR over seeds against seconds of refinement, one curve per policy."""
-    figure, axes = new_figure(7.6, 4.6)
+    figure, axes = new_figure(9.0, 4.6)
     for row in rows:
         runs = [r for r in records if r.policy == row.policy]
         if not runs:
@@ -67,7 +67,7 @@ def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row]) -> Figure:
         axes.plot(seconds, psnr, color=colour, marker=marker, markersize=5, linewidth=1.6, label=row.policy)
     axes.set_xlabel("training time since the end of densification (s)")
     axes.set_ylabel("held-out PSNR (dB)")
-    axes.legend(frameon=False, fontsize=SMALL, loc="lower right")
+    figure.legend(frameon=False, fontsize=SMALL, loc="outside right center")
     axes.set_title(f"Quality against time, {seeds_text(rows)}", loc="left", fontsize=11)
     return figure
 

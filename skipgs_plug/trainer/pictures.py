@@ -66,12 +66,12 @@ def plot_refinement(path: Path, curves: list[Curve]) -> None:
     figure = Figure(figsize=(8, 4.8), layout="constrained")
     losses, skips = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     for curve in curves:
-        losses.plot(curve.steps, smooth(curve.losses), label=curve.name, linewidth=1.2)
+        (line,) = losses.plot(curve.steps, smooth(curve.losses), label=curve.name, linewidth=1.2)
         if any(curve.skipped):
             steps, skipped = np.array(curve.steps), np.array(curve.skipped)
             skips.vlines(steps[skipped], 0, 1, color="0.75", linewidth=0.5)
             share = np.cumsum(skipped) / np.arange(1, len(skipped) + 1)
-            skips.plot(steps, share, color="C1", label="share skipped so far")
+            skips.plot(steps, share, color=line.get_color(), label=f"{curve.name}: share skipped so far")
             skips.legend(loc="upper left", fontsize="small")
     losses.set_ylabel("training loss (running mean)")
     losses.legend()
