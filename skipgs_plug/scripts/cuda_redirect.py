@@ -16,6 +16,8 @@ from typing import Any
 import torch
 from torch.overrides import TorchFunctionMode
 
+from skipgs_plug.fallback_raster.compat.stand_ins import stand_ins
+
 
 class HostEvent:
     """`torch.cuda.Event` on the host's clock: the CPU has finished whatever was called before."""
@@ -73,23 +75,10 @@ def cuda_on_cpu() -> Iterator[None]:
     """Redirect CUDA to the CPU inside the block, in this thread."""
     # Optimizers load dynamo, which lists the functions of torch.cuda once and trips over replaced ones.
     dynamo = importlib.import_module("torch._dynamo")
-    missing = object()
-    before = [(owner, name, getattr(owner, name, missing)) for owner, name, _ in _places()]
-    load = torch.load
-    for owner, name, stand_in in _places():
-        setattr(owner, name, stand_in)
-    torch.load = _load_on_cpu(load)
-    try:
-        # A compiler that believes in CUDA asks for its random state; uncompiled functions give the same.
-        with _CpuPlacement(), dynamo.config.patch(disable=True):
-            yield
-    finally:
-        torch.load = load
-        for owner, name, original in before:
-            if original is missing:
-                delattr(owner, name)
-            else:
-                setattr(owner, name, original)
+    replaced = [*_places(), (torch, "load", _load_on_cpu(torch.load))]
+    # A compiler that believes in CUDA asks for its random state; uncompiled functions give the same.
+    with stand_ins(replaced), _CpuPlacement(), dynamo.config.patch(disable=True):
+        yield
 
 
 def _places() -> list[tuple[Any, str, Any]]:

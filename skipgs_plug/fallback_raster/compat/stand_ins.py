@@ -6,18 +6,20 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+MISSING = object()
+
 
 @contextmanager
 def stand_ins(replaced: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
     """Give each (owner, name) its stand-in inside the block; a name that the owner lacks is removed afterwards."""
-    before = [(owner, name, getattr(owner, name, None)) for owner, name, _ in replaced]
+    before = [(owner, name, getattr(owner, name, MISSING)) for owner, name, _ in replaced]
     for owner, name, stand_in in replaced:
         setattr(owner, name, stand_in)
     try:
         yield
     finally:
         for owner, name, original in before:
-            if original is None:
+            if original is MISSING:
                 delattr(owner, name)
             else:
                 setattr(owner, name, original)
