@@ -11,8 +11,15 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 
 Optimizers = Callable[[], Iterable[torch.optim.Optimizer]]
 
-COLOUR_NAMES = frozenset({"f_dc", "f_rest", "sh0", "shN", "features_dc", "features_rest"})
-OPACITY_NAMES = frozenset({"opacity", "opacities"})
+# What a group of parameters takes of the factor that is meant for all. The higher bands of the colours, whose rate
+# trainers set to a twentieth of the constant band's, bear the longest steps; opacities none beyond the trainer's.
+HIGHER_BANDS, CONSTANT_BAND, POSITIONS, OTHERS = 4.0, 2.0, 2.0, 1.0
+NAMED = {
+    **dict.fromkeys(("f_rest", "shN", "features_rest"), HIGHER_BANDS),
+    **dict.fromkeys(("f_dc", "sh0", "features_dc"), CONSTANT_BAND),
+    **dict.fromkeys(("xyz", "means"), POSITIONS),
+}
+OPACITIES = ("opacity", "opacities")
 
 
 def path_factor(share: float, progress: float, peak: float | None = None) -> float:
@@ -33,19 +40,20 @@ def path_factor(share: float, progress: float, peak: float | None = None) -> flo
 def group_factor(group: dict[str, Any], factor: float) -> float:
     """Factor on the learning rate of a group of an optimizer, where `factor` is that of all.
 
-    The image is linear in the colours, so SH coefficients bear twice as long steps. Opacities are never raised: their
-    rate is large as it is, and steps beyond it flicker. Both are known by the group's name; in groups without one,
-    by shape: [N, K, 3] are SH coefficients, [N, 1] opacities.
+    The image is linear in the colours, so SH coefficients bear longer steps. So do positions, whose rate has fallen to
+    a tenth of what it began with when refinement begins. Opacities are never raised: their rate is large as it is, and
+    steps beyond it flicker. All are known by the group's name; in groups without one, by shape: [N, 1, 3] is the
+    constant band of the SH coefficients, [N, K, 3] are the others, [N, 1] opacities.
     """
     if "name" in group:
-        colour, opacity = group["name"] in COLOUR_NAMES, group["name"] in OPACITY_NAMES
-    else:
-        shapes = [tuple(param.shape[1:]) for param in group["params"]]
-        colour = all(len(shape) == 2 and shape[1] == 3 for shape in shapes)
-        opacity = all(shape == (1,) for shape in shapes)
-    if colour:
-        return 2.0 * factor
-    return min(factor, 1.0) if opacity else factor
+        name = group["name"]
+        return min(factor, 1.0) if name in OPACITIES else NAMED.get(name, OTHERS) * factor
+    shapes = [tuple(param.shape[1:]) for param in group["params"]]
+    if all(shape == (1,) for shape in shapes):
+        return min(factor, 1.0)
+    if all(len(shape) == 2 and shape[1] == 3 for shape in shapes):
+        return (CONSTANT_BAND if all(shape[0] == 1 for shape in shapes) else HIGHER_BANDS) * factor
+    return factor
 
 
 class ScaledRates:

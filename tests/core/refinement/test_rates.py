@@ -34,27 +34,29 @@ def test_the_path_is_conserved():
 @pytest.mark.parametrize(
     "group, shape, times",
     [
-        ({"name": "f_rest"}, (5, 15, 3), 2.0),
+        ({"name": "f_rest"}, (5, 15, 3), 4.0),
         ({"name": "sh0"}, (5, 1, 3), 2.0),
         ({"name": "features_dc"}, (5, 3), 2.0),
         ({"name": "offset"}, (5, 10, 3), 1.0),  # Scaffold-GS: positions of the Gaussians of an anchor
-        ({"name": "xyz"}, (5, 3), 1.0),
-        ({"name": "opacity"}, (5, 1), 1 / 3),  # as they are
-        ({"name": "opacities"}, (5,), 1 / 3),
-        ({}, (5, 15, 3), 2.0),
+        ({"name": "xyz"}, (5, 3), 2.0),
+        ({"name": "scaling"}, (5, 3), 1.0),
+        ({"name": "opacity"}, (5, 1), None),
+        ({"name": "opacities"}, (5,), None),
+        ({}, (5, 15, 3), 4.0),
+        ({}, (5, 1, 3), 2.0),
         ({}, (5, 3), 1.0),
-        ({}, (5, 1), 1 / 3),
+        ({}, (5, 1), None),
         ({}, (5,), 1.0),
     ],
 )
-def test_colours_take_longer_steps_and_opacities_no_longer_ones(group, shape, times, rates):
+def test_colours_and_positions_take_longer_steps_and_opacities_no_longer_ones(group, shape, times, rates):
     value = torch.nn.Parameter(torch.zeros(shape))
     optimizer = torch.optim.SGD([{"params": [value], **group}], lr=0.1)
     value.grad = torch.ones(shape)
     rates.factor = 3.0
     optimizer.step()
-    torch.testing.assert_close(value.detach(), torch.full(shape, -0.3 * times))
-    assert group_factor(optimizer.param_groups[0], 0.25) == (0.5 if times == 2.0 else 0.25)
+    torch.testing.assert_close(value.detach(), torch.full(shape, -0.1 if times is None else -0.3 * times))
+    assert group_factor(optimizer.param_groups[0], 0.25) == (0.25 if times is None else 0.25 * times)
 
 
 class OwnStep(torch.optim.Adam):
