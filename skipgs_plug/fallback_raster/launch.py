@@ -23,7 +23,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_args, get_origin
 
@@ -358,7 +358,7 @@ def _on_all_threads(work: Callable[[], None]) -> None:
         _pool.shutdown()
         _pool = None
     if _pool is None:
-        _pool = ThreadPoolExecutor(_num_threads - 1, thread_name_prefix="skipgs-raster")
+        _pool = _start_pool(_num_threads - 1)
     others: list[Future[None]] = []
     _busy = True
     try:
@@ -371,6 +371,28 @@ def _on_all_threads(work: Callable[[], None]) -> None:
             if not other.cancel():
                 other.result()
     _busy = False
+
+
+def _start_pool(count: int) -> ThreadPoolExecutor:
+    """Start so many threads, from another thread than this one.
+
+    Exceptions of signal handlers come to the main thread alone. One that came while it starts a worker would leave a
+    thread that the pool does not know of, for which the interpreter waits at its end without telling it to stop.
+    """
+    pool = ThreadPoolExecutor(count, thread_name_prefix="skipgs-raster")
+    started = threading.Event()
+
+    def start() -> None:
+        # An interrupted process may be at its end by now, where nothing can be submitted any more.
+        with suppress(RuntimeError):
+            for _ in range(count):
+                pool.submit(started.wait)  # a worker that waits does not take the next one's place
+        started.set()
+
+    starter = threading.Thread(target=start, name="skipgs-raster-start")
+    starter.start()
+    starter.join()
+    return pool
 
 
 def _warn_after_fork() -> None:

@@ -93,6 +93,34 @@ assert torch.equal(once(), truth)
 """
 
 
+INTERRUPTED_START = """
+import threading, torch
+from raster_scenes import random_scene
+from skipgs_plug.fallback_raster import rasterization, set_num_threads
+
+set_num_threads(3)
+start, interrupts = threading.Thread.start, []
+def interrupted_start(thread):
+    start(thread)
+    if not interrupts and threading.current_thread() is threading.main_thread():
+        interrupts.append(thread)
+        raise KeyboardInterrupt
+threading.Thread.start = interrupted_start
+try:
+    rasterization(**random_scene(n=4000, width=200, height=150))
+except KeyboardInterrupt:
+    assert interrupts
+    print("interrupted")
+if AGAIN:
+    rasterization(**random_scene(n=4000, width=200, height=150))
+"""
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_process_interrupted_while_it_starts_threads_comes_to_its_end(again: bool) -> None:
+    assert run("-c", f"AGAIN = {again}\n{INTERRUPTED_START}", timeout=60) == "interrupted\n"
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs SIGALRM")
 def test_signals_that_raise_at_any_time_do_not_crash() -> None:
     run("-c", INTERRUPTED)
