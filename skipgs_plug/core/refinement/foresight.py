@@ -26,9 +26,9 @@ LEAST_WATCHED, MOST_WATCHED = 3, 12  # fewer than three cannot tell a twentieth 
 
 
 def needed_share(iterations: int, n_views: int) -> float:
-    """Share of the refinement iterations that may be needed, known beforehand: each view five times, at least a quarter.
+    """Share of the refinement iterations that may be needed, known beforehand.
 
-    So much that leaving out the rest is not worth it means all.
+    A quarter, or what shows each view five times; so much that leaving out the rest is not worth it means all.
     """
     share = max(LEAST_SHARE, LEAST_VISITS * n_views / max(iterations, 1))
     return share if share < ALL else 1.0

@@ -108,11 +108,7 @@ for (int t = first; t < last; ++t) {
         for (int j = 0; j < count; j += 16) {
             i16 of_block;
             for (int b = 0; b < 16; ++b) of_block[b] = visited >> b & 1 ? (int)(live[b] >> j) & 65535 : 0;
-            for (int i = 0; i < 16 && j + i < count; ++i) {
-                const int k = base + j + i;
-                pair_blocks[k] = bits(of_block & (1 << i));
-                if (pair_blocks[k]) blended_pairs[tile_place[k]] = 1;
-            }
+            for (int i = 0; i < 16 && j + i < count; ++i) pair_blocks[base + j + i] = bits(of_block & (1 << i));
         }
     }
     if (unfinished) still_open[t] = open != 0;

@@ -16,8 +16,8 @@ for (int i = block_start[first]; i < block_start[first + 1]; ++i) {
     bool received = false;
     const auto add = [&](int from, int to) INLINE {
         for (int p = from; p < to; ++p)
-            if (blended_pairs[p]) {
-                sums += load(v_pairs + (long long)PAIR * (pair_number[p] - 1));
+            if (pair_slot[p]) {
+                sums += load(v_pairs + (long long)PAIR * (pair_slot[p] - 1));
                 received = true;
             }
     };
