@@ -40,6 +40,7 @@ def _forward(channels: int) -> Worker:
         transmittance: Annotated[FloatArray, "height, width"],  # out, behind the last Gaussian blended
         pixel_stop: Annotated[IntArray, "height, width"],  # out, place in tile_list behind the last Gaussian blended
         tile_stop: Annotated[IntArray, "tiles_x, tiles_y"],  # out, their maximum
+        tile_blended: Annotated[IntArray, "tiles_x, tiles_y"],  # out, pairs that were blended
         pair_blocks: Annotated[IntArray, "P"],  # out, blocks where it was blended, as bits; nothing beyond tile_stop
         product_left: Annotated[FloatArray, "height if unfinished or continued else 0, width"],  # in and out
         still_open: Annotated[IntArray, "tiles_x * tiles_y if unfinished or continued else 0"],  # out
@@ -112,16 +113,19 @@ def backward_worker(channels: int, absgrad: bool) -> Worker:
     return _BACKWARD[min(width for width in _WIDTHS if width >= channels), absgrad]
 
 
-@worker(read_kernel("number_pairs.h"), items="1", grain="1")
+# Pairs are numbered by row, and neighbours in a list are rows from anywhere: where there are few pairs, several threads
+# would pass their cache lines to and fro.
+@worker(read_kernel("number_pairs.h"), items="parts * tiles", grain="pairs < 262144 ? parts * tiles : 8")
 def number_pairs(
     tile_start: Annotated[IntArray, "tiles + 1"],
     tile_stop: Annotated[IntArray, "tiles"],
     far_start: Annotated[IntArray, "tiles + 1"],  # of the second part of each list, if there is one
     far_stop: Annotated[IntArray, "tiles"],
-    tile_place: Annotated[IntArray, "P"],
-    pair_blocks: Annotated[IntArray, "P"],
-    slot_start: Annotated[IntArray, "parts * tiles + 1"],  # out, blended pairs of the tiles before each
-    pair_slot: Annotated[IntArray, "P"],  # out, zeros before, by number of the pair; 1 + its slot, 0 if not blended
+    tile_place: Annotated[IntArray, "pairs"],
+    pair_blocks: Annotated[IntArray, "pairs"],
+    slot_start: Annotated[IntArray, "parts * tiles + 1"],  # blended pairs of the tiles before each
+    pair_slot: Annotated[IntArray, "pairs"],  # out, zeros before; 1 + the slot of each pair, 0 if it was not blended
+    pairs: int,
     tiles: int,
     parts: int,
 ) -> None: ...

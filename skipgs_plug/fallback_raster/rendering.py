@@ -21,12 +21,14 @@ class Pass:
         bins: The lists, sorted as far as the pixels took them.
         block_start: [blocks + 1] int32, where each block of rows begins among those of `bins`.
         tile_stop: [tiles] int32, place in the list behind the last Gaussian that a pixel of the tile took.
+        tile_blended: [tiles] int32, pairs of the tile that were blended.
         pair_blocks: [P] int32, blocks of a tile in which a pair was blended, as bits, by place in the lists.
     """
 
     bins: Bins
     block_start: Tensor
     tile_stop: Tensor
+    tile_blended: Tensor
     pair_blocks: Tensor
 
     def after(self, near: "Pass") -> "Pass":
@@ -44,7 +46,7 @@ class Pass:
             own.tiles_per_gauss,
         )
         pair_blocks = torch.cat([near.pair_blocks, self.pair_blocks])
-        return Pass(bins, self.block_start, self.tile_stop + pairs, pair_blocks)
+        return Pass(bins, self.block_start, self.tile_stop + pairs, self.tile_blended, pair_blocks)
 
 
 @dataclass
@@ -110,7 +112,7 @@ def _blend_lists(
 ) -> Pass:
     channels, pairs = colors.shape[1], len(bins.tile_list)
     image, transmittance, pixel_stop, product_left, still_open = pixels
-    tile_stop, pair_blocks = ints(size[2] * size[3]), ints(pairs)
+    tile_stop, tile_blended, pair_blocks = ints(size[2] * size[3]), ints(size[2] * size[3]), ints(pairs)
     in_one = channels <= MAX_CHANNELS
     if not in_one:
         bins.sort()
@@ -121,12 +123,12 @@ def _blend_lists(
             pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
         forward_worker(some)(
             bins.records, bins.tile_start, bins.pair_row, bins.unsorted, buffer, bins.tile_list, bins.tile_place,
-            image, transmittance, pixel_stop, tile_stop, pair_blocks, product_left, still_open,
+            image, transmittance, pixel_stop, tile_stop, tile_blended, pair_blocks, product_left, still_open,
             *size, channels, channel, some, int(not in_one), before, int(continued), int(unfinished),
             active_shortcuts(),
         )  # fmt: skip
     bins.unsorted, bins.pair_row = longs(0), ints(0)  # no longer needed
-    return Pass(bins, block_start, tile_stop, pair_blocks)
+    return Pass(bins, block_start, tile_stop, tile_blended, pair_blocks)
 
 
 def blend_adjoint(
@@ -151,11 +153,12 @@ def blend_adjoint(
     absolute = floats(0) if absolute is None else absolute
     pairs = len(lists.tile_list)
     # Behind the surface most pairs are not blended: they have no sums.
-    count = size[2] * size[3]
-    slot_start, pair_slot = ints(parts * count + 1), zeros(pairs, dtype=torch.int32)
+    per_tile = torch.cat([part.tile_blended for part in (near, last)[:parts]])
+    slot_start, pair_slot = zeros(len(per_tile) + 1, dtype=torch.int32), zeros(pairs, dtype=torch.int32)
+    torch.cumsum(per_tile, 0, out=slot_start[1:])
     number_pairs(
         bins.tile_start, near.tile_stop, lists.tile_start, last.tile_stop, lists.tile_place, last.pair_blocks,
-        slot_start, pair_slot, count, parts,
+        slot_start, pair_slot, pairs, len(near.tile_stop), parts,
     )  # fmt: skip
     v_pairs = scratch("v_pairs", int(slot_start[-1]), PAIR)
     for channel in range(0, channels, MAX_CHANNELS):

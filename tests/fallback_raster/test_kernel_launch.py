@@ -44,7 +44,7 @@ def test_every_kernel_file_is_used_and_tested() -> None:
     texts = [PRELUDE, *(found._code for found in WORKERS.values())]
     unused = [path.name for path in KERNELS.glob("*.h") if not any(f'kernels/{path.name}"' in text for text in texts)]
     assert not unused
-    assert len(WORKERS) == 26
+    assert len(WORKERS) == 27
 
 
 @pytest.mark.parametrize("name", WORKERS)
@@ -112,6 +112,7 @@ def test_a_tensor_of_another_size_is_an_error(monkeypatch: pytest.MonkeyPatch) -
     assert {found._name for found, _ in calls} == set(WORKERS)
     # Sizes that nothing else in a call tells, or only up to a whole vector.
     free = {("project_backward", "visible"), ("sh_forward", "visible"), ("sh_backward", "visible")}
+    free.add(("reduce_pairs", "pair_slot"))
     for found, arguments in calls:
         for place, (parameter, kind) in enumerate(found._kinds.items()):
             if kind not in DTYPES or not arguments[place].numel() or (found._name, parameter) in free:
