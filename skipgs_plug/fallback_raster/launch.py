@@ -291,19 +291,19 @@ def worker(
         name: Name of the kernel where the stub's own is not unique.
         constants: More of them, of this kernel alone.
     """
-    # A thread takes its own sections in their order, then the others' from behind, where their owner comes last.
+    # A thread takes its own sections in their order, then the others' from behind, where their owner comes last. Names
+    # end in an underscore so that they hide none of the stub's.
     loop = f"""{declare(SHARED | (constants or {}))}
-const int sections = counters[0], thread = __atomic_fetch_add(counters + 1, 1, __ATOMIC_RELAXED);
-const long long step = {grain}, steps = (({items}) + step - 1) / step;
-for (int turn = 0; turn < sections; ++turn) {{
-    const int ahead = turn < {_SECTIONS} ? turn : sections + {_SECTIONS} - 1 - turn;
-    const int section = (thread * {_SECTIONS} + ahead) % sections;
-    const int end_of_section = (int)(steps * (section + 1) / sections);
+const int sections_ = counters[0], thread_ = __atomic_fetch_add(counters + 1, 1, __ATOMIC_RELAXED);
+const long long step_ = {grain}, steps_ = (({items}) + step_ - 1) / step_;
+for (int turn_ = 0; turn_ < sections_; ++turn_) {{
+    const int ahead_ = turn_ < {_SECTIONS} ? turn_ : sections_ + {_SECTIONS} - 1 - turn_;
+    const int section_ = (thread_ * {_SECTIONS} + ahead_) % sections_;
+    const int begin_ = (int)(steps_ * section_ / sections_), end_ = (int)(steps_ * (section_ + 1) / sections_);
     for (;;) {{
-        const int done = __atomic_fetch_add(counters + {_LINE // 4} * (section + 1), 1, __ATOMIC_RELAXED);
-        const int at = (int)(steps * section / sections) + done;
-        if (at >= end_of_section) break;
-        const int first = (int)(at * step), last = smaller(first + (int)step, {items});
+        const int at_ = begin_ + __atomic_fetch_add(counters + {_LINE // 4} * (section_ + 1), 1, __ATOMIC_RELAXED);
+        if (at_ >= end_) break;
+        const int first = (int)(at_ * step_), last = smaller(first + (int)step_, {items});
 {code}
     }}
 }}
