@@ -8,7 +8,7 @@ if (!more && dense) {
     clear(v_opacities + row_begin, rows_here);
     clear(v_colors + (long long)stride * row_begin, (long long)stride * rows_here);
 }
-constexpr int AHEAD = 8;  // rows
+constexpr int AHEAD = 16;  // rows
 int j = parts > 1 ? far_block_start[first] : 0;
 const int far_end = parts > 1 ? far_block_start[first + 1] : 0;
 for (int i = block_start[first]; i < block_start[first + 1]; ++i) {
