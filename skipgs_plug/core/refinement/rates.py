@@ -20,6 +20,7 @@ NAMED = {
     **dict.fromkeys(("xyz", "means"), POSITIONS),
 }
 OPACITIES = ("opacity", "opacities")
+MOST = 8.0  # beyond, scenes of many overlapping Gaussians lose more by steps than by a shorter path
 
 
 def path_factor(share: float, progress: float, peak: float | None = None) -> float:
@@ -27,14 +28,15 @@ def path_factor(share: float, progress: float, peak: float | None = None) -> flo
 
     Adam's steps are about as long as its learning rate, and refinement is limited by how far parameters travel: a
     share of the steps goes as far as all of them when their mean length is 1 / share. The factor falls linearly from
-    twice that to 0, the shape that averages the noise of the last steps out (Defazio et al., arXiv 2310.07831).
+    twice that, at most 8, to 0, the shape that averages the noise of the last steps out (Defazio et al., arXiv
+    2310.07831).
 
     Args:
         share: Share of the iterations that run, in (0, 1].
         progress: Share of refinement that is over, in [0, 1].
-        peak: Factor at the beginning, instead of 2 / share.
+        peak: Factor at the beginning, instead of that.
     """
-    return (2.0 / share if peak is None else peak) * (1.0 - progress)
+    return (min(2.0 / share, MOST) if peak is None else peak) * (1.0 - progress)
 
 
 def group_factor(group: dict[str, Any], factor: float) -> float:
