@@ -81,6 +81,7 @@ class Nerfstudio(AbstractAdapter):
         hooks.loop(function_names(type(trainer).train), "train", always=self.always_run, pure=("step_check",))
         catch_up_schedulers(hooks, "scheduler_step_all")
         guard_scaler(hooks, trainer.grad_scaler)
+        hooks.optimizer_names(lambda: trainer.optimizers.optimizers)
         strategy = getattr(pipeline.model, "strategy", None)
         self._relocations = leave_out_noise(hooks, strategy, strategy)
         self.output_folder = getattr(trainer, "base_dir", None)

@@ -21,7 +21,7 @@ from skipgs_plug.core.optimizers import OptimizerSteps
 from skipgs_plug.core.policy import Policy, SkipPolicy
 from skipgs_plug.core.refinement.compensation import Compensation
 from skipgs_plug.core.refinement.policy import RefinementPolicy
-from skipgs_plug.core.refinement.rates import Optimizers
+from skipgs_plug.core.refinement.rates import Named, Optimizers
 from skipgs_plug.core.refinement.refinement import Refinement
 from skipgs_plug.core.scene_check import SceneCheck
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, require_state
@@ -74,6 +74,7 @@ class Engine:
             self.refinement = Refinement(config, self._go_on_from_saved)
         self.compensation: Compensation | None = None
         self._optimizers: Optimizers | None = None
+        self._named: Named | None = None
         self.trace: list[TraceRow] | None = [] if record_trace else None
         self._guard = NonFiniteGuard(config.on_nonfinite)
         self._must_run = must_run
@@ -133,10 +134,16 @@ class Engine:
         if self.refinement is not None:
             self.refinement.optimizers = optimizers
 
+    def name_optimizers(self, named: Named) -> None:
+        """Tell parameters apart by the trainer's names of optimizers, whose groups have none."""
+        self._named = named
+        if self.refinement is not None:
+            self.refinement.named = named
+
     def compensate_until(self, last: int) -> None:
         """Scale learning rates for the paper's gate, if that was asked for; `last` is the run's last iteration."""
         if self.config.compensates and self.refinement is None and self.compensation is None:
-            self.compensation = Compensation(self.config, self.start, last, self._optimizers)
+            self.compensation = Compensation(self.config, self.start, last, self._optimizers, self._named)
 
     def release(self) -> None:
         """Let go of loops and optimizers; counts stay readable."""

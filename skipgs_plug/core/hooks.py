@@ -14,6 +14,7 @@ from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.intercept import Around, Patches, intercept_tensor_backward
 from skipgs_plug.core.refinement.loop_range import LoopRange, replace_range
+from skipgs_plug.core.refinement.rates import Named
 from skipgs_plug.core.refinement.refinement import Always, nothing_always
 from skipgs_plug.core.views import view_key
 
@@ -190,6 +191,10 @@ class Hooks:
         """Iterations that must run, as for `loop`, where the loop is the user's own."""
         if self._engine.refinement is not None:
             self._engine.refinement.describe(always)
+
+    def optimizer_names(self, named: Named) -> None:
+        """`named` gives the trainer's optimizers by name, which tell parameters apart where groups have no names."""
+        self._engine.name_optimizers(named)
 
     def own_loop(self, owner: Any, name: str) -> None:
         """`owner.name(...)` gives the range that the training loop counts with, and nothing hangs on its numbers.

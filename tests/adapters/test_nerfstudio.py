@@ -46,6 +46,25 @@ def test_accumulated_gradients_are_stepped_in_a_skipped_iteration():
     assert [step for step in log.steps if step >= 20] == list(range(21, 60, 2))
 
 
+def test_parameters_are_known_by_the_names_of_their_optimizers():
+    new_log()
+    trainer = nerfstudio.Trainer().setup()
+    rates = {}
+
+    def note(optimizer, *_):
+        name = next(name for name, one in trainer.optimizers.optimizers.items() if one is optimizer)
+        rates.setdefault(name, []).append(optimizer.param_groups[0]["lr"])
+
+    with SkipGate(trainer, refine_share=0.4):
+        for optimizer in trainer.optimizers.optimizers.values():
+            optimizer.register_step_pre_hook(note)
+        trainer.train()
+    factors = {name: max(found) / 0.02 for name, found in rates.items()}
+    assert factors["xyz"] == pytest.approx(10.0 * 0.99**19)  # its own schedule goes on
+    assert factors["scaling"] == pytest.approx(5.0)
+    assert factors["opacity"] == pytest.approx(1.0)
+
+
 def test_trainer_before_setup_is_refused():
     with pytest.raises(AdapterMismatchError, match=r"whose setup\(\) was called, as in nerfstudio-project/nerfstudio"):
         SkipGate(nerfstudio.Trainer())

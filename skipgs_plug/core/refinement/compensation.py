@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.refinement.rates import Optimizers, ScaledRates, path_factor
+from skipgs_plug.core.refinement.rates import Named, Optimizers, ScaledRates, path_factor
 
 
 class Compensation:
@@ -13,13 +13,15 @@ class Compensation:
         config: With `compensate`.
         start: First gated iteration.
         last: Last iteration of the run.
-        optimizers: As for `ScaledRates`.
+        optimizers: As for `ScaledRates`, and the next.
     """
 
-    def __init__(self, config: SkipConfig, start: int, last: int, optimizers: Optimizers | None) -> None:
+    def __init__(
+        self, config: SkipConfig, start: int, last: int, optimizers: Optimizers | None, named: Named | None
+    ) -> None:
         self._peak = config.rate_peak
         self._start, self._end = start, last + 1
-        self._rates = ScaledRates(optimizers)
+        self._rates = ScaledRates(optimizers, named)
 
     def heartbeat(self, step: int, floor: float | None) -> None:
         """Iteration `step` begins; `floor` is the least share of real backwards in force."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
 from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
 
 Optimizers = Callable[[], Iterable[torch.optim.Optimizer]]
+Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
 
 # What a group of parameters takes of the factor that is meant for all. The higher bands of the colours, whose rate
 # trainers set to a twentieth of the constant band's, bear the longest steps; opacities none beyond the trainer's.
@@ -39,16 +40,16 @@ def path_factor(share: float, progress: float, peak: float | None = None) -> flo
     return (min(2.0 / share, MOST) if peak is None else peak) * (1.0 - progress)
 
 
-def group_factor(group: dict[str, Any], factor: float) -> float:
+def group_factor(group: dict[str, Any], factor: float, name: str | None = None) -> float:
     """Factor on the learning rate of a group of an optimizer, where `factor` is that of all.
 
     The image is linear in the colours, so SH coefficients bear longer steps. So do positions, whose rate has fallen to
     a tenth of what it began with when refinement begins. Opacities are never raised: their rate is large as it is, and
-    steps beyond it flicker. All are known by the group's name; in groups without one, by shape: [N, 1, 3] is the
-    constant band of the SH coefficients, [N, K, 3] are the others, [N, 1] opacities.
+    steps beyond it flicker. All are known by the group's name, or else the `name` of its optimizer; without either by
+    shape: [N, 1, 3] is the constant band of the SH coefficients, [N, K, 3] are the others, [N, 1] opacities.
     """
-    if "name" in group:
-        name = group["name"]
+    name = group.get("name", name)
+    if name is not None:
         return min(factor, 1.0) if name in OPACITIES else NAMED.get(name, OTHERS) * factor
     shapes = [tuple(param.shape[1:]) for param in group["params"]]
     if all(shape == (1,) for shape in shapes):
@@ -66,14 +67,15 @@ class ScaledRates:
 
     Args:
         only: Gives the optimizers that are meant; None for all that step, of which the trainer alone knows.
+        named: Gives the trainer's names of optimizers whose groups have none.
 
     Attributes:
         factor: in force, see `group_factor`; None touches nothing.
     """
 
-    def __init__(self, only: Optimizers | None = None) -> None:
+    def __init__(self, only: Optimizers | None = None, named: Named | None = None) -> None:
         self.factor: float | None = None
-        self._only = only
+        self._only, self._named = only, named
         self._thread = threading.get_ident()
         self._depth: dict[int, int] = {}  # a step can call the step of its base class
         self._before: dict[int, list[tuple[dict[str, Any], Any]]] = {}
@@ -107,8 +109,13 @@ class ScaledRates:
         if self._depth[key] > 1:
             return
         self._before[key] = [(group, group["lr"]) for group in optimizer.param_groups]
+        name = self._name(optimizer)
         for group in optimizer.param_groups:
-            group["lr"] = group["lr"] * group_factor(group, self.factor)
+            group["lr"] = group["lr"] * group_factor(group, self.factor, name)
+
+    def _name(self, optimizer: torch.optim.Optimizer) -> str | None:
+        named = {} if self._named is None else self._named()
+        return next((name for name, one in named.items() if one is optimizer), None)
 
     def _put_back(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         key = id(optimizer)

@@ -11,7 +11,7 @@ from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.refinement.foresight import CYCLE_ENDS, ONE_CYCLE, Foresight, needed_share, watched_views
 from skipgs_plug.core.refinement.loop_range import LoopRange, line_of
 from skipgs_plug.core.refinement.milestones import milestones
-from skipgs_plug.core.refinement.rates import Optimizers, ScaledRates, path_factor
+from skipgs_plug.core.refinement.rates import Named, Optimizers, ScaledRates, path_factor
 from skipgs_plug.core.refinement.thinning import Thinning
 
 log = logging.getLogger(__name__)
@@ -46,6 +46,7 @@ class Refinement:
         watched: views that are watched and not trained on while `foresight` says so.
         gap: iterations left out right before the present one.
         optimizers: gives those whose rates are scaled; None for all that step.
+        named: gives the trainer's names of optimizers; None where their groups have names.
     """
 
     def __init__(self, config: SkipConfig, go_on: Callable[[int], None]) -> None:
@@ -58,6 +59,7 @@ class Refinement:
         self.watched: frozenset[str] = frozenset()
         self.gap = self._left_out = 0
         self.optimizers: Optimizers | None = None
+        self.named: Named | None = None
         self._rates: ScaledRates | None = None
         self._start = 0
         self._last: int | None = None
@@ -220,7 +222,7 @@ class Refinement:
             if self.foresight is None:
                 self.foresight = Foresight(self._config.tolerance, CYCLE_ENDS if self.watched else ONE_CYCLE)
             if self._rates is None:
-                self._rates = ScaledRates(self.optimizers)
+                self._rates = ScaledRates(self.optimizers, self.named)
         log.info(
             "Refinement: at most %.0f %% of iterations %d to %d run, %d of them in any case.",
             100 * (self.share or 1.0),

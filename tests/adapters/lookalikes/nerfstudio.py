@@ -61,11 +61,11 @@ class Trainer:
 
     def setup(self):
         self.pipeline = Pipeline(self.strategy)
-        self.optimizers = {
-            name: torch.optim.Adam([value], lr=0.02, eps=1e-15) for name, value in self.pipeline.model.values.items()
-        }
+        values = self.pipeline.model.values
+        by_name = {name: torch.optim.Adam([value], lr=0.02, eps=1e-15) for name, value in values.items()}
+        self.optimizers = SimpleNamespace(optimizers=by_name)
         self.callbacks = [self.pipeline.model.step_post_backward]  # bound here, before any gate is attached
-        self.schedulers = [torch.optim.lr_scheduler.ExponentialLR(self.optimizers["xyz"], gamma=0.99)]
+        self.schedulers = [torch.optim.lr_scheduler.ExponentialLR(self.optimizers.optimizers["xyz"], gamma=0.99)]
         return self
 
     def train(self, last=LAST):
@@ -77,14 +77,14 @@ class Trainer:
 
     def train_iteration(self, step):
         if step % self.accumulate == 0:
-            for optimizer in self.optimizers.values():
+            for optimizer in self.optimizers.optimizers.values():
                 optimizer.zero_grad()
         _, loss_dict, _ = self.pipeline.get_train_loss_dict(step=step)
         loss = functools.reduce(torch.add, loss_dict.values())
         self.grad_scaler.scale(loss).backward()
         if step % self.accumulate == self.accumulate - 1:
-            note_step(self.optimizers.values())
-            for optimizer in self.optimizers.values():
+            note_step(self.optimizers.optimizers.values())
+            for optimizer in self.optimizers.optimizers.values():
                 if self.max_norm is not None:
                     self.grad_scaler.unscale_(optimizer)
                     torch.nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], self.max_norm)

@@ -21,6 +21,20 @@ def rates():
     scaled.remove()
 
 
+def test_optimizers_have_names_where_their_groups_have_none():
+    values = {name: torch.nn.Parameter(torch.zeros(5, 3)) for name in ("means", "features_dc", "scales", "opacities")}
+    optimizers = {name: torch.optim.SGD([value], lr=0.1) for name, value in values.items()}
+    scaled = ScaledRates(named=lambda: optimizers)
+    scaled.factor = 3.0
+    for name, value in values.items():
+        value.grad = torch.ones(5, 3)
+        optimizers[name].step()
+    scaled.remove()
+    moved = {name: round(-value[0, 0].item() / 0.1, 3) for name, value in values.items()}
+    assert moved == {"means": 6.0, "features_dc": 6.0, "scales": 3.0, "opacities": 1.0}
+    assert all("name" not in optimizer.param_groups[0] for optimizer in optimizers.values())
+
+
 def test_the_path_is_conserved():
     steps = 1000
     for share in (0.25, 0.4, 1.0):
