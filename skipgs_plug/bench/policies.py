@@ -127,6 +127,7 @@ POLICIES = {
             "thinned", "40 % of the iterations run, with larger, shrinking steps", gate_with(refine_share=SHARE)
         ),
         PolicySpec("thinned-quarter", "25 % of the iterations run, likewise", gate_with(refine_share=0.25)),
+        PolicySpec("thinned-fifth", "20 % of the iterations run, likewise", gate_with(refine_share=0.2)),
         PolicySpec("automatic", "as many iterations as the scene needs, likewise", gate_with(refine_share="auto")),
         PolicySpec(
             "thinned-plain",
