@@ -5,6 +5,7 @@ come as logarithms and logits, whose activations and adjoints happen in the kern
 visible Gaussians only, and the gradients of the parameters are the only tensors of N rows that the backward fills.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,6 +58,7 @@ def rasterize_splats(
     background: Tensor | None = None,  # [3]
     antialiased: bool = False,
     absgrad: bool = False,
+    before_shN: Callable[[Tensor], None] | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Renders raw parameters of 3DGS into one camera, as `rasterization` renders their activations.
 
@@ -100,6 +102,8 @@ def rasterize_splats(
         projected = _project(means, quats, log_scales, logits, viewmat, K, size, near_plane, far_plane, antialiased)
         ids = projected.visible.to(torch.int64)
         centres = take_rows(projected.means2d, projected.visible)
+    if before_shN is not None and sh_degree:
+        before_shN(projected.visible)
     # A leaf that goes in with the parameters, so that its gradient comes out with theirs.
     centres.requires_grad_(torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
     absolute = None
@@ -107,7 +111,7 @@ def rasterize_splats(
         absolute = centres.absgrad = zeros(len(ids), 2)  # type: ignore[attr-defined]
     image, transmittance = _Render.apply(
         means, quats, log_scales, logits, sh0, shN, centres, absolute, projected, viewmat, K, size, sh_degree,
-        antialiased,
+        antialiased, None if before_shN is None else ids,
     )  # fmt: skip
     alpha = (1.0 - transmittance).unsqueeze(-1)
     if background is not None:
@@ -151,6 +155,7 @@ class _Render(torch.autograd.Function):
         size: tuple[int, int],
         degree: int,
         antialiased: bool,
+        sparse: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         p, n = projected, len(means)
         camera = torch.linalg.inv(viewmat)[:3, 3].contiguous()
@@ -167,7 +172,7 @@ class _Render(torch.autograd.Function):
         }
         ctx.projected, ctx.colors, ctx.absolute = projected, colors, absolute
         ctx.camera = camera, viewmat, K, size, antialiased
-        ctx.sh = layout, degree
+        ctx.sh = layout, degree, sparse
         return image, transmittance
 
     @staticmethod
@@ -176,25 +181,28 @@ class _Render(torch.autograd.Function):
         means, quats, log_scales, logits, sh0, shN, transmittance = check_shapes(ctx.saved_tensors, **ctx.shapes)
         p, n = ctx.projected, len(means)
         camera, viewmat, K, size, antialiased = ctx.camera
-        layout, degree = ctx.sh
+        layout, degree, sparse = ctx.sh
         absolute = None if ctx.absolute is None else zeros(n, 2)
         v_means2d, v_conics, v_activated, v_colors = blend_adjoint(
             ctx.blended, p.means2d, p.conics, p.opacities, ctx.colors, transmittance, v_image, v_transmittance, absolute
         )
         if absolute is not None:
             ctx.absolute += take_rows(absolute, p.visible)
-        gradients = [floats(*t.shape) for t in (means, quats, log_scales, logits, sh0, shN)]
-        v_means, v_quats, v_scales, v_logits, v_sh0, v_shN = gradients
+        gradients = [floats(*t.shape) for t in (means, quats, log_scales, logits, sh0)]
+        v_means, v_quats, v_scales, v_logits, v_sh0 = gradients
+        v_shN = floats(n if sparse is None else len(sparse), *shN.shape[1:])
         sh_backward(
             means, camera, sh0, shN, p.visible, p.block_start, ctx.colors, v_colors, v_means, v_sh0, v_shN,
-            zeros(blocks(n), 3), n, *layout, degree, active_shortcuts(),
+            zeros(blocks(n), 3), n, *layout, degree, int(sparse is not None), active_shortcuts(),
         )  # fmt: skip
         project_backward(
             means, quats, log_scales, logits, viewmat, K, p.visible, p.block_start, v_means2d, floats(0), v_conics,
             floats(0), v_activated, v_means, v_quats, v_scales, v_logits, floats(0),
             n, *map(float, size), EPS2D, 0, int(antialiased), 0, 1, active_shortcuts(),
         )  # fmt: skip
-        return *gradients, take_rows(v_means2d, p.visible), *[None] * 7
+        if sparse is not None:
+            v_shN = torch.sparse_coo_tensor(sparse[None], v_shN, shN.shape, is_coalesced=True, check_invariants=False)
+        return *gradients, v_shN, take_rows(v_means2d, p.visible), *[None] * 8
 
 
 def _project(

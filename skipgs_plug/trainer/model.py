@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
 from skipgs_plug.fallback_raster.optimizer import Adam
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.near_plane import before_a_lens
@@ -74,6 +75,8 @@ def create_optimizers(
             optimizers[name] = SelectiveAdam(group, eps=ADAM_EPS)
         elif splats[name].is_cuda:
             optimizers[name] = torch.optim.Adam(group, eps=ADAM_EPS, fused=True)
+        elif name == 'shN' and splats[name].numel():
+            optimizers[name] = LazyAdam(group, eps=ADAM_EPS)
         else:
             optimizers[name] = Adam(group, eps=ADAM_EPS)
     return optimizers
