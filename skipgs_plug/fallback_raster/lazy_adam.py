@@ -31,6 +31,7 @@ def _adam_rows(
     width: int,
     now: int,  # steps to advance by, without the one that has a gradient
     with_gradient: int,
+    all_rows: int,  # also those whose values have come to rest
     take1: float,
     keep2: float,
     take2: float,
@@ -48,12 +49,12 @@ class _Missed:
 
     group: dict[str, Any]  # betas, eps
     done: Tensor  # [N]
+    most_rate: float  # beyond which rows at rest might move
     rates: Tensor = field(default_factory=lambda: floats(STEPS))
     roots: Tensor = field(default_factory=lambda: floats(STEPS))
     per_root: Tensor = field(default_factory=lambda: floats(STEPS))
     now: int = 0
     least_rate: float = math.inf
-    most_rate: float = 0.0
 
 
 class LazyAdam(Adam):
@@ -72,7 +73,7 @@ class LazyAdam(Adam):
         if rows is None:
             rows = torch.arange(len(missed.done), dtype=torch.int32)
             self._missed = None
-        self._advance(missed, rows, floats(0))
+        self._advance(missed, rows, floats(0), self._missed is None)
 
     def _param(self) -> Tensor:
         return self.param_groups[0]["params"][0]
@@ -96,23 +97,22 @@ class LazyAdam(Adam):
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(param), torch.zeros_like(param)
         missed = self._missed
         kept = {name: group[name] for name in ("betas", "eps")}
-        if missed is not None and (missed.now == STEPS or missed.group != kept):
+        corrections = [1 - beta ** (state["step"].item() + 1) for beta in kept["betas"]]
+        rate = float(group["lr"]) / corrections[0]
+        if missed is not None and (missed.now == STEPS or missed.group != kept or rate > missed.most_rate):
             self.catch_up()
             missed = None
         if missed is None:
-            missed = self._missed = _Missed(kept, zeros(len(param), dtype=torch.int32))
+            missed = self._missed = _Missed(kept, zeros(len(param), dtype=torch.int32), 2 * rate)
         state["step"] += 1
-        corrections = [1 - beta ** state["step"].item() for beta in kept["betas"]]
-        rate = float(group["lr"]) / corrections[0]
         missed.rates[missed.now] = rate
         missed.roots[missed.now] = corrections[1] ** 0.5
         missed.per_root[missed.now] = 1 / missed.roots[missed.now]
         missed.least_rate = min(missed.least_rate, rate or math.inf)
-        missed.most_rate = max(missed.most_rate, rate)
-        self._advance(missed, rows.to(torch.int32), grad._values())
+        self._advance(missed, rows.to(torch.int32), grad._values(), True)
         missed.now += 1
 
-    def _advance(self, missed: _Missed, rows: Tensor, gradient: Tensor) -> None:
+    def _advance(self, missed: _Missed, rows: Tensor, gradient: Tensor, all_rows: bool) -> None:
         if not len(rows):
             return
         param = self._param()
@@ -123,7 +123,7 @@ class LazyAdam(Adam):
         width = param.numel() // len(param)
         _adam_rows(
             rows, missed.done, gradient, param.detach(), state["exp_avg"], state["exp_avg_sq"], missed.rates, missed.roots,
-            missed.per_root, len(rows), width, missed.now, int(gradient.numel() > 0), 1 - beta1, beta2, 1 - beta2,
-            beta2**-0.5, missed.group["eps"], least_mean, least_square, 1.1 * missed.most_rate,
+            missed.per_root, len(rows), width, missed.now, int(gradient.numel() > 0), int(all_rows), 1 - beta1, beta2, 1 - beta2,
+            beta2**-0.5, missed.group["eps"], least_mean, least_square, missed.most_rate,
         )
         torch.autograd.graph.increment_version(param)

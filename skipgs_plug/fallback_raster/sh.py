@@ -29,6 +29,18 @@ def sh_forward(
 ) -> None: ...
 
 
+@worker(read_kernel("count_colored.h"), items="(n + BLOCK - 1) / BLOCK", grain="1")
+def list_colored(
+    visible: Annotated[IntArray, "M"],
+    block_start: Annotated[IntArray, "blocks(n) + 1"],
+    colors: Annotated[FloatArray, "n, 3"],
+    v_colors: Annotated[FloatArray, "n, 3"],
+    colored: Annotated[IntArray, "n"],  # out, the rows of a block from its beginning on
+    block_count: Annotated[IntArray, "blocks(n)"],  # out
+    n: int,
+) -> None: ...
+
+
 @worker(read_kernel("sh_backward.h"), items="(n + BLOCK - 1) / BLOCK", grain="1")
 def sh_backward(
     means: Annotated[FloatArray, "n, 3"],

@@ -20,7 +20,7 @@ from .launch import floats, ints, zeros
 from .project import project_backward, project_forward
 from .rendering import blend, blend_adjoint
 from .rows import take_rows, visible_rows
-from .sh import sh_backward, sh_forward
+from .sh import list_colored, sh_backward, sh_forward
 from .shortcuts import active_shortcuts
 
 EPS2D = 0.3  # added to the 2D covariance's diagonal, square pixels
@@ -111,7 +111,7 @@ def rasterize_splats(
         absolute = centres.absgrad = zeros(len(ids), 2)  # type: ignore[attr-defined]
     image, transmittance = _Render.apply(
         means, quats, log_scales, logits, sh0, shN, centres, absolute, projected, viewmat, K, size, sh_degree,
-        antialiased, None if before_shN is None else ids,
+        antialiased, before_shN is not None,
     )  # fmt: skip
     alpha = (1.0 - transmittance).unsqueeze(-1)
     if background is not None:
@@ -155,7 +155,7 @@ class _Render(torch.autograd.Function):
         size: tuple[int, int],
         degree: int,
         antialiased: bool,
-        sparse: Tensor | None,
+        sparse: bool,
     ) -> tuple[Tensor, Tensor]:
         p, n = projected, len(means)
         camera = torch.linalg.inv(viewmat)[:3, 3].contiguous()
@@ -190,18 +190,24 @@ class _Render(torch.autograd.Function):
             ctx.absolute += take_rows(absolute, p.visible)
         gradients = [floats(*t.shape) for t in (means, quats, log_scales, logits, sh0)]
         v_means, v_quats, v_scales, v_logits, v_sh0 = gradients
-        v_shN = floats(n if sparse is None else len(sparse), *shN.shape[1:])
+        rows = p.visible, p.block_start
+        if sparse:
+            seen, block_count = ints(n), ints(blocks(n))
+            list_colored(*rows, ctx.colors, v_colors, seen, block_count, n)
+            rows = visible_rows(seen, block_count)
+        # Of full size, so that the next image's gradient, of other length, lies in the same memory.
+        v_shN = floats(*shN.shape)[: len(rows[0]) if sparse else n]
         sh_backward(
-            means, camera, sh0, shN, p.visible, p.block_start, ctx.colors, v_colors, v_means, v_sh0, v_shN,
-            zeros(blocks(n), 3), n, *layout, degree, int(sparse is not None), active_shortcuts(),
+            means, camera, sh0, shN, *rows, ctx.colors, v_colors, v_means, v_sh0, v_shN,
+            zeros(blocks(n), 3), n, *layout, degree, int(sparse), active_shortcuts(),
         )  # fmt: skip
         project_backward(
             means, quats, log_scales, logits, viewmat, K, p.visible, p.block_start, v_means2d, floats(0), v_conics,
             floats(0), v_activated, v_means, v_quats, v_scales, v_logits, floats(0),
             n, *map(float, size), EPS2D, 0, int(antialiased), 0, 1, active_shortcuts(),
         )  # fmt: skip
-        if sparse is not None:
-            v_shN = torch.sparse_coo_tensor(sparse[None], v_shN, shN.shape, is_coalesced=True, check_invariants=False)
+        if sparse:
+            v_shN = torch.sparse_coo_tensor(rows[0][None].to(torch.int64), v_shN, shN.shape, is_coalesced=True, check_invariants=False)
         return *gradients, v_shN, take_rows(v_means2d, p.visible), *[None] * 8
 
 

@@ -14,7 +14,9 @@ const auto advance = [&](v16 g, v16& m, v16& s, v16& x, float rate, float root) 
 };
 constexpr int VECTORS = 3;
 for (int i = first; i < last; ++i) {
-    const int row = rows[i], begin = done[row];
+    const int row = rows[i];
+    if (done[row] < 0 && !all_rows) continue;
+    const int begin = done[row] < 0 ? ~done[row] : done[row];
     if (begin == now && !with_gradient) continue;
     const long long at = (long long)row * width;
     float *m_row = mean + at, *s_row = square + at, *x_row = values + at, *g_row = gradient + (long long)i * width;
@@ -42,9 +44,13 @@ for (int i = first; i < last; ++i) {
         g[v] = with_gradient ? load(g_row + offset[v]) : (v16)0.0f;
         alive |= (m[v] != 0.0f) | (s[v] != 0.0f) | (g[v] != 0.0f);
     }
-    done[row] = now + with_gradient;
-    if (!bits(alive)) continue;
-    for (int step = begin; step < now;) {
+    if (!bits(alive)) {
+        done[row] = ~(now + with_gradient);
+        continue;
+    }
+    bool at_rest = false;
+    int step = begin;
+    while (step < now) {
 #pragma clang fp contract(off)
         const int end = smaller(step + CHUNK, now);
         i16 moving = (i16)0, outside = (i16)0;
@@ -52,10 +58,15 @@ for (int i = first; i < last; ++i) {
             const v16 size = vabs(m[v]);
             still[v] = m[v] == 0.0f;
             outside |= ~still[v] & ~((size >= least_mean) & (size <= 0x1p40f) & (s[v] >= least_square) & (s[v] <= 0x1p60f));
-            // A step shorter than a quarter of the distance to the next float changes nothing.
-            if (end - step > 8) moving |= ~still[v] & ~(most_rate * size < vsqrt(s[v]) * vabs(x[v]) * 0x1p-27f);
+            // A step shorter than a quarter of the distance to the next float changes nothing, nor do those that follow.
+            const v16 longest = 0x1p20f * most_rate * size, least = 0x1p-7f * x[v];
+            moving |= ~still[v] & ~(longest * longest < s[v] * (least * least));
         }
-        if (end - step > 8 && !bits(moving)) {
+        if (!bits(moving) && !all_rows) {
+            at_rest = true;
+            break;
+        }
+        if (!bits(moving)) {
             for (; step < end; ++step)
                 for (int v = 0; v < VECTORS; ++v) {
                     m[v] = fma((v16)-take1, m[v], m[v]);
@@ -64,7 +75,7 @@ for (int i = first; i < last; ++i) {
                 }
             continue;
         }
-        if (bits(outside)) {
+        if (bits(outside) || end - step == 1) {
             for (; step < end; ++step)
                 for (int v = 0; v < VECTORS; ++v) advance((v16)0.0f, m[v], s[v], x[v], rates[step], roots[step]);
             continue;
@@ -98,6 +109,8 @@ for (int i = first; i < last; ++i) {
                 x[v] = still[v] ? x[v] : x[v] + by;
             }
     }
+    done[row] = at_rest ? ~step : now + with_gradient;
+    if (step == begin && !with_gradient) continue;
     if (with_gradient)
         for (int v = 0; v < VECTORS; ++v) advance(g[v], m[v], s[v], x[v], rates[now], roots[now]);
     for (int v = 0; v < VECTORS; ++v) {
