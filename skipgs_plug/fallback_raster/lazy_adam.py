@@ -1,129 +1,180 @@
-"""Adam for a parameter of many rows of which each step needs few: the others are caught up when they are needed."""
+"""Adam for a parameter of many rows of which few are needed at a time: the others are caught up when they are."""
 
 import math
-from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
-from .launch import FloatArray, IntArray, floats, ints, worker, zeros
-from .optimizer import Adam
+from .launch import FloatArray, IntArray, floats, worker, zeros
+from .optimizer import Adam, moments
 from .source import read_kernel
 
-STEPS = 1024  # that a row may miss: the longest run of rates that is kept
-WIDTH = 48  # floats of a row that the kernel holds in registers, at most
-_CHUNK = 32  # steps between two looks at how small numbers have become
+ROW = 48  # numbers of a row that the kernel holds, at most
+STEPS = 1024  # that a row may miss, for which rates are kept
+CHUNK = 32  # steps of a row between two looks at how small its numbers have become
 
 
-@worker(read_kernel("adam_rows.h"), items="n", grain="256", constants={"CHUNK": _CHUNK})
-def _adam_rows(
-    rows: Annotated[IntArray, "n"],
-    done: Annotated[IntArray, "N"],  # steps that each row is advanced by, updated, as the next but `gradient`
-    gradient: Annotated[FloatArray, "n * with_gradient, width"],
-    values: Annotated[FloatArray, "N, width"],
-    mean: Annotated[FloatArray, "N, width"],
-    square: Annotated[FloatArray, "N, width"],
-    rates: Annotated[FloatArray, "S"],  # of each step, as `adam_step` has it, as the next
-    roots: Annotated[FloatArray, "S"],
-    per_root: Annotated[FloatArray, "S"],  # 1 / roots
+@worker(read_kernel("catch_up.h"), items="n", grain=256, constants={"ROW": ROW, "CHUNK": CHUNK})
+def _catch_up(
+    rows: Annotated[IntArray, "n"],  # none of them twice
+    done: Annotated[IntArray, "R"],  # steps that each row has, updated, as `values`, `mean` and `square`
+    gradient: Annotated[FloatArray, "n if with_gradient else 0, width"],
+    values: Annotated[FloatArray, "R, width"],
+    mean: Annotated[FloatArray, "R, width"],  # as `adam_step` has it, as all that follow
+    square: Annotated[FloatArray, "R, width"],
+    rates: Annotated[FloatArray, "steps"],
+    roots: Annotated[FloatArray, "steps"],
+    inverse_roots: Annotated[FloatArray, "steps"],
     n: int,
     width: int,
-    now: int,  # steps to advance by, without the one that has a gradient
+    now: int,  # steps that rows get before that with a gradient
     with_gradient: int,
-    all_rows: int,  # also those whose values have come to rest
     take1: float,
     keep2: float,
     take2: float,
-    grow: float,  # 1 / sqrt(keep2)
     eps: float,
-    least_mean: float,  # bounds of what arithmetic without division is exact for, and of the rates
-    least_square: float,
+    grow: float,  # 1 / sqrt(keep2)
     most_rate: float,
+    least_mean: float,  # from which on, at the beginning of a chunk, nothing comes near underflow
+    least_square: float,
 ) -> None: ...
 
 
-@dataclass
 class _Missed:
-    """Steps since all rows were up to date, and how many of them each row has."""
+    """The steps since all rows were up to date, and how many of them each row has."""
 
-    group: dict[str, Any]  # betas, eps
-    done: Tensor  # [N]
-    most_rate: float  # beyond which rows at rest might move
-    rates: Tensor = field(default_factory=lambda: floats(STEPS))
-    roots: Tensor = field(default_factory=lambda: floats(STEPS))
-    per_root: Tensor = field(default_factory=lambda: floats(STEPS))
-    now: int = 0
-    least_rate: float = math.inf
+    def __init__(self, param: Tensor, betas: tuple[float, float], eps: float) -> None:
+        self.param, self.betas, self.eps = param, betas, eps
+        self.done = zeros(len(param), dtype=torch.int32)
+        self.rates, self.roots, self.inverse_roots = floats(STEPS), floats(STEPS), floats(STEPS)
+        self.now = 0
+        self._least, self._most = math.inf, 0.0
+
+    def add(self, rate: float, root: float) -> None:
+        """Note a step; it is complete when `now` is raised."""
+        self.rates[self.now] = rate
+        self.roots[self.now] = root
+        self.inverse_roots[self.now] = 1.0 / self.roots[self.now]
+        self._least = min(self._least, abs(rate) or math.inf)
+        self._most = max(self._most, abs(rate))
+
+    def advance(self, rows: Tensor, gradient: Tensor, state: dict[str, Tensor]) -> None:
+        """Bring rows [n] to `now`, and on by the step that was noted last where there is a gradient [n, ...]."""
+        beta1, beta2 = self.betas
+        smallest = self._least * beta1 ** (CHUNK + 1)
+        _catch_up(
+            rows, self.done, gradient, self.param.detach(), state["exp_avg"], state["exp_avg_sq"],
+            self.rates, self.roots, self.inverse_roots, len(rows), self.param[0].numel(), self.now,
+            int(gradient.numel() > 0), 1 - beta1, beta2, 1 - beta2, self.eps, beta2**-0.5, self._most,
+            2.0**-100 / smallest if smallest else math.inf,
+            max(2.0**-74, (2.0**13 * self.eps) ** 2) / beta2 ** (CHUNK + 1),
+        )  # fmt: skip
+        # Past torch's count of changes, by which it knows what is out of date in a backward pass.
+        torch.autograd.graph.increment_version(self.param)
 
 
 class LazyAdam(Adam):
-    """`Adam` for one parameter [N, ...] with row-sparse gradients, equal to it to the bit, in time for the rows it gets."""
+    """`Adam` for one parameter [N, ...], to the bit, that advances only those rows that are asked for.
 
-    def __init__(self, params: Any, **options: Any) -> None:
-        super().__init__(params, **options)
+    Rows without an entry in a row-sparse gradient miss the step: with a gradient of zero their moments decay and the
+    parameter moves on. `catch_up` makes up for that, whenever it is called and for whatever rows, with the same result.
+    Before a row of the parameter is used, or anything of the optimizer's `state`, it has to be called.
+
+    Args:
+        params: One float32 parameter on the CPU, or a group with one, of at most 48 numbers in a row.
+        lr: Learning rate, which may change from step to step.
+        betas: Decay of the two means; the second is not 0.
+        eps: Added to the root, more than 0.
+
+    Raises:
+        ValueError: It is not one parameter of that kind, or `eps` is 0.
+    """
+
+    def __init__(
+        self, params: Any, lr: float = 1e-3, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-8
+    ) -> None:
+        super().__init__(params, lr=lr, betas=betas, eps=eps)
         self._missed: _Missed | None = None
+        given = [param for group in self.param_groups for param in group["params"]]
+        if len(given) != 1 or not _fits(given[0]):
+            raise ValueError(
+                f"LazyAdam takes one contiguous float32 parameter on the CPU with rows of 1 to {ROW} numbers, got "
+                f"{[(tuple(param.shape), param.dtype, param.device.type) for param in given]}; use Adam for others."
+            )
+        if not eps > 0:
+            raise ValueError(f"LazyAdam needs eps > 0, got {eps}: rows without any gradient would become NaN.")
 
     @torch.no_grad()
     def catch_up(self, rows: Tensor | None = None) -> None:
-        """Bring rows up to date: all without `rows`."""
+        """Bring rows up to date.
+
+        Args:
+            rows: Their numbers [M], int32, none twice; all rows without.
+
+        Raises:
+            RuntimeError: The parameter was replaced while rows of it were behind.
+        """
         missed = self._missed
         if missed is None:
             return
+        param = self.param_groups[0]["params"][0]
+        if param is not missed.param:
+            raise RuntimeError("The parameter of a LazyAdam was replaced: call catch_up() before that.")
         if rows is None:
-            rows = torch.arange(len(missed.done), dtype=torch.int32)
+            rows = torch.arange(len(param), dtype=torch.int32, device="cpu")
             self._missed = None
-        self._advance(missed, rows, floats(0), self._missed is None)
+        missed.advance(rows, floats(0), self.state[param])
 
-    def _param(self) -> Tensor:
-        return self.param_groups[0]["params"][0]
+    def state_dict(self) -> dict[str, Any]:
+        """As torch's, of rows that are all up to date."""
+        self.catch_up()
+        return super().state_dict()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """As torch's."""
+        self.catch_up()
+        super().load_state_dict(state_dict)
 
     def _step(self, group: dict[str, Any]) -> None:
-        param = self._param()
-        grad = param.grad
-        if grad is None:
+        (param,) = group["params"]
+        if param.grad is None:
             return
-        if not grad.is_sparse:
+        if not param.grad.is_sparse:
             self.catch_up()
             super()._step(group)
             return
-        rows = grad._indices()[0]
-        if not bool((rows[1:] > rows[:-1]).all()):
-            grad = grad.coalesce()
-            rows = grad._indices()[0]
-        state = self.state[param]
-        if not state:
-            state["step"] = torch.tensor(0.0)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(param), torch.zeros_like(param)
-        missed = self._missed
-        kept = {name: group[name] for name in ("betas", "eps")}
-        corrections = [1 - beta ** (state["step"].item() + 1) for beta in kept["betas"]]
-        rate = float(group["lr"]) / corrections[0]
-        if missed is not None and (missed.now == STEPS or missed.group != kept or rate > missed.most_rate):
+        missed, state = self._missed, moments(self, param)
+        betas, eps = group["betas"], group["eps"]
+        if missed is not None and (missed.now == STEPS or (missed.betas, missed.eps) != (betas, eps)):
             self.catch_up()
             missed = None
         if missed is None:
-            missed = self._missed = _Missed(kept, zeros(len(param), dtype=torch.int32), 2 * rate)
+            missed = self._missed = _Missed(param, betas, eps)
         state["step"] += 1
-        missed.rates[missed.now] = rate
-        missed.roots[missed.now] = corrections[1] ** 0.5
-        missed.per_root[missed.now] = 1 / missed.roots[missed.now]
-        missed.least_rate = min(missed.least_rate, rate or math.inf)
-        self._advance(missed, rows.to(torch.int32), grad._values(), True)
+        corrections = [1 - beta ** state["step"].item() for beta in betas]
+        missed.add(float(group["lr"]) / corrections[0], corrections[1] ** 0.5)
+        rows, gradient = _rows(param.grad)
+        if len(rows):
+            missed.advance(rows, gradient, state)
         missed.now += 1
 
-    def _advance(self, missed: _Missed, rows: Tensor, gradient: Tensor, all_rows: bool) -> None:
-        if not len(rows):
-            return
-        param = self._param()
-        state = self.state[param]
-        beta1, beta2 = missed.group["betas"]
-        least_mean = 2.0**-100 / missed.least_rate / beta1 ** (_CHUNK + 1)
-        least_square = 2.0**-74 / beta2 ** (_CHUNK + 1)
-        width = param.numel() // len(param)
-        _adam_rows(
-            rows, missed.done, gradient, param.detach(), state["exp_avg"], state["exp_avg_sq"], missed.rates, missed.roots,
-            missed.per_root, len(rows), width, missed.now, int(gradient.numel() > 0), int(all_rows), 1 - beta1, beta2, 1 - beta2,
-            beta2**-0.5, missed.group["eps"], least_mean, least_square, missed.most_rate,
-        )
-        torch.autograd.graph.increment_version(param)
+
+def _fits(param: Tensor) -> bool:
+    return (
+        param.dtype is torch.float32
+        and param.is_cpu
+        and param.is_contiguous()
+        and len(param) > 0
+        and 1 <= param[0].numel() <= ROW
+    )
+
+
+def _rows(gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows [M] of a row-sparse gradient, none of them twice, and their values [M, ...]."""
+    rows = gradient._indices()[0].to(torch.int32)
+    # Autograd forgets that a gradient was coalesced, and sorting it anew takes longer than the step.
+    if not bool((rows[1:] > rows[:-1]).all()):
+        gradient = gradient.coalesce()
+        rows = gradient._indices()[0].to(torch.int32)
+    return rows, gradient._values().contiguous()

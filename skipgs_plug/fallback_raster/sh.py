@@ -29,18 +29,6 @@ def sh_forward(
 ) -> None: ...
 
 
-@worker(read_kernel("count_colored.h"), items="(n + BLOCK - 1) / BLOCK", grain="1")
-def list_colored(
-    visible: Annotated[IntArray, "M"],
-    block_start: Annotated[IntArray, "blocks(n) + 1"],
-    colors: Annotated[FloatArray, "n, 3"],
-    v_colors: Annotated[FloatArray, "n, 3"],
-    colored: Annotated[IntArray, "n"],  # out, the rows of a block from its beginning on
-    block_count: Annotated[IntArray, "blocks(n)"],  # out
-    n: int,
-) -> None: ...
-
-
 @worker(read_kernel("sh_backward.h"), items="(n + BLOCK - 1) / BLOCK", grain="1")
 def sh_backward(
     means: Annotated[FloatArray, "n, 3"],
@@ -53,7 +41,7 @@ def sh_backward(
     v_colors: Annotated[FloatArray, "n, 3"],
     v_means: Annotated[FloatArray, "n, 3"],  # out
     v_base: Annotated[FloatArray, "n, base_stride"],  # out
-    v_rest: Annotated[FloatArray, "M if packed else n, rest_stride"],  # out; v_base itself where rest and base are one
+    v_rest: Annotated[FloatArray, "M if packed else n, rest_stride"],  # out; v_base where rest and base are one array
     v_cameras: Annotated[FloatArray, "blocks(n), 3"],  # out, partial sums
     n: int,
     base_stride: int,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from skipgs_plug.fallback_raster.launch import release_memory
 from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
@@ -65,9 +65,7 @@ class Trainer:
     Attributes:
         step: next iteration, 0-based.
         ran: iterations that ran, which is fewer where a gate leaves some out; every view has its turn among these.
-        splats: raw parameters `means scales quats opacities sh0 shN`.
         strategy: gsplat's DefaultStrategy, or None where `mcmc` densifies.
-        optimizers: one per parameter, by the same names.
         exposure: colour correction of each photograph, with an optimizer of its own; None unless asked for.
         refine_stop_iter: end of densification in iterations of this run.
         near_plane: near clipping plane, world units.
@@ -86,7 +84,7 @@ class Trainer:
         self._since: int | None = None  # number after the previous iteration, set by `train`
         self._splats = create_splats(scene, config, self.backend.device, self.near_plane)
         self._optimizers = create_optimizers(self._splats, config, scene.scene_scale)
-        lazy = self._optimizers['shN']
+        lazy = self._optimizers["shN"]
         self._lazy = lazy if isinstance(lazy, LazyAdam) else None
         self.mcmc = Mcmc(config, scene.scene_scale) if config.strategy == "mcmc" else None
         self.strategy: Any = None
@@ -110,22 +108,20 @@ class Trainer:
         self._warm = False
 
     @property
-    def splats(self) -> Any:
+    def splats(self) -> nn.ParameterDict:
+        """Raw parameters `means scales quats opacities sh0 shN`, up to date until the next iteration."""
         self._catch_up()
         return self._splats
 
     @property
-    def optimizers(self) -> Any:
+    def optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """One per parameter, by the same names, with moments that are up to date until the next iteration."""
         self._catch_up()
         return self._optimizers
 
-    def _catch_up(self, rows: Tensor | None = None) -> None:
-        if self._lazy is not None:
-            self._lazy.catch_up(rows)
-
     @property
     def all_optimizers(self) -> list[torch.optim.Optimizer]:
-        """Those of the Gaussians' parameters, and that of the exposure."""
+        """Those of the Gaussians' parameters, and that of the exposure; their moments may be behind."""
         return [*self._optimizers.values(), *([] if self.exposure is None else [self.exposure.optimizer])]
 
     @property
@@ -304,6 +300,7 @@ class Trainer:
         return image if self.exposure is None else self.exposure.apply(image, view.name)
 
     def _rasterize(self, view: View, degree: int, background: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+        lazy = {} if self._lazy is None else {"catch_up": self._lazy.catch_up}
         return self.backend.render(
             self._splats,
             view.viewmat,
@@ -316,7 +313,7 @@ class Trainer:
             near_plane=self.near_plane,
             far_plane=self.config.far_plane,
             absgrad=self.config.absgrad,
-            **({} if self._lazy is None else {'before_shN': self._catch_up}),
+            **lazy,
         )
 
     def _background(self) -> Tensor | None:
@@ -362,9 +359,8 @@ class Trainer:
         due = step % strategy.refine_every == 0
         if due:
             release_memory()  # of gradients, while copies of all parameters and moments are made
+            self._catch_up()
         with self._seeded(step) if due else nullcontext():
-            if due:
-                self._catch_up()
             args = (self._splats, self._optimizers, self.strategy_state, step)
             strategy.step_post_backward(*args, info, packed=info["gaussian_ids"] is not None)
             reset_opacity_if_missed(strategy, *args)
@@ -375,18 +371,21 @@ class Trainer:
         moves = mcmc.moves(step)
         if moves:
             release_memory()  # as in `_densify`
+            self._catch_up()
         if updated or moves:
             rate = self._optimizers["means"].param_groups[0]["lr"] if updated else 0.0
-            if moves:
-                self._catch_up()
             with self._seeded(step):
                 mcmc.after_update(self._splats, self._optimizers, step, rate)
         self._sort_rows(mcmc, step)
 
+    def _catch_up(self) -> None:
+        """Advance what the last views did not show, before somebody else looks at it."""
+        if self._lazy is not None:
+            self._lazy.catch_up()
+
     def _sort_rows(self, strategy: Any, step: int) -> None:
         if sorts_rows(strategy, step):
-            self._catch_up()
-            sort_rows(self._splats, self._optimizers, self.strategy_state)
+            sort_rows(self.splats, self.optimizers, self.strategy_state)
 
     @contextmanager
     def _seeded(self, step: int) -> Iterator[None]:

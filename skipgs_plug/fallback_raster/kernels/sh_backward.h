@@ -5,11 +5,12 @@ float camera_sum[3] = {0.0f, 0.0f, 0.0f};
 // Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
 const long long row_begin = (long long)BLOCK * block;
 const int rows = smaller(BLOCK, n - (int)row_begin);
-const bool empty = block_start[block] == block_start[block + 1];
+const int listed = block_start[block + 1] - block_start[block];
+const bool empty = listed == 0;
 const auto clear_rows = [=](float* p, long long n) { empty ? clear_past_caches(p, n) : clear(p, n); };
 clear_rows(v_means + 3 * row_begin, 3 * rows);
 clear_rows(v_base + base_stride * row_begin, base_stride * rows);
-if (packed) clear(v_rest + (long long)rest_stride * block_start[block], rest_stride * (block_start[block + 1] - block_start[block]));
+if (packed) clear(v_rest + (long long)rest_stride * block_start[block], rest_stride * listed);
 else if (v_rest != v_base) clear_rows(v_rest + rest_stride * row_begin, rest_stride * rows);
 for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
     const int g = visible[i];
