@@ -35,8 +35,9 @@ def _catch_up(
     take2: float,
     eps: float,
     grow: float,  # 1 / sqrt(keep2)
-    most_rate: float,
-    least_mean: float,  # from which on, at the beginning of a chunk, nothing comes near underflow
+    longest_rate: float,  # of all steps; infinite where decay makes steps longer
+    least_mean: float,  # from here to there nothing comes near underflow or overflow in a chunk of steps
+    most_mean: float,
     least_square: float,
 ) -> None: ...
 
@@ -63,11 +64,12 @@ class _Missed:
         """Bring rows [n] to `now`, and on by the step that was noted last where there is a gradient [n, ...]."""
         beta1, beta2 = self.betas
         smallest = self._least * beta1 ** (CHUNK + 1)
+        longest = self._most if beta1**2 <= beta2 else math.inf
         _catch_up(
             rows, self.done, gradient, self.param.detach(), state["exp_avg"], state["exp_avg_sq"],
             self.rates, self.roots, self.inverse_roots, len(rows), self.param[0].numel(), self.now,
-            int(gradient.numel() > 0), 1 - beta1, beta2, 1 - beta2, self.eps, beta2**-0.5, self._most,
-            2.0**-100 / smallest if smallest else math.inf,
+            int(gradient.numel() > 0), 1 - beta1, beta2, 1 - beta2, self.eps, beta2**-0.5, longest,
+            2.0**-100 / smallest if smallest else math.inf, 2.0**60 / self._most if self._most else math.inf,
             max(2.0**-74, (2.0**13 * self.eps) ** 2) / beta2 ** (CHUNK + 1),
         )  # fmt: skip
         # Past torch's count of changes, by which it knows what is out of date in a backward pass.

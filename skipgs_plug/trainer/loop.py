@@ -158,6 +158,7 @@ class Trainer:
             else:  # those at the end may have been left out
                 self.step = self.step if self.stop_requested else max(self.step, until)
         self.stop_requested = False
+        self._catch_up()
 
     def iterations(self, until: int) -> range:
         """Numbers of the iterations up to `until` (exclusive): the seam where a gate leaves some out."""

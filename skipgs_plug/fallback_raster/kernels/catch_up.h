@@ -39,7 +39,6 @@ const auto distance = [&](v16 m, v16 s, v16 half, int step) INLINE -> v16 {
     return fma(fma(-below, quotient, moved), inverse, quotient);
 };
 constexpr int VECTORS = ROW / 16;
-const float most_mean = 0x1p60f / most_rate;
 for (int i = first; i < last; ++i) {
     const int row = rows[i], begin = done[row];
     if (begin == now && !with_gradient) continue;
@@ -79,7 +78,7 @@ for (int i = first; i < last; ++i) {
             zero[v] = m[v] == 0.0f;
             extreme |= ~zero[v] & ~((size >= least_mean) & (size <= most_mean) & (s[v] >= least_square) & (s[v] <= 0x1p20f));
             // A step shorter than a quarter of the distance to the next float changes nothing, nor do those that follow.
-            const v16 longest = 0x1p20f * (most_rate * size), least = 0x1p-7f * x[v];
+            const v16 longest = 0x1p20f * (longest_rate * size), least = 0x1p-7f * x[v];
             moving |= ~zero[v] & ~(longest * longest < s[v] * (least * least));
         }
         if (!bits(moving)) {
