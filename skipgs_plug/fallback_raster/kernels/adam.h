@@ -25,8 +25,12 @@ for (int row = first; row < last;) {
     else row = last;
     const long long end = (long long)row * width, whole = begin + (end - begin) / 16 * 16;
     for (long long i = begin; i < whole; i += 16) {
-        v16 m = load(mean + i), s = load(square + i), x = load(values + i);
-        advance(load(gradient + i), m, s, x);
+        const v16 g = load(gradient + i);
+        v16 m = load(mean + i), s = load(square + i);
+        // Nothing changes where there never was a gradient: without writing it takes two thirds of the time.
+        if (!bits((g != 0.0f) | (m != 0.0f) | (s != 0.0f)) && eps > 0.0f) continue;
+        v16 x = load(values + i);
+        advance(g, m, s, x);
         store(mean + i, m);
         store(square + i, s);
         store(values + i, x);
