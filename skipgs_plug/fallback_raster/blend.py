@@ -9,14 +9,14 @@ takes block after block, so that its pixels stay in registers while the Gaussian
 
 The adjoint walks the same lists back to front, Gaussian after Gaussian, so that here its sums stay in registers, and
 visits only blocks in which the forward pass blended the Gaussian. It needs, beside the colour, the moments of v_sigma
-about the centre: of 1, dx, dy, dx^2, dx dy and dy^2. Each (tile, Gaussian) pair writes its sums to its own place, in
-the order of rows, and `reduce_pairs` adds a Gaussian's pairs in a fixed order and makes gradients of them: no atomics,
-and bit-equal for any thread count.
+about the centre: of 1, dx, dy, dx^2, dx dy and dy^2. Each (tile, Gaussian) pair that was blended writes its sums to a
+slot of its own, in the order of the lists, and `reduce_pairs` adds a Gaussian's pairs in a fixed order and makes
+gradients of them: no atomics, and bit-equal for any thread count.
 """
 
 from typing import Annotated
 
-from .launch import ByteArray, FloatArray, IntArray, LongArray, Worker, worker
+from .launch import FloatArray, IntArray, LongArray, Worker, worker
 from .source import read_kernel
 
 
@@ -40,8 +40,8 @@ def _forward(channels: int) -> Worker:
         transmittance: Annotated[FloatArray, "height, width"],  # out, behind the last Gaussian blended
         pixel_stop: Annotated[IntArray, "height, width"],  # out, place in tile_list behind the last Gaussian blended
         tile_stop: Annotated[IntArray, "tiles_x, tiles_y"],  # out, their maximum
+        tile_blended: Annotated[IntArray, "tiles_x, tiles_y"],  # out, pairs that were blended
         pair_blocks: Annotated[IntArray, "P"],  # out, blocks where it was blended, as bits; nothing beyond tile_stop
-        blended_pairs: Annotated[ByteArray, "padded(P)"],  # out, zeros before; whether there is such a block, by place
         product_left: Annotated[FloatArray, "height if unfinished or continued else 0, width"],  # in and out
         still_open: Annotated[IntArray, "tiles_x * tiles_y if unfinished or continued else 0"],  # out
         width: int,
@@ -76,13 +76,12 @@ def _backward(channels: int, absgrad: bool) -> Worker:
         far_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],  # of the second part of each list, if there is one
         far_stop: Annotated[IntArray, "tiles_x, tiles_y"],
         tile_list: Annotated[IntArray, "P"],
-        tile_place: Annotated[IntArray, "P"],
         pair_blocks: Annotated[IntArray, "P"],
+        slot_start: Annotated[IntArray, "parts * tiles_x * tiles_y + 1"],
         transmittance: Annotated[FloatArray, "height, width"],
         pixel_stop: Annotated[IntArray, "height, width"],
         v_image: Annotated[FloatArray, "height, width, stride"],
         v_transmittance: Annotated[FloatArray, "height, width"],  # gradient of the final transmittance
-        pair_number: Annotated[IntArray, "P"],  # blended pairs up to this one
         v_pairs: Annotated[FloatArray, "Q, PAIR"],  # out
         width: int,
         height: int,
@@ -114,6 +113,24 @@ def backward_worker(channels: int, absgrad: bool) -> Worker:
     return _BACKWARD[min(width for width in _WIDTHS if width >= channels), absgrad]
 
 
+# Pairs are numbered by row, and neighbours in a list are rows from anywhere: where there are few pairs, several threads
+# would pass their cache lines to and fro.
+@worker(read_kernel("number_pairs.h"), items="parts * tiles", grain="pairs < 262144 ? parts * tiles : 8")
+def number_pairs(
+    tile_start: Annotated[IntArray, "tiles + 1"],
+    tile_stop: Annotated[IntArray, "tiles"],
+    far_start: Annotated[IntArray, "tiles + 1"],  # of the second part of each list, if there is one
+    far_stop: Annotated[IntArray, "tiles"],
+    tile_place: Annotated[IntArray, "pairs"],
+    pair_blocks: Annotated[IntArray, "pairs"],
+    slot_start: Annotated[IntArray, "parts * tiles + 1"],  # blended pairs of the tiles before each
+    pair_slot: Annotated[IntArray, "pairs"],  # out, zeros before; 1 + the slot of each pair, 0 if it was not blended
+    pairs: int,
+    tiles: int,
+    parts: int,
+) -> None: ...
+
+
 @worker(read_kernel("reduce_pairs.h"), items="(rows + BLOCK - 1) / BLOCK", grain="1")
 def reduce_pairs(
     visible: Annotated[IntArray, "M"],
@@ -122,8 +139,7 @@ def reduce_pairs(
     far_visible: Annotated[IntArray, "F"],  # those with pairs in the second part of the lists
     far_block_start: Annotated[IntArray, "blocks(rows) + 1"],
     far_pair_start: Annotated[IntArray, "F + 1"],
-    pair_number: Annotated[IntArray, "P"],
-    blended_pairs: Annotated[ByteArray, "padded(P)"],
+    pair_slot: Annotated[IntArray, "P"],
     v_pairs: Annotated[FloatArray, "Q, PAIR"],
     conics: Annotated[FloatArray, "rows, 3"],
     opacities: Annotated[FloatArray, "rows"],

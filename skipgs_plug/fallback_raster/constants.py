@@ -51,8 +51,3 @@ def blocks(n: int) -> int:
 def tiles(width: int, height: int) -> tuple[int, int]:
     """Tiles along the sides of an image."""
     return -(-width // TILE), -(-height // TILE)
-
-
-def padded(n: int) -> int:
-    """`n` floats in whole vectors of 16."""
-    return -(-n // 16) * 16

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from . import constants
-from .constants import blocks, padded
+from .constants import blocks
 
 OFF, SIZES, ZONES = range(3)
 
@@ -71,7 +71,7 @@ class Sizes:
         Raises:
             ValueError: A tensor has another size.
         """
-        known: dict[str, Any] = {"blocks": blocks, "padded": padded, **vars(constants)}
+        known: dict[str, Any] = {"blocks": blocks, **vars(constants)}
         known |= {name: value for name, value in arguments.items() if not isinstance(value, Tensor)}
         for name, dimensions in self._parsed.items():
             size = arguments[name].numel()

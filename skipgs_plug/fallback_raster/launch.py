@@ -5,7 +5,7 @@ use (up to a few seconds each), caches them on disk and launches them; no compil
 them is written in Warp's Python dialect, whose scalar code does not vectorise across pixels.
 
 Warp executes a CPU launch on the calling thread, but it releases the interpreter lock while the kernel runs.
-Every kernel here is therefore a worker: it takes the next block of items from a shared atomic counter until
+Every kernel here is therefore a worker: it takes one block of items after the other from shared atomic counters until
 none is left, and calling it starts one worker per thread. Blocks are handed out dynamically, so a busy core or
 an expensive tile delays nobody, and since no two blocks write to one location the result does not depend on
 the number of threads.
@@ -47,9 +47,10 @@ _pool: ThreadPoolExecutor | None = None
 _busy = False  # threads of the pool may still be at work
 _forked = False  # this process inherited torch's OpenMP without its threads, and has not been told so
 
-# The counter has a cache line of its own, so that nothing else is slowed down by it.
-_Counter = ctypes.c_int32 * 32
-_COUNTER_OFFSET = 64
+# Sections of the items for each thread. Neighbouring items write to the same cache lines: threads that took items in
+# turns would pass these lines to and fro.
+_SECTIONS = 4
+_LINE = 64  # bytes; the counter of each section has a cache line of its own
 
 
 def get_num_threads() -> int:
@@ -134,10 +135,6 @@ class LongArray:
     """Marks a worker's parameter as a contiguous int64 tensor, passed flat."""
 
 
-class ByteArray:
-    """Marks a worker's parameter as a contiguous uint8 tensor, passed flat."""
-
-
 class _Kind(NamedTuple):
     """What a parameter is in Python, in Warp and in C++."""
 
@@ -151,7 +148,6 @@ _KINDS: dict[type, _Kind] = {
     FloatArray: _Kind(torch.float32, "wp.uint64", "float"),
     IntArray: _Kind(torch.int32, "wp.uint64", "int"),
     LongArray: _Kind(torch.int64, "wp.uint64", "long long"),
-    ByteArray: _Kind(torch.uint8, "wp.uint64", "unsigned char"),
     int: _Kind(None, "wp.int32", ""),
     float: _Kind(None, "wp.float32", ""),
 }
@@ -225,19 +221,21 @@ class Worker:
             if _forked:
                 _warn_after_fork()
             command, bounds, parameters = self._command
-            counter = _Counter()
-            block = parameters(ctypes.addressof(counter) + _COUNTER_OFFSET, *values)
+            sections = _SECTIONS * _num_threads if _num_threads > 1 else 1
+            counters = (ctypes.c_int32 * (_LINE // 4 * (sections + 2)))()
+            counters[_LINE // 4] = sections
+            block = parameters(ctypes.addressof(counters) + _LINE, *values)
 
             # What a thread needs lives as long as its work: an exception may end this call before they do.
-            def work(owned: Any = (counter, arguments)) -> None:
+            def work(owned: Any = (counters, arguments)) -> None:
                 command.hooks.forward(bounds, ctypes.byref(block))
 
             _on_all_threads(work)
 
     def _record(self) -> Any:
         wp = _warp()
-        declared = {"counter_address": "wp.uint64"}
-        pointers = "int* counter = (int*)counter_address;\n"
+        declared = {"counters_address": "wp.uint64"}
+        pointers = "int* counters = (int*)counters_address;\n"
         for name, kind in self._kinds.items():
             _, type_in_warp, pointer = _KINDS[kind]
             if pointer:
@@ -282,23 +280,32 @@ def worker(
 ) -> Callable[[Callable[..., None]], Worker]:
     """Turns a stub function into a `Worker`.
 
-    The stub's parameters are annotated `FloatArray`, `IntArray`, `LongArray`, `ByteArray`, `int` or `float`; arrays
+    The stub's parameters are annotated `FloatArray`, `IntArray`, `LongArray`, `int` or `float`; arrays
     also `Annotated[FloatArray, "n, 3"]` with the sizes that `guard.Sizes` checks.
 
     Args:
         code: C++ that handles items `[first, last)`; array parameters of the stub are pointers of their name. It knows
             what `simd.h` defines, the constants of `constants.py` and the shortcuts by name.
         items: C++ expression for the number of items, in terms of the stub's parameters.
-        grain: Items taken from the counter at a time, a number or the name of a constant.
+        grain: Items taken at a time, a number or C++.
         name: Name of the kernel where the stub's own is not unique.
         constants: More of them, of this kernel alone.
     """
+    # A thread takes its own sections in their order, then the others' from behind, where their owner comes last. Names
+    # end in an underscore so that they hide none of the stub's.
     loop = f"""{declare(SHARED | (constants or {}))}
-for (;;) {{
-    const int first = __atomic_fetch_add(counter, {grain}, __ATOMIC_RELAXED);
-    if (first >= ({items})) break;
-    const int last = smaller(first + {grain}, {items});
+const int sections_ = counters[0], thread_ = __atomic_fetch_add(counters + 1, 1, __ATOMIC_RELAXED);
+const long long step_ = {grain}, steps_ = (({items}) + step_ - 1) / step_;
+for (int turn_ = 0; turn_ < sections_; ++turn_) {{
+    const int ahead_ = turn_ < {_SECTIONS} ? turn_ : sections_ + {_SECTIONS} - 1 - turn_;
+    const int section_ = (thread_ * {_SECTIONS} + ahead_) % sections_;
+    const int begin_ = (int)(steps_ * section_ / sections_), end_ = (int)(steps_ * (section_ + 1) / sections_);
+    for (;;) {{
+        const int at_ = begin_ + __atomic_fetch_add(counters + {_LINE // 4} * (section_ + 1), 1, __ATOMIC_RELAXED);
+        if (at_ >= end_) break;
+        const int first = (int)(at_ * step_), last = smaller(first + (int)step_, {items});
 {code}
+    }}
 }}
 """
 

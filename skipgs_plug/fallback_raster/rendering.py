@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from .binning import Bins, bin_gaussians, pack_colors
-from .blend import backward_worker, forward_worker, reduce_pairs
-from .constants import MAX_CHANNELS, PAIR, padded, tiles
+from .blend import backward_worker, forward_worker, number_pairs, reduce_pairs
+from .constants import MAX_CHANNELS, PAIR, tiles
 from .launch import floats, ints, longs, scratch, zeros
 from .near_first import bin_the_rest, near_ranges
 from .shortcuts import active_shortcuts
@@ -21,15 +21,15 @@ class Pass:
         bins: The lists, sorted as far as the pixels took them.
         block_start: [blocks + 1] int32, where each block of rows begins among those of `bins`.
         tile_stop: [tiles] int32, place in the list behind the last Gaussian that a pixel of the tile took.
+        tile_blended: [tiles] int32, pairs of the tile that were blended.
         pair_blocks: [P] int32, blocks of a tile in which a pair was blended, as bits, by place in the lists.
-        blended_pairs: [P, padded] uint8, whether a pair was blended, by its number.
     """
 
     bins: Bins
     block_start: Tensor
     tile_stop: Tensor
+    tile_blended: Tensor
     pair_blocks: Tensor
-    blended_pairs: Tensor
 
     def after(self, near: "Pass") -> "Pass":
         """This one as the second part of one list of pairs whose first part is `near`."""
@@ -45,12 +45,8 @@ class Pass:
             own.unsorted,
             own.tiles_per_gauss,
         )
-        count = pairs + len(own.tile_list)
-        blended_pairs = zeros(padded(count), dtype=torch.uint8)
-        blended_pairs[:pairs] = near.blended_pairs[:pairs]
-        blended_pairs[pairs:count] = self.blended_pairs[: len(own.tile_list)]
         pair_blocks = torch.cat([near.pair_blocks, self.pair_blocks])
-        return Pass(bins, self.block_start, self.tile_stop + pairs, pair_blocks, blended_pairs)
+        return Pass(bins, self.block_start, self.tile_stop + pairs, self.tile_blended, pair_blocks)
 
 
 @dataclass
@@ -116,8 +112,7 @@ def _blend_lists(
 ) -> Pass:
     channels, pairs = colors.shape[1], len(bins.tile_list)
     image, transmittance, pixel_stop, product_left, still_open = pixels
-    tile_stop, pair_blocks = ints(size[2] * size[3]), ints(pairs)
-    blended_pairs = zeros(padded(pairs), dtype=torch.uint8)
+    tile_stop, tile_blended, pair_blocks = ints(size[2] * size[3]), ints(size[2] * size[3]), ints(pairs)
     in_one = channels <= MAX_CHANNELS
     if not in_one:
         bins.sort()
@@ -128,12 +123,12 @@ def _blend_lists(
             pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
         forward_worker(some)(
             bins.records, bins.tile_start, bins.pair_row, bins.unsorted, buffer, bins.tile_list, bins.tile_place,
-            image, transmittance, pixel_stop, tile_stop, pair_blocks, blended_pairs, product_left, still_open,
+            image, transmittance, pixel_stop, tile_stop, tile_blended, pair_blocks, product_left, still_open,
             *size, channels, channel, some, int(not in_one), before, int(continued), int(unfinished),
             active_shortcuts(),
         )  # fmt: skip
     bins.unsorted, bins.pair_row = longs(0), ints(0)  # no longer needed
-    return Pass(bins, block_start, tile_stop, pair_blocks, blended_pairs)
+    return Pass(bins, block_start, tile_stop, tile_blended, pair_blocks)
 
 
 def blend_adjoint(
@@ -158,20 +153,26 @@ def blend_adjoint(
     absolute = floats(0) if absolute is None else absolute
     pairs = len(lists.tile_list)
     # Behind the surface most pairs are not blended: they have no sums.
-    pair_number = last.blended_pairs[:pairs].cumsum(0, dtype=torch.int32)
-    v_pairs = scratch("v_pairs", int(pair_number[-1]) if pairs else 0, PAIR)
+    per_tile = torch.cat([part.tile_blended for part in (near, last)[:parts]])
+    slot_start, pair_slot = zeros(len(per_tile) + 1, dtype=torch.int32), zeros(pairs, dtype=torch.int32)
+    torch.cumsum(per_tile, 0, out=slot_start[1:])
+    number_pairs(
+        bins.tile_start, near.tile_stop, lists.tile_start, last.tile_stop, lists.tile_place, last.pair_blocks,
+        slot_start, pair_slot, pairs, len(near.tile_stop), parts,
+    )  # fmt: skip
+    v_pairs = scratch("v_pairs", int(slot_start[-1]), PAIR)
     for channel in range(0, channels, MAX_CHANNELS):
         some = min(MAX_CHANNELS, channels - channel)
         if channels > MAX_CHANNELS:
             pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
         backward_worker(some, with_absolute)(
             bins.records, bins.tile_start, near.tile_stop, lists.tile_start, last.tile_stop, lists.tile_list,
-            lists.tile_place, last.pair_blocks, transmittance, blended.pixel_stop, v_image, v_transmittance,
-            pair_number, v_pairs, *size, channels, channel, some, parts, active_shortcuts(),
+            last.pair_blocks, slot_start, transmittance, blended.pixel_stop, v_image, v_transmittance,
+            v_pairs, *size, channels, channel, some, parts, active_shortcuts(),
         )  # fmt: skip
         reduce_pairs(
             bins.visible, near.block_start, bins.pair_start, lists.visible, last.block_start, lists.pair_start,
-            pair_number, last.blended_pairs, v_pairs, conics, opacities, v_means2d, v_conics, v_opacities, absolute,
+            pair_slot, v_pairs, conics, opacities, v_means2d, v_conics, v_opacities, absolute,
             v_colors, len(means2d), channels, channel, some, int(with_absolute), int(blended.dense), parts,
         )  # fmt: skip
         # The gradient of the transmittance belongs to the first pass alone.

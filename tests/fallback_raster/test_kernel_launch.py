@@ -25,7 +25,7 @@ from skipgs_plug.fallback_raster import (
 from skipgs_plug.fallback_raster.compat import statistics
 from skipgs_plug.fallback_raster.compat.inria import GaussianRasterizationSettings
 from skipgs_plug.fallback_raster.compat.rendering import render, splats
-from skipgs_plug.fallback_raster.launch import ByteArray, FloatArray, IntArray, LongArray, Worker, worker
+from skipgs_plug.fallback_raster.launch import FloatArray, IntArray, LongArray, Worker, worker
 from skipgs_plug.fallback_raster.source import KERNELS, PRELUDE, read_kernel
 from skipgs_plug.fallback_raster.splats import rasterize_splats
 
@@ -36,7 +36,7 @@ WORKERS = {
     for found in (value.values() if isinstance(value, dict) else [value])
     if isinstance(found, Worker)
 }
-DTYPES = {FloatArray: torch.float32, IntArray: torch.int32, LongArray: torch.int64, ByteArray: torch.uint8}
+DTYPES = {FloatArray: torch.float32, IntArray: torch.int32, LongArray: torch.int64}
 EXAMPLES: dict[type, Any] = {kind: torch.zeros(0, dtype=dtype) for kind, dtype in DTYPES.items()} | {int: 0, float: 0.0}
 
 
@@ -44,7 +44,7 @@ def test_every_kernel_file_is_used_and_tested() -> None:
     texts = [PRELUDE, *(found._code for found in WORKERS.values())]
     unused = [path.name for path in KERNELS.glob("*.h") if not any(f'kernels/{path.name}"' in text for text in texts)]
     assert not unused
-    assert len(WORKERS) == 26
+    assert len(WORKERS) == 27
 
 
 @pytest.mark.parametrize("name", WORKERS)
@@ -112,7 +112,7 @@ def test_a_tensor_of_another_size_is_an_error(monkeypatch: pytest.MonkeyPatch) -
     assert {found._name for found, _ in calls} == set(WORKERS)
     # Sizes that nothing else in a call tells, or only up to a whole vector.
     free = {("project_backward", "visible"), ("sh_forward", "visible"), ("sh_backward", "visible")}
-    free.add(("reduce_pairs", "pair_number"))
+    free.add(("reduce_pairs", "pair_slot"))
     for found, arguments in calls:
         for place, (parameter, kind) in enumerate(found._kinds.items()):
             if kind not in DTYPES or not arguments[place].numel() or (found._name, parameter) in free:

@@ -19,16 +19,16 @@ from typing import Any
 CYCLE_ENDS = (0.125, 0.25, 1.0)
 ONE_CYCLE = (1.0,)  # where nothing is to be foreseen: the share is given, or no view is watched
 LEAST_VISITS = 5  # of each view: about 2.5 were enough on two scenes; on a third 2.9 cost 0.2 dB
-LEAST_SHARE = 0.4
+LEAST_SHARE = 0.25
 ALL = 0.95
 WATCHED_SHARE = 1 / 12  # of the views
 LEAST_WATCHED, MOST_WATCHED = 3, 12  # fewer than three cannot tell a twentieth of a decibel: none then
 
 
 def needed_share(iterations: int, n_views: int) -> float:
-    """Share of the refinement iterations that may be needed, known beforehand: each view five times, at least 0.4.
+    """Share of the refinement iterations that may be needed, known beforehand.
 
-    So much that leaving out the rest is not worth it means all.
+    A quarter, or what shows each view five times; so much that leaving out the rest is not worth it means all.
     """
     share = max(LEAST_SHARE, LEAST_VISITS * n_views / max(iterations, 1))
     return share if share < ALL else 1.0

@@ -33,9 +33,9 @@ for (int t = first; t < last; ++t) {
     // The part of the list that was blended last comes first.
     for (int part = parts - 1; part >= 0; --part) {
         const int begin = part ? far_start[t] : tile.begin, tile_end = part ? far_stop[t] : tile_stop[t];
+        int slot = slot_start[part * tiles_x * tiles_y + t + 1];
         for (int k = tile_end - 1; k >= begin; --k) {
             __builtin_prefetch(records + (long long)RECORD * tile_list[larger(k - 8, begin)]);
-            __builtin_prefetch(pair_number + tile_place[larger(k - 16, begin)]);
             if (!pair_blocks[k]) continue;
             unsigned todo = pair_blocks[k] & open;
             const float* r = records + (long long)RECORD * tile_list[k];
@@ -72,7 +72,7 @@ for (int t = first; t < last; ++t) {
                     abs_y += vabs(v_sigma * (r[3] * seen.p + r[4] * seen.w));
                 }
             }
-            float* out = v_pairs + (long long)PAIR * (pair_number[tile_place[k]] - 1);
+            float* out = v_pairs + (long long)PAIR * --slot;
             for (int c = 0; c < D && c < 2; ++c) m[6 + c] = v_color[c];
             *(v8*)out = sum8(m);
             for (int c = 2; c < 4; ++c) out[6 + c] = c < D ? sum(v_color[c < D ? c : 0]) : 0.0f;

@@ -6,6 +6,7 @@ for (int t = first; t < last; ++t) {
     const Tile tile(t, tile_start, tiles_x, width, height);
     if (continued && tile.begin == tile.end) {
         tile_stop[t] = tile.begin;
+        tile_blended[t] = 0;
         continue;
     }
     const int x0 = tile.x0, y0 = tile.y0, begin = tile.begin, end = tile.end;
@@ -36,6 +37,7 @@ for (int t = first; t < last; ++t) {
         for (int b = 0; b < 16; ++b)
             if (!any(P[b] > TRANSMITTANCE_MIN)) open &= ~(1u << b);
     }
+    int blended_here = 0;
     for (int base = begin; base < end && open; base += 64) {
         alignas(64) float chunk[65 * RECORD];  // their records, and one that no pixel sees
         unsigned long long live[16] = {};  // by block, the Gaussians of these 64 that reach it
@@ -109,9 +111,8 @@ for (int t = first; t < last; ++t) {
             i16 of_block;
             for (int b = 0; b < 16; ++b) of_block[b] = visited >> b & 1 ? (int)(live[b] >> j) & 65535 : 0;
             for (int i = 0; i < 16 && j + i < count; ++i) {
-                const int k = base + j + i;
-                pair_blocks[k] = bits(of_block & (1 << i));
-                if (pair_blocks[k]) blended_pairs[tile_place[k]] = 1;
+                const int blocks = pair_blocks[base + j + i] = bits(of_block & (1 << i));
+                blended_here += blocks != 0;
             }
         }
     }
@@ -119,6 +120,7 @@ for (int t = first; t < last; ++t) {
     int tile_end = begin;
     for (int b = 0; b < 16; ++b) tile_end = larger(tile_end, __builtin_reduce_max(stop[b]));
     tile_stop[t] = tile_end;
+    tile_blended[t] = blended_here;
     for (int y = 0; y < tile.rows; ++y)
         for (int x = 0; x < tile.columns; ++x) {
             const long long at = (long long)(y0 + y) * width + x0 + x;

@@ -8,6 +8,7 @@ if (!more && dense) {
     clear(v_opacities + row_begin, rows_here);
     clear(v_colors + (long long)stride * row_begin, (long long)stride * rows_here);
 }
+constexpr int AHEAD = 16;  // rows
 int j = parts > 1 ? far_block_start[first] : 0;
 const int far_end = parts > 1 ? far_block_start[first + 1] : 0;
 for (int i = block_start[first]; i < block_start[first + 1]; ++i) {
@@ -16,11 +17,15 @@ for (int i = block_start[first]; i < block_start[first + 1]; ++i) {
     bool received = false;
     const auto add = [&](int from, int to) INLINE {
         for (int p = from; p < to; ++p)
-            if (blended_pairs[p]) {
-                sums += load(v_pairs + (long long)PAIR * (pair_number[p] - 1));
+            if (pair_slot[p]) {
+                sums += load(v_pairs + (long long)PAIR * (pair_slot[p] - 1));
                 received = true;
             }
     };
+    // Slots follow the lists: those of a row lie anywhere.
+    const int later = smaller(i + AHEAD, block_start[first + 1] - 1);
+    for (int p = pair_start[later]; p < pair_start[later + 1]; ++p)
+        __builtin_prefetch(v_pairs + (long long)PAIR * larger(pair_slot[p] - 1, 0));
     add(pair_start[i], pair_start[i + 1]);
     if (j < far_end && far_visible[j] == g) {
         add(far_pair_start[j], far_pair_start[j + 1]);

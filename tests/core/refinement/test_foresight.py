@@ -81,7 +81,7 @@ def test_a_saved_state_goes_on():
 
 
 def test_the_share_follows_from_the_visits():
-    assert needed_share(15_000, 100) == 0.4
+    assert needed_share(15_000, 100) == 0.25
     assert needed_share(2000, 172) == pytest.approx(0.43)
     assert needed_share(1500, 255) == pytest.approx(0.85)
     assert needed_share(1000, 300) == 1.0
