@@ -124,9 +124,11 @@ class LazyAdam(Adam):
         if param is not missed.param:
             raise RuntimeError("The parameter of a LazyAdam was replaced: call catch_up() before that.")
         if rows is None:
-            rows = torch.arange(len(param), dtype=torch.int32, device="cpu")
+            every = torch.arange(len(param), dtype=torch.int32, device="cpu")
+            missed.advance(every, floats(0), self.state[param])
             self._missed = None
-        missed.advance(rows, floats(0), self.state[param])
+        elif len(rows):
+            missed.advance(rows, floats(0), self.state[param])
 
     def state_dict(self) -> dict[str, Any]:
         """As torch's, of rows that are all up to date."""
