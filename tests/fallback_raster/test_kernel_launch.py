@@ -103,6 +103,8 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker, list[A
         param = torch.nn.Parameter(torch.ones(5, 3))
         param.grad = torch.ones(5, 3)
         adam.adam_rows(torch.ones(5) > 0, param, torch.zeros(5, 3), torch.zeros(5, 3), 0.1, (0.9, 0.999), 1e-15)
+        param.grad = param.grad.to_sparse(1)
+        lazy_adam.LazyAdam([param]).step()
         with torch.no_grad():
             statistics.gather(render(GaussianRasterizationSettings(**camera()), splats(**gaussians())).footprint)
     return list(calls.values())
