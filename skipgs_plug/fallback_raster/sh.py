@@ -41,12 +41,13 @@ def sh_backward(
     v_colors: Annotated[FloatArray, "n, 3"],
     v_means: Annotated[FloatArray, "n, 3"],  # out
     v_base: Annotated[FloatArray, "n, base_stride"],  # out
-    v_rest: Annotated[FloatArray, "n, rest_stride"],  # out; the same array as v_base where rest and base are
+    v_rest: Annotated[FloatArray, "M if packed else n, rest_stride"],  # out; v_base where rest and base are one array
     v_cameras: Annotated[FloatArray, "blocks(n), 3"],  # out, partial sums
     n: int,
     base_stride: int,
     rest_stride: int,
     rest_offset: int,
     degree: int,
+    packed: int,  # v_rest has the visible rows only
     shortcuts: int,
 ) -> None: ...

@@ -5,6 +5,7 @@ come as logarithms and logits, whose activations and adjoints happen in the kern
 visible Gaussians only, and the gradients of the parameters are the only tensors of N rows that the backward fills.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ from .rows import take_rows, visible_rows
 from .sh import sh_backward, sh_forward
 from .shortcuts import active_shortcuts
 
+MOST_SPARSE = 2 / 3  # share of rows in a sparse gradient; updating more of them one by one takes longer than all
 EPS2D = 0.3  # added to the 2D covariance's diagonal, square pixels
 
 
@@ -57,6 +59,7 @@ def rasterize_splats(
     background: Tensor | None = None,  # [3]
     antialiased: bool = False,
     absgrad: bool = False,
+    catch_up: Callable[[Tensor], None] | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Renders raw parameters of 3DGS into one camera, as `rasterization` renders their activations.
 
@@ -79,6 +82,9 @@ def rasterize_splats(
         background: Colour behind everything; black if None.
         antialiased: Scale opacities by the area lost to the blur of 0.3 square pixels.
         absgrad: Also add up |gradient| of the 2D means over pixels, in `info["means2d"].absgrad`.
+        catch_up: Called with the visible rows [M], int32, before their `shN` is read, which it may change in place.
+            With it the gradient of `shN` is row-sparse, of these rows in that order, when they are less than two
+            thirds of all; at degree 0 it has no row, and nothing is called.
 
     Returns:
         Image [H, W, 3], alpha [H, W, 1] and a dictionary as gsplat's packed mode has it, one row for each of M visible
@@ -100,6 +106,12 @@ def rasterize_splats(
         projected = _project(means, quats, log_scales, logits, viewmat, K, size, near_plane, far_plane, antialiased)
         ids = projected.visible.to(torch.int64)
         centres = take_rows(projected.means2d, projected.visible)
+    sparse = None
+    if catch_up is not None and sh_degree == 0:
+        sparse = ids[:0]
+    elif catch_up is not None:
+        catch_up(projected.visible)
+        sparse = ids if len(ids) < MOST_SPARSE * len(means) else None
     # A leaf that goes in with the parameters, so that its gradient comes out with theirs.
     centres.requires_grad_(torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
     absolute = None
@@ -107,7 +119,7 @@ def rasterize_splats(
         absolute = centres.absgrad = zeros(len(ids), 2)  # type: ignore[attr-defined]
     image, transmittance = _Render.apply(
         means, quats, log_scales, logits, sh0, shN, centres, absolute, projected, viewmat, K, size, sh_degree,
-        antialiased,
+        antialiased, sparse,
     )  # fmt: skip
     alpha = (1.0 - transmittance).unsqueeze(-1)
     if background is not None:
@@ -131,7 +143,8 @@ def rasterize_splats(
 class _Render(torch.autograd.Function):
     """Image [H, W, 3] of projected Gaussians and the transmittance [H, W] behind it.
 
-    `absolute` [M, 2] receives the sum over pixels of |v_centres| when it is not None.
+    `absolute` [M, 2] receives the sum over pixels of |v_centres| when it is not None. `sparse` names the rows of the
+    gradient of `shN`: the visible ones, or none at degree 0; all of them where it is None.
     """
 
     @staticmethod
@@ -151,6 +164,7 @@ class _Render(torch.autograd.Function):
         size: tuple[int, int],
         degree: int,
         antialiased: bool,
+        sparse: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         p, n = projected, len(means)
         camera = torch.linalg.inv(viewmat)[:3, 3].contiguous()
@@ -167,7 +181,7 @@ class _Render(torch.autograd.Function):
         }
         ctx.projected, ctx.colors, ctx.absolute = projected, colors, absolute
         ctx.camera = camera, viewmat, K, size, antialiased
-        ctx.sh = layout, degree
+        ctx.sh = layout, degree, sparse
         return image, transmittance
 
     @staticmethod
@@ -176,7 +190,7 @@ class _Render(torch.autograd.Function):
         means, quats, log_scales, logits, sh0, shN, transmittance = check_shapes(ctx.saved_tensors, **ctx.shapes)
         p, n = ctx.projected, len(means)
         camera, viewmat, K, size, antialiased = ctx.camera
-        layout, degree = ctx.sh
+        layout, degree, sparse = ctx.sh
         absolute = None if ctx.absolute is None else zeros(n, 2)
         v_means2d, v_conics, v_activated, v_colors = blend_adjoint(
             ctx.blended, p.means2d, p.conics, p.opacities, ctx.colors, transmittance, v_image, v_transmittance, absolute
@@ -185,16 +199,22 @@ class _Render(torch.autograd.Function):
             ctx.absolute += take_rows(absolute, p.visible)
         gradients = [floats(*t.shape) for t in (means, quats, log_scales, logits, sh0, shN)]
         v_means, v_quats, v_scales, v_logits, v_sh0, v_shN = gradients
+        if sparse is not None:
+            # Part of a tensor of full size, so that gradients of different lengths lie in the same memory.
+            v_shN = v_shN[: len(p.visible)]
+            gradients[-1] = torch.sparse_coo_tensor(
+                sparse[None], v_shN[: len(sparse)], shN.shape, is_coalesced=True, check_invariants=False
+            )
         sh_backward(
             means, camera, sh0, shN, p.visible, p.block_start, ctx.colors, v_colors, v_means, v_sh0, v_shN,
-            zeros(blocks(n), 3), n, *layout, degree, active_shortcuts(),
+            zeros(blocks(n), 3), n, *layout, degree, int(sparse is not None), active_shortcuts(),
         )  # fmt: skip
         project_backward(
             means, quats, log_scales, logits, viewmat, K, p.visible, p.block_start, v_means2d, floats(0), v_conics,
             floats(0), v_activated, v_means, v_quats, v_scales, v_logits, floats(0),
             n, *map(float, size), EPS2D, 0, int(antialiased), 0, 1, active_shortcuts(),
         )  # fmt: skip
-        return *gradients, take_rows(v_means2d, p.visible), *[None] * 7
+        return *gradients, take_rows(v_means2d, p.visible), *[None] * 8
 
 
 def _project(

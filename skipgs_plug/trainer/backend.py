@@ -43,7 +43,8 @@ class Backend:
             K: intrinsics in pixels.
             background: colour behind everything; None for black, which needs no compositing.
             antialiased: compensate opacities for the blur.
-            options: `width height sh_degree near_plane far_plane absgrad` of `rasterization`.
+            options: `width height sh_degree near_plane far_plane absgrad` of `rasterization`, and
+                `catch_up` of `rasterize_splats` on the CPU.
 
         Returns:
             Image [H, W, 3] and the dictionary of `rasterization`.

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from skipgs_plug.fallback_raster.launch import release_memory
+from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
 from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.clock import TrainClock
@@ -64,9 +65,7 @@ class Trainer:
     Attributes:
         step: next iteration, 0-based.
         ran: iterations that ran, which is fewer where a gate leaves some out; every view has its turn among these.
-        splats: raw parameters `means scales quats opacities sh0 shN`.
         strategy: gsplat's DefaultStrategy, or None where `mcmc` densifies.
-        optimizers: one per parameter, by the same names.
         exposure: colour correction of each photograph, with an optimizer of its own; None unless asked for.
         refine_stop_iter: end of densification in iterations of this run.
         near_plane: near clipping plane, world units.
@@ -83,14 +82,16 @@ class Trainer:
         self.near_plane = near_plane(config, scene)
         self.step = self.ran = 0
         self._since: int | None = None  # number after the previous iteration, set by `train`
-        self.splats = create_splats(scene, config, self.backend.device, self.near_plane)
-        self.optimizers = create_optimizers(self.splats, config, scene.scene_scale)
+        self._splats = create_splats(scene, config, self.backend.device, self.near_plane)
+        self._optimizers = create_optimizers(self._splats, config, scene.scene_scale)
+        lazy = self._optimizers["shN"]
+        self._lazy = lazy if isinstance(lazy, LazyAdam) else None
         self.mcmc = Mcmc(config, scene.scene_scale) if config.strategy == "mcmc" else None
         self.strategy: Any = None
         self.strategy_state: dict[str, Any] = {}
         if self.mcmc is None:
             self.strategy = create_strategy(config)
-            self.strategy.check_sanity(self.splats, self.optimizers)
+            self.strategy.check_sanity(self._splats, self._optimizers)
             self.strategy_state = self.strategy.initialize_state(scene_scale=scene.scene_scale)
         self.refine_stop_iter = config.scaled(config.recipe.refine_stop_iter)
         self.view_names = [view.name for view in scene.train]
@@ -107,9 +108,21 @@ class Trainer:
         self._warm = False
 
     @property
+    def splats(self) -> nn.ParameterDict:
+        """Raw parameters `means scales quats opacities sh0 shN`, up to date until the next iteration."""
+        self._catch_up()
+        return self._splats
+
+    @property
+    def optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """One per parameter, by the same names, with moments that are up to date until the next iteration."""
+        self._catch_up()
+        return self._optimizers
+
+    @property
     def all_optimizers(self) -> list[torch.optim.Optimizer]:
-        """Those of the Gaussians' parameters, and that of the exposure."""
-        return [*self.optimizers.values(), *([] if self.exposure is None else [self.exposure.optimizer])]
+        """Those of the Gaussians' parameters, and that of the exposure; their moments may be behind."""
+        return [*self._optimizers.values(), *([] if self.exposure is None else [self.exposure.optimizer])]
 
     @property
     def phase_seconds(self) -> dict[str, float]:
@@ -139,12 +152,13 @@ class Trainer:
                 loss = self.train_step()
                 bar.update()
                 if self.ran % 10 == 0:
-                    bar.set_postfix_str(f"loss={loss:.3f} | GS={len(self.splats['means'])}", refresh=False)
+                    bar.set_postfix_str(f"loss={loss:.3f} | GS={len(self._splats['means'])}", refresh=False)
                 if self.stop_requested:
                     break
             else:  # those at the end may have been left out
                 self.step = self.step if self.stop_requested else max(self.step, until)
         self.stop_requested = False
+        self._catch_up()
 
     def iterations(self, until: int) -> range:
         """Numbers of the iterations up to `until` (exclusive): the seam where a gate leaves some out."""
@@ -167,7 +181,7 @@ class Trainer:
         image, target, info = self._forward(view, self.active_sh_degree(step), step)
         self.clock.mark("forward")
         if densifying and self.strategy is not None:
-            self.strategy.step_pre_backward(self.splats, self.optimizers, self.strategy_state, step, info)
+            self.strategy.step_pre_backward(self._splats, self._optimizers, self.strategy_state, step, info)
         loss = self._loss(image, target)
         value = float(loss.detach())
         self.clock.mark("loss")
@@ -209,7 +223,7 @@ class Trainer:
         """Set the learning rates of positions and exposure to those of iteration `step`; the others are constant."""
         progress = min(step / self.config.schedule, 1.0)
         rate = self.config.means_lr * self.scene.scene_scale * MEANS_LR_END**progress
-        self.optimizers["means"].param_groups[0]["lr"] = rate
+        self._optimizers["means"].param_groups[0]["lr"] = rate
         if self.exposure is not None:
             self.exposure.set_learning_rate(progress)
 
@@ -239,7 +253,7 @@ class Trainer:
         means = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
         return {
             **means,
-            "num_GS": len(self.splats["means"]),
+            "num_GS": len(self._splats["means"]),
             "step": self.step,
             "split": split,
             "views": len(views),
@@ -287,8 +301,9 @@ class Trainer:
         return image if self.exposure is None else self.exposure.apply(image, view.name)
 
     def _rasterize(self, view: View, degree: int, background: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+        lazy = {} if self._lazy is None else {"catch_up": self._lazy.catch_up}
         return self.backend.render(
-            self.splats,
+            self._splats,
             view.viewmat,
             view.K,
             background,
@@ -299,6 +314,7 @@ class Trainer:
             near_plane=self.near_plane,
             far_plane=self.config.far_plane,
             absgrad=self.config.absgrad,
+            **lazy,
         )
 
     def _background(self) -> Tensor | None:
@@ -314,15 +330,15 @@ class Trainer:
         loss = self.backend.loss(image, target, self.config.ssim_lambda)
         recipe = self._recipe
         if recipe.opacity_reg > 0.0:
-            loss = loss + recipe.opacity_reg * torch.sigmoid(self.splats["opacities"]).mean()
+            loss = loss + recipe.opacity_reg * torch.sigmoid(self._splats["opacities"]).mean()
         if recipe.scale_reg > 0.0:
-            loss = loss + recipe.scale_reg / self.scene.scene_scale * torch.exp(self.splats["scales"]).mean()
+            loss = loss + recipe.scale_reg / self.scene.scene_scale * torch.exp(self._splats["scales"]).mean()
         return loss
 
     def _optimizer_step(self, info: dict[str, Any]) -> bool:
         """Step; returns whether positions were updated, which a gate may leave out or put off."""
-        pending = self.splats["means"].grad is not None
-        for optimizer in self.optimizers.values():
+        pending = self._splats["means"].grad is not None
+        for optimizer in self._optimizers.values():
             if self.config.visible_adam:
                 optimizer.step(self._visible(info))  # type: ignore[call-overload]
             else:
@@ -330,13 +346,13 @@ class Trainer:
             optimizer.zero_grad(set_to_none=True)
         if self.exposure is not None:
             self.exposure.step()
-        return pending and self.splats["means"].grad is None
+        return pending and self._splats["means"].grad is None
 
     def _visible(self, info: dict[str, Any]) -> Tensor:
         """Return which Gaussians the image shows [N]."""
         if info["gaussian_ids"] is None:
             return (info["radii"] > 0).all(dim=-1).any(dim=0)  # type: ignore[no-any-return]
-        visible = torch.zeros(len(self.splats["means"]), dtype=torch.bool, device=self.backend.device)
+        visible = torch.zeros(len(self._splats["means"]), dtype=torch.bool, device=self.backend.device)
         visible[info["gaussian_ids"]] = True
         return visible
 
@@ -344,8 +360,9 @@ class Trainer:
         due = step % strategy.refine_every == 0
         if due:
             release_memory()  # of gradients, while copies of all parameters and moments are made
+            self._catch_up()
         with self._seeded(step) if due else nullcontext():
-            args = (self.splats, self.optimizers, self.strategy_state, step)
+            args = (self._splats, self._optimizers, self.strategy_state, step)
             strategy.step_post_backward(*args, info, packed=info["gaussian_ids"] is not None)
             reset_opacity_if_missed(strategy, *args)
         self._sort_rows(strategy, step)
@@ -355,11 +372,17 @@ class Trainer:
         moves = mcmc.moves(step)
         if moves:
             release_memory()  # as in `_densify`
+            self._catch_up()
         if updated or moves:
-            rate = self.optimizers["means"].param_groups[0]["lr"] if updated else 0.0
+            rate = self._optimizers["means"].param_groups[0]["lr"] if updated else 0.0
             with self._seeded(step):
-                mcmc.after_update(self.splats, self.optimizers, step, rate)
+                mcmc.after_update(self._splats, self._optimizers, step, rate)
         self._sort_rows(mcmc, step)
+
+    def _catch_up(self) -> None:
+        """Advance what the last views did not show, before somebody else looks at it."""
+        if self._lazy is not None:
+            self._lazy.catch_up()
 
     def _sort_rows(self, strategy: Any, step: int) -> None:
         if sorts_rows(strategy, step):

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
 from skipgs_plug.fallback_raster.optimizer import Adam
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.near_plane import before_a_lens
@@ -58,7 +59,10 @@ def neighbour_distance(points: Tensor) -> Tensor:
 def create_optimizers(
     splats: nn.ParameterDict, config: TrainConfig, scene_scale: float
 ) -> dict[str, torch.optim.Optimizer]:
-    """Return one Adam per parameter, learning rates as in gsplat's simple_trainer; on the CPU it runs on all cores."""
+    """Return one Adam per parameter, learning rates as in gsplat's simple_trainer.
+
+    On the CPU it runs on all cores, and that of `shN`, three quarters of all numbers, updates what views show.
+    """
     rates = {
         "means": config.means_lr * scene_scale,
         "scales": config.scales_lr,
@@ -74,6 +78,8 @@ def create_optimizers(
             optimizers[name] = SelectiveAdam(group, eps=ADAM_EPS)
         elif splats[name].is_cuda:
             optimizers[name] = torch.optim.Adam(group, eps=ADAM_EPS, fused=True)
+        elif name == "shN" and splats[name].numel():
+            optimizers[name] = LazyAdam(group, eps=ADAM_EPS)
         else:
             optimizers[name] = Adam(group, eps=ADAM_EPS)
     return optimizers

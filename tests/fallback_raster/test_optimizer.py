@@ -285,3 +285,27 @@ def test_it_leaves_torchs_compiler_alone() -> None:
         "sys.exit('torch._dynamo' in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("eps", [1e-15, 0.0])
+def test_numbers_that_never_had_a_gradient_are_torchs(eps: float) -> None:
+    """They stay, also zeros that are negative; without `eps` all become NaN, 0 / 0."""
+    generator = torch.Generator().manual_seed(4)
+    values = torch.randn(200, 16, generator=generator)
+    values[::3] = -0.0
+    trained = torch.rand(200, generator=generator) < 0.3
+    found = []
+    for optimizer in (Adam, torch.optim.Adam):
+        param = torch.nn.Parameter(values.clone())
+        options = {} if optimizer is Adam else {"fused": True}
+        adam = optimizer([param], lr=0.01, eps=eps, **options)
+        for _ in range(3):
+            param.grad = torch.zeros_like(param)
+            param.grad[trained] = torch.randn(int(trained.sum()), 16, generator=generator.manual_seed(5))
+            adam.step()
+        found.append(param.detach())
+    ours, torchs = found
+    assert torch.equal(ours.isnan(), torchs.isnan())
+    assert torch.equal(ours.nan_to_num().view(torch.int32), torchs.nan_to_num().view(torch.int32))
+    untrained = ours[~trained]
+    assert untrained.isnan().all() if eps == 0 else torch.equal(untrained, values[~trained])

@@ -5,11 +5,13 @@ float camera_sum[3] = {0.0f, 0.0f, 0.0f};
 // Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
 const long long row_begin = (long long)BLOCK * block;
 const int rows = smaller(BLOCK, n - (int)row_begin);
-const bool empty = block_start[block] == block_start[block + 1];
+const int listed = block_start[block + 1] - block_start[block];
+const bool empty = listed == 0;
 const auto clear_rows = [=](float* p, long long n) { empty ? clear_past_caches(p, n) : clear(p, n); };
 clear_rows(v_means + 3 * row_begin, 3 * rows);
 clear_rows(v_base + base_stride * row_begin, base_stride * rows);
-if (v_rest != v_base) clear_rows(v_rest + rest_stride * row_begin, rest_stride * rows);
+if (packed) clear(v_rest + (long long)rest_stride * block_start[block], rest_stride * listed);
+else if (v_rest != v_base) clear_rows(v_rest + rest_stride * row_begin, rest_stride * rows);
 for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
     const int g = visible[i];
     // Where the colour was clamped at zero, and where nothing blended the Gaussian, there is no gradient.
@@ -23,7 +25,7 @@ for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
     const int terms = (degree + 1) * (degree + 1);
     const float* sh = rest + (long long)g * rest_stride + rest_offset - 3;  // sh[3 k] is band k, from 1 on
     float* v_constant = v_base + (long long)g * base_stride;
-    float* v_sh = v_rest + (long long)g * rest_stride + rest_offset - 3;
+    float* v_sh = v_rest + (long long)(packed ? i : g) * rest_stride + rest_offset - 3;
     v_constant[0] = basis[0] * v0;
     v_constant[1] = basis[0] * v1;
     v_constant[2] = basis[0] * v2;

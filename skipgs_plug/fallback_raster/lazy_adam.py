@@ -1,0 +1,184 @@
+"""Adam for a parameter of many rows of which few are needed at a time: the others are caught up when they are."""
+
+import math
+from typing import Annotated, Any
+
+import torch
+from torch import Tensor
+
+from .launch import FloatArray, IntArray, floats, worker, zeros
+from .optimizer import Adam, moments
+from .source import read_kernel
+
+ROW = 48  # numbers of a row that the kernel holds, at most
+STEPS = 1024  # that a row may miss, for which rates are kept
+CHUNK = 32  # steps of a row between two looks at how small its numbers have become
+
+
+@worker(read_kernel("catch_up.h"), items="n", grain=256, constants={"ROW": ROW, "CHUNK": CHUNK})
+def _catch_up(
+    rows: Annotated[IntArray, "n"],  # none of them twice
+    done: Annotated[IntArray, "R"],  # steps that each row has, updated, as `values`, `mean` and `square`
+    gradient: Annotated[FloatArray, "n if with_gradient else 0, width"],
+    values: Annotated[FloatArray, "R, width"],
+    mean: Annotated[FloatArray, "R, width"],  # as `adam_step` has it, as all that follow
+    square: Annotated[FloatArray, "R, width"],
+    rates: Annotated[FloatArray, "steps"],
+    roots: Annotated[FloatArray, "steps"],
+    inverse_roots: Annotated[FloatArray, "steps"],
+    n: int,
+    width: int,
+    now: int,  # steps that rows get before that with a gradient
+    with_gradient: int,
+    take1: float,
+    keep2: float,
+    take2: float,
+    eps: float,
+    grow: float,  # 1 / sqrt(keep2)
+    longest_rate: float,  # of all steps; infinite where decay makes steps longer
+    least_mean: float,  # from here to there nothing comes near underflow or overflow in a chunk of steps
+    most_mean: float,
+    least_square: float,
+) -> None: ...
+
+
+class _Missed:
+    """The steps since all rows were up to date, and how many of them each row has."""
+
+    def __init__(self, param: Tensor, betas: tuple[float, float], eps: float) -> None:
+        self.param, self.betas, self.eps = param, betas, eps
+        self.done = zeros(len(param), dtype=torch.int32)
+        self.rates, self.roots, self.inverse_roots = floats(STEPS), floats(STEPS), floats(STEPS)
+        self.now = 0
+        self._least, self._most = math.inf, 0.0
+
+    def add(self, rate: float, root: float) -> None:
+        """Note a step; it is complete when `now` is raised."""
+        self.rates[self.now] = rate
+        self.roots[self.now] = root
+        self.inverse_roots[self.now] = 1.0 / self.roots[self.now]
+        self._least = min(self._least, abs(rate) or math.inf)
+        self._most = max(self._most, abs(rate))
+
+    def advance(self, rows: Tensor, gradient: Tensor, state: dict[str, Tensor]) -> None:
+        """Bring rows [n] to `now`, and on by the step that was noted last where there is a gradient [n, ...]."""
+        beta1, beta2 = self.betas
+        smallest = self._least * beta1 ** (CHUNK + 1)
+        longest = self._most if beta1**2 <= beta2 else math.inf
+        _catch_up(
+            rows, self.done, gradient, self.param.detach(), state["exp_avg"], state["exp_avg_sq"],
+            self.rates, self.roots, self.inverse_roots, len(rows), self.param[0].numel(), self.now,
+            int(gradient.numel() > 0), 1 - beta1, beta2, 1 - beta2, self.eps, beta2**-0.5, longest,
+            2.0**-100 / smallest if smallest else math.inf, 2.0**60 / self._most if self._most else math.inf,
+            max(2.0**-74, (2.0**13 * self.eps) ** 2) / beta2 ** (CHUNK + 1),
+        )  # fmt: skip
+        # Past torch's count of changes, by which it knows what is out of date in a backward pass.
+        torch.autograd.graph.increment_version(self.param)
+
+
+class LazyAdam(Adam):
+    """`Adam` for one parameter [N, ...], to the bit, that advances only those rows that are asked for.
+
+    Rows without an entry in a row-sparse gradient miss the step: with a gradient of zero their moments decay and the
+    parameter moves on. `catch_up` makes up for that, whenever it is called and for whatever rows, with the same result.
+    Before a row of the parameter is used, or anything of the optimizer's `state`, it has to be called.
+
+    Args:
+        params: One float32 parameter on the CPU, or a group with one, of at most 48 numbers in a row.
+        lr: Learning rate, which may change from step to step.
+        betas: Decay of the two means; the second is not 0.
+        eps: Added to the root, more than 0.
+
+    Raises:
+        ValueError: It is not one parameter of that kind, or `eps` is 0.
+    """
+
+    def __init__(
+        self, params: Any, lr: float = 1e-3, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-8
+    ) -> None:
+        super().__init__(params, lr=lr, betas=betas, eps=eps)
+        self._missed: _Missed | None = None
+        given = [param for group in self.param_groups for param in group["params"]]
+        if len(given) != 1 or not _fits(given[0]):
+            raise ValueError(
+                f"LazyAdam takes one contiguous float32 parameter on the CPU with rows of 1 to {ROW} numbers, got "
+                f"{[(tuple(param.shape), param.dtype, param.device.type) for param in given]}; use Adam for others."
+            )
+        if not eps > 0:
+            raise ValueError(f"LazyAdam needs eps > 0, got {eps}: rows without any gradient would become NaN.")
+
+    @torch.no_grad()
+    def catch_up(self, rows: Tensor | None = None) -> None:
+        """Bring rows up to date.
+
+        Args:
+            rows: Their numbers [M], int32, none twice; all rows without.
+
+        Raises:
+            RuntimeError: The parameter was replaced while rows of it were behind.
+        """
+        missed = self._missed
+        if missed is None:
+            return
+        param = self.param_groups[0]["params"][0]
+        if param is not missed.param:
+            raise RuntimeError("The parameter of a LazyAdam was replaced: call catch_up() before that.")
+        if rows is None:
+            every = torch.arange(len(param), dtype=torch.int32, device="cpu")
+            missed.advance(every, floats(0), self.state[param])
+            self._missed = None
+        elif len(rows):
+            missed.advance(rows, floats(0), self.state[param])
+
+    def state_dict(self) -> dict[str, Any]:
+        """As torch's, of rows that are all up to date."""
+        self.catch_up()
+        return super().state_dict()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """As torch's."""
+        self.catch_up()
+        super().load_state_dict(state_dict)
+
+    def _step(self, group: dict[str, Any]) -> None:
+        (param,) = group["params"]
+        if param.grad is None:
+            return
+        if not param.grad.is_sparse:
+            self.catch_up()
+            super()._step(group)
+            return
+        missed, state = self._missed, moments(self, param)
+        betas, eps = group["betas"], group["eps"]
+        if missed is not None and (missed.now == STEPS or (missed.betas, missed.eps) != (betas, eps)):
+            self.catch_up()
+            missed = None
+        if missed is None:
+            missed = self._missed = _Missed(param, betas, eps)
+        state["step"] += 1
+        corrections = [1 - beta ** state["step"].item() for beta in betas]
+        missed.add(float(group["lr"]) / corrections[0], corrections[1] ** 0.5)
+        rows, gradient = _rows(param.grad)
+        if len(rows):
+            missed.advance(rows, gradient, state)
+        missed.now += 1
+
+
+def _fits(param: Tensor) -> bool:
+    return (
+        param.dtype is torch.float32
+        and param.is_cpu
+        and param.is_contiguous()
+        and len(param) > 0
+        and 1 <= param[0].numel() <= ROW
+    )
+
+
+def _rows(gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows [M] of a row-sparse gradient, none of them twice, and their values [M, ...]."""
+    rows = gradient._indices()[0].to(torch.int32)
+    # Autograd forgets that a gradient was coalesced, and sorting it anew takes longer than the step.
+    if not bool((rows[1:] > rows[:-1]).all()):
+        gradient = gradient.coalesce()
+        rows = gradient._indices()[0].to(torch.int32)
+    return rows, gradient._values().contiguous()
