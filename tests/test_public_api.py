@@ -72,6 +72,7 @@ HOOKS = {
     "number": "(self, counted: 'int') -> 'int'",
     "on_detach": "(self, label: 'str', undo: 'Callable[[], None]') -> 'None'",
     "own_loop": "(self, owner: 'Any', name: 'str') -> 'None'",
+    "optimizer_names": "(self, named: 'Named') -> 'None'",
     "ready": "(self, facts: 'TrainerFacts') -> 'None'",
     "restore": "(self) -> 'None'",
     "signal": "(self, value: 'float | torch.Tensor') -> 'None'",
