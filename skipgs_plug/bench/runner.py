@@ -152,7 +152,7 @@ class Bench:
         else:
             densify(trainer, self.progress, self._scalars(seed, "densify"))
             trainer.save_checkpoint(path)
-            count = len(trainer.splats["means"])
+            count = trainer.num_gaussians
             self.say(f"seed {seed}: densified to {count:,} Gaussians in {trainer.t_total:.1f} s of training")
         return trainer.snapshot()
 

@@ -33,7 +33,7 @@ class LossCurve:
             iteration.step,
             round(self._trainer.t_total, 3),
             sum(self._pending) / len(self._pending),
-            len(self._trainer.splats["means"]),
+            self._trainer.num_gaussians,
         )
         for column, value in zip(self._columns.values(), values, strict=True):
             column.append(value)

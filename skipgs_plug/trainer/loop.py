@@ -120,6 +120,11 @@ class Trainer:
         return self._optimizers
 
     @property
+    def num_gaussians(self) -> int:
+        """How many there are, for whoever asks often: nothing is brought up to date for it."""
+        return len(self._splats["means"])
+
+    @property
     def all_optimizers(self) -> list[torch.optim.Optimizer]:
         """Those of the Gaussians' parameters, and that of the exposure; their moments may be behind."""
         return [*self._optimizers.values(), *([] if self.exposure is None else [self.exposure.optimizer])]
@@ -152,7 +157,7 @@ class Trainer:
                 loss = self.train_step()
                 bar.update()
                 if self.ran % 10 == 0:
-                    bar.set_postfix_str(f"loss={loss:.3f} | GS={len(self._splats['means'])}", refresh=False)
+                    bar.set_postfix_str(f"loss={loss:.3f} | GS={self.num_gaussians}", refresh=False)
                 if self.stop_requested:
                     break
             else:  # those at the end may have been left out
@@ -253,7 +258,7 @@ class Trainer:
         means = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
         return {
             **means,
-            "num_GS": len(self._splats["means"]),
+            "num_GS": self.num_gaussians,
             "step": self.step,
             "split": split,
             "views": len(views),
@@ -352,7 +357,7 @@ class Trainer:
         """Return which Gaussians the image shows [N]."""
         if info["gaussian_ids"] is None:
             return (info["radii"] > 0).all(dim=-1).any(dim=0)  # type: ignore[no-any-return]
-        visible = torch.zeros(len(self._splats["means"]), dtype=torch.bool, device=self.backend.device)
+        visible = torch.zeros(self.num_gaussians, dtype=torch.bool, device=self.backend.device)
         visible[info["gaussian_ids"]] = True
         return visible
 

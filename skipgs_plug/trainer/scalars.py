@@ -41,7 +41,7 @@ class ScalarLog:
         trainer, image, target = self._trainer, iteration.image, iteration.target
         with torch.no_grad():  # the parts of the loss that the trainer computes in one go
             l1, ssim = (float(trainer.backend.loss(image, target, weight)) for weight in (0.0, 1.0))
-        scalars = {"loss": iteration.loss, "l1loss": l1, "ssimloss": ssim, "num_GS": len(trainer.splats["means"])}
+        scalars = {"loss": iteration.loss, "l1loss": l1, "ssimloss": ssim, "num_GS": trainer.num_gaussians}
         memory = peak_memory(trainer.backend.device)
         if memory is not None:
             scalars["mem"] = memory / 2**30
