@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from .launch import FloatArray, IntArray, floats, worker, zeros
-from .optimizer import Adam, moments
+from .optimizer import Adam, corrected, moments
 from .source import read_kernel
 
 ROW = 48  # numbers of a row that the kernel holds, at most
@@ -156,8 +156,7 @@ class LazyAdam(Adam):
         if missed is None:
             missed = self._missed = _Missed(param, betas, eps)
         state["step"] += 1
-        corrections = [1 - beta ** state["step"].item() for beta in betas]
-        missed.add(float(group["lr"]) / corrections[0], corrections[1] ** 0.5)
+        missed.add(*corrected(float(group["lr"]), state["step"], betas))
         rows, gradient = _rows(param.grad)
         if len(rows):
             missed.advance(rows, gradient, state)

@@ -75,6 +75,12 @@ def moments(optimizer: torch.optim.Optimizer, param: Tensor) -> dict[str, Tensor
     return state
 
 
+def corrected(lr: float, step: Tensor, betas: tuple[float, float]) -> tuple[float, float]:
+    """`rate` and `root` of `adam_step` in step number `step`, from 1 on: with the bias corrections of both means."""
+    first, second = (1 - beta ** step.item() for beta in betas)
+    return lr / first, second**0.5
+
+
 def adam(
     params: Sequence[Tensor],
     grads: Sequence[Tensor],  # of the same shapes, as the next two
@@ -113,8 +119,7 @@ def adam(
             left.append(number)
             continue
         step += 1
-        corrections = [1 - beta ** step.item() for beta in betas]
-        adam_step(None, *tensors, lr / corrections[0], corrections[1] ** 0.5, betas, eps)
+        adam_step(None, *tensors, *corrected(lr, step, betas), betas, eps)
     if left:
         some = ([whole[i] for i in left] if whole else [] for whole in everything)
         _torchs_adam(*some, **options)
