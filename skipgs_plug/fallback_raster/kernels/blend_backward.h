@@ -4,7 +4,8 @@ for (int t = first; t < last; ++t) {
     const Tile tile(t, tile_start, tiles_x, width, height);
     const int x0 = tile.x0, y0 = tile.y0;
 
-    // behind = (what lies behind the current Gaussian) . v_image, less what alpha and background receive.
+    // behind = (the colour one would see without the current Gaussian and those before it) . v_image, so that it is not
+    // divided by 1 - alpha; at the end of the list that is what alpha and background receive.
     alignas(64) v16 T[16], behind[16], v[16][D];
     alignas(64) i16 stop[16];
     for (int b = 0; b < 16; ++b) {
@@ -26,7 +27,6 @@ for (int t = first; t < last; ++t) {
     for (int b = 0; b < 16; ++b) {
         i16 wanted = behind[b] != 0.0f;
         for (int c = 0; c < D; ++c) wanted |= v[b][c] != 0.0f;
-        behind[b] *= T[b];
         // A block without incoming gradient adds exact zeros.
         if (any(wanted) || !(shortcuts & ZERO_GRADIENT)) open |= 1u << b;
     }
@@ -48,17 +48,14 @@ for (int t = first; t < last; ++t) {
 
                 const i16 hit = (seen.log2_alpha >= LOG2_ALPHA_MIN) & (stop[b] > k);
                 const v16 full = exp2(seen.log2_alpha);
-                const v16 alpha = vmin((v16)ALPHA_MAX, full);
-                const v16 passed = 1.0f / (1.0f - alpha);
+                const v16 alpha = hit ? vmin((v16)ALPHA_MAX, full) : (v16)0.0f;
                 v16 shade = r[8] * v[b][0];
                 for (int c = 1; c < D; ++c) shade += r[8 + c] * v[b][c];
-                // T is the transmittance behind the Gaussian, T / (1 - alpha) that before it.
-                const v16 share = hit ? alpha * passed : (v16)0.0f;
-                const v16 weight = share * T[b];
+                T[b] = T[b] * (1.0f / (1.0f - alpha));  // from behind the Gaussian to before it
+                const v16 weight = alpha * T[b], less = behind[b] - shade;
+                behind[b] = hit ? behind[b] - alpha * less : behind[b];
                 // Where alpha is clamped, neither opacity nor shape moves it.
-                const v16 v_sigma = (hit & (full <= ALPHA_MAX)) ? share * (behind[b] - T[b] * shade) : (v16)0.0f;
-                T[b] += weight;
-                behind[b] += hit ? weight * shade : (v16)0.0f;
+                const v16 v_sigma = (hit & (full <= ALPHA_MAX)) ? weight * less : (v16)0.0f;
                 for (int c = 0; c < D; ++c) v_color[c] += weight * v[b][c];
                 const v16 v_x = v_sigma * seen.dx, v_y = v_sigma * seen.dy;
                 m[0] += v_sigma;

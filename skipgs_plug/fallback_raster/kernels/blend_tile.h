@@ -22,6 +22,6 @@ struct Falloff {
 #pragma clang fp contract(fast)
         dx = tile.px[block & 3] - r[0], dy = tile.py[block >> 2] - r[1];
         p = r[2] * dx + r[3] * dy, w = r[4] * dy;
-        log2_alpha = r[5] - p * p - w * w;
+        log2_alpha = r[5] - w * w - p * p;  // p takes longest
     }
 };
