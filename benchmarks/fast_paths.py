@@ -53,17 +53,17 @@ EXACT_EXP2 = """auto exp2 = [](v16 t) -> v16 {
 def exact_exponential() -> Iterator[None]:
     """Blends with 2^t in float64 inside the block."""
     workers = [*blend._FORWARD.values(), *blend._BACKWARD.values()]
-    kept = launch.PRELUDE, [(worker._name, worker._command) for worker in workers]
+    kept = launch.PRELUDE, [(worker._name, worker._kernel) for worker in workers]
     launch.PRELUDE = re.sub(r"auto exp2 = .*?\n};\n", EXACT_EXP2, launch.PRELUDE, flags=re.DOTALL)
     assert kept[0] != launch.PRELUDE
     for worker in workers:
-        worker._name, worker._command = f"{worker._name}_exact", None
+        worker._name, worker._kernel = f"{worker._name}_exact", None
     try:
         yield
     finally:
         launch.PRELUDE = kept[0]
         for worker, (name, command) in zip(workers, kept[1], strict=True):
-            worker._name, worker._command = name, command
+            worker._name, worker._kernel = name, command
 
 
 @dataclasses.dataclass

@@ -6,7 +6,7 @@ compiled (seconds, cached on disk), when something is first rendered.
 """
 
 from .install import install_as_gsplat as install_as_gsplat
-from .launch import get_num_threads as get_num_threads
-from .launch import set_num_threads as set_num_threads
 from .loss import l1_ssim_loss as l1_ssim_loss
 from .rasterization import rasterization as rasterization
+from .threads import get_num_threads as get_num_threads
+from .threads import set_num_threads as set_num_threads

@@ -5,7 +5,8 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from .launch import FloatArray, IntArray, ints, worker
+from .buffers import ints
+from .launch import FloatArray, IntArray, worker
 from .source import read_kernel
 
 

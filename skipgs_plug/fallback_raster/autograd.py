@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from .buffers import floats, ints, zeros
 from .constants import blocks
-from .launch import floats, ints, zeros
 from .project import project_backward, project_forward
 from .rendering import blend, blend_adjoint
 from .rows import all_rows, visible_rows

@@ -12,10 +12,12 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from .buffers import floats, ints, longs, zeros
 from .constants import BOX, MAX_CHANNELS, RECORD, tiles
-from .launch import FloatArray, IntArray, LongArray, floats, get_num_threads, ints, longs, worker, zeros
+from .launch import FloatArray, IntArray, LongArray, worker
 from .shortcuts import active_shortcuts
 from .source import read_kernel
+from .threads import get_num_threads
 
 # What 32-bit places in a list of pairs can count.
 MAX_PAIRS = 2**31 - 1

@@ -6,7 +6,8 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from .launch import FloatArray, IntArray, floats, worker, zeros
+from .buffers import floats, zeros
+from .launch import FloatArray, IntArray, worker
 from .optimizer import Adam, corrected, moments
 from .source import read_kernel
 

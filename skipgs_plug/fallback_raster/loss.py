@@ -23,8 +23,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from .buffers import floats
 from .constants import BAND, CHUNK, LOSS_CHANNELS, WINDOW
-from .launch import FloatArray, floats, worker
+from .launch import FloatArray, worker
 from .source import read_kernel
 
 # Columns of float32 count no further exactly, and kernels find them in it.

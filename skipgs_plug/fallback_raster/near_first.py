@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from .binning import Bins, bin_gaussians
+from .buffers import floats, ints
 from .constants import tiles
-from .launch import FloatArray, IntArray, floats, ints, worker
+from .launch import FloatArray, IntArray, worker
 from .rows import visible_rows
 from .shortcuts import SHORTCUTS, active_shortcuts
 from .source import read_kernel

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from .binning import Bins, bin_gaussians, pack_colors
 from .blend import backward_worker, forward_worker, number_pairs, reduce_pairs
+from .buffers import floats, ints, longs, scratch, zeros
 from .constants import MAX_CHANNELS, PAIR, tiles
-from .launch import floats, ints, longs, scratch, zeros
 from .near_first import bin_the_rest, near_ranges
 from .shortcuts import active_shortcuts
 

@@ -5,8 +5,9 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from .buffers import floats, ints
 from .constants import BLOCK, blocks
-from .launch import FloatArray, IntArray, floats, ints, worker
+from .launch import FloatArray, IntArray, worker
 from .project import list_visible
 from .source import read_kernel
 

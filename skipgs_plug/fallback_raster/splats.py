@@ -15,8 +15,8 @@ from torch.autograd.function import once_differentiable
 
 from .arguments import check_tensors
 from .autograd import check_shapes
+from .buffers import floats, ints, zeros
 from .constants import TILE, blocks, tiles
-from .launch import floats, ints, zeros
 from .project import project_backward, project_forward
 from .rendering import blend, blend_adjoint
 from .rows import take_rows, visible_rows

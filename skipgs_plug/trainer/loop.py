@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-from skipgs_plug.fallback_raster.launch import release_memory
+from skipgs_plug.fallback_raster.buffers import release_memory
 from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
 from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend

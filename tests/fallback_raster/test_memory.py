@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from skipgs_plug.fallback_raster import launch, memory
+from skipgs_plug.fallback_raster import buffers, memory
 from skipgs_plug.fallback_raster.memory import Pool
 
 pytestmark = pytest.mark.skipif(not memory.SUPPORTED, reason="no private pages without a file here")
@@ -98,11 +98,11 @@ def test_tensors_may_die_in_any_thread(pool: Pool) -> None:
 
 
 def test_large_tensors_of_the_rasterizer_lie_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(launch, "LARGE", 4 * PAGE)
-    monkeypatch.setattr(launch, "_memory", Pool())
-    small = launch.floats(PAGE - 1)
-    assert launch._memory.mapped == 0
-    address = launch.ints(2, PAGE).data_ptr()
-    assert launch.floats(PAGE, 2).data_ptr() == address
-    launch.release_memory()
-    assert launch._memory.mapped == 0 and len(small) == PAGE - 1
+    monkeypatch.setattr(buffers, "LARGE", 4 * PAGE)
+    monkeypatch.setattr(buffers, "_memory", Pool())
+    small = buffers.floats(PAGE - 1)
+    assert buffers._memory.mapped == 0
+    address = buffers.ints(2, PAGE).data_ptr()
+    assert buffers.floats(PAGE, 2).data_ptr() == address
+    buffers.release_memory()
+    assert buffers._memory.mapped == 0 and len(small) == PAGE - 1

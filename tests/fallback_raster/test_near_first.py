@@ -11,9 +11,9 @@ from torch import Tensor
 
 from skipgs_plug.fallback_raster import near_first, rasterization, rendering, set_num_threads
 from skipgs_plug.fallback_raster.constants import tiles
-from skipgs_plug.fallback_raster.launch import get_num_threads
 from skipgs_plug.fallback_raster.shortcuts import without_shortcuts
 from skipgs_plug.fallback_raster.splats import rasterize_splats
+from skipgs_plug.fallback_raster.threads import get_num_threads
 
 
 def rendered(scene: dict[str, Any], **options: Any) -> tuple[list[Tensor], list[Tensor]]:

@@ -14,7 +14,7 @@ import pytest
 import torch
 from raster_scenes import leaves, random_scene
 
-from skipgs_plug.fallback_raster import binning, get_num_threads, l1_ssim_loss, launch, rasterization, set_num_threads
+from skipgs_plug.fallback_raster import binning, get_num_threads, l1_ssim_loss, rasterization, set_num_threads, threads
 from skipgs_plug.fallback_raster.adam import adam_rows
 from skipgs_plug.fallback_raster.cache import load_or_rebuild, say_unwritable
 from skipgs_plug.files import WriteError
@@ -58,9 +58,9 @@ def test_an_exception_waits_for_the_other_threads(two_threads: None) -> None:
         done.append(True)
 
     with pytest.raises(KeyboardInterrupt):
-        launch._on_all_threads(work)
+        threads.on_all_threads(work)
     assert done
-    launch._on_all_threads(lambda: done.append(True))  # the pool still works
+    threads.on_all_threads(lambda: done.append(True))  # the pool still works
     assert len(done) >= 2
 
 
@@ -94,18 +94,18 @@ assert torch.equal(once(), truth)
 
 
 INTERRUPTED_START = """
-import threading, torch
+import _thread
 from raster_scenes import random_scene
 from skipgs_plug.fallback_raster import rasterization, set_num_threads
 
 set_num_threads(3)
-start, interrupts = threading.Thread.start, []
-def interrupted_start(thread):
-    start(thread)
-    if not interrupts and threading.current_thread() is threading.main_thread():
-        interrupts.append(thread)
+start, interrupts = _thread.start_new_thread, []
+def interrupted_start(*arguments):
+    start(*arguments)
+    if not interrupts:
+        interrupts.append(True)
         raise KeyboardInterrupt
-threading.Thread.start = interrupted_start
+_thread.start_new_thread = interrupted_start
 try:
     rasterization(**random_scene(n=4000, width=200, height=150))
 except KeyboardInterrupt:

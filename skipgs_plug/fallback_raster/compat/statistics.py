@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from ..binning import bin_gaussians
+from ..buffers import floats, ints, zeros
 from ..constants import tiles
-from ..launch import FloatArray, IntArray, floats, ints, worker, zeros
+from ..launch import FloatArray, IntArray, worker
 from ..source import read_kernel
 
 SUMS = 8  # of a (tile, Gaussian) pair, six of them used
