@@ -111,18 +111,18 @@ class SkipGate:
         scheduler, is yours to advance by number.
 
         Args:
-            numbers: All iterations, one by one.
+            numbers: All iterations of the run, or all that are left, one by one.
             always: Iterations that must run, instead of those read from the loop.
             views: Keys of all training views; `refine_share="auto"` must know them.
 
         Raises:
-            SkipGSError: The numbers do not go up by one, or a condition of the loop cannot be foreseen.
+            SkipGSError: The numbers do not go up by one, or go on after those of an earlier call, or a condition of the
+                loop cannot be foreseen.
         """
         if not isinstance(numbers, range) or numbers.step != 1:
             raise SkipGSError("iterations() takes a range that goes up by one, such as range(30_000).")
         engine = self._engine
-        if numbers:
-            engine.compensate_until(numbers[-1])
+        engine.compensate(numbers)
         if engine.refinement is None:
             return LoopRange(numbers, EVERY)
         source = None

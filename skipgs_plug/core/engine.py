@@ -20,6 +20,7 @@ from skipgs_plug.core.nonfinite import NonFiniteGuard
 from skipgs_plug.core.optimizers import OptimizerSteps
 from skipgs_plug.core.policy import Policy, SkipPolicy
 from skipgs_plug.core.refinement.compensation import Compensation
+from skipgs_plug.core.refinement.loop_range import require_planned
 from skipgs_plug.core.refinement.policy import RefinementPolicy
 from skipgs_plug.core.refinement.rates import Named, Optimizers
 from skipgs_plug.core.refinement.refinement import Refinement
@@ -124,7 +125,7 @@ class Engine:
             else:
                 self.policy = RefinementPolicy(config, self.refinement)
         if facts.max_steps is not None:
-            self.compensate_until(facts.max_steps)
+            self.compensate(range(facts.max_steps + 1))
         if self._pending_state is not None:
             self.load_state_dict(self._pending_state)
 
@@ -140,10 +141,18 @@ class Engine:
         if self.refinement is not None:
             self.refinement.named = named
 
-    def compensate_until(self, last: int) -> None:
-        """Scale learning rates for the paper's gate, if that was asked for; `last` is the run's last iteration."""
-        if self.config.compensates and self.refinement is None and self.compensation is None:
-            self.compensation = Compensation(self.config, self.start, last, self._optimizers, self._named)
+    def compensate(self, numbers: range) -> None:
+        """Scale learning rates for the paper's gate, if that was asked for; `numbers` are the run's iterations.
+
+        Raises:
+            SkipGSError: They go on after the end that was given before.
+        """
+        if not numbers or not self.config.compensates or self.refinement is not None:
+            return
+        if self.compensation is not None:
+            require_planned(numbers, self.compensation.last)
+            return
+        self.compensation = Compensation(self.config, self.start, numbers[-1], self._optimizers, self._named)
 
     def release(self) -> None:
         """Let go of loops and optimizers; counts stay readable."""

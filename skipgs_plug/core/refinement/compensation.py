@@ -14,13 +14,16 @@ class Compensation:
         start: First gated iteration.
         last: Last iteration of the run.
         optimizers: As for `ScaledRates`, and the next.
+
+    Attributes:
+        last: iteration after which steps have no length.
     """
 
     def __init__(
         self, config: SkipConfig, start: int, last: int, optimizers: Optimizers | None, named: Named | None
     ) -> None:
         self._peak = config.rate_peak
-        self._start, self._end = start, last + 1
+        self._start, self.last = start, last
         self._rates = ScaledRates(optimizers, named)
 
     def heartbeat(self, step: int, floor: float | None) -> None:
@@ -29,7 +32,8 @@ class Compensation:
         if step < self._start:
             self._rates.factor = None
             return
-        progress = (step - self._start) / max(self._end - self._start, 1)
+        # A trainer may go on after the end that it told: with steps of length 0.
+        progress = min((step - self._start) / max(self.last + 1 - self._start, 1), 1.0)
         self._rates.factor = path_factor(1.0 if floor is None else floor, progress, self._peak)
 
     def remove(self) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from types import CodeType
 from typing import Any, Protocol
 
+from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.intercept import Patches
 
 
@@ -70,6 +71,15 @@ class LoopRange:
 
     def __repr__(self) -> str:
         return repr(self.numbers)
+
+
+def require_planned(numbers: range, last: int) -> None:
+    """Raise SkipGSError when a loop goes on after the iteration at which steps have shrunk to nothing."""
+    if numbers and numbers[-1] > last:
+        raise SkipGSError(
+            f"Iterations up to {numbers[-1]} come after a plan that ends with {last}; "
+            "give gate.iterations() all iterations of the run at once."
+        )
 
 
 class _Every:

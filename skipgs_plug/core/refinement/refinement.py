@@ -9,7 +9,7 @@ from typing import Any
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.refinement.foresight import CYCLE_ENDS, ONE_CYCLE, Foresight, needed_share, watched_views
-from skipgs_plug.core.refinement.loop_range import LoopRange, line_of
+from skipgs_plug.core.refinement.loop_range import LoopRange, line_of, require_planned
 from skipgs_plug.core.refinement.milestones import milestones
 from skipgs_plug.core.refinement.rates import Named, Optimizers, ScaledRates, path_factor
 from skipgs_plug.core.refinement.thinning import Thinning
@@ -118,7 +118,13 @@ class Refinement:
         return None if self._driver is None else self._driver.current
 
     def follow(self, loop: LoopRange) -> LoopRange:
-        """Take this loop for the one that trains."""
+        """Take this loop for the one that trains.
+
+        Raises:
+            SkipGSError: It goes on after the end that was planned for.
+        """
+        if self._begun and self._last is not None:
+            require_planned(loop.numbers, self._last)
         self._driver = loop
         return loop
 
@@ -192,9 +198,10 @@ class Refinement:
             self._recovery, self._recovered = max(n_views, RECOVERY) if pause is None else pause, 0
 
     def _begin(self, loop: LoopRange, number: int) -> None:
-        numbers = range(number, loop.numbers.stop)
         if self._first is None:
             self._first = number
+        # Of a run that goes on, those behind it too: conditions are judged by how often they hold.
+        numbers = range(self._first, loop.numbers.stop)
         self._begun = True
         found = {}
         if loop.source is not None:
@@ -226,7 +233,7 @@ class Refinement:
         log.info(
             "Refinement: at most %.0f %% of iterations %d to %d run, %d of them in any case.",
             100 * (self.share or 1.0),
-            number,
+            self._first,
             self._last,
             len(self._must),
         )

@@ -124,6 +124,26 @@ def test_interrupted_and_resumed_goes_as_uninterrupted(settings):
     assert torch.equal(second.value, whole.value)
 
 
+def test_a_condition_that_holds_half_the_time_says_the_same_after_a_resume():
+    def train(first, state=None):
+        ran, states = [], {}
+        with SkipGate(start_iter=1, refine_share=0.3) as gate:
+            if state is not None:
+                gate.load_state_dict(state)
+            for step in gate.iterations(range(first, 41)):
+                gate.backward(torch.ones((), requires_grad=True) * 0.1, view="a", step=step)
+                ran.append(step)
+                states[step] = gate.state_dict()
+                if step % 2 == 0:
+                    pass
+        return ran, states, gate.report()["always_run"]
+
+    whole, states, always = train(0)
+    for step in (7, 11, 20):
+        rest, _, again = train(step + 1, states[step])
+        assert rest == [n for n in whole if n > step] and list(again.values()) == list(always.values())
+
+
 def first_part(loop, gate, middle, options):
     """Train up to `middle`, giving the gate's state at the end of each iteration."""
     for step in gate.iterations(range(loop.begin, loop.end), always=range(0, 400, 25), **options):
@@ -193,6 +213,29 @@ def test_the_gate_makes_up_for_skipped_backwards_when_asked():
     with SkipGate(start_iter=40, compensate=True, min_bwd_ratio=0.5, warmup=0) as gate:
         loop.train(gate)
     assert loop.ran == list(range(400)) and factors[40] == pytest.approx(4.0) and factors[-1] < 0.1
+
+
+@pytest.mark.parametrize("settings", [{"refine_share": 0.5}, {"compensate": True}])
+def test_iterations_that_come_after_the_last_one_are_refused(settings):
+    with SkipGate(start_iter=4, **settings) as gate:
+        for step in gate.iterations(range(10)):
+            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
+        with pytest.raises(SkipGSError, match=r"up to 19 come after a plan that ends with 9; give gate\.iterations"):
+            gate.iterations(range(10, 20))
+        assert gate.iterations(range(5, 10)) and gate.iterations(range(0)) is not None
+
+
+def test_a_trainer_that_goes_on_after_its_end_is_not_trained_backwards():
+    value = torch.nn.Parameter(torch.zeros(2))
+    optimizer = torch.optim.SGD([value], lr=1.0)
+    with SkipGate(start_iter=0, compensate=True, warmup=100) as gate:
+        gate.iterations(range(10))
+        for step in range(20):
+            before = value.detach().clone()
+            gate.backward((value * 1.0).sum(), view="a", step=step)
+            optimizer.step()
+            optimizer.zero_grad()
+            assert bool((value < before).all()) if step < 10 else torch.equal(value, before)
 
 
 def test_unfit_numbers_and_settings_are_refused():
