@@ -272,6 +272,7 @@ class Engine:
         accumulator = self.steps.accumulator
         state = gate_state(state)
         if is_release_state(state):
+            self._load_refinement(None)
             self._refuse_other_scene(state["view_loss_ema"])
             self.policy.load_state_dict(state)
             self.stats.load_release_state(state)
@@ -287,7 +288,8 @@ class Engine:
             self._guard.in_a_row = state["non_finite_in_a_row"]
             self.clock.load_state_dict(state["clock"])
             step = state["step"]
-        self._scene_check.start()
+        if self.refinement is None or not self.stats.events:  # where nothing pauses, means lag behind a change for long
+            self._scene_check.start()
         self.iteration.begin(step)
 
     def _go_on_from_saved(self, step: int) -> None:
@@ -331,9 +333,12 @@ class Engine:
         self._guard.in_a_row = 0
         if self._must_run is not None and self._must_run(step):
             return decision.FORCED
-        if self._scene_check.running:
-            self._scene_check.see(loss, self.mean(view), step)
-        return self.policy.decide(view, loss, step)
+        mean = self.mean(view) if self._scene_check.running else None
+        answer = self.policy.decide(view, loss, step)
+        if answer is decision.PAUSE:
+            self._scene_check.stop()  # means are from before the change
+        self._scene_check.see(loss, mean, step)
+        return answer
 
     def _refuse_other_scene(self, views: Iterable[Any]) -> None:
         if self._view_names is None:
