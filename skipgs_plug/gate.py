@@ -19,7 +19,7 @@ from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Adapter, Hooks
 from skipgs_plug.core.optimizers import listed
 from skipgs_plug.core.policy import Policy
-from skipgs_plug.core.refinement.loop_range import EVERY, LoopRange
+from skipgs_plug.core.refinement.loop_range import Every, LoopRange
 from skipgs_plug.core.report import build_report, counters, summarise
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.views import view_key
@@ -124,7 +124,7 @@ class SkipGate:
         engine = self._engine
         engine.compensate(numbers)
         if engine.refinement is None:
-            return LoopRange(numbers, EVERY)
+            return LoopRange(numbers, Every(engine.rates.rest))
         source = None
         if always is None:
             frame = sys._getframe(1)

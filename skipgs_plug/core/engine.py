@@ -22,7 +22,7 @@ from skipgs_plug.core.policy import Policy, SkipPolicy
 from skipgs_plug.core.refinement.compensation import Compensation
 from skipgs_plug.core.refinement.loop_range import require_planned
 from skipgs_plug.core.refinement.policy import RefinementPolicy
-from skipgs_plug.core.refinement.rates import Named, Optimizers
+from skipgs_plug.core.refinement.rates import ScaledRates
 from skipgs_plug.core.refinement.refinement import Refinement
 from skipgs_plug.core.scene_check import SceneCheck
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, require_state
@@ -50,6 +50,7 @@ class Engine:
         start: first iteration that may be skipped.
         iteration: what is known of the present iteration.
         stats, clock, steps: counts, seconds, optimizer steps.
+        rates: scales learning rates, for one of the next two.
         refinement: leaves out whole iterations; None without `refine_share`.
         compensation: scales learning rates for skipped backwards; None unless asked for.
         trace: rows of gated decisions; None when they are not recorded.
@@ -70,12 +71,11 @@ class Engine:
         self.stats = GateStats()
         self.clock = GateClock()
         self.steps = OptimizerSteps(config, self.iteration)
+        self.rates = ScaledRates()
         self.refinement: Refinement | None = None
         if config.enabled and config.refine_share is not None:
-            self.refinement = Refinement(config, self._go_on_from_saved)
+            self.refinement = Refinement(config, self.rates, self._go_on_from_saved)
         self.compensation: Compensation | None = None
-        self._optimizers: Optimizers | None = None
-        self._named: Named | None = None
         self.trace: list[TraceRow] | None = [] if record_trace else None
         self._guard = NonFiniteGuard(config.on_nonfinite)
         self._must_run = must_run
@@ -129,18 +129,6 @@ class Engine:
         if self._pending_state is not None:
             self.load_state_dict(self._pending_state)
 
-    def scale_only(self, optimizers: Optimizers) -> None:
-        """Scale the learning rates of these optimizers only: others may step in this thread too."""
-        self._optimizers = optimizers
-        if self.refinement is not None:
-            self.refinement.optimizers = optimizers
-
-    def name_optimizers(self, named: Named) -> None:
-        """Tell parameters apart by the trainer's names of optimizers, whose groups have none."""
-        self._named = named
-        if self.refinement is not None:
-            self.refinement.named = named
-
     def compensate(self, numbers: range) -> None:
         """Scale learning rates for the paper's gate, if that was asked for; `numbers` are the run's iterations.
 
@@ -152,13 +140,13 @@ class Engine:
         if self.compensation is not None:
             require_planned(numbers, self.compensation.last)
             return
-        self.compensation = Compensation(self.config, self.start, numbers[-1], self._optimizers, self._named)
+        self.compensation = Compensation(self.config, self.start, numbers[-1], self.rates)
 
     def release(self) -> None:
         """Let go of loops and optimizers; counts stay readable."""
-        for holder in (self.refinement, self.compensation):
-            if holder is not None:
-                holder.remove()
+        if self.refinement is not None:
+            self.refinement.remove()
+        self.rates.remove()
 
     @property
     def active(self) -> bool:

@@ -246,6 +246,22 @@ class Endless(Toy):
         hooks.ready(TrainerFacts(None))
 
 
+def test_facts_that_come_late_and_are_refused_leave_nothing_behind() -> None:
+    class Late(Toy):
+        hurried = True
+
+        def attach(self, hooks) -> None:
+            hooks.before(self.trainer, "begin", lambda step: hooks.ready(TrainerFacts(None)))
+            hooks.gate_tensor_backward("train")
+
+    trainer = ToyTrainer()
+    gate = SkipGate(trainer, adapter=Late(trainer))
+    with pytest.raises(SkipGSError, match="start_iter"):
+        trainer.train()
+    assert gate.patched == []
+    assert plain(trainer)
+
+
 def test_two_views_of_one_name_are_refused() -> None:
     class Twins(Toy):
         hurried = True

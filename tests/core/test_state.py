@@ -142,8 +142,7 @@ def test_ambiguous_view_keys_are_refused() -> None:
 def resumed(
     factor: float, *, before: bool = False, event: bool = False, share: float | None = None, steps: int = 40
 ) -> SkipGate:
-    """A gate that learnt means of 1 and goes on with losses of `factor`; an event came right before it was saved or after
-    that."""
+    """A gate that learnt means of 1 and goes on with losses of `factor`; with an event before it is saved or after."""
     settings: dict = {"start_iter": 0, "warmup": 2, "refine_share": share}
     first = SkipGate(**settings)
     for step in range(20):

@@ -113,7 +113,8 @@ def test_scaled_rates_reach_missed_steps() -> None:
     try:
 
         def before(step: int, lazy: LazyAdam, rows: Tensor) -> None:
-            scaled.factor = None if step < 50 else 10.0 * (1 - step / 200)
+            if step >= 50:
+                scaled.scale(10.0 * (1 - step / 200))
 
         lazy, dense = train(SHAPES[0], 200, 0.1, before=before)
     finally:

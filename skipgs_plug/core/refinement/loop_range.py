@@ -7,7 +7,7 @@ import functools
 import inspect
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import CodeType
 from typing import Any, Protocol
 
@@ -29,6 +29,10 @@ class Owner(Protocol):
 
     def expected(self, loop: LoopRange) -> int:
         """How many numbers the loop will run, as far as is known."""
+        ...
+
+    def ended(self, loop: LoopRange) -> None:
+        """The loop is over, or was left."""
         ...
 
 
@@ -56,6 +60,7 @@ class LoopRange:
                     yield number
         finally:
             self.current = None
+            self._owner.ended(self)
 
     def __len__(self) -> int:
         return self._owner.expected(self)
@@ -82,10 +87,13 @@ def require_planned(numbers: range, last: int) -> None:
         )
 
 
-class _Every:
-    """Owner of a loop that runs all its numbers."""
+class Every:
+    """Owner of a loop that runs all its numbers; `at_end` is called when it is over, or was left."""
 
     wants_loop = False
+
+    def __init__(self, at_end: Callable[[], None]) -> None:
+        self._at_end = at_end
 
     def runs(self, loop: LoopRange, number: int) -> bool:
         return True
@@ -93,8 +101,8 @@ class _Every:
     def expected(self, loop: LoopRange) -> int:
         return len(loop.numbers)
 
-
-EVERY = _Every()
+    def ended(self, loop: LoopRange) -> None:
+        self._at_end()
 
 
 def replace_range(patches: Patches, names: dict[str, Any], functions: tuple[str, ...], owner: Owner) -> None:

@@ -11,7 +11,7 @@ from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.refinement.foresight import CYCLE_ENDS, ONE_CYCLE, Foresight, needed_share, watched_views
 from skipgs_plug.core.refinement.loop_range import LoopRange, line_of, require_planned
 from skipgs_plug.core.refinement.milestones import milestones
-from skipgs_plug.core.refinement.rates import Named, Optimizers, ScaledRates, path_factor
+from skipgs_plug.core.refinement.rates import ScaledRates, path_factor
 from skipgs_plug.core.refinement.thinning import Thinning
 
 log = logging.getLogger(__name__)
@@ -36,6 +36,7 @@ class Refinement:
 
     Args:
         config: With `refine_share`.
+        rates: What scales.
         go_on: Loads the state that belongs to what training goes on from with an iteration, if there is one.
 
     Attributes:
@@ -45,12 +46,11 @@ class Refinement:
         always: numbers that must run, by the reason.
         watched: views that are watched and not trained on while `foresight` says so.
         gap: iterations left out right before the present one.
-        optimizers: gives those whose rates are scaled; None for all that step.
-        named: gives the trainer's names of optimizers; None where their groups have names.
     """
 
-    def __init__(self, config: SkipConfig, go_on: Callable[[int], None]) -> None:
+    def __init__(self, config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None]) -> None:
         self._config = config
+        self._rates = rates
         self._go_on = go_on
         self.share: float | None = None if config.refine_share == "auto" else config.refine_share  # type: ignore[assignment]
         self.thinning = Thinning(1.0)
@@ -58,9 +58,6 @@ class Refinement:
         self.always: dict[str, set[int]] = {}
         self.watched: frozenset[str] = frozenset()
         self.gap = self._left_out = 0
-        self.optimizers: Optimizers | None = None
-        self.named: Named | None = None
-        self._rates: ScaledRates | None = None
         self._start = 0
         self._last: int | None = None
         self._views: list[str] | None = None
@@ -99,11 +96,8 @@ class Refinement:
         self._hidden, self._pure = always, tuple(pure)
 
     def remove(self) -> None:
-        """Let go of the optimizers."""
+        """Let go of the loop, which runs all its numbers from now on."""
         self._removed = True
-        if self._rates is not None:
-            self._rates.remove()
-            self._rates = None
 
     # What the loop asks.
 
@@ -179,6 +173,11 @@ class Refinement:
         before = len(range(numbers.start, min(max(self._start, numbers.start), numbers.stop)))
         return before + round((len(numbers) - before) * (self.share or 1.0))
 
+    def ended(self, loop: LoopRange) -> None:
+        """The loop is over, or was left: whatever steps afterwards is no part of it."""
+        if loop is self._driver:
+            self._rates.rest()
+
     # Refinement.
 
     @property
@@ -225,11 +224,8 @@ class Refinement:
             self.watched = watched_views(self._views)
         if not self._scales:
             self.thinning.share = self.share
-        else:
-            if self.foresight is None:
-                self.foresight = Foresight(self._config.tolerance, CYCLE_ENDS if self.watched else ONE_CYCLE)
-            if self._rates is None:
-                self._rates = ScaledRates(self.optimizers, self.named)
+        elif self.foresight is None:
+            self.foresight = Foresight(self._config.tolerance, CYCLE_ENDS if self.watched else ONE_CYCLE)
         log.info(
             "Refinement: at most %.0f %% of iterations %d to %d run, %d of them in any case.",
             100 * (self.share or 1.0),
@@ -263,9 +259,8 @@ class Refinement:
                 self._over = self.foresight.ended
                 self.thinning.share = 0.0 if self._over else 1.0
             factor = path_factor(self.share, progress, self._config.rate_peak)
-        if self._rates is not None:
-            self._rates.follow_thread()
-            self._rates.factor = factor
+        if self._scales:
+            self._rates.scale(factor)
 
     # State and report.
 

@@ -27,6 +27,9 @@ class Every3rd:
     def expected(self, loop):
         return sum(number % 3 == 0 for number in loop.numbers)
 
+    def ended(self, loop):
+        assert loop.current is None
+
 
 def moved_on_by_hand(end):
     bar = Bar(

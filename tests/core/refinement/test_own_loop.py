@@ -225,6 +225,22 @@ def test_iterations_that_come_after_the_last_one_are_refused(settings):
         assert gate.iterations(range(5, 10)) and gate.iterations(range(0)) is not None
 
 
+@pytest.mark.parametrize("settings", [{"refine_share": 0.5}, {"compensate": True}])
+@pytest.mark.parametrize("leaves", [False, True])
+def test_what_steps_after_the_loop_is_left_alone(settings, leaves):
+    gate = SkipGate(start_iter=4, **settings)  # never detached
+    for step in gate.iterations(range(20), always=range(20)):
+        gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
+        if leaves and step == 10:
+            break
+    value = torch.nn.Parameter(torch.zeros(2))
+    optimizer = torch.optim.SGD([value], lr=0.5)
+    value.grad = torch.ones(2)
+    optimizer.step()
+    gate.detach()
+    assert value.tolist() == [-0.5, -0.5]
+
+
 def test_a_trainer_that_goes_on_after_its_end_is_not_trained_backwards():
     value = torch.nn.Parameter(torch.zeros(2))
     optimizer = torch.optim.SGD([value], lr=1.0)
