@@ -373,6 +373,7 @@ class SkipGate:
         if kept:
             torch.stack(kept).sum().backward()
             self._iteration.ran = True
+        self._engine.clock.mark()
         return bool(kept)
 
     def _new_in_iteration(self, view: Any) -> str:
