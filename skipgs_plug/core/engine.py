@@ -267,9 +267,9 @@ class Engine:
             accumulator.load_release_state(state)
             step = None
         else:
+            self._refuse_other_scene(state["stats"]["views"])
             if not pending:
                 self._load_refinement(state["refinement"])
-            self._refuse_other_scene(state["stats"]["views"])
             self.policy.load_state_dict(state["policy"])
             self.stats.load_state_dict(state["stats"])
             accumulator.load_state_dict(state["accumulator"])
