@@ -197,7 +197,7 @@ def bin_gaussians(
     covered = before + pairs
     if covered > MAX_PAIRS:
         raise ValueError(
-            f"{n:,} visible Gaussians cover {covered:,} tiles of an image of {width}x{height} pixels in all, and at most "
+            f"{n:,} visible Gaussians cover {covered:,} tiles of an image of {width}x{height} pixels in all, at most "
             f"{MAX_PAIRS:,} can be listed: render a smaller image, or fewer or smaller Gaussians."
         )
     pair_row, unsorted = ints(pairs), longs(pairs)
