@@ -116,8 +116,6 @@ class Engine:
         if config.enabled and facts.max_steps is not None and self.start > facts.max_steps:
             log.warning("The gate starts at %d, after the last iteration %d.", self.start, facts.max_steps)
         if self.refinement is not None:
-            if config.refine_share == "auto":
-                distributed.refuse_several("refine_share='auto' decides by the losses of one process")
             self.refinement.configure(self.start, facts.max_steps, self._view_names, facts.accumulates)
         if self.policy is None:
             if self.refinement is None:
@@ -133,13 +131,18 @@ class Engine:
         """Scale learning rates for the paper's gate, if that was asked for; `numbers` are the run's iterations.
 
         Raises:
-            SkipGSError: They go on after the end that was given before.
+            SkipGSError: They go on after the end that was given before, or processes would scale differently.
         """
         if not numbers or not self.config.compensates or self.refinement is not None:
             return
         if self.compensation is not None:
             require_planned(numbers, self.compensation.last)
             return
+        if self.config.min_bwd_ratio == "auto":
+            distributed.refuse_several(
+                "compensate=True scales learning rates by a floor that each process finds by itself",
+                "give min_bwd_ratio, such as 0.5",
+            )
         self.compensation = Compensation(self.config, self.start, numbers[-1], self.rates)
 
     def release(self) -> None:

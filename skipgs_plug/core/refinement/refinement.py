@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.refinement.foresight import CYCLE_ENDS, ONE_CYCLE, Foresight, needed_share, watched_views
@@ -84,7 +85,11 @@ class Refinement:
             last: Last iteration of the run; None where the loop's range says it.
             views: Keys of all training views, when they are known.
             keeps_rates: Leave learning rates alone: the trainer takes as many steps as before.
+
+        Raises:
+            SkipGSError: Processes would find different ends.
         """
+        self._refuse_several()
         self._start, self._last, self._views, self._keeps_rates = start, last, views, keeps_rates
 
     def know_views(self, views: list[str]) -> None:
@@ -115,8 +120,9 @@ class Refinement:
         """Take this loop for the one that trains.
 
         Raises:
-            SkipGSError: It goes on after the end that was planned for.
+            SkipGSError: It goes on after the end that was planned for, or processes would find different ends.
         """
+        self._refuse_several()
         if self._begun and self._last is not None:
             require_planned(loop.numbers, self._last)
         self._driver = loop
@@ -243,6 +249,12 @@ class Refinement:
         if self._keeps_rates or not self._config.compensates:
             return False
         return self._config.rate_peak is not None or (self.share is not None and self.share < 1.0)
+
+    def _refuse_several(self) -> None:
+        if self._auto:
+            distributed.refuse_several(
+                "refine_share='auto' decides by the losses of one process", "give a share, such as 0.4"
+            )
 
     def _set_pace(self, number: int) -> None:
         """Set the share and the factor with which this number is decided on."""

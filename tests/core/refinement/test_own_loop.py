@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.core import distributed
 from skipgs_plug.core.refinement.rates import path_factor
 
 VIEWS = [f"{i}.png" for i in range(4)]
@@ -200,6 +201,17 @@ def test_auto_runs_the_whole_share_where_views_are_too_few_to_watch():
 def test_auto_must_know_the_views():
     with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match="give views="):
         Loop().train(gate)
+
+
+def test_what_each_process_would_find_by_itself_is_refused_in_a_group(monkeypatch):
+    auto, larger = SkipGate(start_iter=10, refine_share="auto"), SkipGate(start_iter=10, compensate=True)
+    monkeypatch.setattr(distributed, "group_size", lambda: 2)  # the group may come after the gate
+    with auto, pytest.raises(SkipGSError, match=r"of one process, but 2 train together; give a share"):
+        Loop().train(auto, views=VIEWS)
+    with larger, pytest.raises(SkipGSError, match=r"by itself, but 2 train together; give min_bwd_ratio"):
+        larger.iterations(range(100))
+    with SkipGate(start_iter=10, compensate=True, min_bwd_ratio=0.5) as gate:
+        assert len(gate.iterations(range(100))) == 100
 
 
 def test_the_gate_makes_up_for_skipped_backwards_when_asked():
