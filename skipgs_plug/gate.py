@@ -112,7 +112,7 @@ class SkipGate:
 
         Args:
             numbers: All iterations of the run, or all that are left, one by one.
-            always: Iterations that must run, instead of those read from the loop.
+            always: Iterations that must run, instead of those read from the loop; what an adapter knows comes on top.
             views: Keys of all training views; `refine_share="auto"` must know them.
 
         Raises:
@@ -129,9 +129,7 @@ class SkipGate:
         if always is None:
             frame = sys._getframe(1)
             source = (frame.f_code, {**frame.f_globals, **frame.f_locals})
-        else:
-            chosen = set(always)
-            engine.refinement.describe(lambda left: chosen)
+        engine.refinement.choose(always or ())
         if views is not None:
             engine.refinement.know_views([view_key(view) for view in views])
         return engine.refinement.follow(LoopRange(numbers, engine.refinement, source))

@@ -296,6 +296,25 @@ def test_training_anew_with_one_gate_is_refused() -> None:
             trainer.train()
 
 
+def test_what_the_adapter_knows_of_numbers_holds_beside_what_the_user_chose() -> None:
+    class Knowing(Toy):
+        def attach(self, hooks) -> None:
+            super().attach(hooks)
+            hooks.always(lambda numbers: (n for n in numbers if n % 30 == 29))
+
+    trainer, ran = ToyTrainer(), []
+
+    def train(steps) -> None:
+        for step in steps:
+            trainer.begin(step)
+            ran.append(step)
+            (trainer.render("v0") ** 2).mean().backward()
+
+    with SkipGate(trainer, adapter=Knowing(trainer), refine_share=0.1) as gate:
+        train(gate.iterations(range(100), always=[70]))
+    assert ran == [*range(28), 29, 59, 70, 89, 99]
+
+
 def test_accumulation_holds_back_the_trainers_own_steps() -> None:
     trainer = ToyTrainer(60)
     steps = []

@@ -64,6 +64,7 @@ class Refinement:
         self._views: list[str] | None = None
         self._keeps_rates = False
         self._hidden: Always = nothing_always
+        self._chosen: frozenset[int] = frozenset()
         self._pure: tuple[str, ...] = ()
         self._driver: LoopRange | None = None
         self._loops: list[LoopRange] = []
@@ -99,6 +100,10 @@ class Refinement:
     def describe(self, always: Always = nothing_always, pure: Iterable[str] = ()) -> None:
         """Take what cannot be read off the loop: hidden numbers, and functions that only look at numbers."""
         self._hidden, self._pure = always, tuple(pure)
+
+    def choose(self, always: Iterable[int]) -> None:
+        """Take the numbers that the user wants to run beside hidden ones."""
+        self._chosen = frozenset(always)
 
     def remove(self) -> None:
         """Let go of the loop, which runs all its numbers from now on."""
@@ -213,7 +218,7 @@ class Refinement:
             code, names = loop.source
             found = milestones(code, line_of(code), numbers, names, self._pure)
             loop.source = None
-        hidden = {n for n in self._hidden(numbers) if n in numbers}
+        hidden = {n for n in (*self._hidden(numbers), *self._chosen) if n in numbers}
         if hidden:
             found["named for this trainer"] = hidden
         self.always = found
