@@ -25,10 +25,10 @@ class Compensation:
         self._rates = rates
 
     def heartbeat(self, step: int, floor: float | None) -> None:
-        """Iteration `step` begins; `floor` is the least share of real backwards in force."""
+        """Iteration `step` begins; `floor` is the least share of real backwards in force, None or 0 without one."""
         if step < self._start:
             self._rates.rest()
             return
         # A trainer may go on after the end that it told: with steps of length 0.
         progress = min((step - self._start) / max(self.last + 1 - self._start, 1), 1.0)
-        self._rates.scale(path_factor(1.0 if floor is None else floor, progress, self._peak))
+        self._rates.scale(path_factor(floor or 1.0, progress, self._peak))

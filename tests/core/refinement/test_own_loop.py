@@ -266,6 +266,17 @@ def test_a_trainer_that_goes_on_after_its_end_is_not_trained_backwards():
             assert bool((value < before).all()) if step < 10 else torch.equal(value, before)
 
 
+def test_without_a_floor_steps_are_as_long_as_if_all_backwards_ran():
+    value = torch.nn.Parameter(torch.zeros(2))
+    optimizer = torch.optim.SGD([value], lr=0.5)
+    with SkipGate(start_iter=0, compensate=True, min_bwd_ratio=0.0, warmup=5) as gate:
+        for step in gate.iterations(range(10)):
+            gate.backward(value.sum(), view="a", step=step)
+            before, value.grad = value[0].item(), torch.ones(2)
+            optimizer.step()
+            assert before - value[0].item() == pytest.approx(0.5 * path_factor(1.0, step / 10))
+
+
 def test_unfit_numbers_and_settings_are_refused():
     with pytest.raises(SkipGSError, match=r"takes a range that goes up by one"):
         SkipGate(start_iter=1).iterations(range(0, 10, 2))
