@@ -65,6 +65,13 @@ class LoopRange:
     def __len__(self) -> int:
         return self._owner.expected(self)
 
+    # Python would ask for the length.
+    def __bool__(self) -> bool:
+        return bool(self.numbers)
+
+    def __reversed__(self) -> Iterator[int]:
+        return reversed(self.numbers)
+
     def __contains__(self, number: object) -> bool:
         return number in self.numbers
 
