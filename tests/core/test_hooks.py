@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from always import Always
+from torch.optim import lr_scheduler as schedulers
 
 from skipgs_plug import AdapterMismatchError, GateOrderError, SkipGate, SkipGSError, UnknownTrainerError
 from skipgs_plug.adapters import AbstractAdapter, TrainerFacts
+from skipgs_plug.adapters.schedulers import catch_up_schedulers
 
 
 class ToyTrainer:
@@ -313,6 +315,43 @@ def test_what_the_adapter_knows_of_numbers_holds_beside_what_the_user_chose() ->
     with SkipGate(trainer, adapter=Knowing(trainer), refine_share=0.1) as gate:
         train(gate.iterations(range(100), always=[70]))
     assert ran == [*range(28), 29, 59, 70, 89, 99]
+
+
+SCHEDULERS = {
+    "one": lambda optimizer: schedulers.ExponentialLR(optimizer, 0.99),
+    "chained": lambda optimizer: schedulers.ChainedScheduler(
+        [schedulers.LinearLR(optimizer, 0.1, total_iters=40), schedulers.ExponentialLR(optimizer, 0.99)]
+    ),
+    "one after the other": lambda optimizer: schedulers.SequentialLR(
+        optimizer,
+        [schedulers.LinearLR(optimizer, 0.1, total_iters=40), schedulers.ExponentialLR(optimizer, 0.99)],
+        milestones=[40],
+    ),
+    "with restarts": lambda optimizer: schedulers.CosineAnnealingWarmRestarts(optimizer, 30),
+}
+
+
+@pytest.mark.parametrize("kind", SCHEDULERS)
+def test_schedulers_that_count_calls_are_where_they_would_be_if_all_iterations_ran(kind) -> None:
+    class Scheduling(Toy):
+        def attach(self, hooks) -> None:
+            super().attach(hooks)
+            catch_up_schedulers(hooks, "train")
+
+    def train(trainer, steps) -> float:
+        scheduler = SCHEDULERS[kind](trainer.optimizer)
+        for step in steps:
+            trainer.begin(step)
+            (trainer.render("v0") ** 2).mean().backward()
+            trainer.optimizer.step()
+            scheduler.step()
+        return trainer.optimizer.param_groups[0]["lr"]
+
+    expected = train(ToyTrainer(), range(100))
+    trainer = ToyTrainer()
+    with SkipGate(trainer, adapter=Scheduling(trainer), refine_share=0.1) as gate:
+        assert train(trainer, gate.iterations(range(100), always=[70])) == pytest.approx(expected)
+    assert gate.stats()["iterations_skipped"] > 60
 
 
 def test_accumulation_holds_back_the_trainers_own_steps() -> None:
