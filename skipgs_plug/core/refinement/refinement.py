@@ -234,6 +234,11 @@ class Refinement:
         if self._auto and self._views is not None:
             self.watched = watched_views(self._views)
         if not self._scales:
+            if self.foresight is not None:
+                raise SkipGSError(
+                    "The gate state was saved with larger, shrinking steps, which are off now; go on with compensate as "
+                    "it was, or start the gate afresh."
+                )
             self.thinning.share = self.share
         elif self.foresight is None:
             self.foresight = Foresight(self._config.tolerance, CYCLE_ENDS if self.watched else ONE_CYCLE)

@@ -168,6 +168,18 @@ def test_a_state_of_another_share_is_refused():
             gate.load_state_dict(state)
 
 
+def test_a_state_with_larger_steps_does_not_go_on_without():
+    with SkipGate(start_iter=10, refine_share=0.4) as gate:
+        for step in gate.iterations(range(100), always=()):
+            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
+            if step == 20:
+                state = gate.state_dict()
+    with SkipGate(start_iter=10, refine_share=0.4, compensate=False) as gate:
+        gate.load_state_dict(state)
+        with pytest.raises(SkipGSError, match="saved with larger, shrinking steps, which are off now"):
+            next(iter(gate.iterations(range(21, 100), always=())))
+
+
 def test_auto_ends_where_nothing_is_gained_and_goes_on_with_what_hangs_on_numbers():
     ran = []
     with SkipGate(start_iter=100, refine_share="auto") as gate:
