@@ -19,7 +19,7 @@ from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Adapter, Hooks
 from skipgs_plug.core.optimizers import listed
 from skipgs_plug.core.policy import Policy
-from skipgs_plug.core.refinement.loop_range import EVERY, LoopRange
+from skipgs_plug.core.refinement.loop_range import Every, LoopRange
 from skipgs_plug.core.report import build_report, counters, summarise
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.views import view_key
@@ -111,27 +111,25 @@ class SkipGate:
         scheduler, is yours to advance by number.
 
         Args:
-            numbers: All iterations, one by one.
-            always: Iterations that must run, instead of those read from the loop.
+            numbers: All iterations of the run, or all that are left, one by one.
+            always: Iterations that must run, instead of those read from the loop; what an adapter knows comes on top.
             views: Keys of all training views; `refine_share="auto"` must know them.
 
         Raises:
-            SkipGSError: The numbers do not go up by one, or a condition of the loop cannot be foreseen.
+            SkipGSError: The numbers do not go up by one, or go on after those of an earlier call, or a condition of the
+                loop cannot be foreseen.
         """
         if not isinstance(numbers, range) or numbers.step != 1:
             raise SkipGSError("iterations() takes a range that goes up by one, such as range(30_000).")
         engine = self._engine
-        if numbers:
-            engine.compensate_until(numbers[-1])
+        engine.compensate(numbers)
         if engine.refinement is None:
-            return LoopRange(numbers, EVERY)
+            return LoopRange(numbers, Every(engine.rates.rest))
         source = None
         if always is None:
             frame = sys._getframe(1)
             source = (frame.f_code, {**frame.f_globals, **frame.f_locals})
-        else:
-            chosen = set(always)
-            engine.refinement.describe(lambda left: chosen)
+        engine.refinement.choose(always or ())
         if views is not None:
             engine.refinement.know_views([view_key(view) for view in views])
         return engine.refinement.follow(LoopRange(numbers, engine.refinement, source))
@@ -373,6 +371,7 @@ class SkipGate:
         if kept:
             torch.stack(kept).sum().backward()
             self._iteration.ran = True
+        self._engine.clock.mark()
         return bool(kept)
 
     def _new_in_iteration(self, view: Any) -> str:

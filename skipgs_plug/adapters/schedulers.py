@@ -6,15 +6,18 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from torch.optim.lr_scheduler import ChainedScheduler, LRScheduler
+from torch.optim.lr_scheduler import ChainedScheduler, CosineAnnealingWarmRestarts, LRScheduler, SequentialLR
 
 from skipgs_plug.core.hooks import Hooks
+
+# Those with a `step` of their own that counts its calls.
+COUNTING = (LRScheduler, ChainedScheduler, SequentialLR, CosineAnnealingWarmRestarts)
 
 
 def catch_up_schedulers(hooks: Hooks, caller: str) -> None:
     """Let every scheduler that the function `caller` steps be where it would be if all iterations ran."""
-    hooks.catch_up(LRScheduler, "step", caller)
-    hooks.catch_up(ChainedScheduler, "step", caller)
+    for kind in COUNTING:
+        hooks.catch_up(kind, "step", caller)
 
 
 def function_names(function: Callable[..., Any]) -> dict[str, Any]:

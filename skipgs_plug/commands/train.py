@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 from dataclasses import dataclass
@@ -84,7 +85,7 @@ def run(args: Args) -> int:
     gate = SkipGate(trainer, **settings) if args.gate or settings else None
     trainer.register_state("gate_settings", GateSettings(gate))
     curve = LossCurve(trainer)
-    with exclusive(folder.root):
+    with exclusive(folder.root), gate or contextlib.nullcontext():
         if folder.checkpoints() != found:
             raise InputError(f"Another process trained in {args.out} just now; give the command again.")
         folder.remove_leftovers()

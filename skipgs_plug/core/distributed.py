@@ -33,10 +33,10 @@ def refuse_unreachable_ranks(world_size: int | None = None) -> None:
         )
 
 
-def refuse_several(because: str) -> None:
+def refuse_several(because: str, instead: str) -> None:
     """Raise SkipGSError when several processes train together, for a reason given as half a sentence."""
     if group_size() > 1:
-        raise SkipGSError(f"{because}, but {group_size()} train together; give a share, such as 0.4.")
+        raise SkipGSError(f"{because}, but {group_size()} train together; {instead}.")
 
 
 def agree(own: Decision) -> Decision:

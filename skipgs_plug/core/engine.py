@@ -20,8 +20,9 @@ from skipgs_plug.core.nonfinite import NonFiniteGuard
 from skipgs_plug.core.optimizers import OptimizerSteps
 from skipgs_plug.core.policy import Policy, SkipPolicy
 from skipgs_plug.core.refinement.compensation import Compensation
+from skipgs_plug.core.refinement.loop_range import require_planned
 from skipgs_plug.core.refinement.policy import RefinementPolicy
-from skipgs_plug.core.refinement.rates import Named, Optimizers
+from skipgs_plug.core.refinement.rates import ScaledRates
 from skipgs_plug.core.refinement.refinement import Refinement
 from skipgs_plug.core.scene_check import SceneCheck
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, require_state
@@ -49,6 +50,7 @@ class Engine:
         start: first iteration that may be skipped.
         iteration: what is known of the present iteration.
         stats, clock, steps: counts, seconds, optimizer steps.
+        rates: scales learning rates, for one of the next two.
         refinement: leaves out whole iterations; None without `refine_share`.
         compensation: scales learning rates for skipped backwards; None unless asked for.
         trace: rows of gated decisions; None when they are not recorded.
@@ -69,12 +71,11 @@ class Engine:
         self.stats = GateStats()
         self.clock = GateClock()
         self.steps = OptimizerSteps(config, self.iteration)
+        self.rates = ScaledRates()
         self.refinement: Refinement | None = None
         if config.enabled and config.refine_share is not None:
-            self.refinement = Refinement(config, self._go_on_from_saved)
+            self.refinement = Refinement(config, self.rates, self._go_on_from_saved)
         self.compensation: Compensation | None = None
-        self._optimizers: Optimizers | None = None
-        self._named: Named | None = None
         self.trace: list[TraceRow] | None = [] if record_trace else None
         self._guard = NonFiniteGuard(config.on_nonfinite)
         self._must_run = must_run
@@ -115,8 +116,6 @@ class Engine:
         if config.enabled and facts.max_steps is not None and self.start > facts.max_steps:
             log.warning("The gate starts at %d, after the last iteration %d.", self.start, facts.max_steps)
         if self.refinement is not None:
-            if config.refine_share == "auto":
-                distributed.refuse_several("refine_share='auto' decides by the losses of one process")
             self.refinement.configure(self.start, facts.max_steps, self._view_names, facts.accumulates)
         if self.policy is None:
             if self.refinement is None:
@@ -124,32 +123,33 @@ class Engine:
             else:
                 self.policy = RefinementPolicy(config, self.refinement)
         if facts.max_steps is not None:
-            self.compensate_until(facts.max_steps)
+            self.compensate(range(facts.max_steps + 1))
         if self._pending_state is not None:
             self.load_state_dict(self._pending_state)
 
-    def scale_only(self, optimizers: Optimizers) -> None:
-        """Scale the learning rates of these optimizers only: others may step in this thread too."""
-        self._optimizers = optimizers
-        if self.refinement is not None:
-            self.refinement.optimizers = optimizers
+    def compensate(self, numbers: range) -> None:
+        """Scale learning rates for the paper's gate, if that was asked for; `numbers` are the run's iterations.
 
-    def name_optimizers(self, named: Named) -> None:
-        """Tell parameters apart by the trainer's names of optimizers, whose groups have none."""
-        self._named = named
-        if self.refinement is not None:
-            self.refinement.named = named
-
-    def compensate_until(self, last: int) -> None:
-        """Scale learning rates for the paper's gate, if that was asked for; `last` is the run's last iteration."""
-        if self.config.compensates and self.refinement is None and self.compensation is None:
-            self.compensation = Compensation(self.config, self.start, last, self._optimizers, self._named)
+        Raises:
+            SkipGSError: They go on after the end that was given before, or processes would scale differently.
+        """
+        if not numbers or not self.config.compensates or self.refinement is not None:
+            return
+        if self.compensation is not None:
+            require_planned(numbers, self.compensation.last)
+            return
+        if self.config.min_bwd_ratio == "auto":
+            distributed.refuse_several(
+                "compensate=True scales learning rates by a floor that each process finds by itself",
+                "give min_bwd_ratio, such as 0.5",
+            )
+        self.compensation = Compensation(self.config, self.start, numbers[-1], self.rates)
 
     def release(self) -> None:
         """Let go of loops and optimizers; counts stay readable."""
-        for holder in (self.refinement, self.compensation):
-            if holder is not None:
-                holder.remove()
+        if self.refinement is not None:
+            self.refinement.remove()
+        self.rates.remove()
 
     @property
     def active(self) -> bool:
@@ -263,22 +263,24 @@ class Engine:
         accumulator = self.steps.accumulator
         state = gate_state(state)
         if is_release_state(state):
+            self._load_refinement(None)
             self._refuse_other_scene(state["view_loss_ema"])
             self.policy.load_state_dict(state)
             self.stats.load_release_state(state)
             accumulator.load_release_state(state)
             step = None
         else:
+            self._refuse_other_scene(state["stats"]["views"])
             if not pending:
                 self._load_refinement(state["refinement"])
-            self._refuse_other_scene(state["stats"]["views"])
             self.policy.load_state_dict(state["policy"])
             self.stats.load_state_dict(state["stats"])
             accumulator.load_state_dict(state["accumulator"])
             self._guard.in_a_row = state["non_finite_in_a_row"]
             self.clock.load_state_dict(state["clock"])
             step = state["step"]
-        self._scene_check.start()
+        if self.refinement is None or not self.stats.events:  # where nothing pauses, means lag behind a change for long
+            self._scene_check.start()
         self.iteration.begin(step)
 
     def _go_on_from_saved(self, step: int) -> None:
@@ -322,9 +324,12 @@ class Engine:
         self._guard.in_a_row = 0
         if self._must_run is not None and self._must_run(step):
             return decision.FORCED
-        if self._scene_check.running:
-            self._scene_check.see(loss, self.mean(view), step)
-        return self.policy.decide(view, loss, step)
+        mean = self.mean(view) if self._scene_check.running else None
+        answer = self.policy.decide(view, loss, step)
+        if answer is decision.PAUSE:
+            self._scene_check.stop()  # means are from before the change
+        self._scene_check.see(loss, mean, step)
+        return answer
 
     def _refuse_other_scene(self, views: Iterable[Any]) -> None:
         if self._view_names is None:

@@ -70,10 +70,11 @@ class Hooks:
         Raises:
             SkipGSError: As `Engine.configure`.
         """
-        self._engine.configure(facts, self._given)
-        if self._engine.config.compensates:
-            self.on_detach("torch.optim.Optimizer.step (hooks)", self._engine.release)
-        self._ready = True
+        with self._detaching_on_error():
+            self._engine.configure(facts, self._given)
+            if self._engine.config.compensates:
+                self.on_detach("torch.optim.Optimizer.step (hooks)", self._engine.release)
+            self._ready = True
 
     # What the trainer does.
 
@@ -193,15 +194,18 @@ class Hooks:
             self._engine.refinement.describe(always)
 
     def optimizer_names(self, named: Named) -> None:
-        """`named` gives the trainer's optimizers by name, which tell parameters apart where groups have no names."""
-        self._engine.name_optimizers(named)
+        """`named` gives the trainer's optimizers by name, which tell parameters apart where groups have no names.
+
+        The learning rates of these are scaled, and of no others.
+        """
+        self._engine.rates.only = named
 
     def own_loop(self, owner: Any, name: str) -> None:
         """`owner.name(...)` gives the range that the training loop counts with, and nothing hangs on its numbers.
 
         The learning rates of the adapter's `optimizers` are scaled, and of no others.
         """
-        self._engine.scale_only(self._adapter.optimizers)
+        self._engine.rates.only = self._adapter.optimizers
         if self._engine.refinement is None:
             return
         refinement = self._engine.refinement

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import sys
 import types
@@ -91,9 +92,14 @@ class Patches:
         before = vars(owner).get(name, _ABSENT) if hasattr(owner, "__dict__") else _ABSENT
         setattr(owner, name, value)
         if before is _ABSENT:
-            self.add_undo(label, lambda: delattr(owner, name))
+            self.add_undo(label, lambda: _remove(owner, name))
         else:
             self.add_undo(label, lambda: setattr(owner, name, before))
+
+
+def _remove(owner: Any, name: str) -> None:
+    with contextlib.suppress(AttributeError):  # somebody was faster, and the rest has to be put back all the same
+        delattr(owner, name)
 
 
 def _is_bound(function: Any, owner: Any) -> bool:

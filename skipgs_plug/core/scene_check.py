@@ -20,7 +20,7 @@ class SceneCheck:
 
     @property
     def running(self) -> bool:
-        """Whether losses are to be shown to `see`."""
+        """Whether losses are still judged."""
         return self._left > 0
 
     def start(self) -> None:
@@ -32,12 +32,12 @@ class SceneCheck:
         self._left = 0
 
     def see(self, loss: float, mean: float | None, step: int) -> None:
-        """Judge one loss; a view without a mean says nothing.
+        """Judge one loss, while the check runs; a view without a mean says nothing.
 
         Raises:
             SkipGSError: It was the tenth, and all were far off.
         """
-        if mean is None:
+        if mean is None or not self.running:
             return
         if mean <= 0.0 or mean / FAR <= loss <= mean * FAR:
             self.stop()

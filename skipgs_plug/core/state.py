@@ -35,6 +35,12 @@ class PolicyState(TypedDict):
     events: int
 
 
+class RefinementPolicyState(TypedDict):
+    """As `RefinementPolicy.state_dict`."""
+
+    means: dict[Any, float]
+
+
 class StatsState(TypedDict):
     """As `GateStats.state_dict`; a view's row is visits, backwards, skips, last loss."""
 
@@ -151,6 +157,16 @@ def policy_state(state: Mapping[str, Any], release_warmup_end: int) -> dict[str,
     _require_version(state, POLICY_VERSION)
     _require(state, PolicyState, "policy")
     return dict(state)
+
+
+def refinement_policy_state(state: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Check the state of a `RefinementPolicy`.
+
+    Raises:
+        SkipGSError: An entry is missing or of another type.
+    """
+    _require(state, RefinementPolicyState, "policy")
+    return state
 
 
 def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:

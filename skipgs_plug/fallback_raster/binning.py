@@ -165,11 +165,13 @@ def bin_gaussians(
     dense: bool = True,
     ranges: Tensor | None = None,  # [tiles, 2] int32
     records: Tensor | None = None,  # [R, RECORD]
+    before: int = 0,
 ) -> Bins:
     """Lists the visible Gaussians of one image per tile, not yet sorted by depth, with their first channels.
 
     With `ranges`, only at depths, as bits of float32, that lie between the two numbers of the tile; `records` may be
-    given where they hold the records of other lists. `tiles_per_gauss` is empty unless `dense`, and counts all tiles.
+    given where they hold the records of other lists, which hold `before` pairs. `tiles_per_gauss` is empty unless
+    `dense`, and counts all tiles.
 
     Raises:
         ValueError: There are more (tile, Gaussian) pairs than can be listed.
@@ -194,9 +196,10 @@ def bin_gaussians(
     )  # fmt: skip
     scan_pairs(counts, totals, tile_start, slices, tiles_x * tiles_y)
     pairs = int(totals[-1])
-    if pairs > MAX_PAIRS:
+    covered = before + pairs
+    if covered > MAX_PAIRS:
         raise ValueError(
-            f"{n:,} visible Gaussians cover {pairs:,} tiles of an image of {width}x{height} pixels in all, and at most "
+            f"{n:,} visible Gaussians cover {covered:,} tiles of an image of {width}x{height} pixels in all, at most "
             f"{MAX_PAIRS:,} can be listed: render a smaller image, or fewer or smaller Gaussians."
         )
     pair_row, unsorted = ints(pairs), longs(pairs)

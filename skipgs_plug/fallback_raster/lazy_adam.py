@@ -53,6 +53,11 @@ class _Missed:
         self.now = 0
         self._least, self._most = math.inf, 0.0
 
+    def require(self, param: Tensor) -> None:
+        """Raise RuntimeError unless these are the steps of this parameter."""
+        if param is not self.param:
+            raise RuntimeError("The parameter of a LazyAdam was replaced: call catch_up() before that.")
+
     def add(self, rate: float, root: float) -> None:
         """Note a step; it is complete when `now` is raised."""
         self.rates[self.now] = rate
@@ -118,12 +123,10 @@ class LazyAdam(Adam):
         Raises:
             RuntimeError: The parameter was replaced while rows of it were behind.
         """
-        missed = self._missed
+        missed, param = self._missed, self.param_groups[0]["params"][0]
         if missed is None:
             return
-        param = self.param_groups[0]["params"][0]
-        if param is not missed.param:
-            raise RuntimeError("The parameter of a LazyAdam was replaced: call catch_up() before that.")
+        missed.require(param)
         if rows is None:
             every = torch.arange(len(param), dtype=torch.int32, device="cpu")
             missed.advance(every, floats(0), self.state[param])
@@ -156,6 +159,7 @@ class LazyAdam(Adam):
             missed = None
         if missed is None:
             missed = self._missed = _Missed(param, betas, eps)
+        missed.require(param)
         state["step"] += 1
         missed.add(*corrected(float(group["lr"]), state["step"], betas))
         rows, gradient = _rows(param.grad)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from .arguments import check_tensors, refuse_unsupported
 from .autograd import Blend, Project, SphericalHarmonics
-from .constants import TILE, tiles
+from .constants import MAX_CHANNELS, TILE, tiles
 from .rows import all_rows
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
@@ -69,7 +69,7 @@ def rasterization(
         Ks: Intrinsics in pixels; pixel centres lie at +0.5.
         width: Image width in pixels.
         height: Image height in pixels.
-        near_plane: Gaussians nearer than this are left out, world units.
+        near_plane: Gaussians nearer than this are left out, world units; those behind the camera always are.
         far_plane: Gaussians farther than this are left out, world units.
         radius_clip: Gaussians whose radii are all at or below this are left out, pixels.
         eps2d: Added to the 2D covariance's diagonal, square pixels.
@@ -79,7 +79,8 @@ def rasterization(
         backgrounds: Colour behind everything; black if None.
         render_mode: Colour, accumulated depth (D), expected depth (ED), or colour and depth.
         sparse_grad: Not supported.
-        absgrad: Also add up |gradient| of the 2D means over pixels (AbsGS), in `info["means2d"].absgrad`.
+        absgrad: Also add up |gradient| of the 2D means over pixels (AbsGS), in `info["means2d"].absgrad`;
+            with at most four channels, depth included.
         rasterize_mode: "antialiased" scales opacities by the area lost to `eps2d` (Mip-Splatting).
         channel_chunk: Kept for gsplat's callers; any number of channels works.
         distributed: Not supported, as every argument below; each raises when it is used.
@@ -129,6 +130,16 @@ def rasterization(
             raise ValueError("colors as a tuple must be a pair (sh0 [N, 1, 3], shN [N, K - 1, 3]) with sh_degree set.")
         colors, sh_rest = colors
     check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, sh_rest, backgrounds, width, height)
+    # What lies behind a camera is never drawn: kernels sort by the bits of depths, which orders positive ones only.
+    near_plane, far_plane = max(float(near_plane), 0.0), float(far_plane)
+    radius_clip, eps2d = float(radius_clip), float(eps2d)
+    blended = (render_mode != "RGB") + ("RGB" in render_mode) * colors.shape[-1]
+    # A pass over some of the channels knows a part of each pixel's gradient, whose absolute value is none of the whole.
+    if absgrad and blended > MAX_CHANNELS:
+        raise NotImplementedError(
+            f"The CPU rasterizer supports absgrad with at most {MAX_CHANNELS} channels, depth included, got {blended}; "
+            "render the others without."
+        )
 
     dtype, n_cameras, n = means.dtype, len(viewmats), len(means)
     means, quats, scales, opacities, colors, viewmats, Ks = (

@@ -77,7 +77,7 @@ def rasterize_splats(
         width: Image width in pixels.
         height: Image height in pixels.
         sh_degree: 0 to 3.
-        near_plane: Gaussians nearer than this are left out, world units.
+        near_plane: Gaussians nearer than this are left out, world units; those behind the camera always are.
         far_plane: Gaussians farther than this are left out, world units.
         background: Colour behind everything; black if None.
         antialiased: Scale opacities by the area lost to the blur of 0.3 square pixels.
@@ -99,6 +99,7 @@ def rasterize_splats(
         means, quats, log_scales, logits, sh0, viewmat[None], K[None], sh_degree, shN,
         None if background is None else background[None], width, height,
     )  # fmt: skip
+    near_plane, far_plane = max(float(near_plane), 0.0), float(far_plane)  # as in `rasterization`
     means, quats, log_scales, logits, sh0, shN = (t.to(torch.float32).contiguous() for t in tensors)
     viewmat, K = viewmat.to(torch.float32).contiguous(), K.to(torch.float32).contiguous()
     size = (width, height)

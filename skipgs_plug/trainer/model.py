@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
 from skipgs_plug.fallback_raster.optimizer import Adam
 from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.near_plane import before_a_lens
 from skipgs_plug.trainer.scene import Scene
 from skipgs_plug.trainer.selective_adam import SelectiveAdam
@@ -20,7 +21,11 @@ ADAM_EPS = 1e-15
 def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near: float = 0.0) -> nn.ParameterDict:
     """Return `means [N, 3]`, `scales [N, 3]` (log), `quats [N, 4]` (wxyz), `opacities [N]` (logit),
     `sh0 [N, 1, 3]` and `shN [N, K - 1, 3]`: the Gaussians of the scene, else an isotropic one per point,
-    without those of points that lie before a lens, nearer than the near plane `near`."""
+    without those of points that lie before a lens, nearer than the near plane `near`.
+
+    Raises:
+        InputError: all points do.
+    """
     if scene.gaussians is not None:
         tensors = {name: tensor.clone() for name, tensor in scene.gaussians.items()}
         higher = torch.zeros(len(tensors["means"]), (config.sh_degree + 1) ** 2 - 1, 3)
@@ -30,6 +35,11 @@ def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near:
     else:
         tensors = one_per_point(scene, config)
         wrong = before_a_lens(scene.train, scene.points, near)
+        if bool(wrong.all()):
+            raise InputError(
+                f"All {len(wrong):,} points of {scene.name} are nearer than the near plane {near:g}; "
+                "lower --near-plane or leave it out."
+            )
         tensors = {name: tensor[~wrong] for name, tensor in tensors.items()}
     return nn.ParameterDict({name: nn.Parameter(t.to(device)) for name, t in tensors.items()})
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.optim.optimizer import _global_optimizer_pre_hooks
 
 from benchmarks import soak_runs
 from skipgs_plug.cli import main
@@ -233,3 +234,9 @@ def test_a_run_folder_that_vanishes_is_made_anew(
     assert checkpoints(out) == checkpoints(whole)[-2:]
     assert (out / "ply/point_cloud_59.ply").read_bytes() == (whole / "ply/point_cloud_59.ply").read_bytes()
     assert train(packed, out, "--resume") == 0
+
+
+def test_nothing_of_the_gate_stays_behind_in_the_process(packed: str, tmp_path: Path) -> None:
+    before = dict(_global_optimizer_pre_hooks)
+    assert train(packed, tmp_path / "run", "--refine-share", "0.5") == 0
+    assert before == dict(_global_optimizer_pre_hooks)

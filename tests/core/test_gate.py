@@ -109,6 +109,13 @@ def test_separate_backwards_of_one_iteration_are_gated_one_by_one() -> None:
     assert not gate.skipped
 
 
+def test_the_backward_of_a_batch_is_on_the_clock() -> None:
+    gate = SkipGate(start_iter=0)
+    loss = torch.ones((), requires_grad=True)
+    gate.backward([loss * 1.0, loss * 2.0], view=["a", "b"], step=0)
+    assert gate.stats()["t_post"] > 0.0
+
+
 def test_batch_of_another_length_is_refused() -> None:
     with pytest.raises(SkipGSError, match="2 view keys came with 1 losses"):
         SkipGate(start_iter=0).backward([loss_of(1.0)], view=["a", "b"], step=0)

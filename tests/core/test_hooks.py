@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from always import Always
+from torch.optim import lr_scheduler as schedulers
 
 from skipgs_plug import AdapterMismatchError, GateOrderError, SkipGate, SkipGSError, UnknownTrainerError
 from skipgs_plug.adapters import AbstractAdapter, TrainerFacts
+from skipgs_plug.adapters.schedulers import catch_up_schedulers
 
 
 class ToyTrainer:
@@ -246,6 +248,22 @@ class Endless(Toy):
         hooks.ready(TrainerFacts(None))
 
 
+def test_facts_that_come_late_and_are_refused_leave_nothing_behind() -> None:
+    class Late(Toy):
+        hurried = True
+
+        def attach(self, hooks) -> None:
+            hooks.before(self.trainer, "begin", lambda step: hooks.ready(TrainerFacts(None)))
+            hooks.gate_tensor_backward("train")
+
+    trainer = ToyTrainer()
+    gate = SkipGate(trainer, adapter=Late(trainer))
+    with pytest.raises(SkipGSError, match="start_iter"):
+        trainer.train()
+    assert gate.patched == []
+    assert plain(trainer)
+
+
 def test_two_views_of_one_name_are_refused() -> None:
     class Twins(Toy):
         hurried = True
@@ -278,6 +296,62 @@ def test_training_anew_with_one_gate_is_refused() -> None:
         trainer.train()
         with pytest.raises(GateOrderError, match="went back from 99 to 0"):
             trainer.train()
+
+
+def test_what_the_adapter_knows_of_numbers_holds_beside_what_the_user_chose() -> None:
+    class Knowing(Toy):
+        def attach(self, hooks) -> None:
+            super().attach(hooks)
+            hooks.always(lambda numbers: (n for n in numbers if n % 30 == 29))
+
+    trainer, ran = ToyTrainer(), []
+
+    def train(steps) -> None:
+        for step in steps:
+            trainer.begin(step)
+            ran.append(step)
+            (trainer.render("v0") ** 2).mean().backward()
+
+    with SkipGate(trainer, adapter=Knowing(trainer), refine_share=0.1) as gate:
+        train(gate.iterations(range(100), always=[70]))
+    assert ran == [*range(28), 29, 59, 70, 89, 99]
+
+
+SCHEDULERS = {
+    "one": lambda optimizer: schedulers.ExponentialLR(optimizer, 0.99),
+    "chained": lambda optimizer: schedulers.ChainedScheduler(
+        [schedulers.LinearLR(optimizer, 0.1, total_iters=40), schedulers.ExponentialLR(optimizer, 0.99)]
+    ),
+    "one after the other": lambda optimizer: schedulers.SequentialLR(
+        optimizer,
+        [schedulers.LinearLR(optimizer, 0.1, total_iters=40), schedulers.ExponentialLR(optimizer, 0.99)],
+        milestones=[40],
+    ),
+    "with restarts": lambda optimizer: schedulers.CosineAnnealingWarmRestarts(optimizer, 30),
+}
+
+
+@pytest.mark.parametrize("kind", SCHEDULERS)
+def test_schedulers_that_count_calls_are_where_they_would_be_if_all_iterations_ran(kind) -> None:
+    class Scheduling(Toy):
+        def attach(self, hooks) -> None:
+            super().attach(hooks)
+            catch_up_schedulers(hooks, "train")
+
+    def train(trainer, steps) -> float:
+        scheduler = SCHEDULERS[kind](trainer.optimizer)
+        for step in steps:
+            trainer.begin(step)
+            (trainer.render("v0") ** 2).mean().backward()
+            trainer.optimizer.step()
+            scheduler.step()
+        return trainer.optimizer.param_groups[0]["lr"]
+
+    expected = train(ToyTrainer(), range(100))
+    trainer = ToyTrainer()
+    with SkipGate(trainer, adapter=Scheduling(trainer), refine_share=0.1) as gate:
+        assert train(trainer, gate.iterations(range(100), always=[70])) == pytest.approx(expected)
+    assert gate.stats()["iterations_skipped"] > 60
 
 
 def test_accumulation_holds_back_the_trainers_own_steps() -> None:

@@ -62,6 +62,21 @@ def test_a_method_stays_a_method() -> None:
     patches.restore()
 
 
+def test_a_name_that_somebody_else_removed_keeps_nothing_from_being_put_back() -> None:
+    class Player:
+        def play(self) -> int:
+            return 3
+
+    original, player, patches = Base.work, Player(), Patches()
+    patches.wrap(Base, "work", twice)
+    patches.wrap(player, "play", twice)
+    del player.play  # of the instance: the class keeps its own
+    patches.restore()
+    assert patches.names == []
+    assert Base.work is original
+    assert player.play() == 3
+
+
 def test_second_gate_is_refused() -> None:
     first, second = Patches(), Patches()
     first.wrap(Base, "work", twice)

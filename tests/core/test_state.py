@@ -97,12 +97,14 @@ def entries(state: dict, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]
             yield from entries(value, (*path, key))
 
 
-@pytest.mark.parametrize("release", [False, True])
-def test_an_entry_that_is_missing_or_of_another_type_is_an_error_or_harmless(release: bool) -> None:
+@pytest.mark.parametrize("kind", ["gate", "release", "refinement"])
+def test_an_entry_that_is_missing_or_of_another_type_is_an_error_or_harmless(kind: str) -> None:
     """Every entry of a state is taken away once, and replaced by everything else once."""
-    gate = SkipGate(start_iter=0)
-    gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
-    whole = RELEASE if release else json.loads(json.dumps(gate.state_dict()))
+    settings: dict = {"start_iter": 0} | ({"refine_share": 0.5} if kind == "refinement" else {})
+    gate = SkipGate(**settings)
+    for _step in gate.iterations(range(1)):
+        gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
+    whole = RELEASE if kind == "release" else json.loads(json.dumps(gate.state_dict()))
     refused = 0
     for path in entries(whole):
         for wrong in (KeyError, *WRONG):
@@ -114,7 +116,7 @@ def test_an_entry_that_is_missing_or_of_another_type_is_an_error_or_harmless(rel
                 del parent[path[-1]]
             else:
                 parent[path[-1]] = wrong
-            other = SkipGate(start_iter=0)
+            other = SkipGate(**settings)
             try:
                 other.load_state_dict(state)
             except SkipGSError as error:
@@ -137,12 +139,17 @@ def test_ambiguous_view_keys_are_refused() -> None:
         policy.state_dict()
 
 
-def resumed(factor: float, *, event: bool = False, steps: int = 40) -> SkipGate:
-    """A gate that learnt means of 1 and goes on with losses of `factor`."""
-    first = SkipGate(start_iter=0, warmup=2)
+def resumed(
+    factor: float, *, before: bool = False, event: bool = False, share: float | None = None, steps: int = 40
+) -> SkipGate:
+    """A gate that learnt means of 1 and goes on with losses of `factor`; with an event before it is saved or after."""
+    settings: dict = {"start_iter": 0, "warmup": 2, "refine_share": share}
+    first = SkipGate(**settings)
     for step in range(20):
         first.backward(torch.tensor(1.0, requires_grad=True), view=step % 3, step=step)
-    gate = SkipGate(start_iter=0, warmup=2)
+    if before:
+        first.notify_event("opacity reset")
+    gate = SkipGate(**settings)
     gate.load_state_dict(first.state_dict())
     if event:
         gate.notify_event("prune")
@@ -151,14 +158,25 @@ def resumed(factor: float, *, event: bool = False, steps: int = 40) -> SkipGate:
     return gate
 
 
+@pytest.mark.parametrize("share", [None, 0.5])
 @pytest.mark.parametrize("factor", [9.0, 0.1])
-def test_losses_far_from_all_means_are_another_scenes(factor: float) -> None:
-    resumed(factor, steps=9)
+def test_losses_far_from_all_means_are_another_scenes(factor: float, share: float | None) -> None:
+    resumed(factor, share=share, steps=9)
     with pytest.raises(SkipGSError, match="another scene: up to iteration 29 each of 10 losses"):
-        resumed(factor)
+        resumed(factor, share=share)
 
 
 def test_losses_near_their_means_or_after_an_event_pass() -> None:
     for factor in (0.6, 1.9):
         resumed(factor)
     resumed(9.0, event=True)
+    resumed(9.0, before=True)
+    resumed(9.0, before=True, share=0.5)
+
+
+def test_a_state_of_the_authors_controller_has_no_refinement() -> None:
+    with (
+        SkipGate(start_iter=0, refine_share=0.4) as gate,
+        pytest.raises(SkipGSError, match=r"refine_share=None, not 0\.4"),
+    ):
+        gate.load_state_dict(RELEASE)

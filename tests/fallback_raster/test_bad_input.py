@@ -92,6 +92,22 @@ def test_what_gsplat_can_and_this_cannot(name: str, value: Any) -> None:
     refuse(name, **{name: value})
 
 
+def test_absolute_gradients_of_many_channels() -> None:
+    scene = random_scene(n=7, cameras=2)
+    for channels, mode in ((5, "RGB"), (4, "RGB+ED")):
+        changes = {"colors": torch.ones(7, channels), "render_mode": mode, "absgrad": True}
+        with pytest.raises(NotImplementedError, match="absgrad with at most 4 channels, depth included, got 5"):
+            rasterization(**{**scene, **changes})
+        rasterization(**{**scene, **changes, "absgrad": False})
+
+
+def test_whole_numbers_where_gsplat_takes_them() -> None:
+    scene = random_scene(n=7, cameras=2)
+    expected, _, _ = rasterization(**scene, near_plane=1.0, far_plane=100.0, radius_clip=0.0, eps2d=1.0)
+    image, _, _ = rasterization(**scene, near_plane=1, far_plane=100, radius_clip=0, eps2d=1)
+    assert torch.equal(image, expected)
+
+
 def test_rolling_shutter() -> None:
     gsplat: Any = pytest.importorskip("gsplat")
     refuse("rolling_shutter", rolling_shutter=gsplat.RollingShutterType.ROLLING_TOP_TO_BOTTOM)

@@ -113,7 +113,8 @@ def test_scaled_rates_reach_missed_steps() -> None:
     try:
 
         def before(step: int, lazy: LazyAdam, rows: Tensor) -> None:
-            scaled.factor = None if step < 50 else 10.0 * (1 - step / 200)
+            if step >= 50:
+                scaled.scale(10.0 * (1 - step / 200))
 
         lazy, dense = train(SHAPES[0], 200, 0.1, before=before)
     finally:
@@ -227,6 +228,10 @@ def test_eps_must_not_be_zero() -> None:
 
 def test_a_parameter_replaced_while_rows_are_behind_is_an_error() -> None:
     lazy, _ = train(SHAPES[0], 3, 0.1)
-    lazy.param_groups[0]["params"][0] = torch.nn.Parameter(torch.zeros(4, 15, 3))
+    new = lazy.param_groups[0]["params"][0] = torch.nn.Parameter(torch.zeros(4, 15, 3))
     with pytest.raises(RuntimeError, match=r"call catch_up\(\) before"):
         lazy.catch_up()
+    rows = torch.tensor([[0, 2]])
+    new.grad = torch.sparse_coo_tensor(rows, torch.ones(2, 15, 3), new.shape, check_invariants=True)
+    with pytest.raises(RuntimeError, match=r"call catch_up\(\) before"):
+        lazy.step()

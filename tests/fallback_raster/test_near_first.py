@@ -9,7 +9,7 @@ import torch
 from raster_scenes import deep_scene, leaves, relative_error
 from torch import Tensor
 
-from skipgs_plug.fallback_raster import near_first, rasterization, rendering, set_num_threads
+from skipgs_plug.fallback_raster import binning, near_first, rasterization, rendering, set_num_threads
 from skipgs_plug.fallback_raster.constants import tiles
 from skipgs_plug.fallback_raster.shortcuts import without_shortcuts
 from skipgs_plug.fallback_raster.splats import rasterize_splats
@@ -115,6 +115,25 @@ def test_equal_depths_on_either_side_of_the_end_stay_together(monkeypatch: pytes
         whole = rendered(scene)
     ending_at(monkeypatch, lambda count: torch.full((count,), 4.0))
     assert_same(rendered(scene), whole)
+
+
+def test_both_lists_together_are_no_longer_than_their_places_can_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = deep_scene(2000)
+    listed: list[int] = []
+
+    def bin_gaussians(*args: Any) -> Any:
+        bins = binning.bin_gaussians(*args)
+        listed.append(len(bins.tile_list))
+        return bins
+
+    monkeypatch.setattr(rendering, "bin_gaussians", bin_gaussians)
+    lists = ending_at(monkeypatch, lambda count: torch.full((count,), 3.0))
+    rendered(scene)
+    monkeypatch.setattr(binning, "MAX_PAIRS", listed[0] + lists[0])
+    rendered(scene)
+    monkeypatch.setattr(binning, "MAX_PAIRS", listed[0] + lists[0] - 1)
+    with pytest.raises(ValueError, match=f"cover {listed[0] + lists[0]:,} tiles"):
+        rendered(scene)
 
 
 def test_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:

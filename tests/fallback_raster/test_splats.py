@@ -50,6 +50,7 @@ def activated(raw: dict[str, Tensor], camera: dict[str, Any], **options: Any) ->
         camera["K"][None],
         camera["width"],
         camera["height"],
+        near_plane=options.get("near_plane", 0.01),
         sh_degree=options.get("sh_degree", 3),
         packed=True,
         absgrad=options.get("absgrad", False),
@@ -148,6 +149,18 @@ def test_a_wrong_shape_names_the_argument() -> None:
     raw["logits"] = raw["logits"][:-1]
     with pytest.raises(ValueError, match="opacities must have shape"):
         splatted(raw, camera)
+
+
+def test_planes_may_be_whole_numbers_and_what_lies_behind_the_camera_is_never_drawn() -> None:
+    raw, camera = raw_scene()
+    expected, _, _ = splatted(raw, camera, near_plane=1.0, far_plane=50.0)
+    assert torch.equal(splatted(raw, camera, near_plane=1, far_plane=50)[0], expected)
+    with torch.no_grad():
+        raw["means"][::2, 2] *= -1.0
+    expected, _, _ = splatted(raw, camera, near_plane=0.0)
+    for near in (-1.0, -100.0):
+        assert torch.equal(splatted(raw, camera, near_plane=near)[0], expected)
+        assert torch.equal(activated(raw, camera, near_plane=near)[0], activated(raw, camera, near_plane=0.0)[0])
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])

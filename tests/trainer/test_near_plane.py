@@ -67,3 +67,10 @@ def test_points_that_nothing_would_ever_draw_do_not_become_gaussians() -> None:
     other.train[1].viewmat[2, 3] = 3.0  # stands back: it shows what lies before the lens of the other
     other.points[0] = torch.tensor([0.0, 0.0, 0.2])
     assert not before_a_lens(other.train, other.points, 0.4).any()
+
+
+def test_a_near_plane_behind_all_points_is_refused() -> None:
+    with pytest.raises(
+        InputError, match=r"All 1,000 points of .* are nearer than the near plane 50; lower --near-plane"
+    ):
+        Trainer(TrainConfig(max_steps=3, near_plane=50), scene())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.refinement.rates import Named, Optimizers, ScaledRates, path_factor
+from skipgs_plug.core.refinement.rates import ScaledRates, path_factor
 
 
 class Compensation:
@@ -13,25 +13,22 @@ class Compensation:
         config: With `compensate`.
         start: First gated iteration.
         last: Last iteration of the run.
-        optimizers: As for `ScaledRates`, and the next.
+        rates: What scales.
+
+    Attributes:
+        last: iteration after which steps have no length.
     """
 
-    def __init__(
-        self, config: SkipConfig, start: int, last: int, optimizers: Optimizers | None, named: Named | None
-    ) -> None:
+    def __init__(self, config: SkipConfig, start: int, last: int, rates: ScaledRates) -> None:
         self._peak = config.rate_peak
-        self._start, self._end = start, last + 1
-        self._rates = ScaledRates(optimizers, named)
+        self._start, self.last = start, last
+        self._rates = rates
 
     def heartbeat(self, step: int, floor: float | None) -> None:
-        """Iteration `step` begins; `floor` is the least share of real backwards in force."""
-        self._rates.follow_thread()
+        """Iteration `step` begins; `floor` is the least share of real backwards in force, None or 0 without one."""
         if step < self._start:
-            self._rates.factor = None
+            self._rates.rest()
             return
-        progress = (step - self._start) / max(self._end - self._start, 1)
-        self._rates.factor = path_factor(1.0 if floor is None else floor, progress, self._peak)
-
-    def remove(self) -> None:
-        """Let go of the optimizers."""
-        self._rates.remove()
+        # A trainer may go on after the end that it told: with steps of length 0.
+        progress = min((step - self._start) / max(self.last + 1 - self._start, 1), 1.0)
+        self._rates.scale(path_factor(floor or 1.0, progress, self._peak))

@@ -7,10 +7,11 @@ import functools
 import inspect
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import CodeType
 from typing import Any, Protocol
 
+from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.intercept import Patches
 
 
@@ -28,6 +29,10 @@ class Owner(Protocol):
 
     def expected(self, loop: LoopRange) -> int:
         """How many numbers the loop will run, as far as is known."""
+        ...
+
+    def ended(self, loop: LoopRange) -> None:
+        """The loop is over, or was left."""
         ...
 
 
@@ -55,9 +60,17 @@ class LoopRange:
                     yield number
         finally:
             self.current = None
+            self._owner.ended(self)
 
     def __len__(self) -> int:
         return self._owner.expected(self)
+
+    # Python would ask for the length.
+    def __bool__(self) -> bool:
+        return bool(self.numbers)
+
+    def __reversed__(self) -> Iterator[int]:
+        return reversed(self.numbers)
 
     def __contains__(self, number: object) -> bool:
         return number in self.numbers
@@ -72,10 +85,22 @@ class LoopRange:
         return repr(self.numbers)
 
 
-class _Every:
-    """Owner of a loop that runs all its numbers."""
+def require_planned(numbers: range, last: int) -> None:
+    """Raise SkipGSError when a loop goes on after the iteration at which steps have shrunk to nothing."""
+    if numbers and numbers[-1] > last:
+        raise SkipGSError(
+            f"Iterations up to {numbers[-1]} come after a plan that ends with {last}; "
+            "give gate.iterations() all iterations of the run at once."
+        )
+
+
+class Every:
+    """Owner of a loop that runs all its numbers; `at_end` is called when it is over, or was left."""
 
     wants_loop = False
+
+    def __init__(self, at_end: Callable[[], None]) -> None:
+        self._at_end = at_end
 
     def runs(self, loop: LoopRange, number: int) -> bool:
         return True
@@ -83,8 +108,8 @@ class _Every:
     def expected(self, loop: LoopRange) -> int:
         return len(loop.numbers)
 
-
-EVERY = _Every()
+    def ended(self, loop: LoopRange) -> None:
+        self._at_end()
 
 
 def replace_range(patches: Patches, names: dict[str, Any], functions: tuple[str, ...], owner: Owner) -> None:

@@ -18,7 +18,10 @@ from typing import Any, NamedTuple
 from skipgs_plug.core.errors import SkipGSError
 
 SAFE = frozenset({"abs", "bool", "int", "len", "max", "min", "round"})
+# Methods by which lists, sets and queues change: what they are called on is another thing in the next iteration.
+CHANGES = frozenset({"add", "append", "appendleft", "clear", "discard", "extend", "insert", "pop", "popleft", "remove"})
 _POINT = (ast.Eq, ast.NotEq, ast.In, ast.NotIn, ast.Is, ast.IsNot)
+_PLACE = (ast.Name, ast.Attribute, ast.Subscript)
 
 
 class _Leaf(NamedTuple):
@@ -105,25 +108,27 @@ class _Loop:
         self.target = statement.target.id
         self.file, self.first_line = file, first_line
         self._pure = pure | SAFE
+        parts = [node for one in statement.body for node in ast.walk(one)]
         stored = [
-            node.id
-            for one in statement.body
-            for node in ast.walk(one)
-            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id != self.target
+            ast.unparse(node)
+            for node in parts
+            if isinstance(node, _PLACE) and not isinstance(node.ctx, ast.Load) and ast.unparse(node) != self.target
         ]
-        self._changing = set(stored)
+        called = [node.func for node in parts if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
+        self._changing = {*stored, *(ast.unparse(method.value) for method in called if method.attr in CHANGES)}
         self.body = self._spelled_out(statement.body, stored)
 
     def _spelled_out(self, body: list[ast.stmt], stored: list[str]) -> list[ast.stmt]:
-        """Replace names that stand for something of the number: `epoch_step = step % len(views)`."""
+        """Replace names and attributes that stand for something of the number: `epoch_step = step % len(views)`."""
         for statement in body:
             if not (isinstance(statement, ast.Assign) and len(statement.targets) == 1):
                 continue
-            (name,), value = statement.targets, statement.value
-            if not isinstance(name, ast.Name) or stored.count(name.id) != 1:
+            (place,), value = statement.targets, statement.value
+            text = ast.unparse(place)
+            if not isinstance(place, (ast.Name, ast.Attribute)) or stored.count(text) != 1:
                 continue
             if self.mentions(value) and not self.leaf(value).unforeseeable:
-                body = [_Inline(name.id, value).visit(copy.deepcopy(one)) for one in body]
+                body = [_Inline(text, value).visit(copy.deepcopy(one)) for one in body]
         return body
 
     def leaf(self, node: ast.expr) -> _Leaf:
@@ -136,10 +141,10 @@ class _Loop:
             for name in ast.walk(part.target)
             if isinstance(name, ast.Name)
         }
-        names = {part.id for part in ast.walk(node) if isinstance(part, ast.Name)} - inner
+        places = {ast.unparse(part) for part in ast.walk(node) if isinstance(part, _PLACE)} - inner
         calls = [part for part in ast.walk(node) if isinstance(part, ast.Call)]
         impure = any(not isinstance(call.func, ast.Name) or call.func.id not in self._pure for call in calls)
-        if impure or names & self._changing:
+        if impure or places & self._changing:
             return _Leaf(None, True)
         return _Leaf(compile(ast.Expression(node), self.file, "eval"), False)
 
@@ -165,15 +170,17 @@ class _Loop:
 
 
 class _Inline(ast.NodeTransformer):
-    """Puts an expression where a name is read."""
+    """Puts an expression where a name or an attribute is read."""
 
-    def __init__(self, name: str, value: ast.expr) -> None:
-        self._name, self._value = name, value
+    def __init__(self, place: str, value: ast.expr) -> None:
+        self._place, self._value = place, value
 
-    def visit_Name(self, node: ast.Name) -> ast.expr:
-        if node.id != self._name or not isinstance(node.ctx, ast.Load):
-            return node
-        return ast.copy_location(copy.deepcopy(self._value), node)
+    def visit_Name(self, node: ast.Name | ast.Attribute) -> ast.AST:
+        if isinstance(node.ctx, ast.Load) and ast.unparse(node) == self._place:
+            return ast.copy_location(copy.deepcopy(self._value), node)
+        return self.generic_visit(node)
+
+    visit_Attribute = visit_Name
 
 
 def milestones(
@@ -183,7 +190,7 @@ def milestones(
 
     Args:
         code: Of the function that holds the loop.
-        line: A line inside the loop.
+        line: Where the function stands when the loop asks for a number: in the first lines of its `for`.
         numbers: Those that may be left out.
         names: What the function had names for before its loop began.
         pure: Functions that only look at numbers, and may stand in conditions.
@@ -222,11 +229,12 @@ def _loop_at(code: CodeType, line: int, pure: frozenset[str]) -> _Loop:
             "which iterations must run; gate without refine_share, or name them (always=)."
         ) from error
     first = code.co_firstlineno
-    for node in ast.walk(tree):  # breadth first: the outermost loop around the line
+    for node in ast.walk(tree):
+        # Loops inside and around it do not stand there.
         if (
             isinstance(node, ast.For)
             and isinstance(node.target, ast.Name)
-            and node.lineno <= line - first + 1 <= (node.end_lineno or node.lineno)
+            and node.lineno <= line - first + 1 <= (node.iter.end_lineno or node.lineno)
         ):
             return _Loop(node, code.co_filename, first, pure)
     raise SkipGSError(
@@ -246,8 +254,8 @@ def _tests(body: list[ast.stmt], path: list[ast.expr]) -> Iterator[tuple[ast.exp
             yield from _tests(statement.orelse, [*path, ast.UnaryOp(ast.Not(), statement.test)])
             continue
         inner = [part for part in ast.iter_child_nodes(statement) if isinstance(part, ast.stmt)]
-        for handler in getattr(statement, "handlers", ()):
-            inner += handler.body
+        for part in (*getattr(statement, "handlers", ()), *getattr(statement, "cases", ())):
+            inner += part.body
         yield from _tests(inner, path)
         for part in ast.iter_child_nodes(statement):
             if isinstance(part, ast.expr):

@@ -11,6 +11,7 @@ from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.ema import ViewMeans
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.refinement.refinement import Refinement
+from skipgs_plug.core.state import refinement_policy_state
 
 
 class RefinementPolicy(Policy):
@@ -57,4 +58,9 @@ class RefinementPolicy(Policy):
         return {"means": self._means.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._means.load_state_dict(state["means"])
+        """Continue from `state_dict()`.
+
+        Raises:
+            SkipGSError: Something is missing from it, or of another type.
+        """
+        self._means.load_state_dict(refinement_policy_state(state)["means"])

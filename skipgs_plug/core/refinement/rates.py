@@ -8,9 +8,10 @@ from typing import Any
 
 import torch
 from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
+from torch.utils.hooks import RemovableHandle
 
-Optimizers = Callable[[], Iterable[torch.optim.Optimizer]]
 Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
+Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 
 # What a group of parameters takes of the factor that is meant for all. The higher bands of the colours, whose rate
 # trainers set to a twentieth of the constant band's, bear the longest steps; opacities none beyond the trainer's.
@@ -66,56 +67,64 @@ class ScaledRates:
     trainer's schedule is never disturbed, and a checkpoint holds the trainer's rates.
 
     Args:
-        only: Gives the optimizers that are meant; None for all that step, of which the trainer alone knows.
-        named: Gives the trainer's names of optimizers whose groups have none.
+        only: Gives the optimizers that are meant, by name where their groups have none; None for all that step, of
+            which the trainer alone knows.
 
     Attributes:
-        factor: in force, see `group_factor`; None touches nothing.
+        only: as given.
     """
 
-    def __init__(self, only: Optimizers | None = None, named: Named | None = None) -> None:
-        self.factor: float | None = None
-        self._only, self._named = only, named
+    def __init__(self, only: Optimizers | None = None) -> None:
+        self.only = only
+        self._factor: float | None = None
         self._thread = threading.get_ident()
         self._depth: dict[int, int] = {}  # a step can call the step of its base class
         self._before: dict[int, list[tuple[dict[str, Any], Any]]] = {}
-        self._handles = (
-            register_optimizer_step_pre_hook(self._scale),
-            register_optimizer_step_post_hook(self._put_back),
-        )
+        self._handles: list[RemovableHandle] = []
+        self._removed = False
 
-    def follow_thread(self) -> None:
-        """Scale the steps of the thread that calls this, which is the one that trains."""
-        self._thread = threading.get_ident()
-        if self._before:  # a step that raised had no end
-            for saved in self._before.values():
-                _restore(saved)
-            self._before.clear()
-            self._depth.clear()
+    def scale(self, factor: float) -> None:
+        """Scale the steps of the thread that calls this, which is the one that trains; see `group_factor`."""
+        self.rest()
+        if self._removed:
+            return
+        self._factor, self._thread = factor, threading.get_ident()
+        if not self._handles:
+            self._handles = [
+                register_optimizer_step_pre_hook(self._scale),
+                register_optimizer_step_post_hook(self._put_back),
+            ]
+
+    def rest(self) -> None:
+        """Touch nothing until the next `scale`."""
+        self._factor = None
+        for saved in self._before.values():  # a step that raised had no end
+            _restore(saved)
+        self._before.clear()
+        self._depth.clear()
 
     def remove(self) -> None:
-        """Take the hooks back."""
-        self.follow_thread()
-        for handle in self._handles:
-            handle.remove()
+        """Take the hooks back, for good."""
+        self.rest()
+        self._removed = True
+        while self._handles:
+            self._handles.pop().remove()
 
     def _scale(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        if self.factor is None or threading.get_ident() != self._thread:
+        if self._factor is None or threading.get_ident() != self._thread:
             return
-        if self._only is not None and not any(optimizer is one for one in self._only()):
+        own = {None: optimizer} if self.only is None else self.only()
+        named = own.items() if isinstance(own, Mapping) else ((None, one) for one in own)
+        names = [name for name, one in named if one is optimizer]
+        if not names:
             return
         key = id(optimizer)
         self._depth[key] = self._depth.get(key, 0) + 1
         if self._depth[key] > 1:
             return
         self._before[key] = [(group, group["lr"]) for group in optimizer.param_groups]
-        name = self._name(optimizer)
         for group in optimizer.param_groups:
-            group["lr"] = group["lr"] * group_factor(group, self.factor, name)
-
-    def _name(self, optimizer: torch.optim.Optimizer) -> str | None:
-        named = {} if self._named is None else self._named()
-        return next((name for name, one in named.items() if one is optimizer), None)
+            group["lr"] = group["lr"] * group_factor(group, self._factor, names[0])
 
     def _put_back(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         key = id(optimizer)

@@ -6,12 +6,13 @@ import logging
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.refinement.foresight import CYCLE_ENDS, ONE_CYCLE, Foresight, needed_share, watched_views
-from skipgs_plug.core.refinement.loop_range import LoopRange, line_of
+from skipgs_plug.core.refinement.loop_range import LoopRange, line_of, require_planned
 from skipgs_plug.core.refinement.milestones import milestones
-from skipgs_plug.core.refinement.rates import Named, Optimizers, ScaledRates, path_factor
+from skipgs_plug.core.refinement.rates import ScaledRates, path_factor
 from skipgs_plug.core.refinement.thinning import Thinning
 
 log = logging.getLogger(__name__)
@@ -36,6 +37,7 @@ class Refinement:
 
     Args:
         config: With `refine_share`.
+        rates: What scales.
         go_on: Loads the state that belongs to what training goes on from with an iteration, if there is one.
 
     Attributes:
@@ -45,12 +47,11 @@ class Refinement:
         always: numbers that must run, by the reason.
         watched: views that are watched and not trained on while `foresight` says so.
         gap: iterations left out right before the present one.
-        optimizers: gives those whose rates are scaled; None for all that step.
-        named: gives the trainer's names of optimizers; None where their groups have names.
     """
 
-    def __init__(self, config: SkipConfig, go_on: Callable[[int], None]) -> None:
+    def __init__(self, config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None]) -> None:
         self._config = config
+        self._rates = rates
         self._go_on = go_on
         self.share: float | None = None if config.refine_share == "auto" else config.refine_share  # type: ignore[assignment]
         self.thinning = Thinning(1.0)
@@ -58,14 +59,12 @@ class Refinement:
         self.always: dict[str, set[int]] = {}
         self.watched: frozenset[str] = frozenset()
         self.gap = self._left_out = 0
-        self.optimizers: Optimizers | None = None
-        self.named: Named | None = None
-        self._rates: ScaledRates | None = None
         self._start = 0
         self._last: int | None = None
         self._views: list[str] | None = None
         self._keeps_rates = False
         self._hidden: Always = nothing_always
+        self._chosen: frozenset[int] = frozenset()
         self._pure: tuple[str, ...] = ()
         self._driver: LoopRange | None = None
         self._loops: list[LoopRange] = []
@@ -87,7 +86,11 @@ class Refinement:
             last: Last iteration of the run; None where the loop's range says it.
             views: Keys of all training views, when they are known.
             keeps_rates: Leave learning rates alone: the trainer takes as many steps as before.
+
+        Raises:
+            SkipGSError: Processes would find different ends.
         """
+        self._refuse_several()
         self._start, self._last, self._views, self._keeps_rates = start, last, views, keeps_rates
 
     def know_views(self, views: list[str]) -> None:
@@ -98,12 +101,13 @@ class Refinement:
         """Take what cannot be read off the loop: hidden numbers, and functions that only look at numbers."""
         self._hidden, self._pure = always, tuple(pure)
 
+    def choose(self, always: Iterable[int]) -> None:
+        """Take the numbers that the user wants to run beside hidden ones."""
+        self._chosen = frozenset(always)
+
     def remove(self) -> None:
-        """Let go of the optimizers."""
+        """Let go of the loop, which runs all its numbers from now on."""
         self._removed = True
-        if self._rates is not None:
-            self._rates.remove()
-            self._rates = None
 
     # What the loop asks.
 
@@ -118,7 +122,14 @@ class Refinement:
         return None if self._driver is None else self._driver.current
 
     def follow(self, loop: LoopRange) -> LoopRange:
-        """Take this loop for the one that trains."""
+        """Take this loop for the one that trains.
+
+        Raises:
+            SkipGSError: It goes on after the end that was planned for, or processes would find different ends.
+        """
+        self._refuse_several()
+        if self._begun and self._last is not None:
+            require_planned(loop.numbers, self._last)
         self._driver = loop
         return loop
 
@@ -173,6 +184,11 @@ class Refinement:
         before = len(range(numbers.start, min(max(self._start, numbers.start), numbers.stop)))
         return before + round((len(numbers) - before) * (self.share or 1.0))
 
+    def ended(self, loop: LoopRange) -> None:
+        """The loop is over, or was left: whatever steps afterwards is no part of it."""
+        if loop is self._driver:
+            self._rates.rest()
+
     # Refinement.
 
     @property
@@ -192,16 +208,17 @@ class Refinement:
             self._recovery, self._recovered = max(n_views, RECOVERY) if pause is None else pause, 0
 
     def _begin(self, loop: LoopRange, number: int) -> None:
-        numbers = range(number, loop.numbers.stop)
         if self._first is None:
             self._first = number
+        # Of a run that goes on, those behind it too: conditions are judged by how often they hold.
+        numbers = range(self._first, loop.numbers.stop)
         self._begun = True
         found = {}
         if loop.source is not None:
             code, names = loop.source
             found = milestones(code, line_of(code), numbers, names, self._pure)
             loop.source = None
-        hidden = {n for n in self._hidden(numbers) if n in numbers}
+        hidden = {n for n in (*self._hidden(numbers), *self._chosen) if n in numbers}
         if hidden:
             found["named for this trainer"] = hidden
         self.always = found
@@ -217,16 +234,18 @@ class Refinement:
         if self._auto and self._views is not None:
             self.watched = watched_views(self._views)
         if not self._scales:
+            if self.foresight is not None:
+                raise SkipGSError(
+                    "The gate state was saved with larger, shrinking steps, which are off now; go on with compensate as "
+                    "it was, or start the gate afresh."
+                )
             self.thinning.share = self.share
-        else:
-            if self.foresight is None:
-                self.foresight = Foresight(self._config.tolerance, CYCLE_ENDS if self.watched else ONE_CYCLE)
-            if self._rates is None:
-                self._rates = ScaledRates(self.optimizers, self.named)
+        elif self.foresight is None:
+            self.foresight = Foresight(self._config.tolerance, CYCLE_ENDS if self.watched else ONE_CYCLE)
         log.info(
             "Refinement: at most %.0f %% of iterations %d to %d run, %d of them in any case.",
             100 * (self.share or 1.0),
-            number,
+            self._first,
             self._last,
             len(self._must),
         )
@@ -240,6 +259,12 @@ class Refinement:
         if self._keeps_rates or not self._config.compensates:
             return False
         return self._config.rate_peak is not None or (self.share is not None and self.share < 1.0)
+
+    def _refuse_several(self) -> None:
+        if self._auto:
+            distributed.refuse_several(
+                "refine_share='auto' decides by the losses of one process", "give a share, such as 0.4"
+            )
 
     def _set_pace(self, number: int) -> None:
         """Set the share and the factor with which this number is decided on."""
@@ -256,9 +281,8 @@ class Refinement:
                 self._over = self.foresight.ended
                 self.thinning.share = 0.0 if self._over else 1.0
             factor = path_factor(self.share, progress, self._config.rate_peak)
-        if self._rates is not None:
-            self._rates.follow_thread()
-            self._rates.factor = factor
+        if self._scales:
+            self._rates.scale(factor)
 
     # State and report.
 

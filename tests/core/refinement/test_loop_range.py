@@ -27,6 +27,9 @@ class Every3rd:
     def expected(self, loop):
         return sum(number % 3 == 0 for number in loop.numbers)
 
+    def ended(self, loop):
+        assert loop.current is None
+
 
 def moved_on_by_hand(end):
     bar = Bar(
@@ -90,3 +93,18 @@ def test_a_bar_that_may_be_looped_over_counts_those_that_run(function):
     bar, ran = train(function)
     assert type(bar.numbers) is LoopRange and bar.total == 10
     assert ran == list(range(0, 30, 3))
+
+
+def test_all_but_its_length_and_what_it_hands_out_is_as_in_the_range():
+    numbers, loop = range(1, 9), LoopRange(range(1, 9), Every3rd())
+    assert (list(loop), len(loop)) == ([3, 6], 2)
+    assert list(reversed(loop)) == list(reversed(numbers))
+    assert bool(LoopRange(range(1, 2), Every3rd())) and not LoopRange(range(0), Every3rd())
+    assert (7 in loop, 9 in loop, loop[2], loop[1:3], loop.stop, repr(loop)) == (
+        True,
+        False,
+        3,
+        range(2, 4),
+        9,
+        "range(1, 9)",
+    )

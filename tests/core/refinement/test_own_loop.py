@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.core import distributed
 from skipgs_plug.core.refinement.rates import path_factor
 
 VIEWS = [f"{i}.png" for i in range(4)]
@@ -124,6 +125,26 @@ def test_interrupted_and_resumed_goes_as_uninterrupted(settings):
     assert torch.equal(second.value, whole.value)
 
 
+def test_a_condition_that_holds_half_the_time_says_the_same_after_a_resume():
+    def train(first, state=None):
+        ran, states = [], {}
+        with SkipGate(start_iter=1, refine_share=0.3) as gate:
+            if state is not None:
+                gate.load_state_dict(state)
+            for step in gate.iterations(range(first, 41)):
+                gate.backward(torch.ones((), requires_grad=True) * 0.1, view="a", step=step)
+                ran.append(step)
+                states[step] = gate.state_dict()
+                if step % 2 == 0:
+                    pass
+        return ran, states, gate.report()["always_run"]
+
+    whole, states, always = train(0)
+    for step in (7, 11, 20):
+        rest, _, again = train(step + 1, states[step])
+        assert rest == [n for n in whole if n > step] and list(again.values()) == list(always.values())
+
+
 def first_part(loop, gate, middle, options):
     """Train up to `middle`, giving the gate's state at the end of each iteration."""
     for step in gate.iterations(range(loop.begin, loop.end), always=range(0, 400, 25), **options):
@@ -145,6 +166,18 @@ def test_a_state_of_another_share_is_refused():
     for settings in ({"refine_share": 0.5}, {}):
         with SkipGate(start_iter=10, **settings) as gate, pytest.raises(SkipGSError, match=r"refine_share=0\.4"):
             gate.load_state_dict(state)
+
+
+def test_a_state_with_larger_steps_does_not_go_on_without():
+    with SkipGate(start_iter=10, refine_share=0.4) as gate:
+        for step in gate.iterations(range(100), always=()):
+            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
+            if step == 20:
+                state = gate.state_dict()
+    with SkipGate(start_iter=10, refine_share=0.4, compensate=False) as gate:
+        gate.load_state_dict(state)
+        with pytest.raises(SkipGSError, match="saved with larger, shrinking steps, which are off now"):
+            next(iter(gate.iterations(range(21, 100), always=())))
 
 
 def test_auto_ends_where_nothing_is_gained_and_goes_on_with_what_hangs_on_numbers():
@@ -182,6 +215,17 @@ def test_auto_must_know_the_views():
         Loop().train(gate)
 
 
+def test_what_each_process_would_find_by_itself_is_refused_in_a_group(monkeypatch):
+    auto, larger = SkipGate(start_iter=10, refine_share="auto"), SkipGate(start_iter=10, compensate=True)
+    monkeypatch.setattr(distributed, "group_size", lambda: 2)  # the group may come after the gate
+    with auto, pytest.raises(SkipGSError, match=r"of one process, but 2 train together; give a share"):
+        Loop().train(auto, views=VIEWS)
+    with larger, pytest.raises(SkipGSError, match=r"by itself, but 2 train together; give min_bwd_ratio"):
+        larger.iterations(range(100))
+    with SkipGate(start_iter=10, compensate=True, min_bwd_ratio=0.5) as gate:
+        assert len(gate.iterations(range(100))) == 100
+
+
 def test_the_gate_makes_up_for_skipped_backwards_when_asked():
     with SkipGate(start_iter=40, compensate=True) as gate, pytest.raises(SkipGSError, match=r"gate\.iterations"):
         gate.backward(torch.ones((), requires_grad=True), view="a", step=50)
@@ -193,6 +237,56 @@ def test_the_gate_makes_up_for_skipped_backwards_when_asked():
     with SkipGate(start_iter=40, compensate=True, min_bwd_ratio=0.5, warmup=0) as gate:
         loop.train(gate)
     assert loop.ran == list(range(400)) and factors[40] == pytest.approx(4.0) and factors[-1] < 0.1
+
+
+@pytest.mark.parametrize("settings", [{"refine_share": 0.5}, {"compensate": True}])
+def test_iterations_that_come_after_the_last_one_are_refused(settings):
+    with SkipGate(start_iter=4, **settings) as gate:
+        for step in gate.iterations(range(10)):
+            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
+        with pytest.raises(SkipGSError, match=r"up to 19 come after a plan that ends with 9; give gate\.iterations"):
+            gate.iterations(range(10, 20))
+        assert gate.iterations(range(5, 10)) and gate.iterations(range(0)) is not None
+
+
+@pytest.mark.parametrize("settings", [{"refine_share": 0.5}, {"compensate": True}])
+@pytest.mark.parametrize("leaves", [False, True])
+def test_what_steps_after_the_loop_is_left_alone(settings, leaves):
+    gate = SkipGate(start_iter=4, **settings)  # never detached
+    for step in gate.iterations(range(20), always=range(20)):
+        gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
+        if leaves and step == 10:
+            break
+    value = torch.nn.Parameter(torch.zeros(2))
+    optimizer = torch.optim.SGD([value], lr=0.5)
+    value.grad = torch.ones(2)
+    optimizer.step()
+    gate.detach()
+    assert value.tolist() == [-0.5, -0.5]
+
+
+def test_a_trainer_that_goes_on_after_its_end_is_not_trained_backwards():
+    value = torch.nn.Parameter(torch.zeros(2))
+    optimizer = torch.optim.SGD([value], lr=1.0)
+    with SkipGate(start_iter=0, compensate=True, warmup=100) as gate:
+        gate.iterations(range(10))
+        for step in range(20):
+            before = value.detach().clone()
+            gate.backward((value * 1.0).sum(), view="a", step=step)
+            optimizer.step()
+            optimizer.zero_grad()
+            assert bool((value < before).all()) if step < 10 else torch.equal(value, before)
+
+
+def test_without_a_floor_steps_are_as_long_as_if_all_backwards_ran():
+    value = torch.nn.Parameter(torch.zeros(2))
+    optimizer = torch.optim.SGD([value], lr=0.5)
+    with SkipGate(start_iter=0, compensate=True, min_bwd_ratio=0.0, warmup=5) as gate:
+        for step in gate.iterations(range(10)):
+            gate.backward(value.sum(), view="a", step=step)
+            before, value.grad = value[0].item(), torch.ones(2)
+            optimizer.step()
+            assert before - value[0].item() == pytest.approx(0.5 * path_factor(1.0, step / 10))
 
 
 def test_unfit_numbers_and_settings_are_refused():

@@ -24,8 +24,8 @@ def rates():
 def test_optimizers_have_names_where_their_groups_have_none():
     values = {name: torch.nn.Parameter(torch.zeros(5, 3)) for name in ("means", "features_dc", "scales", "opacities")}
     optimizers = {name: torch.optim.SGD([value], lr=0.1) for name, value in values.items()}
-    scaled = ScaledRates(named=lambda: optimizers)
-    scaled.factor = 3.0
+    scaled = ScaledRates(lambda: optimizers)
+    scaled.scale(3.0)
     for name, value in values.items():
         value.grad = torch.ones(5, 3)
         optimizers[name].step()
@@ -68,7 +68,7 @@ def test_colours_and_positions_take_longer_steps_and_opacities_no_longer_ones(gr
     value = torch.nn.Parameter(torch.zeros(shape))
     optimizer = torch.optim.SGD([{"params": [value], **group}], lr=0.1)
     value.grad = torch.ones(shape)
-    rates.factor = 3.0
+    rates.scale(3.0)
     optimizer.step()
     torch.testing.assert_close(value.detach(), torch.full(shape, -0.1 if times is None else -0.3 * times))
     assert group_factor(optimizer.param_groups[0], 0.25) == (0.25 if times is None else 0.25 * times)
@@ -94,11 +94,11 @@ def test_a_step_is_as_long_as_the_factor_says_and_the_rate_comes_back(kind, rate
     }[kind]
     arguments = (True, 3) if kind == "own" else ()
     scaled, plain = make(value), make(other)
-    rates.factor = 4.0
+    rates.scale(4.0)
     before = scaled.param_groups[0]["lr"]
     scaled.step(*arguments)
     assert scaled.param_groups[0]["lr"] is before
-    rates.factor = None
+    rates.rest()
     plain.step(*arguments)
     torch.testing.assert_close(1.0 - value.detach(), 4.0 * (1.0 - other.detach()), rtol=1e-5, atol=0)
 
@@ -109,10 +109,10 @@ def test_a_step_that_raises_gives_its_rate_back_in_the_next_iteration(rates):
             raise ZeroDivisionError
 
     optimizer = Broken([parameter()], lr=0.1)
-    rates.factor = 5.0
+    rates.scale(5.0)
     with pytest.raises(ZeroDivisionError):
         optimizer.step()
-    rates.follow_thread()
+    rates.scale(5.0)
     assert optimizer.param_groups[0]["lr"] == 0.1
 
 
@@ -122,7 +122,7 @@ def test_other_threads_and_removed_hooks_are_left_alone(rates):
         torch.optim.SGD([value], lr=0.1).step()
         return round(1.0 - value[0].item(), 5)
 
-    rates.factor = 3.0
+    rates.scale(3.0)
     seen = []
     thread = threading.Thread(target=lambda: seen.append(moved()))
     thread.start()
