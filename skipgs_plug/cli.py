@@ -126,7 +126,8 @@ def explain(error: Exception, extra: str) -> str | None:
 
         return f"This command needs the package {error.name}; run: {install_command(extra)}"
     if isinstance(error, OSError) and error.errno and error.strerror:
-        where = error.filename if error.filename is not None else "A file"
+        # Of two files the second is the one that is written: a copy, or the new name.
+        where = next((name for name in (error.filename2, error.filename) if name is not None), "A file")
         return f"{where}: {error.strerror}; make room there or give another path."
     return None
 
