@@ -183,9 +183,7 @@ def test_only_leftovers_are_removed(tmp_path: Path) -> None:
         ("", " is a folder; give the name of a file."),
     ],
 )
-def test_what_is_in_the_way_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str, cure: str
-) -> None:
+def test_what_is_in_the_way_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str, cure: str) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("kept")
     (tmp_path / "folder").mkdir()

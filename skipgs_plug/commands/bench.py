@@ -95,5 +95,6 @@ def run(args: Args, command: str) -> list[Row]:
     with write_aside(folder.root / "table.md") as temporary:
         temporary.write_text(text)
     write_plots(folder.root, records, rows, result["view_names"])
-    print(f"\n{text}\nTable, plots and bench.json: {folder.root}; {next_command('report', folder.root)} makes one page.")
+    page = next_command("report", folder.root)
+    print(f"\n{text}\nTable, plots and bench.json: {folder.root}; {page} makes one page.")
     return rows

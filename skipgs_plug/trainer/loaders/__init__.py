@@ -67,7 +67,7 @@ def load_scene(
     else:
         raise MissingFileError(
             f"Scene {path} holds neither {path / 'sparse' / '0'} (COLMAP) nor {path / 'transforms_train.json'} "
-            "(Blender) nor transforms.json (nerfstudio); for photographs run: " + next_command("sfm", path, "SCENE") + "."
+            f"(Blender) nor transforms.json (nerfstudio); for photographs run: {next_command('sfm', path, 'SCENE')}."
         )
     if cloud is None:
         return scene
