@@ -178,7 +178,10 @@ def test_auto_runs_the_whole_share_where_views_are_too_few_to_watch():
 
 
 def test_auto_must_know_the_views():
-    with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match="give views="):
+    with (
+        SkipGate(start_iter=10, refine_share="auto") as gate,
+        pytest.raises(SkipGSError, match=r"give views= \(names\) to gate\.iterations\(\), or a share"),
+    ):
         Loop().train(gate)
 
 
@@ -207,3 +210,14 @@ def test_unfit_numbers_and_settings_are_refused():
     ]:
         with pytest.raises(SkipGSError, match=sentence):
             SkipGate(start_iter=1, **settings)
+
+
+def test_a_loop_that_forgot_iterations_is_told():
+    gate = SkipGate(start_iter=3, refine_share=0.5)
+    loss = torch.ones((), requires_grad=True)
+    for step in range(3):
+        assert gate.backward(loss, view="a", step=step)
+    with pytest.raises(SkipGSError, match=r"refine_share .* for step in gate\.iterations\(range\(\.\.\.\)\)"):
+        gate.backward(loss, view="a", step=3)
+    off = SkipGate(start_iter=3, refine_share=0.5, enabled=False)
+    assert off.backward(loss, view="a", step=9)
