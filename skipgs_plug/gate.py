@@ -120,6 +120,8 @@ class SkipGate:
         """
         if not isinstance(numbers, range) or numbers.step != 1:
             raise SkipGSError("iterations() takes a range that goes up by one, such as range(30_000).")
+        if isinstance(views, str):
+            raise SkipGSError(f"views= takes a list of all names of training views, not the one name {views!r}.")
         engine = self._engine
         if numbers:
             engine.compensate_until(numbers[-1])
@@ -133,7 +135,7 @@ class SkipGate:
             chosen = set(always)
             engine.refinement.describe(lambda left: chosen)
         if views is not None:
-            engine.refinement.know_views([view_key(view) for view in views])
+            engine.refinement.know_views(list(dict.fromkeys(view_key(view) for view in views)))
         return engine.refinement.follow(LoopRange(numbers, engine.refinement, source))
 
     def backward(self, loss: Any, view: Any, step: int, *, signal: Any = None) -> bool:

@@ -212,8 +212,8 @@ class Refinement:
         if self._auto and self.share is None:
             if self._views is None:
                 raise SkipGSError(
-                    'refine_share="auto" must know the training views; give their names to gate.iterations() as views=, '
-                    "or a share."
+                    'refine_share="auto" must know the training views; give their names to gate.iterations() as views='
+                    ", or a share."
                 )
             self.share = needed_share(total, len(self._views))
         assert self.share is not None

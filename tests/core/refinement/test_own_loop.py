@@ -178,11 +178,20 @@ def test_auto_runs_the_whole_share_where_views_are_too_few_to_watch():
 
 
 def test_auto_must_know_the_views():
-    with (
-        SkipGate(start_iter=10, refine_share="auto") as gate,
-        pytest.raises(SkipGSError, match=r"give views= \(names\) to gate\.iterations\(\), or a share"),
-    ):
+    sentence = r"give their names to gate\.iterations\(\) as views=, or a share"
+    with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match=sentence):
         Loop().train(gate)
+    with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match="views= takes a list"):
+        gate.iterations(range(100), views="0.png")
+
+
+def test_views_named_twice_are_known_once():
+    reports = []
+    for views in (VIEWS, VIEWS * 40):
+        with SkipGate(start_iter=40, refine_share="auto", warmup=0) as gate:
+            Loop(end=400).train(gate, views=views)
+        reports.append(gate.report()["refine_share"])
+    assert reports[0] == reports[1] < 1
 
 
 def test_the_gate_makes_up_for_skipped_backwards_when_asked():
