@@ -122,9 +122,19 @@ def test_ctrl_c_that_an_import_turned_into_another_error(monkeypatch: pytest.Mon
     assert cli.main(["train"]) == 130
 
 
-@pytest.mark.parametrize("number", [errno.EROFS, errno.ENOSPC, errno.EACCES, errno.ENAMETOOLONG, errno.EIO])
+@pytest.mark.parametrize(
+    ("number", "cure"),
+    [
+        (errno.ENOSPC, "make room there or give another path"),
+        (errno.EFBIG, "make room there or give another path"),
+        (errno.EACCES, "change its permissions or give another path"),
+        (errno.EROFS, "give another path"),
+        (errno.ENAMETOOLONG, "give another path"),
+        (errno.EIO, "give another path"),
+    ],
+)
 def test_file_systems_in_trouble(
-    number: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    number: int, cure: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     class Command:
         @staticmethod
@@ -133,9 +143,7 @@ def test_file_systems_in_trouble(
 
     monkeypatch.setattr(cli.importlib, "import_module", lambda name: Command)
     assert cli.main(["report"]) == 2
-    assert capsys.readouterr().err == (
-        f"skipgs-plug: /some/where: {os.strerror(number)}; make room there or give another path.\n"
-    )
+    assert capsys.readouterr().err == (f"skipgs-plug: /some/where: {os.strerror(number)}; {cure}.\n")
 
 
 def test_nobody_reads_the_output() -> None:

@@ -11,6 +11,7 @@ from skipgs_plug.commands.signals import stop_on_signal
 from skipgs_plug.core.report import write_report
 from skipgs_plug.files import WriteError, keep_going
 from skipgs_plug.install import next_command
+from skipgs_plug.terminate import UNREAD
 from skipgs_plug.trainer import InputError, Trainer
 from skipgs_plug.trainer.autosave import Autosave
 from skipgs_plug.trainer.curve import LossCurve
@@ -66,7 +67,8 @@ class Session:
         """Train, and finish unless a signal stopped training.
 
         Returns:
-            0 for a finished run, 128 + number of the signal for one that was stopped.
+            0 for a finished run, 128 + number of the signal for one that was stopped, `UNREAD` when nobody reads
+            what it prints.
 
         Raises:
             InputError: a file could not be written.
@@ -75,7 +77,10 @@ class Session:
         with self._open_log() as self._log, self._open_view() as self._live:
             trainer.on_step = self._after_iteration
             with stop_on_signal(trainer) as stop:
-                trainer.train(progress=not self._options.no_progress)
+                try:
+                    trainer.train(progress=not self._options.no_progress)
+                except BrokenPipeError:  # between two iterations as well, so that the checkpoint is exact
+                    stop.exit_code = UNREAD
                 with keep_going(self._failed):
                     self._autosave.save()
             trainer.on_step = None

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tqdm.auto import tqdm
 
 from benchmarks import soak_runs
 from skipgs_plug.cli import main
@@ -116,6 +117,24 @@ def test_a_finished_run_is_completed(tmp_path: Path, packed: str, whole: Path, l
     ]:
         path.rename(path.with_name(f".{path.name}.4711.tmp"))
     (out / ".skipgs.json.4711").write_text("{")
+    assert train(packed, out, "--resume") == 0
+    assert_same(out, whole)
+
+
+def test_when_nobody_reads_any_more_a_checkpoint_is_left(
+    tmp_path: Path, packed: str, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, command = tmp_path / "run", [option for option in OPTIONS if option != "--no-progress"]
+
+    def unread(self: tqdm, n: float | None = 1) -> None:
+        self.n += n or 0
+        if self.n >= 33:
+            raise BrokenPipeError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tqdm, "update", unread)
+        assert main(["train", packed, "--out", str(out), *command]) == 141
+    assert checkpoints(out)[-1] == "ckpt_32_rank0.pt"
     assert train(packed, out, "--resume") == 0
     assert_same(out, whole)
 
