@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import importlib
 import os
 import sys
@@ -11,7 +12,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, NamedTuple, Union
 
-from skipgs_plug.terminate import Terminated, terminable
+from skipgs_plug.terminate import UNREAD, Terminated, terminable
 
 
 class Command(NamedTuple):
@@ -37,7 +38,10 @@ DESCRIPTION = "skipgs-plug COMMAND --help describes its options; --debug shows t
 BAD_INPUT = 2
 INTERRUPTED = 130
 TERMINATED = 143
-UNREAD = 141
+CURES = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room there or "),
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "change its permissions or "),
+}
 OURS = ("SkipGSError", "InputError", "WriteError")
 
 
@@ -126,8 +130,9 @@ def explain(error: Exception, extra: str) -> str | None:
 
         return f"This command needs the package {error.name}; run: {install_command(extra)}"
     if isinstance(error, OSError) and error.errno and error.strerror:
-        where = error.filename if error.filename is not None else "A file"
-        return f"{where}: {error.strerror}; make room there or give another path."
+        # Of two files the second is the one that is written: a copy, or the new name.
+        where = next((name for name in (error.filename2, error.filename) if name is not None), "A file")
+        return f"{where}: {error.strerror}; {CURES.get(error.errno, '')}give another path."
     return None
 
 

@@ -32,7 +32,7 @@ def write_aside(path: str | Path, size: int | None = None) -> Iterator[Path]:
         WriteError: the file cannot be written; says why, and how much room is needed.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.parent / f".{path.name}.{os.getpid()}.tmp"
     try:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -77,9 +77,16 @@ def remove_leftovers(folder: Path) -> None:
 def write_error(path: Path, error: OSError, size: int | None = None) -> WriteError:
     """Return what to raise when `path`, of `size` bytes, cannot be written."""
     reason = os.strerror(error.errno) if error.errno else str(error)
+    blocking = next((parent for parent in path.parents if os.path.isfile(parent)), None)
+    if blocking is not None:
+        return WriteError(
+            f"{path} cannot be written ({reason}): {blocking} is a file and no folder; give another place."
+        )
     free = _free(path)
     # numpy's writer says how many items it wrote instead of why it stopped.
     if error.errno not in OUT_OF_SPACE and not (error.errno is None and free is not None and free < (size or 2**20)):
+        if os.path.isdir(path):
+            return WriteError(f"{path} cannot be written ({reason}): {path} is a folder; give the name of a file.")
         return WriteError(f"{path} cannot be written ({reason}); make its folder writable or give another one.")
     needed = "more room than there is" if size is None else f"about {_megabytes(size)}"
     left = "" if free is None else f", {_megabytes(free)} are free"

@@ -121,6 +121,8 @@ class SkipGate:
         """
         if not isinstance(numbers, range) or numbers.step != 1:
             raise SkipGSError("iterations() takes a range that goes up by one, such as range(30_000).")
+        if isinstance(views, str):
+            raise SkipGSError(f"views= takes a list of all names of training views, not the one name {views!r}.")
         engine = self._engine
         engine.compensate(numbers)
         if engine.refinement is None:
@@ -131,7 +133,7 @@ class SkipGate:
             source = (frame.f_code, {**frame.f_globals, **frame.f_locals})
         engine.refinement.choose(always or ())
         if views is not None:
-            engine.refinement.know_views([view_key(view) for view in views])
+            engine.refinement.know_views(list(dict.fromkeys(view_key(view) for view in views)))
         return engine.refinement.follow(LoopRange(numbers, engine.refinement, source))
 
     def backward(self, loss: Any, view: Any, step: int, *, signal: Any = None) -> bool:
@@ -148,10 +150,17 @@ class SkipGate:
         Raises:
             GateOrderError: The view was decided on already in this iteration, the iteration was ended by
                 `update`, or iterations go backwards.
-            SkipGSError: The key is not usable, or losses stay non-finite.
+            SkipGSError: The key is not usable, the loss is no tensor, losses stay non-finite, or `refine_share` is
+                given and no loop over `iterations` runs.
         """
         self._require_manual("backward")
         engine, now, step = self._engine, self._iteration, int(step)
+        self._check_losses(loss, view)
+        if engine.refinement is not None and engine.refinement.wants_loop and step >= engine.start:
+            raise SkipGSError(
+                "refine_share leaves out iterations of a loop that it is given: write the loop as "
+                "for step in gate.iterations(range(...))."
+            )
         if step != now.step:
             engine.open_iteration(step)
         elif now.ended or now.stepped:
@@ -361,6 +370,15 @@ class SkipGate:
         except BaseException:
             self._hooks.restore()
             raise
+
+    @staticmethod
+    def _check_losses(loss: Any, view: Any) -> None:
+        batch = isinstance(view, list)
+        if batch and not isinstance(loss, (list, tuple)) and not (isinstance(loss, Tensor) and loss.dim()):
+            raise SkipGSError(f"{len(view)} view keys came with one loss; give one loss per view.")
+        for one in loss if batch else (loss,):
+            if not hasattr(one, "backward"):
+                raise SkipGSError(f"backward() needs the loss itself, a tensor, not {type(one).__name__}.")
 
     def _backward_batch(self, losses: Any, views: list[Any], signals: Any) -> bool:
         if not len(losses) == len(views) == len(signals):

@@ -21,6 +21,11 @@ def program() -> str:
     return PROGRAM if shutil.which(PROGRAM) else f"{shlex.quote(sys.executable)} -m {NAME}"
 
 
+def next_command(*words: str | Path) -> str:
+    """Return a command line of this package that can be pasted into a shell, whatever folders are called."""
+    return f"{program()} {shlex.join(map(str, words))}"
+
+
 def install_command(extra: str = "full") -> str:
     """Return the `pip install` command for an extra of this package, from where the package itself came from."""
     root = Path(__file__).resolve().parents[1]

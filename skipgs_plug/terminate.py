@@ -7,6 +7,8 @@ import signal
 from collections.abc import Iterator
 from typing import Any
 
+UNREAD = 141  # exit code when nobody reads the output any more, as a shell reports SIGPIPE
+
 
 class Terminated(KeyboardInterrupt):
     """SIGTERM arrived."""

@@ -67,6 +67,10 @@ def test_bad_input_is_one_sentence(tmp_path: Path, packed: str, capsys: pytest.C
     assert "threshold must be" in one_sentence(capsys)
     assert main(["train", packed, "--out", out, "--max-steps", "0"]) == 2
     assert not Path(out).exists()
+    capsys.readouterr()
+    for arguments in (["", "--out", out], [packed, "--out", ""]):  # as of shell variables that are not set
+        assert main(["train", *arguments, *SHORT]) == 2
+        assert "is empty" in one_sentence(capsys)
     assert main(["train", packed, "--out", out, "--resume", "--debug"]) == 2
     assert "Traceback" in capsys.readouterr().err
 

@@ -122,9 +122,19 @@ def test_ctrl_c_that_an_import_turned_into_another_error(monkeypatch: pytest.Mon
     assert cli.main(["train"]) == 130
 
 
-@pytest.mark.parametrize("number", [errno.EROFS, errno.ENOSPC, errno.EACCES, errno.ENAMETOOLONG, errno.EIO])
+@pytest.mark.parametrize(
+    ("number", "cure"),
+    [
+        (errno.ENOSPC, "make room there or give another path"),
+        (errno.EFBIG, "make room there or give another path"),
+        (errno.EACCES, "change its permissions or give another path"),
+        (errno.EROFS, "give another path"),
+        (errno.ENAMETOOLONG, "give another path"),
+        (errno.EIO, "give another path"),
+    ],
+)
 def test_file_systems_in_trouble(
-    number: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    number: int, cure: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     class Command:
         @staticmethod
@@ -133,9 +143,7 @@ def test_file_systems_in_trouble(
 
     monkeypatch.setattr(cli.importlib, "import_module", lambda name: Command)
     assert cli.main(["report"]) == 2
-    assert capsys.readouterr().err == (
-        f"skipgs-plug: /some/where: {os.strerror(number)}; make room there or give another path.\n"
-    )
+    assert capsys.readouterr().err == (f"skipgs-plug: /some/where: {os.strerror(number)}; {cure}.\n")
 
 
 def test_nobody_reads_the_output() -> None:
@@ -172,3 +180,36 @@ def test_only_leftovers_are_removed(tmp_path: Path) -> None:
         (tmp_path / name).write_text("")
     remove_leftovers(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".hidden", ".lock", ".owner.json", "x.4711.tmp"]
+
+
+@pytest.mark.parametrize(
+    ("target", "cure"),
+    [
+        ("file/x.html", "file is a file and no folder; give another place."),
+        ("file/deeper/x.html", "file is a file and no folder; give another place."),
+        ("folder", "folder is a folder; give the name of a file."),
+        ("", " is a folder; give the name of a file."),
+    ],
+)
+def test_what_is_in_the_way_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str, cure: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("kept")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(WriteError) as raised, write_aside(target) as temporary:
+        temporary.write_text("new")
+    assert str(raised.value).endswith(cure) and "make its folder writable" not in str(raised.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_a_copy_that_does_not_fit_names_the_copy(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Command:
+        @staticmethod
+        def main(argv: list[str]) -> int:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/photographs/a.jpg", None, "/scene/a.jpg")
+
+    monkeypatch.setattr(cli.importlib, "import_module", lambda name: Command)
+    assert cli.main(["sfm"]) == 2
+    assert capsys.readouterr().err.startswith("skipgs-plug: /scene/a.jpg: No space left on device; make room there")

@@ -18,7 +18,7 @@ from skipgs_plug.bench.runner import Bench, Clock
 from skipgs_plug.bench.store import BenchFolder
 from skipgs_plug.bench.summary import Row, row_from_dict
 from skipgs_plug.bench.table import legend, markdown, notes, tables
-from skipgs_plug.install import program
+from skipgs_plug.install import next_command
 from skipgs_plug.trainer import TrainConfig, load_scene
 from skipgs_plug.trainer.files import write_aside, write_json
 from skipgs_plug.trainer.lock import exclusive
@@ -95,5 +95,6 @@ def run(args: Args, command: str) -> list[Row]:
     with write_aside(folder.root / "table.md") as temporary:
         temporary.write_text(text)
     write_plots(folder.root, records, rows, result["view_names"])
-    print(f"\n{text}\nTable, plots and bench.json: {folder.root}; {program()} report {folder.root} makes one page.")
+    page = next_command("report", folder.root)
+    print(f"\n{text}\nTable, plots and bench.json: {folder.root}; {page} makes one page.")
     return rows

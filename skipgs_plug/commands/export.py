@@ -10,7 +10,7 @@ import tyro
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.ply import write_ply
-from skipgs_plug.view.model import open_model
+from skipgs_plug.view.model import open_snapshots
 
 FORMATS = {".compressed.ply": "ply_compressed", ".splat": "splat"}  # as gsplat.export_splats calls them
 
@@ -40,7 +40,7 @@ def run(args: Args) -> int:
     ending = next((ending for ending in (*FORMATS, ".ply") if out.name.lower().endswith(ending)), None)
     if ending is None:
         raise InputError(f"{out.name} has an ending that is not written here; use {', '.join(FORMATS)} or .ply.")
-    splats = open_model(args.model).snapshots[-1].load()
+    splats = open_snapshots(args.model)[-1].load()
     if ending == ".ply":
         write_ply(splats, out)
     else:

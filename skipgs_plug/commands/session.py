@@ -10,7 +10,8 @@ from skipgs_plug import SkipGate
 from skipgs_plug.commands.signals import stop_on_signal
 from skipgs_plug.core.report import write_report
 from skipgs_plug.files import WriteError, keep_going
-from skipgs_plug.install import program
+from skipgs_plug.install import next_command
+from skipgs_plug.terminate import UNREAD
 from skipgs_plug.trainer import InputError, Trainer
 from skipgs_plug.trainer.autosave import Autosave
 from skipgs_plug.trainer.curve import LossCurve
@@ -66,7 +67,8 @@ class Session:
         """Train, and finish unless a signal stopped training.
 
         Returns:
-            0 for a finished run, 128 + number of the signal for one that was stopped.
+            0 for a finished run, 128 + number of the signal for one that was stopped, `UNREAD` when nobody reads
+            what it prints.
 
         Raises:
             InputError: a file could not be written.
@@ -75,7 +77,10 @@ class Session:
         with self._open_log() as self._log, self._open_view() as self._live:
             trainer.on_step = self._after_iteration
             with stop_on_signal(trainer) as stop:
-                trainer.train(progress=not self._options.no_progress)
+                try:
+                    trainer.train(progress=not self._options.no_progress)
+                except BrokenPipeError:  # between two iterations as well, so that the checkpoint is exact
+                    stop.exit_code = UNREAD
                 with keep_going(self._failed):
                     self._autosave.save()
             trainer.on_step = None
@@ -84,10 +89,13 @@ class Session:
                     self._gate.verify()
                 self._finish()
         if self._failed:
-            raise InputError(
-                f"{len(self._failed)} files of {self._folder.root} could not be written; make room, and the same "
-                "command with --resume writes them."
-            )
+            lost = f"{len(self._failed)} files of {self._folder.root} could not be written"
+            if not self._folder.checkpoints():
+                raise InputError(
+                    f"{lost}, and no checkpoint is there to go on from; make room, and give the same command again, "
+                    "without --resume: it trains anew."
+                )
+            raise InputError(f"{lost}; make room, and the same command with --resume writes them.")
         if stop.exit_code:
             print(f"Stopped after iteration {trainer.step - 1:,}; the same command with --resume continues.")
         return stop.exit_code
@@ -143,7 +151,7 @@ class Session:
             print(self._gate.summary())
         print(f"{self._described(stats)}; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s")
         if ply is not None:
-            print(f"{ply}\nNext: {program()} view {folder.root}")
+            print(f"{ply}\nNext: {next_command('view', folder.root)}")
 
     def _described(self, stats: dict[str, Any]) -> str:
         net = self._options.lpips_net

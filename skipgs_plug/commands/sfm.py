@@ -13,7 +13,7 @@ from typing import Any
 import tyro
 from tqdm.auto import tqdm
 
-from skipgs_plug.install import program
+from skipgs_plug.install import next_command
 from skipgs_plug.photos import global_mapping
 from skipgs_plug.photos.gather import gather
 from skipgs_plug.photos.reconstruct import Mapping, Matching, Reconstruction
@@ -53,7 +53,8 @@ def main(argv: list[str]) -> int:
 def run(args: Args) -> int:
     """Reconstruct and print what was placed; see `Args`."""
     scene = reconstruct(args)
-    print(f"Scene: {scene}. Next: {program()} train {scene} --out runs/{scene.resolve().name}")
+    train = next_command("train", scene, "--out", f"runs/{scene.resolve().name}")
+    print(f"Scene: {scene}. Next: {train}")
     return 0
 
 

@@ -16,7 +16,7 @@ from skipgs_plug.commands import sfm
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.commands.gate_settings import GateSettings
 from skipgs_plug.commands.session import Session, SessionOptions
-from skipgs_plug.install import program
+from skipgs_plug.install import next_command
 from skipgs_plug.photos.gather import are_photographs
 from skipgs_plug.trainer import InputError, MissingFileError, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.config import REFERENCE_STEPS
@@ -107,6 +107,9 @@ def check(args: Args, checkpoints: list[Path]) -> None:
     Raises:
         InputError: LPIPS cannot be computed, --resume does not fit what --out holds, or --sfm what SCENE is.
     """
+    for name, value in (("SCENE", args.scene), ("--out", args.out)):
+        if not value:  # which pathlib takes for the current folder
+            raise InputError(f"{name} is empty; give the name of a folder.")
     given = Path(args.scene).expanduser()
     if args.sfm and not are_photographs(given):
         what = "is a scene already" if is_scene(given) else "is neither a video nor a folder with photographs"
@@ -114,7 +117,7 @@ def check(args: Args, checkpoints: list[Path]) -> None:
     if not args.sfm and are_photographs(given):
         raise InputError(
             f"{args.scene} holds photographs and nothing that says where they were taken; add --sfm to find that out "
-            f"first, or run: {program()} sfm {args.scene} SCENE."
+            f"first, or run: {next_command('sfm', args.scene, 'SCENE')}."
         )
     if args.session.lpips_net is not None:
         require_lpips(args.session.lpips_net)

@@ -1,5 +1,10 @@
 """What `rasterization` refuses, in one sentence that names the argument."""
 
+import math
+import numbers
+import operator
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -17,6 +22,25 @@ def refuse_unsupported(**used: bool) -> None:
     for name, in_use in used.items():
         if in_use:
             raise NotImplementedError(f"The CPU rasterizer does not support {name}; leave it at its default.")
+
+
+def as_float(name: str, value: Any) -> float:
+    """Returns a number of any kind as kernels take it.
+
+    Raises:
+        ValueError: It is none, or NaN.
+    """
+    if not isinstance(value, numbers.Real) or math.isnan(value):
+        raise ValueError(f"{name} must be a number, got {value!r}.")
+    return float(value)
+
+
+def as_int(value: Any) -> Any:
+    """Returns a whole number of any kind, such as NumPy's, as kernels take it, and all else as it is."""
+    try:
+        return operator.index(value)
+    except TypeError:
+        return value
 
 
 def check_tensors(
@@ -60,7 +84,9 @@ def check_tensors(
     if means.dim() != 2 or means.shape[1] != 3:
         raise ValueError(f"means must have shape [N, 3] (no batch dimensions), got {list(means.shape)}.")
     n = len(means)
-    n_cameras = len(viewmats) if viewmats.dim() else 0
+    if viewmats.dim() != 3:
+        raise ValueError(f"viewmats must have shape [C, 4, 4], got {list(viewmats.shape)}.")
+    n_cameras = len(viewmats)
     expected = {
         "quats": [n, 4],
         "scales": [n, 3],
@@ -79,7 +105,7 @@ def check_tensors(
             raise ValueError(f"colors must have shape [{n}, D] or [{n_cameras}, {n}, D], got {shape}.")
         channels = shape[-1]
     else:
-        if sh_degree not in (0, 1, 2, 3):
+        if type(sh_degree) is not int or sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"sh_degree must be 0 to 3 on the CPU, got {sh_degree!r}.")
         terms = (sh_degree + 1) ** 2
         if sh_rest is not None:

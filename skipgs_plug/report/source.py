@@ -94,7 +94,9 @@ def read_source(path: str | Path) -> RunSource | BenchSource:
     Raises:
         SkipGSError: there is none, or it is damaged or of another version; names the file.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise SkipGSError(f"{path} does not exist; give the folder of a run or of a bench.")
     if path.is_file():
         folder, file = path.parent, path
     else:

@@ -152,10 +152,10 @@ class Trainer:
         bar = tqdm(total=until, initial=self.step, desc="Training", disable=not progress, mininterval=0.5)
         with bar:
             for step in () if self.stop_requested else self.iterations(until):
-                bar.update(step - self.step)
-                self._since, self.step = self.step, step
+                before, self.step = self.step, step
+                self._since = before
                 loss = self.train_step()
-                bar.update()
+                bar.update(self.step - before)  # after the iteration: it raises when nobody reads any more
                 if self.ran % 10 == 0:
                     bar.set_postfix_str(f"loss={loss:.3f} | GS={self.num_gaussians}", refresh=False)
                 if self.stop_requested:

@@ -101,10 +101,12 @@ def model_of(path: Path, vertices: Mapping[str, np.ndarray]) -> dict[str, Tensor
     if lacking:
         raise InputError(f"PLY {path} is not a 3DGS model: it lacks {', '.join(lacking[:4])}; export it again.")
     table = columns(path, vertices, names)
+    if not len(table):
+        raise InputError(f"PLY {path} holds no Gaussians; export it again from a sound checkpoint.")
     means, sh0, rest, opacity, scales, quats = torch.from_numpy(table).split([3, 3, count, 1, 3, 4], dim=1)
     if (quats == 0).all(dim=1).any():
         raise InputError(f"PLY {path} holds rotations of length 0; export it again from a sound checkpoint.")
-    if len(scales) and float(scales.max()) > MAX_LOG_SCALE:
+    if float(scales.max()) > MAX_LOG_SCALE:
         raise InputError(f"PLY {path} holds scales above e^{MAX_LOG_SCALE:g}: they must be logarithms.")
     return {
         "means": means.contiguous(),

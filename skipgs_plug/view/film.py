@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import contextlib
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from skipgs_plug.files import WriteError
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.files import write_aside
 
@@ -15,21 +17,52 @@ QUALITY = 8  # of imageio's scale to 10
 
 
 def write_film(path: Path, frames: Iterable[np.ndarray], fps: int) -> None:
-    """Write frames [H, W, 3] uint8 of one size as H.264; an odd last row or column is cut off."""
+    """Write frames [H, W, 3] uint8 of one size as H.264; an odd last row or column is cut off.
+
+    Raises:
+        WriteError: the film cannot be written whole.
+    """
     import imageio.v2 as iio
 
     with write_aside(path) as temporary:
         target = temporary.with_suffix(".mp4")  # ffmpeg goes by the suffix
         try:
+            target.touch()  # says why it cannot be, which the coder does not
             options: dict[str, Any] = {"fps": fps, "quality": QUALITY, "macro_block_size": 2}
             writer: Any
+            given = 0
             with iio.get_writer(target, format="FFMPEG", **options) as writer:
                 for frame in frames:
                     height, width = (side // 2 * 2 for side in frame.shape[:2])
-                    writer.append_data(frame[:height, :width])
+                    with coder_ended_early(path):
+                        writer.append_data(frame[:height, :width])
+                    given += 1
+            with coder_ended_early(path):
+                check_length(target, given)
             target.replace(temporary)
         finally:
             target.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def coder_ended_early(path: Path) -> Iterator[None]:
+    """Raise WriteError for what imageio raises then, which has the coder's whole command in it."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        raise WriteError(
+            f"{path} cannot be written (the coder ended early, and may have said why); make room there or give "
+            "another place."
+        ) from error
+
+
+def check_length(film: Path, frames: int) -> None:
+    """Raise RuntimeError unless a film has so many frames: imageio does not look at the exit code of its coder."""
+    from imageio_ffmpeg import count_frames_and_secs
+
+    found = count_frames_and_secs(str(film))[0]
+    if found != frames:
+        raise RuntimeError(f"{film} has {found} of {frames} frames")
 
 
 def write_pictures(folder: Path, frames: Iterable[np.ndarray], names: Iterable[str]) -> None:

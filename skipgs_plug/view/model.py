@@ -84,16 +84,8 @@ def open_model(path: str | Path, scene: str | None = None, data_factor: int | No
         InputError: a file is damaged.
     """
     path = Path(path).expanduser()
-    if not path.exists():
-        raise MissingFileError(f"{path} does not exist; give a run folder or a PLY.")
-    config: Mapping[str, Any] = {}
-    if path.is_file():
-        if path.suffix.lower() != ".ply":
-            raise InputError(f"{path} is neither a run folder nor a PLY.")
-        snapshots = [Snapshot(None, path)]
-    else:
-        snapshots = find_snapshots(path)
-        config = read_config(path)
+    snapshots = open_snapshots(path)
+    config = read_config(path) if path.is_dir() else {}
     source = scene or config.get("data_dir")
     factor = data_factor or config.get("data_factor", 1)
     loaded = None
@@ -111,6 +103,23 @@ def open_model(path: str | Path, scene: str | None = None, data_factor: int | No
         bool(config.get("antialiased", False)),
         bool(config.get("exposure", False)),
     )
+
+
+def open_snapshots(path: str | Path) -> list[Snapshot]:
+    """Return the models of a run folder by iteration, or the one of a PLY, without their scene.
+
+    Raises:
+        MissingFileError: there is no such file, or no model in the folder.
+        InputError: the file is no PLY.
+    """
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise MissingFileError(f"{path} does not exist; give a run folder or a PLY.")
+    if path.is_dir():
+        return find_snapshots(path)
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path} is neither a run folder nor a PLY.")
+    return [Snapshot(None, path)]
 
 
 def find_snapshots(folder: Path) -> list[Snapshot]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from pathlib import Path
 import pytest
 import torch
 from torch.optim.optimizer import _global_optimizer_pre_hooks
+from tqdm.auto import tqdm
 
 from benchmarks import soak_runs
 from skipgs_plug.cli import main
@@ -120,6 +122,24 @@ def test_a_finished_run_is_completed(tmp_path: Path, packed: str, whole: Path, l
     assert_same(out, whole)
 
 
+def test_when_nobody_reads_any_more_a_checkpoint_is_left(
+    tmp_path: Path, packed: str, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, command = tmp_path / "run", [option for option in OPTIONS if option != "--no-progress"]
+
+    def unread(self: tqdm, n: float | None = 1) -> None:
+        self.n += n or 0
+        if self.n >= 33:
+            raise BrokenPipeError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tqdm, "update", unread)
+        assert main(["train", packed, "--out", str(out), *command]) == 141
+    assert checkpoints(out)[-1] == "ckpt_32_rank0.pt"
+    assert train(packed, out, "--resume") == 0
+    assert_same(out, whole)
+
+
 def test_a_full_disk_costs_one_checkpoint(
     tmp_path: Path, packed: str, whole: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -142,6 +162,24 @@ def test_a_full_disk_at_the_end_costs_those_files(
     assert (tmp_path / "run/stats/val_step59.json").is_file() and (tmp_path / "run/renders").is_dir()
     assert train(packed, tmp_path / "run", "--resume") == 0
     assert_same(tmp_path / "run", whole)
+
+
+def test_a_full_disk_that_leaves_no_checkpoint_does_not_promise_to_resume(
+    tmp_path: Path, packed: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with monkeypatch.context() as patch:
+        fail_to_write(patch, "ckpt_", ".ply")
+        assert train(packed, tmp_path / "run") == 2
+    error = capsys.readouterr().err
+    assert "no checkpoint" in error and "without --resume" in error and "--resume writes them" not in error
+    assert train(packed, tmp_path / "run", "--max-steps", "4") == 0  # as the sentence says
+
+
+def test_the_next_command_can_be_pasted(tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "my $run"
+    assert train(packed, out, "--max-steps", "4") == 0
+    command = capsys.readouterr().out.splitlines()[-1].partition("Next: ")[2]
+    assert shlex.split(command)[-2:] == ["view", str(out)]
 
 
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(

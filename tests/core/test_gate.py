@@ -217,3 +217,19 @@ def test_clock_separates_the_part_from_start_on() -> None:
         gate.backward(loss_of(1.0), view="a", step=step)
     stats = gate.stats()
     assert 0.0 < stats["t_post"] < stats["t_total"]
+
+
+@pytest.mark.parametrize("loss", [1.0, None, "loss"])
+def test_a_loss_that_is_no_tensor_is_refused_and_the_iteration_can_be_given_again(loss) -> None:
+    gate = SkipGate(start_iter=0)
+    with pytest.raises(SkipGSError, match=r"needs the loss itself, a tensor, not (float|NoneType|str)"):
+        gate.backward(loss, view="a", step=0)
+    assert gate.backward(loss_of(1.0), view="a", step=0)
+
+
+def test_a_list_of_views_needs_a_list_of_losses() -> None:
+    gate = SkipGate(start_iter=0)
+    with pytest.raises(SkipGSError, match="1 view keys came with one loss; give one loss per view"):
+        gate.backward(loss_of(1.0), view=["a"], step=0)
+    with pytest.raises(SkipGSError, match="a tensor, not float"):
+        gate.backward([1.0], view=["a"], step=0)

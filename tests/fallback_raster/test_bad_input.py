@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from raster_scenes import random_scene
@@ -113,3 +114,26 @@ def test_rolling_shutter() -> None:
     refuse("rolling_shutter", rolling_shutter=gsplat.RollingShutterType.ROLLING_TOP_TO_BOTTOM)
     scene = random_scene(n=7, cameras=2)
     rasterization(**scene, rolling_shutter=gsplat.RollingShutterType.GLOBAL)  # its default
+
+
+def test_whole_numbers_serve_where_gsplat_takes_them() -> None:
+    scene = random_scene(n=7, cameras=1, sh_degree=1)
+    plain = rasterization(**{**scene, "near_plane": 1.0, "far_plane": 100.0, "radius_clip": 0.0, "eps2d": 1.0})[0]
+    whole = {"near_plane": 1, "far_plane": 100, "radius_clip": 0, "eps2d": 1}
+    sizes = {name: np.int64(scene[name]) for name in ("width", "height")}
+    assert torch.equal(plain, rasterization(**{**scene, **whole, **sizes})[0])
+
+
+@pytest.mark.parametrize("degree", [1.0, "1", True])
+def test_degrees_that_are_no_whole_number(degree: Any) -> None:
+    refuse("sh_degree must be 0 to 3", sh_degree=degree)
+
+
+@pytest.mark.parametrize("name", ["near_plane", "far_plane", "radius_clip", "eps2d"])
+@pytest.mark.parametrize("value", ["1", None, float("nan")])
+def test_distances_that_are_no_numbers(name: str, value: Any) -> None:
+    refuse(f"{name} must be a number", **{name: value})
+
+
+def test_a_single_camera_without_its_dimension() -> None:
+    refuse(r"viewmats must have shape \[C, 4, 4\]", viewmats=torch.eye(4))

@@ -154,6 +154,8 @@ def test_a_run_whose_gate_was_never_active_is_shown(script_folder, tmp_path):
 
 
 def test_folders_without_a_run_are_named(tmp_path, capsys):
+    assert main(["report", str(tmp_path / "gone/skipgs.json")]) == 2
+    assert "gone/skipgs.json does not exist" in capsys.readouterr().err
     assert main(["report", str(tmp_path)]) == 2
     assert f"{tmp_path} holds neither skipgs.json, bench.json nor stats" in capsys.readouterr().err
     (tmp_path / "stats").mkdir()

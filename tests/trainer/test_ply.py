@@ -92,6 +92,9 @@ def test_bad_files(tmp_path: Path) -> None:
     path.write_bytes(whole.replace(b"property float f_rest_44\n", b""))
     with pytest.raises(InputError, match=r"model\.ply has 44 f_rest properties"):
         read_ply(path)
+    write_ply({name: tensor[:0] for name, tensor in make_splats().items()}, path)
+    with pytest.raises(InputError, match=r"model\.ply holds no Gaussians"):
+        read_ply(path)
 
 
 @pytest.mark.parametrize("count", [2**31, 2**40, 2**62])

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from skipgs_plug.cli import main
 from skipgs_plug.trainer.ply import read_ply
@@ -42,3 +45,12 @@ def test_a_run_folder_is_exported_compressed_and_as_ply(run_folder, ply, tmp_pat
 def test_other_endings_are_refused(ply, tmp_path, capsys, name):
     assert main(["export", str(ply), str(tmp_path / name)]) == 2
     assert "use .compressed.ply, .splat or .ply" in capsys.readouterr().err
+
+
+def test_a_run_is_exported_without_its_scene(run_folder, tmp_path, capsys):
+    moved = tmp_path / "moved"
+    shutil.copytree(run_folder, moved)
+    configuration = yaml.safe_load((moved / "cfg.yml").read_text())
+    (moved / "cfg.yml").write_text(yaml.safe_dump({**configuration, "data_dir": str(tmp_path / "gone")}))
+    assert main(["export", str(moved), str(tmp_path / "model.splat")]) == 0, capsys.readouterr().err
+    assert (tmp_path / "model.splat").stat().st_size % SPLAT.itemsize == 0

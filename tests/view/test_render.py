@@ -149,3 +149,28 @@ def test_colours_of_depth():
     assert colours[0, 0].tolist() == [0, 0, 0]
     assert colours[0, 1, 0] > colours[0, 1, 2] and colours[1, 1, 2] > colours[1, 1, 1]  # near is red, far is blue
     assert depth_range([torch.zeros(2, 2)]) == (0.0, 1.0)
+
+
+@pytest.mark.filterwarnings(LEAVES_PIPES)
+def test_a_film_that_cannot_be_written_is_one_sentence(run_folder, tmp_path, capfd):
+    (tmp_path / "file").write_text("")
+    film = tmp_path / "file/film.mp4"
+    assert main(["render", str(run_folder), str(film), "--frames", "2", "--no-progress"]) == 2
+    assert capfd.readouterr().err.splitlines() == [
+        f"skipgs-plug: {film} cannot be written (File exists): {tmp_path / 'file'} is a file and no folder; "
+        "give another place."
+    ]
+
+
+@pytest.mark.filterwarnings(LEAVES_PIPES)
+def test_a_film_that_does_not_fit_is_one_sentence(run_folder, tmp_path, capfd):
+    resource = pytest.importorskip("resource")
+    film, limits = tmp_path / "film.mp4", resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500, limits[1]))  # the coder inherits it
+    try:
+        assert main(["render", str(run_folder), str(film), "--frames", "60", "--no-progress"]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    said = [line for line in capfd.readouterr().err.splitlines() if line.startswith("skipgs-plug: ")]
+    assert len(said) == 1 and said[0].startswith(f"skipgs-plug: {film} cannot be written (the coder ended early")
+    assert not list(tmp_path.iterdir())

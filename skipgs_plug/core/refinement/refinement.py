@@ -228,7 +228,10 @@ class Refinement:
         total = self._last + 1 - self._first
         if self._auto and self.share is None:
             if self._views is None:
-                raise SkipGSError('refine_share="auto" must know the training views; give views=, or a share.')
+                raise SkipGSError(
+                    'refine_share="auto" must know the training views; give their names to gate.iterations() as views='
+                    ", or a share."
+                )
             self.share = needed_share(total, len(self._views))
         assert self.share is not None
         if self._auto and self._views is not None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from skipgs_plug.install import program
+from skipgs_plug.install import next_command
 from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.loaders.blender import load_blender
 from skipgs_plug.trainer.loaders.colmap import load_colmap
@@ -67,7 +67,7 @@ def load_scene(
     else:
         raise MissingFileError(
             f"Scene {path} holds neither {path / 'sparse' / '0'} (COLMAP) nor {path / 'transforms_train.json'} "
-            f"(Blender) nor transforms.json (nerfstudio); for photographs run: {program()} sfm {path} SCENE."
+            f"(Blender) nor transforms.json (nerfstudio); for photographs run: {next_command('sfm', path, 'SCENE')}."
         )
     if cloud is None:
         return scene

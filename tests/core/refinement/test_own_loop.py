@@ -211,8 +211,20 @@ def test_auto_runs_the_whole_share_where_views_are_too_few_to_watch():
 
 
 def test_auto_must_know_the_views():
-    with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match="give views="):
+    sentence = r"give their names to gate\.iterations\(\) as views=, or a share"
+    with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match=sentence):
         Loop().train(gate)
+    with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match="views= takes a list"):
+        gate.iterations(range(100), views="0.png")
+
+
+def test_views_named_twice_are_known_once():
+    reports = []
+    for views in (VIEWS, VIEWS * 40):
+        with SkipGate(start_iter=40, refine_share="auto", warmup=0) as gate:
+            Loop(end=400).train(gate, views=views)
+        reports.append(gate.report()["refine_share"])
+    assert reports[0] == reports[1] < 1
 
 
 def test_what_each_process_would_find_by_itself_is_refused_in_a_group(monkeypatch):
@@ -301,3 +313,14 @@ def test_unfit_numbers_and_settings_are_refused():
     ]:
         with pytest.raises(SkipGSError, match=sentence):
             SkipGate(start_iter=1, **settings)
+
+
+def test_a_loop_that_forgot_iterations_is_told():
+    gate = SkipGate(start_iter=3, refine_share=0.5)
+    loss = torch.ones((), requires_grad=True)
+    for step in range(3):
+        assert gate.backward(loss, view="a", step=step)
+    with pytest.raises(SkipGSError, match=r"refine_share .* for step in gate\.iterations\(range\(\.\.\.\)\)"):
+        gate.backward(loss, view="a", step=3)
+    off = SkipGate(start_iter=3, refine_share=0.5, enabled=False)
+    assert off.backward(loss, view="a", step=9)
