@@ -239,8 +239,8 @@ class Refinement:
         if not self._scales:
             if self.foresight is not None:
                 raise SkipGSError(
-                    "The gate state was saved with larger, shrinking steps, which are off now; go on with compensate as "
-                    "it was, or start the gate afresh."
+                    "The gate state was saved with larger, shrinking steps, which are off now; go on with compensate "
+                    "as it was, or start the gate afresh."
                 )
             self.thinning.share = self.share
         elif self.foresight is None:
