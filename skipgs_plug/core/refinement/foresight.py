@@ -16,6 +16,8 @@ import random
 from collections.abc import Iterable
 from typing import Any
 
+from skipgs_plug.core.errors import SkipGSError
+
 CYCLE_ENDS = (0.125, 0.25, 1.0)
 ONE_CYCLE = (1.0,)  # where nothing is to be foreseen: the share is given, or no view is watched
 LEAST_SHARE = 0.25
@@ -126,6 +128,16 @@ class Foresight:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict()`.
+
+        Raises:
+            SkipGSError: Its cycles are none.
+        """
+        if tuple(state["ends"]) not in (CYCLE_ENDS, ONE_CYCLE) or not 0 <= state["cycle"] < len(state["ends"]):
+            raise SkipGSError(
+                f"The gate state is in cycle {state['cycle']} of those that end at {state['ends']}, which no run has; "
+                "start the gate afresh."
+            )
         self._ends = tuple(state["ends"])
         self.cycle, self.ended, self.foreseen = int(state["cycle"]), bool(state["ended"]), state["foreseen"]
         self.gains = [(float(mean), float(error)) for mean, error in state["gains"]]

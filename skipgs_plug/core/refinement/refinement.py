@@ -325,7 +325,10 @@ class Refinement:
                 f"The gate state was saved with refine_share={state['asked']!r}, not {self._config.refine_share!r}; "
                 "go on with its setting, or start the gate afresh."
             )
-        self.share, self._first = state["share"], state["first"]
+        share = state["share"]
+        if not (self._auto and state["first"] is None if share is None else 0.0 < share <= 1.0):
+            raise SkipGSError(f"The gate state has share={share!r}, which none is; start the gate afresh.")
+        self.share, self._first = share, state["first"]
         self.thinning.load_state_dict(state["thinning"])
         self._recovery, self._recovered = state["recovery"]
         if state["foresight"] is not None:
