@@ -160,7 +160,9 @@ POLICIES = {
 
 
 def check_policies(names: Sequence[str]) -> None:
-    """Raise InputError for a policy that does not exist, is given twice, or lacks one that it needs."""
+    """Raise InputError for no policy, one that does not exist, is given twice, or lacks one that it needs."""
+    if not names:
+        raise InputError(f"--policies names none; give some of {', '.join(POLICIES)}, or leave it out for all.")
     for name in names:
         if name not in POLICIES:
             raise InputError(f"There is no policy {name!r}; the policies are {', '.join(POLICIES)}.")

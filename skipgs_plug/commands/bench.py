@@ -18,6 +18,7 @@ from skipgs_plug.bench.runner import Bench, Clock
 from skipgs_plug.bench.store import BenchFolder
 from skipgs_plug.bench.summary import Row, row_from_dict
 from skipgs_plug.bench.table import legend, markdown, notes, tables
+from skipgs_plug.commands.names import require_names
 from skipgs_plug.install import next_command
 from skipgs_plug.trainer import TrainConfig, load_scene
 from skipgs_plug.trainer.files import write_aside, write_json
@@ -68,6 +69,7 @@ def main(argv: list[str]) -> int:
 
 def run(args: Args, command: str) -> list[Row]:
     """Run what is missing, print the table, write bench.json, decisions.json, table.md and plots; returns the rows."""
+    require_names(("SCENE", args.scene), ("--out", args.out))
     check_policies(args.policies)
     config = dataclasses.replace(args.train, data_dir=args.scene, result_dir=args.out)
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)

@@ -9,6 +9,7 @@ from typing import Any
 import tyro
 
 from skipgs_plug import SkipGate
+from skipgs_plug.commands.names import require_names
 from skipgs_plug.core.report import write_report
 from skipgs_plug.trainer import TrainConfig, Trainer
 from skipgs_plug.trainer.lock import exclusive
@@ -59,6 +60,7 @@ class Result:
 
 def main(argv: list[str]) -> int:
     args = tyro.cli(Args, args=argv, prog="skipgs-plug demo", config=(tyro.conf.FlagCreatePairsOff,))
+    require_names(("--out", args.out))
     with exclusive(Path(args.out)):
         run(args)
     return 0

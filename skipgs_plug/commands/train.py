@@ -15,6 +15,7 @@ from skipgs_plug import SkipGate
 from skipgs_plug.commands import sfm
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.commands.gate_settings import GateSettings
+from skipgs_plug.commands.names import require_names
 from skipgs_plug.commands.session import Session, SessionOptions
 from skipgs_plug.install import next_command
 from skipgs_plug.photos.gather import are_photographs
@@ -107,9 +108,7 @@ def check(args: Args, checkpoints: list[Path]) -> None:
     Raises:
         InputError: LPIPS cannot be computed, --resume does not fit what --out holds, or --sfm what SCENE is.
     """
-    for name, value in (("SCENE", args.scene), ("--out", args.out)):
-        if not value:  # which pathlib takes for the current folder
-            raise InputError(f"{name} is empty; give the name of a folder.")
+    require_names(("SCENE", args.scene), ("--out", args.out))
     given = Path(args.scene).expanduser()
     if args.sfm and not are_photographs(given):
         what = "is a scene already" if is_scene(given) else "is neither a video nor a folder with photographs"

@@ -47,6 +47,7 @@ def test_command_prints_the_table_and_leaves_json_and_plots(packed, tmp_path, ca
     ("more", "sentence"),
     [
         (("--policies", "gatee"), "There is no policy 'gatee'"),
+        (("--policies",), "--policies names none"),
         (("--policies", "random", "ungated"), "add gate to --policies"),
         (("--seeds", "1", "1"), "each once"),
         (("--max-steps", "1"), "nothing to refine"),
