@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -44,19 +43,3 @@ def test_sigterm_stays_what_it_was() -> None:
         command = [sys.executable, "-c", code.format(handler=handler)]
         done = subprocess.run(command, capture_output=True, text=True)
         assert (done.returncode, done.stderr, done.stdout) == (returned, "", "mine\n" if handler else "")
-
-
-@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals cannot wait here")
-def test_sigterm_while_it_is_loaded_waits_for_who_answers_it(tmp_path: Path) -> None:
-    (tmp_path / "pycolmap.py").write_text(
-        "import os, signal\nsignal.signal(signal.SIGTERM, signal.SIG_DFL)\nos.kill(os.getpid(), signal.SIGTERM)\n"
-    )
-    code = (
-        "import signal\n"
-        "from skipgs_plug.trainer.loaders.native import import_pycolmap\n"
-        "signal.signal(signal.SIGTERM, lambda *_: print('mine'))\n"
-        "import_pycolmap()\n"
-    )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    assert (done.returncode, done.stdout) == (0, "mine\n"), done.stderr

@@ -4,8 +4,7 @@ On Linux pycolmap brings a zlib whose functions Pillow's own are then bound to, 
 the first PNG that Pillow writes ends the process (deflateEnd frees what another deflateInit allocated). With Pillow
 loaded first, both work.
 
-Its logging library answers SIGTERM with a stack trace of the process; what Python had in place comes back, and a signal
-that arrives while it is loaded waits for that.
+Its logging library answers SIGTERM with a stack trace of the process; what Python had in place comes back.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import signal
 import sys
-from collections.abc import Iterator
 from typing import Any
 
 import PIL.Image  # noqa: F401
@@ -32,25 +30,13 @@ def import_pycolmap() -> Any:
     Raises:
         InputError: pycolmap is not installed.
     """
+    loaded = "pycolmap" in sys.modules
+    before = signal.getsignal(signal.SIGTERM)  # None: not from Python, and not ours to put back
     try:
-        with contextlib.nullcontext() if "pycolmap" in sys.modules else _sigterm_kept():
-            import pycolmap
+        import pycolmap
     except ImportError as error:
         raise InputError(f"Cameras of photographs need pycolmap ({error}); run: {install_command()}.") from error
+    if not loaded and before is not None:
+        with contextlib.suppress(ValueError):  # another thread than the main one may not
+            signal.signal(signal.SIGTERM, before)
     return pycolmap
-
-
-@contextlib.contextmanager
-def _sigterm_kept() -> Iterator[None]:
-    """Put back at the end what answers SIGTERM, and let the signal wait until then."""
-    before = signal.getsignal(signal.SIGTERM)  # None: not from Python, and not ours to put back
-    can_wait = hasattr(signal, "pthread_sigmask")
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM}) if can_wait else set()
-    try:
-        yield
-    finally:
-        if before is not None:
-            with contextlib.suppress(ValueError):  # another thread than the main one may not
-                signal.signal(signal.SIGTERM, before)
-        if can_wait:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
