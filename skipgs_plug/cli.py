@@ -38,10 +38,6 @@ DESCRIPTION = "skipgs-plug COMMAND --help describes its options; --debug shows t
 BAD_INPUT = 2
 INTERRUPTED = 130
 TERMINATED = 143
-CURES = {
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room there or "),
-    **dict.fromkeys((errno.EACCES, errno.EPERM), "change its permissions or "),
-}
 OURS = ("SkipGSError", "InputError", "WriteError")
 
 
@@ -130,9 +126,14 @@ def explain(error: Exception, extra: str) -> str | None:
 
         return f"This command needs the package {error.name}; run: {install_command(extra)}"
     if isinstance(error, OSError) and error.errno and error.strerror:
+        from skipgs_plug.files import OUT_OF_SPACE
+
         # Of two files the second is the one that is written: a copy, or the new name.
         where = next((name for name in (error.filename2, error.filename) if name is not None), "A file")
-        return f"{where}: {error.strerror}; {CURES.get(error.errno, '')}give another path."
+        cure = "make room there or " if error.errno in OUT_OF_SPACE else ""
+        if error.errno in (errno.EACCES, errno.EPERM):
+            cure = "change its permissions or "
+        return f"{where}: {error.strerror}; {cure}give another path."
     return None
 
 

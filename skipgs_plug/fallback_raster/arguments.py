@@ -35,6 +35,17 @@ def as_float(name: str, value: Any) -> float:
     return float(value)
 
 
+def planes(near_plane: Any, far_plane: Any) -> tuple[float, float]:
+    """Returns the clipping planes as kernels take them.
+
+    What lies behind a camera is never drawn: kernels sort by the bits of depths, which orders positive ones only.
+
+    Raises:
+        ValueError: One is no number.
+    """
+    return max(as_float("near_plane", near_plane), 0.0), as_float("far_plane", far_plane)
+
+
 def as_int(value: Any) -> Any:
     """Returns a whole number of any kind, such as NumPy's, as kernels take it, and all else as it is."""
     try:

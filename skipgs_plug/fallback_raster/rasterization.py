@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from .arguments import as_float, as_int, check_tensors, refuse_unsupported
+from .arguments import as_float, as_int, check_tensors, planes, refuse_unsupported
 from .autograd import Blend, Project, SphericalHarmonics
 from .constants import MAX_CHANNELS, TILE, tiles
 from .rows import all_rows
@@ -129,8 +129,7 @@ def rasterization(
         if sh_degree is None or len(colors) != 2:
             raise ValueError("colors as a tuple must be a pair (sh0 [N, 1, 3], shN [N, K - 1, 3]) with sh_degree set.")
         colors, sh_rest = colors
-    # What lies behind a camera is never drawn: kernels sort by the bits of depths, which orders positive ones only.
-    near_plane, far_plane = max(as_float("near_plane", near_plane), 0.0), as_float("far_plane", far_plane)
+    near_plane, far_plane = planes(near_plane, far_plane)
     radius_clip, eps2d = as_float("radius_clip", radius_clip), as_float("eps2d", eps2d)
     width, height = as_int(width), as_int(height)
     check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, sh_rest, backgrounds, width, height)

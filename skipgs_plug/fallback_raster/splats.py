@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .arguments import check_tensors
+from .arguments import check_tensors, planes
 from .autograd import check_shapes
 from .buffers import floats, ints, zeros
 from .constants import TILE, blocks, tiles
@@ -92,14 +92,14 @@ def rasterize_splats(
         width, height, n_cameras.
 
     Raises:
-        ValueError: A shape, dtype or device does not fit, or the camera is not finite.
+        ValueError: A shape, dtype or device does not fit, the camera is not finite, or a plane is no number.
     """
     tensors = (means, quats, log_scales, logits, sh0, shN)
     check_tensors(
         means, quats, log_scales, logits, sh0, viewmat[None], K[None], sh_degree, shN,
         None if background is None else background[None], width, height,
     )  # fmt: skip
-    near_plane, far_plane = max(float(near_plane), 0.0), float(far_plane)  # as in `rasterization`
+    near_plane, far_plane = planes(near_plane, far_plane)
     means, quats, log_scales, logits, sh0, shN = (t.to(torch.float32).contiguous() for t in tensors)
     viewmat, K = viewmat.to(torch.float32).contiguous(), K.to(torch.float32).contiguous()
     size = (width, height)

@@ -146,7 +146,7 @@ def resumed(
     """A gate that learnt means of 1 and goes on with losses of `factor`; with an event before it is saved or after."""
     settings: dict = {"start_iter": 0, "warmup": 2, "refine_share": share}
     first = SkipGate(**settings)
-    for step in first.iterations(range(20 + steps)):
+    for step in first.iterations(range(100)):  # half of them takes the first ones
         if step == 20:
             break
         first.backward(torch.tensor(1.0, requires_grad=True), view=step % 3, step=step)
@@ -156,7 +156,9 @@ def resumed(
     gate.load_state_dict(first.state_dict())
     if event:
         gate.notify_event("prune")
-    for step in gate.iterations(range(20, 20 + steps)):
+    for step in gate.iterations(range(20, 100)):
+        if step == 20 + steps:
+            break
         gate.backward(torch.tensor(factor, requires_grad=True), view=step % 3, step=step)
     return gate
 
@@ -165,7 +167,7 @@ def resumed(
 @pytest.mark.parametrize("factor", [9.0, 0.1])
 def test_losses_far_from_all_means_are_another_scenes(factor: float, share: float | None) -> None:
     resumed(factor, share=share, steps=9)
-    with pytest.raises(SkipGSError, match=r"another scene: up to iteration \d+ each of 10 losses"):
+    with pytest.raises(SkipGSError, match="another scene: up to iteration 29 each of 10 losses"):
         resumed(factor, share=share)
 
 
