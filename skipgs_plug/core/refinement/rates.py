@@ -1,4 +1,4 @@
-"""Larger, shrinking steps: a factor on every learning rate, for the length of each optimizer step only."""
+"""Larger, shrinking steps: other learning rates and a shorter memory, for the length of each optimizer step only."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 
 # What a group of parameters takes of the factor that is meant for all. The higher bands of the colours, whose rate
 # trainers set to a twentieth of the constant band's, bear the longest steps; opacities none beyond the trainer's.
-HIGHER_BANDS, CONSTANT_BAND, POSITIONS, OTHERS = 4.0, 2.0, 2.0, 1.0
+HIGHER_BANDS, POSITIONS, OTHERS = 4.0, 2.0, 1.0
 NAMED = {
     **dict.fromkeys(("f_rest", "shN", "features_rest"), HIGHER_BANDS),
-    **dict.fromkeys(("f_dc", "sh0", "features_dc"), CONSTANT_BAND),
     **dict.fromkeys(("xyz", "means"), POSITIONS),
 }
 OPACITIES = ("opacity", "opacities")
 MOST = 8.0  # beyond, scenes of many overlapping Gaussians lose more by steps than by a shorter path
+# Of Adam's running mean of squares (beta2), at most. What a visit moves a Gaussian that hardly any view shows is its
+# rate over the root of 1 - beta2 at worst: 32 times the rate at the usual 0.999, too far where rates are larger.
+SQUARES_KEPT = 0.99
 
 
 def path_factor(share: float, progress: float, peak: float | None = None) -> float:
@@ -44,10 +46,10 @@ def path_factor(share: float, progress: float, peak: float | None = None) -> flo
 def group_factor(group: dict[str, Any], factor: float, name: str | None = None) -> float:
     """Factor on the learning rate of a group of an optimizer, where `factor` is that of all.
 
-    The image is linear in the colours, so SH coefficients bear longer steps. So do positions, whose rate has fallen to
-    a tenth of what it began with when refinement begins. Opacities are never raised: their rate is large as it is, and
-    steps beyond it flicker. All are known by the group's name, or else the `name` of its optimizer; without either by
-    shape: [N, 1, 3] is the constant band of the SH coefficients, [N, K, 3] are the others, [N, 1] opacities.
+    The image is linear in the colours, so the higher bands, whose rate is small, bear longer steps. So do positions,
+    whose rate has fallen to a tenth of what it began with when refinement begins. Opacities are never raised: their
+    rate is large as it is, and steps beyond it flicker. All are known by the group's name, or else the `name` of its
+    optimizer; without either by shape: [N, K, 3] with K above 1 are higher bands, [N, 1] opacities.
     """
     name = group.get("name", name)
     if name is not None:
@@ -55,13 +57,15 @@ def group_factor(group: dict[str, Any], factor: float, name: str | None = None) 
     shapes = [tuple(param.shape[1:]) for param in group["params"]]
     if all(shape == (1,) for shape in shapes):
         return min(factor, 1.0)
-    if all(len(shape) == 2 and shape[1] == 3 for shape in shapes):
-        return (CONSTANT_BAND if all(shape[0] == 1 for shape in shapes) else HIGHER_BANDS) * factor
+    if all(len(shape) == 2 and shape[0] > 1 and shape[1] == 3 for shape in shapes):
+        return HIGHER_BANDS * factor
     return factor
 
 
 class ScaledRates:
     """Multiplies the learning rates of optimizers that step in this thread, and puts them back afterwards.
+
+    Where a group has `betas`, as Adam's have, the second is at most `SQUARES_KEPT` for the length of the step.
 
     PyTorch's own hooks around `step` are used, so fused, sparse and selective optimizers are reached alike, the
     trainer's schedule is never disturbed, and a checkpoint holds the trainer's rates.
@@ -79,7 +83,7 @@ class ScaledRates:
         self._factor: float | None = None
         self._thread = threading.get_ident()
         self._depth: dict[int, int] = {}  # a step can call the step of its base class
-        self._before: dict[int, list[tuple[dict[str, Any], Any]]] = {}
+        self._before: dict[int, list[tuple[dict[str, Any], dict[str, Any]]]] = {}
         self._handles: list[RemovableHandle] = []
         self._removed = False
 
@@ -122,9 +126,15 @@ class ScaledRates:
         self._depth[key] = self._depth.get(key, 0) + 1
         if self._depth[key] > 1:
             return
-        self._before[key] = [(group, group["lr"]) for group in optimizer.param_groups]
+        self._before[key] = [
+            (group, {setting: group[setting] for setting in ("lr", "betas") if setting in group})
+            for group in optimizer.param_groups
+        ]
         for group in optimizer.param_groups:
             group["lr"] = group["lr"] * group_factor(group, self._factor, names[0])
+            if "betas" in group:
+                first, second, *others = group["betas"]
+                group["betas"] = (first, min(second, SQUARES_KEPT), *others)
 
     def _put_back(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         key = id(optimizer)
@@ -136,6 +146,6 @@ class ScaledRates:
             _restore(self._before.pop(key))
 
 
-def _restore(saved: list[tuple[dict[str, Any], Any]]) -> None:
-    for group, rate in saved:
-        group["lr"] = rate
+def _restore(saved: list[tuple[dict[str, Any], dict[str, Any]]]) -> None:
+    for group, settings in saved:
+        group.update(settings)

@@ -31,7 +31,7 @@ def test_optimizers_have_names_where_their_groups_have_none():
         optimizers[name].step()
     scaled.remove()
     moved = {name: round(-value[0, 0].item() / 0.1, 3) for name, value in values.items()}
-    assert moved == {"means": 6.0, "features_dc": 6.0, "scales": 3.0, "opacities": 1.0}
+    assert moved == {"means": 6.0, "features_dc": 3.0, "scales": 3.0, "opacities": 1.0}
     assert all("name" not in optimizer.param_groups[0] for optimizer in optimizers.values())
 
 
@@ -50,21 +50,21 @@ def test_the_path_is_conserved():
     "group, shape, times",
     [
         ({"name": "f_rest"}, (5, 15, 3), 4.0),
-        ({"name": "sh0"}, (5, 1, 3), 2.0),
-        ({"name": "features_dc"}, (5, 3), 2.0),
+        ({"name": "sh0"}, (5, 1, 3), 1.0),
+        ({"name": "features_dc"}, (5, 3), 1.0),
         ({"name": "offset"}, (5, 10, 3), 1.0),  # Scaffold-GS: positions of the Gaussians of an anchor
         ({"name": "xyz"}, (5, 3), 2.0),
         ({"name": "scaling"}, (5, 3), 1.0),
         ({"name": "opacity"}, (5, 1), None),
         ({"name": "opacities"}, (5,), None),
         ({}, (5, 15, 3), 4.0),
-        ({}, (5, 1, 3), 2.0),
+        ({}, (5, 1, 3), 1.0),
         ({}, (5, 3), 1.0),
         ({}, (5, 1), None),
         ({}, (5,), 1.0),
     ],
 )
-def test_colours_and_positions_take_longer_steps_and_opacities_no_longer_ones(group, shape, times, rates):
+def test_higher_bands_and_positions_take_longer_steps_and_opacities_no_longer_ones(group, shape, times, rates):
     value = torch.nn.Parameter(torch.zeros(shape))
     optimizer = torch.optim.SGD([{"params": [value], **group}], lr=0.1)
     value.grad = torch.ones(shape)
@@ -101,6 +101,36 @@ def test_a_step_is_as_long_as_the_factor_says_and_the_rate_comes_back(kind, rate
     rates.rest()
     plain.step(*arguments)
     torch.testing.assert_close(1.0 - value.detach(), 4.0 * (1.0 - other.detach()), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_squares_are_forgotten_sooner_while_steps_are_larger(fused, rates):
+    """As an Adam whose second beta is 0.99 from the first larger step on."""
+    values = parameter(), parameter()
+    scaled, sooner = (torch.optim.Adam([value], lr=0.1, fused=fused) for value in values)
+    for iteration in range(8):
+        for value in values:
+            value.grad = torch.tensor([1.0, 0.1, 0.0]) * (iteration % 3)
+        larger = iteration >= 3
+        if larger:
+            rates.scale(1.5)
+        scaled.step()
+        assert scaled.param_groups[0]["betas"] == (0.9, 0.999)
+        rates.rest()
+        sooner.param_groups[0].update({"lr": 0.1 * 1.5, "betas": (0.9, 0.99)} if larger else {})
+        sooner.step()
+    torch.testing.assert_close(values[0], values[1], rtol=0, atol=0)
+
+
+def test_a_memory_that_is_shorter_already_stays(rates):
+    values = parameter(), parameter()
+    scaled, plain = (torch.optim.Adam([value], lr=0.1, betas=(0.8, 0.9)) for value in values)
+    for _ in range(3):
+        rates.scale(1.0)
+        scaled.step()
+        rates.rest()
+        plain.step()
+    torch.testing.assert_close(values[0], values[1], rtol=0, atol=0)
 
 
 def test_a_step_that_raises_gives_its_rate_back_in_the_next_iteration(rates):
