@@ -6,7 +6,8 @@ brought to views that are not trained on. What a doubling of the iterations brin
 doubling, so the second cycle's gain times the doublings that are left bounds what the rest would still bring; when
 that is less than the tolerance, refinement ends. Watched views that get worse still lose what only training gave them,
 which says nothing of the others. In the last cycle all views are trained. Watched views never get back wholly what
-they missed, so there are few, not for long, and none where a twelfth of the views is less than three.
+they missed, so there are few, not for long, and none where a twelfth of the views is less than three or where a cycle
+is too short to show each of them.
 """
 
 from __future__ import annotations
@@ -39,11 +40,19 @@ def needed_share(iterations: int, n_views: int) -> float:
     return share if share < ALL else 1.0
 
 
-def watched_views(names: Iterable[str], seed: int = 0) -> frozenset[str]:
-    """Draw the views to watch; the same for the same names, none where there are few views."""
+def watched_views(names: Iterable[str], iterations: float, seed: int = 0) -> frozenset[str]:
+    """Draw the views to watch; the same for the same names, none where there are few views.
+
+    Args:
+        names: Of all training views.
+        iterations: That may run. None is watched where the first cycle does not show every view.
+        seed: Of the draw.
+    """
     names = sorted(names)
     count = min(MOST_WATCHED, round(len(names) * WATCHED_SHARE))
-    return frozenset(random.Random(seed).sample(names, count) if count >= LEAST_WATCHED else ())
+    if count < LEAST_WATCHED or CYCLE_ENDS[0] * iterations < len(names):
+        return frozenset()
+    return frozenset(random.Random(seed).sample(names, count))
 
 
 class Foresight:

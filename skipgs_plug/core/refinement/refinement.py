@@ -235,7 +235,7 @@ class Refinement:
             self.share = needed_share(total, len(self._views))
         assert self.share is not None
         if self._auto and self._views is not None:
-            self.watched = watched_views(self._views)
+            self.watched = watched_views(self._views, self.share * total)
         if not self._scales:
             if self.foresight is not None:
                 raise SkipGSError(

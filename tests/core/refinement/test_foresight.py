@@ -90,9 +90,10 @@ def test_the_share_follows_from_the_visits():
 
 def test_watched_views_are_few_and_always_the_same():
     names = [f"{i:03}.jpg" for i in range(255)]
-    assert watched_views(names) == watched_views(reversed(names)) and len(watched_views(names)) == 12
-    assert len(watched_views(names[:46])) == 4
-    assert watched_views(names[:17]) == watched_views(names[:1]) == frozenset()
+    assert watched_views(names, 3750) == watched_views(reversed(names), 3000) and len(watched_views(names, 3000)) == 12
+    assert len(watched_views(names[:46], 1000)) == 4
+    assert watched_views(names[:17], 1000) == watched_views(names[:1], 1000) == frozenset()
+    assert len(watched_views(names, 8 * 255)) == 12 and not watched_views(names, 8 * 255 - 1)  # a cycle shows not all
 
 
 def test_gain_in_decibels():
