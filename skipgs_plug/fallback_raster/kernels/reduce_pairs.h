@@ -8,27 +8,29 @@ if (!more && dense) {
     clear(v_opacities + row_begin, rows_here);
     clear(v_colors + (long long)stride * row_begin, (long long)stride * rows_here);
 }
-constexpr int AHEAD = 16;  // rows
+constexpr int AHEAD = 32;  // pairs
+alignas(64) const float nothing[PAIR] = {};
 int j = parts > 1 ? far_block_start[first] : 0;
 const int far_end = parts > 1 ? far_block_start[first + 1] : 0;
-for (int i = block_start[first]; i < block_start[first + 1]; ++i) {
+const int end = block_start[first + 1];
+for (int i = block_start[first]; i < end; ++i) {
     const int g = visible[i];
     v16 sums = (v16)0.0f;
-    bool received = false;
-    const auto add = [&](int from, int to) INLINE {
-        for (int p = from; p < to; ++p)
-            if (pair_slot[p]) {
-                sums += load(v_pairs + (long long)PAIR * (pair_slot[p] - 1));
-                received = true;
-            }
+    int received = 0;
+    // Slots follow the lists: those of a row lie anywhere. Which pairs were blended nobody can foresee, so that sums of
+    // zero cost less than a branch.
+    const auto add = [&](int from, int to, int last) INLINE {
+        for (int p = from; p < to; ++p) {
+            __builtin_prefetch(v_pairs + (long long)PAIR * larger(pair_slot[smaller(p + AHEAD, last)] - 1, 0));
+            const int slot = pair_slot[p];
+            const float* own = slot ? v_pairs + (long long)PAIR * (slot - 1) : nothing;
+            sums += load(own);
+            received |= slot;
+        }
     };
-    // Slots follow the lists: those of a row lie anywhere.
-    const int later = smaller(i + AHEAD, block_start[first + 1] - 1);
-    for (int p = pair_start[later]; p < pair_start[later + 1]; ++p)
-        __builtin_prefetch(v_pairs + (long long)PAIR * larger(pair_slot[p] - 1, 0));
-    add(pair_start[i], pair_start[i + 1]);
+    add(pair_start[i], pair_start[i + 1], pair_start[end] - 1);
     if (j < far_end && far_visible[j] == g) {
-        add(far_pair_start[j], far_pair_start[j + 1]);
+        add(far_pair_start[j], far_pair_start[j + 1], far_pair_start[far_end] - 1);
         ++j;
     }
     if (!received) {

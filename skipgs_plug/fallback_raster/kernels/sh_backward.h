@@ -1,4 +1,4 @@
-// Adjoint of sh_forward for one block of rows.
+// Adjoint of sh_forward for one block of rows, 16 of those that received a gradient at a time.
 #include "sh_basis.h"
 const int block = first;
 float camera_sum[3] = {0.0f, 0.0f, 0.0f};
@@ -12,33 +12,44 @@ clear_rows(v_means + 3 * row_begin, 3 * rows);
 clear_rows(v_base + base_stride * row_begin, base_stride * rows);
 if (packed) clear(v_rest + (long long)rest_stride * block_start[block], rest_stride * listed);
 else if (v_rest != v_base) clear_rows(v_rest + rest_stride * row_begin, rest_stride * rows);
-for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
-    const int g = visible[i];
+const int terms = (degree + 1) * (degree + 1), begin = block_start[block];
+int received[BLOCK], place[BLOCK], count = 0;
+for (int i = begin; i < begin + listed; ++i) {
     // Where the colour was clamped at zero, and where nothing blended the Gaussian, there is no gradient.
-    float v0 = colors[3 * g] > 0.0f ? v_colors[3 * g] : 0.0f;
-    float v1 = colors[3 * g + 1] > 0.0f ? v_colors[3 * g + 1] : 0.0f;
-    float v2 = colors[3 * g + 2] > 0.0f ? v_colors[3 * g + 2] : 0.0f;
-    if (v0 == 0.0f && v1 == 0.0f && v2 == 0.0f && (shortcuts & CONTRIBUTED_ONLY)) continue;
-    float basis[16], x, y, z, norm, shrink;
-    harmonics(means + 3ll * g, camera, degree, basis, x, y, z, norm, shrink);
-    const float xx = x * x, yy = y * y, zz = z * z;
-    const int terms = (degree + 1) * (degree + 1);
-    const float* sh = rest + (long long)g * rest_stride + rest_offset - 3;  // sh[3 k] is band k, from 1 on
-    float* v_constant = v_base + (long long)g * base_stride;
-    float* v_sh = v_rest + (long long)(packed ? i : g) * rest_stride + rest_offset - 3;
-    v_constant[0] = basis[0] * v0;
-    v_constant[1] = basis[0] * v1;
-    v_constant[2] = basis[0] * v2;
-    float along[16];
-    for (int k = 1; k < terms; ++k) {
-        v_sh[3 * k] = basis[k] * v0;
-        v_sh[3 * k + 1] = basis[k] * v1;
-        v_sh[3 * k + 2] = basis[k] * v2;
-        along[k] = sh[3 * k] * v0 + sh[3 * k + 1] * v1 + sh[3 * k + 2] * v2;
+    const int g = visible[i];
+    bool any = !(shortcuts & CONTRIBUTED_ONLY);
+    for (int k = 0; k < 3; ++k) any |= (colors[3 * g + k] > 0.0f) & (v_colors[3 * g + k] != 0.0f);
+    received[count] = g;
+    place[count] = packed ? i : g;
+    count += any;
+}
+for (int i = 0; i < count; i += 16) {
+    const int lanes = smaller(16, count - i);
+    int row[16];
+    for (int l = 0; l < 16; ++l) row[l] = received[i + smaller(l, lanes - 1)];
+    for (int l = 0; l < 16; ++l) {
+        const float* later = rest + (long long)rest_stride * received[smaller(i + 16 + l, count - 1)] + rest_offset;
+        for (int k = 0; k < 3 * (terms - 1); k += 16) __builtin_prefetch(later + k);
     }
+    v16 basis[16], v_sh[48], color[3], v[3], x, y, z, norm, shrink;
+    gather3(colors, row, n, color);
+    gather3(v_colors, row, n, v);
+    for (int k = 0; k < 3; ++k) v[k] = color[k] > 0.0f ? v[k] : (v16)0.0f;
+    harmonics(means, row, n, camera, degree, basis, x, y, z, norm, shrink);
+    const v16 xx = x * x, yy = y * y, zz = z * z;
+    const v16 v_constant[3] = {basis[0] * v[0], basis[0] * v[1], basis[0] * v[2]};
+    if (base_stride == 3) scatter3(v_base, row, v_constant[0], v_constant[1], v_constant[2], lanes);
+    else put_bands(v_base, row, base_stride, 3, v_constant, lanes);
+    for (int band = 1; band < terms; ++band)
+        for (int k = 0; k < 3; ++k) v_sh[3 * band - 3 + k] = basis[band] * v[k];
+    put_bands(v_rest + rest_offset, place + i, rest_stride, 3 * (terms - 1), v_sh, lanes);
     if (degree == 0) continue;
-    float vx = -0.4886025119029199f * along[3], vy = -0.4886025119029199f * along[1];
-    float vz = 0.4886025119029199f * along[2];
+    v16 sh[48], along[16];
+    take_bands(rest + rest_offset, row, rest_stride, 3 * (terms - 1), sh);
+    for (int band = 1; band < terms; ++band)
+        along[band] = sh[3 * band - 3] * v[0] + sh[3 * band - 2] * v[1] + sh[3 * band - 1] * v[2];
+    v16 vx = -0.4886025119029199f * along[3], vy = -0.4886025119029199f * along[1];
+    v16 vz = 0.4886025119029199f * along[2];
     if (degree > 1) {
         vx += 1.0925484305920792f * (y * along[4] - z * along[7] + x * along[8]) - 0.6307831305050401f * x * along[6];
         vy += 1.0925484305920792f * (x * along[4] - z * along[5] - y * along[8]) - 0.6307831305050401f * y * along[6];
@@ -57,11 +68,12 @@ for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
             + 1.1195289977703462f * (2.0f * zz - xx - yy) * along[12] + 1.445305721320277f * (xx - yy) * along[14];
     }
     // Through the normalisation of the direction.
-    const float back = norm * shrink, radial = vx * x + vy * y + vz * z;
-    const float v_direction[3] = {(vx - radial * x) * back, (vy - radial * y) * back, (vz - radial * z) * back};
-    for (int c = 0; c < 3; ++c) {
-        v_means[3 * g + c] = v_direction[c];
-        camera_sum[c] -= v_direction[c];
-    }
+    const v16 back = norm * shrink, radial = vx * x + vy * y + vz * z;
+    const v16 v_direction[3] = {(vx - radial * x) * back, (vy - radial * y) * back, (vz - radial * z) * back};
+    scatter3(v_means, row, v_direction[0], v_direction[1], v_direction[2], lanes);
+    alignas(64) float moved[3][16];
+    for (int k = 0; k < 3; ++k) *(v16*)moved[k] = v_direction[k];
+    for (int l = 0; l < lanes; ++l)
+        for (int k = 0; k < 3; ++k) camera_sum[k] -= moved[k][l];
 }
-for (int c = 0; c < 3; ++c) v_cameras[3 * block + c] = camera_sum[c];
+for (int k = 0; k < 3; ++k) v_cameras[3 * block + k] = camera_sum[k];

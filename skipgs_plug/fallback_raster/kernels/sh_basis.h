@@ -1,22 +1,24 @@
-// Real spherical harmonics up to degree 3 with the signs of 3DGS (Kerbl et al. 2023), in the unit direction x, y, z
-// from the camera to a Gaussian; norm * shrink is what the distance was multiplied with.
-static constexpr auto harmonics = [](const float* mean, const float* camera, int degree, float* basis, float& x,
-                                     float& y, float& z, float& norm, float& shrink) INLINE {
-    const float dx = mean[0] - camera[0], dy = mean[1] - camera[1], dz = mean[2] - camera[2];
+// Real spherical harmonics up to degree 3 with the signs of 3DGS (Kerbl et al. 2023), of 16 rows, in the unit directions
+// x, y, z from the camera to the Gaussians; norm * shrink is what the distances were multiplied with.
+static constexpr auto harmonics = [](const float* means, const int* row, int n, const float* camera, int degree,
+                                     v16* basis, v16& x, v16& y, v16& z, v16& norm, v16& shrink) INLINE {
+    v16 mean[3];
+    gather3(means, row, n, mean);
+    const v16 dx = mean[0] - camera[0], dy = mean[1] - camera[1], dz = mean[2] - camera[2];
     // Scaled by the longest side first: the square of a tiny or huge distance would leave float's range.
-    const float longest = fmaxf(fabsf(dx), fmaxf(fabsf(dy), fabsf(dz)));
-    shrink = longest > 1e-30f ? 1.0f / longest : 0.0f;
+    const v16 longest = vmax(vabs(dx), vmax(vabs(dy), vabs(dz)));
+    shrink = longest > 1e-30f ? 1.0f / longest : (v16)0.0f;
     x = dx * shrink, y = dy * shrink, z = dz * shrink;
-    float square;
+    v16 square;
     {
         // Fused by hand, so that both passes get one direction: Clang's choice depends on what stands around.
 #pragma clang fp contract(off)
         square = __builtin_elementwise_fma(x, x, y * y) + z * z;
     }
-    norm = 1.0f / sqrtf(fmaxf(square, 1e-30f));
+    norm = 1.0f / vsqrt(vmax(square, (v16)1e-30f));
     x *= norm, y *= norm, z *= norm;
-    const float xx = x * x, yy = y * y, zz = z * z;
-    basis[0] = 0.28209479177387814f;
+    const v16 xx = x * x, yy = y * y, zz = z * z;
+    basis[0] = (v16)0.28209479177387814f;
     if (degree > 0) {
         basis[1] = -0.4886025119029199f * y;
         basis[2] = 0.4886025119029199f * z;
@@ -38,4 +40,39 @@ static constexpr auto harmonics = [](const float* mean, const float* camera, int
         basis[14] = 1.445305721320277f * z * (xx - yy);
         basis[15] = -0.5900435899266435f * x * (xx - 3.0f * yy);
     }
+};
+// `count` numbers of 16 rows, those of row g from p + stride g on, as columns. Rows move as a whole, 16 numbers to a vector,
+// of which the last overlap those before them.
+static constexpr auto take_bands = [](const float* p, const int* row, int stride, int count, v16* columns) INLINE {
+    if (count < 16) {
+        for (int j = 0; j < count; ++j)
+            for (int l = 0; l < 16; ++l) columns[j][l] = p[(long long)stride * row[l] + j];
+        return;
+    }
+    for (int begin = 0; begin < count; begin += 16) {
+        const int at = smaller(begin, count - 16);
+        v16* own = columns + at;
+        for (int l = 0; l < 16; ++l) own[l] = load(p + (long long)stride * row[l] + at);
+        transpose(own);
+    }
+};
+// The other way round, for the first `lanes` rows.
+static constexpr auto put_bands = [](float* p, const int* row, int stride, int count, const v16* columns, int lanes) INLINE {
+    if (count < 16) {
+        for (int j = 0; j < count; ++j)
+            for (int l = 0; l < lanes; ++l) p[(long long)stride * row[l] + j] = columns[j][l];
+        return;
+    }
+    for (int begin = 0; begin < count; begin += 16) {
+        const int at = smaller(begin, count - 16);
+        v16 own[16];
+        for (int j = 0; j < 16; ++j) own[j] = columns[at + j];
+        transpose(own);
+        for (int l = 0; l < lanes; ++l) store(p + (long long)stride * row[l] + at, own[l]);
+    }
+};
+// The constant band of 16 rows of `n`.
+static constexpr auto take_constants = [](const float* p, const int* row, int n, int stride, v16* columns) INLINE {
+    if (stride == 3) gather3(p, row, n, columns);
+    else take_bands(p, row, stride, 3, columns);
 };

@@ -1,24 +1,23 @@
-// Colours of the visible rows of one block; zero for the others where `dense`.
+// Colours of the visible rows of one block, 16 at a time; zero for the others where `dense`.
 #include "sh_basis.h"
-const int block = first;
+const int block = first, terms = (degree + 1) * (degree + 1);
 if (dense) clear(colors + 3ll * BLOCK * block, 3 * smaller(BLOCK, n - BLOCK * block));
-for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
-    const int g = visible[i];
-    float basis[16], x, y, z, norm, shrink;
-    harmonics(means + 3ll * g, camera, degree, basis, x, y, z, norm, shrink);
-    const int terms = (degree + 1) * (degree + 1);
-    const float* constant = base + (long long)g * base_stride;
-    const float* sh = rest + (long long)g * rest_stride + rest_offset - 3;  // sh[3 k] is band k, from 1 on
-    float c0 = 0.5f + basis[0] * constant[0];
-    float c1 = 0.5f + basis[0] * constant[1];
-    float c2 = 0.5f + basis[0] * constant[2];
-    for (int k = 1; k < terms; ++k) {
-        c0 += basis[k] * sh[3 * k];
-        c1 += basis[k] * sh[3 * k + 1];
-        c2 += basis[k] * sh[3 * k + 2];
+for (int i = block_start[block]; i < block_start[block + 1]; i += 16) {
+    const int lanes = smaller(16, block_start[block + 1] - i);
+    int row[16];
+    for (int l = 0; l < 16; ++l) row[l] = visible[i + smaller(l, lanes - 1)];
+    for (int l = 0; l < 16; ++l) {
+        const char* later = (const char*)(rest + (long long)rest_stride * visible[smaller(i + 32 + l, block_start[block + 1] - 1)] + rest_offset);
+        for (int k = 0; k < 12 * (terms - 1); k += 64) __builtin_prefetch(later + k);
     }
+    v16 basis[16], sh[48], constant[3], c[3], x, y, z, norm, shrink;
+    harmonics(means, row, n, camera, degree, basis, x, y, z, norm, shrink);
+    take_constants(base, row, n, base_stride, constant);
+    take_bands(rest + rest_offset, row, rest_stride, 3 * (terms - 1), sh);
+    for (int k = 0; k < 3; ++k) c[k] = 0.5f + basis[0] * constant[k];
+    for (int band = 1; band < terms; ++band)
+        for (int k = 0; k < 3; ++k) c[k] += basis[band] * sh[3 * band - 3 + k];
     // Written so that NaN stays NaN: a bad coefficient must be seen in the pixels it touches.
-    colors[3 * g] = c0 < 0.0f ? 0.0f : c0;
-    colors[3 * g + 1] = c1 < 0.0f ? 0.0f : c1;
-    colors[3 * g + 2] = c2 < 0.0f ? 0.0f : c2;
+    for (int k = 0; k < 3; ++k) c[k] = c[k] < 0.0f ? (v16)0.0f : c[k];
+    scatter3(colors, row, c[0], c[1], c[2], lanes);
 }

@@ -174,8 +174,9 @@ static constexpr auto scatter4 = [](float* p, const int* row, v16 x, v16 y, v16 
     scatter_rows(p, row, 4, columns, lanes);
 };
 // Rows become columns in four rounds: rows `step` apart exchange the lanes that lie `step` apart.
-static constexpr auto transpose = [](v16* a) {
-    auto exchange = [a](int step, auto low, auto high) {
+static constexpr auto transpose = [](v16* a) INLINE {
+    auto exchange = [a](int step, auto low, auto high) INLINE {
+#pragma clang loop unroll(full)
         for (int i = 0; i < 16; ++i)
             if (!(i & step)) {
                 const v16 b = low(a[i], a[i + step]), c = high(a[i], a[i + step]);
