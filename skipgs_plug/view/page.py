@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
+import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -12,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.mask import leave_out
 from skipgs_plug.trainer.metrics import psnr
 from skipgs_plug.trainer.scene import Scene, View
@@ -39,6 +42,9 @@ class Page:
     Args:
         draw: renders a model as a view of the scene sees it, [H, W, 3] in [0, 1].
         steps: iterations to choose from; the slider appears with two or more.
+
+    Raises:
+        InputError: Nothing can listen on this host and port.
     """
 
     def __init__(
@@ -51,6 +57,7 @@ class Page:
     ) -> None:
         import viser
 
+        require_address(host, port)
         self._draw = draw
         self._scene = scene
         self._unit = RADIUS / scene.scene_scale if scene else 1.0
@@ -207,6 +214,25 @@ class Page:
         ahead = depths[depths > 0]
         distance = float(ahead.median()) if len(ahead) else self._scene.scene_scale
         return pose[:3, 3] * self._unit, (pose[:3, 3] + distance * pose[:3, 2]) * self._unit
+
+
+def require_address(host: str, port: int) -> None:
+    """Raise InputError unless a server can listen there; the port may be taken.
+
+    Viser binds in a thread, whose errors leave its caller waiting for ever.
+    """
+    if not 1 <= port <= 65535:
+        raise InputError(f"port={port} is not in 1..65535.")
+    try:
+        for family, kind, protocol, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+            with socket.socket(family, kind, protocol) as trial:
+                trial.bind(address)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:
+            raise InputError(
+                f"Cannot listen on {host}:{port} ({error.strerror or error}); give --host an address of this machine, "
+                "such as 127.0.0.1, and --port a number above 1023."
+            ) from None
 
 
 def field_of_view(view: View) -> float:
