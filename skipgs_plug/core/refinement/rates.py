@@ -22,7 +22,7 @@ NAMED = {
 }
 OPACITIES = ("opacity", "opacities")
 MOST = 8.0  # beyond, scenes of many overlapping Gaussians lose more by steps than by a shorter path
-# Of Adam's running mean of squares (beta2), at most. What the gradient of a single view can move a parameter is its rate
+# Of Adam's running mean of squares (beta2), at most. By the gradient of a single view a parameter can move its rate
 # over the root of 1 - beta2: 32 times the rate at the usual 0.999, too far where rates are larger.
 SQUARES_KEPT = 0.99
 
