@@ -38,7 +38,7 @@ class SkipConfig:
         tolerance: Decibels that the rest of refinement may be worth when "auto" ends it.
         compensate: Make up for what is left out with larger, shrinking steps. None: with `refine_share`, not
             with the paper's gate.
-        rate_peak: Factor on learning rates when refinement begins, falling linearly to 0; SH coefficients and
+        rate_peak: Factor on learning rates when refinement begins, falling linearly to 0; the higher SH bands and
             positions take more of it, opacities at most 1. None for twice the inverse of the share that runs.
 
     Raises:
