@@ -27,10 +27,8 @@ for (int i = 0; i < count; i += 16) {
     const int lanes = smaller(16, count - i);
     int row[16];
     for (int l = 0; l < 16; ++l) row[l] = received[i + smaller(l, lanes - 1)];
-    for (int l = 0; l < 16; ++l) {
-        const float* later = rest + (long long)rest_stride * received[smaller(i + 16 + l, count - 1)] + rest_offset;
-        for (int k = 0; k < 3 * (terms - 1); k += 16) __builtin_prefetch(later + k);
-    }
+    for (int l = 0; l < 16; ++l)
+        fetch_bands(rest + rest_offset, received[smaller(i + 16 + l, count - 1)], rest_stride, 3 * (terms - 1));
     v16 basis[16], v_sh[48], color[3], v[3], x, y, z, norm, shrink;
     gather3(colors, row, n, color);
     gather3(v_colors, row, n, v);

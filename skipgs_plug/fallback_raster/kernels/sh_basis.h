@@ -41,6 +41,10 @@ static constexpr auto harmonics = [](const float* means, const int* row, int n, 
         basis[15] = -0.5900435899266435f * x * (xx - 3.0f * yy);
     }
 };
+// Fetches `count` numbers of row g ahead of their use.
+static constexpr auto fetch_bands = [](const float* p, int g, int stride, int count) INLINE {
+    for (int k = 0; k < count; k += 16) __builtin_prefetch(p + (long long)stride * g + k);
+};
 // `count` numbers of 16 rows, those of row g from p + stride g on, as columns. Rows move as a whole, 16 numbers to a vector,
 // of which the last overlap those before them.
 static constexpr auto take_bands = [](const float* p, const int* row, int stride, int count, v16* columns) INLINE {

@@ -1,15 +1,13 @@
 // Colours of the visible rows of one block, 16 at a time; zero for the others where `dense`.
 #include "sh_basis.h"
-const int block = first, terms = (degree + 1) * (degree + 1);
+const int block = first, terms = (degree + 1) * (degree + 1), end = block_start[block + 1];
 if (dense) clear(colors + 3ll * BLOCK * block, 3 * smaller(BLOCK, n - BLOCK * block));
-for (int i = block_start[block]; i < block_start[block + 1]; i += 16) {
-    const int lanes = smaller(16, block_start[block + 1] - i);
+for (int i = block_start[block]; i < end; i += 16) {
+    const int lanes = smaller(16, end - i);
     int row[16];
     for (int l = 0; l < 16; ++l) row[l] = visible[i + smaller(l, lanes - 1)];
-    for (int l = 0; l < 16; ++l) {
-        const char* later = (const char*)(rest + (long long)rest_stride * visible[smaller(i + 32 + l, block_start[block + 1] - 1)] + rest_offset);
-        for (int k = 0; k < 12 * (terms - 1); k += 64) __builtin_prefetch(later + k);
-    }
+    for (int l = 0; l < 16; ++l)
+        fetch_bands(rest + rest_offset, visible[smaller(i + 32 + l, end - 1)], rest_stride, 3 * (terms - 1));
     v16 basis[16], sh[48], constant[3], c[3], x, y, z, norm, shrink;
     harmonics(means, row, n, camera, degree, basis, x, y, z, norm, shrink);
     take_constants(base, row, n, base_stride, constant);
