@@ -15,16 +15,16 @@ Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 
 # What a group of parameters takes of the factor that is meant for all. The higher bands of the colours, whose rate
 # trainers set to a twentieth of the constant band's, bear the longest steps; opacities none beyond the trainer's.
-HIGHER_BANDS, POSITIONS, OTHERS = 4.0, 2.0, 1.0
+HIGHER_BANDS, GEOMETRY, OTHERS = 4.0, 2.0, 1.0
 NAMED = {
     **dict.fromkeys(("f_rest", "shN", "features_rest"), HIGHER_BANDS),
-    **dict.fromkeys(("xyz", "means"), POSITIONS),
+    **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
 MOST = 8.0  # beyond, scenes of many overlapping Gaussians lose more by steps than by a shorter path
 # Of Adam's running mean of squares (beta2), at most. By the gradient of a single view a parameter can move its rate
 # over the root of 1 - beta2: 32 times the rate at the usual 0.999, too far where rates are larger.
-SQUARES_KEPT = 0.99
+SQUARES_KEPT = 0.98
 
 
 def path_factor(share: float, progress: float, peak: float | None = None) -> float:
@@ -47,8 +47,8 @@ def group_factor(group: dict[str, Any], factor: float, name: str | None = None) 
     """Factor on the learning rate of a group of an optimizer, where `factor` is that of all.
 
     The image is linear in the colours, so the higher bands, whose rate is small, bear longer steps. So do positions,
-    whose rate has fallen to a tenth of what it began with when refinement begins. Opacities are never raised: their
-    rate is large as it is, and steps beyond it flicker. All are known by the group's name, or else the `name` of its
+    whose rate has fallen to a tenth of what it began with when refinement begins, and scales. Opacities are never
+    raised: their rate is large as it is, and steps beyond it flicker. All are known by the group's name, or else the `name` of its
     optimizer; without either by shape: [N, K, 3] with K above 1 are higher bands, [N, 1] opacities.
     """
     name = group.get("name", name)
