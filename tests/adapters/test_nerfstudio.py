@@ -61,7 +61,7 @@ def test_parameters_are_known_by_the_names_of_their_optimizers():
         trainer.train()
     factors = {name: max(found) / 0.02 for name, found in rates.items()}
     assert factors["xyz"] == pytest.approx(10.0 * 0.99**19)  # its own schedule goes on
-    assert factors["scaling"] == pytest.approx(5.0)
+    assert factors["scaling"] == pytest.approx(10.0)
     assert factors["opacity"] == pytest.approx(1.0)
 
 

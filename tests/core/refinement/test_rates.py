@@ -31,7 +31,7 @@ def test_optimizers_have_names_where_their_groups_have_none():
         optimizers[name].step()
     scaled.remove()
     moved = {name: round(-value[0, 0].item() / 0.1, 3) for name, value in values.items()}
-    assert moved == {"means": 6.0, "features_dc": 3.0, "scales": 3.0, "opacities": 1.0}
+    assert moved == {"means": 6.0, "features_dc": 3.0, "scales": 6.0, "opacities": 1.0}
     assert all("name" not in optimizer.param_groups[0] for optimizer in optimizers.values())
 
 
