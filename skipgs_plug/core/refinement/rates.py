@@ -13,11 +13,11 @@ from torch.utils.hooks import RemovableHandle
 Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
 Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 
-# What a group of parameters takes of the factor that is meant for all. The higher bands of the colours, whose rate
-# trainers set to a twentieth of the constant band's, bear the longest steps; opacities none beyond the trainer's.
-HIGHER_BANDS, GEOMETRY, OTHERS = 4.0, 2.0, 1.0
+# What a group of parameters takes of the factor that is meant for all; opacities take none beyond the trainer's rate.
+HIGHER_BANDS, GEOMETRY, OTHERS, CONSTANT_BAND = 4.0, 2.0, 1.0, 0.5
 NAMED = {
     **dict.fromkeys(("f_rest", "shN", "features_rest"), HIGHER_BANDS),
+    **dict.fromkeys(("f_dc", "sh0", "features_dc"), CONSTANT_BAND),
     **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
@@ -46,10 +46,11 @@ def path_factor(share: float, progress: float, peak: float | None = None) -> flo
 def group_factor(group: dict[str, Any], factor: float, name: str | None = None) -> float:
     """Factor on the learning rate of a group of an optimizer, where `factor` is that of all.
 
-    The image is linear in the colours, so the higher bands, whose rate is small, bear longer steps. So do positions,
-    whose rate has fallen to a tenth of what it began with when refinement begins, and scales. Opacities are never
-    raised: their rate is large as it is, and steps beyond it flicker. All are known by the group's name, or else the `name` of its
-    optimizer; without either by shape: [N, K, 3] with K above 1 are higher bands, [N, 1] opacities.
+    The image is linear in the colours, so their higher bands, whose rate trainers set to a twentieth of the constant
+    band's, bear the longest steps, and the constant band, which all views agree on, needs shorter ones. Positions,
+    whose rate has fallen to a tenth when refinement begins, and scales bear longer steps. Opacities are never raised:
+    their rate is large as it is, and steps beyond it flicker. All are known by the group's name, or else the `name` of
+    its optimizer; without either by shape: [N, 1, 3] is the constant band, [N, K, 3] higher ones, [N, 1] opacities.
     """
     name = group.get("name", name)
     if name is not None:
@@ -57,6 +58,8 @@ def group_factor(group: dict[str, Any], factor: float, name: str | None = None) 
     shapes = [tuple(param.shape[1:]) for param in group["params"]]
     if all(shape == (1,) for shape in shapes):
         return min(factor, 1.0)
+    if all(shape == (1, 3) for shape in shapes):
+        return CONSTANT_BAND * factor
     if all(len(shape) == 2 and shape[0] > 1 and shape[1] == 3 for shape in shapes):
         return HIGHER_BANDS * factor
     return factor
