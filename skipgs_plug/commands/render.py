@@ -66,7 +66,8 @@ def run(args: Args) -> int:
     if args.cameras == "held-out" and not held_out:
         raise InputError(f"Scene {model.scene.name} holds out no view; use --cameras path.")
     splats = model.snapshots[-1].load()
-    painter = Painter(resolve_backend(args.backend), model.background, model.near_plane, model.antialiased)
+    settings = model.background, model.near_plane, model.antialiased, model.far_plane
+    painter = Painter(resolve_backend(args.backend), *settings)
 
     if args.cameras == "path":
         lens = train[0]

@@ -40,7 +40,8 @@ def main(argv: list[str]) -> int:
 def run(args: Args) -> int:
     """Serve the page; see `Args`."""
     model = open_model(args.model, args.scene, args.data_factor)
-    painter = Painter(resolve_backend(args.backend), model.background, model.near_plane, model.antialiased)
+    settings = model.background, model.near_plane, model.antialiased, model.far_plane
+    painter = Painter(resolve_backend(args.backend), *settings)
 
     def draw(splats: Splats, view: View) -> Tensor:
         image = painter.draw(splats, view.viewmat, view.K, view.width, view.height)[0]

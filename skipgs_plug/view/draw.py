@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.trainer.backend import Backend
+from skipgs_plug.trainer.config import TrainConfig
 
 DEPTH_QUANTILES = (0.02, 0.98)
 
@@ -19,15 +20,21 @@ class Painter:
     Args:
         background: colour in [0, 1] behind the model.
         near_plane: in scene units.
-        antialiased: as the model was trained.
+        antialiased: as the model was trained, as the next.
+        far_plane: in scene units.
     """
 
     def __init__(
-        self, backend: Backend, background: tuple[float, float, float], near_plane: float, antialiased: bool = False
+        self,
+        backend: Backend,
+        background: tuple[float, float, float],
+        near_plane: float,
+        antialiased: bool = False,
+        far_plane: float = TrainConfig.far_plane,
     ) -> None:
         self._backend = backend
         self._background = background
-        self._near_plane = near_plane
+        self._near_plane, self._far_plane = near_plane, far_plane
         self._mode = "antialiased" if antialiased else "classic"
 
     @torch.no_grad()
@@ -55,6 +62,7 @@ class Painter:
                 width=width,
                 height=height,
                 near_plane=self._near_plane,
+                far_plane=self._far_plane,
                 sh_degree=round((1 + raw["shN"].shape[1]) ** 0.5) - 1,
                 render_mode="RGB+ED",
                 rasterize_mode=self._mode,
