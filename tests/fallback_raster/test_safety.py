@@ -185,10 +185,12 @@ def test_images_beyond_what_kernels_can_count_are_refused(width: int, height: in
         rasterization(**{**random_scene(n=3), "width": width, "height": height})
 
 
-@pytest.mark.parametrize("name", ["means", "quats", "scales", "colors"])
+@pytest.mark.parametrize(
+    ("name", "sh_degree"), [("means", 1), ("quats", 1), ("scales", 1), ("colors", 1), ("colors", None)]
+)
 @pytest.mark.parametrize("n", [20, 200])
-def test_data_replaced_between_forward_and_backward_is_an_error(name: str, n: int) -> None:
-    inputs = leaves(random_scene(n=100, sh_degree=1), torch.float32)
+def test_data_replaced_between_forward_and_backward_is_an_error(name: str, sh_degree: int | None, n: int) -> None:
+    inputs = leaves(random_scene(n=100, sh_degree=sh_degree), torch.float32)
     image, _, _ = rasterization(**inputs, packed=False)
     inputs[name].data = torch.ones(n, *inputs[name].shape[1:])
     with pytest.raises(RuntimeError, match=rf"{name} had shape \[100, .* has \[{n}, .* before the number"):
