@@ -99,7 +99,7 @@ def rasterization(
     Returns:
         Colours [C, H, W, X], alphas [C, H, W, 1] and gsplat's dictionary: means2d (with a gradient after
         backward), radii, depths, conics, opacities, tiles_per_gauss, width, height, n_cameras, ...; not in it are
-        isect_ids and flatten_ids.
+        isect_ids, flatten_ids and isect_offsets.
 
     Raises:
         ValueError: A shape, dtype, device or mode does not fit, or a camera is not finite or cannot be inverted.
