@@ -40,6 +40,7 @@ def test_fitted_colours_undo_any_affine_map() -> None:
     mask[:10] = True
     spoilt = torch.where(mask[..., None], target, torch.ones(()))
     assert torch.allclose(fit_colours(changed, spoilt, mask), target, atol=1e-3)
+    assert measure(chosen(fitted=True), changed, spoilt, mask)["cc_psnr"] > 50
     grey = torch.full((20, 30, 3), 0.5)
     assert torch.allclose(fit_colours(grey, grey), grey, atol=1e-5)
     values = measure(chosen(fitted=True), changed, target)
