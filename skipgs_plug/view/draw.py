@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.backend import Backend
+from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.view.model import Model
 
 DEPTH_QUANTILES = (0.02, 0.98)
 
@@ -36,6 +37,12 @@ class Painter:
         self._background = background
         self._near_plane, self._far_plane = near_plane, far_plane
         self._mode = "antialiased" if antialiased else "classic"
+
+    @classmethod
+    def of(cls, model: Model, backend: str) -> Painter:
+        """Return what draws a model as it was trained, on the backend of that name."""
+        settings = model.background, model.near_plane, model.antialiased, model.far_plane
+        return cls(resolve_backend(backend), *settings)
 
     @torch.no_grad()
     def draw(
