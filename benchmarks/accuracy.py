@@ -22,7 +22,6 @@ import tyro
 from common import (
     RESULTS,
     SCENES,
-    cores,
     frustum_scene,
     garden_scene,
     median_ms,
@@ -34,6 +33,7 @@ from common import (
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import rasterization
+from skipgs_plug.fallback_raster.cores import usable_cores
 from skipgs_plug.fallback_raster.torch_reference import near_cutoff, rasterization_reference
 from skipgs_plug.fallback_raster.torch_reference_projection import rotation_matrices, spherical_harmonics
 
@@ -162,7 +162,7 @@ def main(repeats: int = 5) -> None:
     Args:
         repeats: Timed passes of each case.
     """
-    about = provenance() | {"threads": cores()}
+    about = provenance() | {"threads": usable_cores()}
     small = {degree: frustum(2000, 128, 96, degree) for degree in (None, 0, 1, 2, 3)}
     cases: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
         ("plain colors", small[None], {}),
@@ -180,7 +180,7 @@ def main(repeats: int = 5) -> None:
     print(header + "  worst gradient")
     rows = []
     for name, scene, options in cases:
-        with threads(cores()):
+        with threads(usable_cores()):
             row = measure(name, scene, repeats, **options)
         rows.append(row)
         worst = max(row["gradient_errors"], key=lambda k: row["gradient_errors"][k])

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from skipgs_plug.bench.provenance import commit, cpu_name, versions
 from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
+from skipgs_plug.fallback_raster.cores import usable_cores
 from skipgs_plug.fallback_raster.launch import FloatArray, Worker, worker
 from skipgs_plug.trainer.files import write_aside
 
@@ -112,11 +113,6 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before[1])
 
 
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 @contextmanager
 def kernel_seconds() -> Iterator[dict[str, float]]:
     """Collects the wall time of the rasterizer's kernels by name inside a `with` block."""
@@ -190,7 +186,7 @@ def provenance() -> dict[str, Any]:
         "command": shlex.join(["python", *sys.argv]),
         "commit": commit(),
         "cpu": cpu_name(),
-        "cores": cores(),
+        "cores": usable_cores(),
         "load_before": os.getloadavg()[0],  # above 0.5 something else was running: do not trust the times
         "versions": versions(),
     }

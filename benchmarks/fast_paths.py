@@ -23,7 +23,6 @@ from common import (
     PARAMETERS,
     RESULTS,
     SCENES,
-    cores,
     frustum_scene,
     leaves,
     provenance,
@@ -33,6 +32,7 @@ from common import (
 )
 
 from skipgs_plug.fallback_raster import blend, launch, rasterization
+from skipgs_plug.fallback_raster.cores import usable_cores
 from skipgs_plug.trainer import TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.loss import l1_ssim_loss as convolved_loss
@@ -102,7 +102,7 @@ def one_pass(path: Path) -> dict[str, Any]:
     scene = frustum_scene(10_000, 252, 189)
     target = torch.rand(1, 189, 252, 3, generator=torch.Generator().manual_seed(0))
     inputs = leaves(scene, PARAMETERS)
-    with threads(cores()), path.exponential():
+    with threads(usable_cores()), path.exponential():
         image, _, _ = rasterization(**inputs, packed=False)
         path.backend.loss(image, target, 0.2).backward()
     return {"image": image.detach(), **{name: inputs[name].grad for name in PARAMETERS}}

@@ -15,8 +15,9 @@ from typing import Any
 
 import torch
 import tyro
-from common import RESULTS, SCENES, cores, exponents, median_ms, provenance, threads, write_part
+from common import RESULTS, SCENES, exponents, median_ms, provenance, threads, write_part
 
+from skipgs_plug.fallback_raster.cores import usable_cores
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer, load_scene
 
 FILE = RESULTS / "iteration.json"
@@ -104,7 +105,7 @@ def main(scene: Path = SCENES / "fern", quick: bool = False, iterations: int = 1
     print(f" {'peer':>6} {'faster':>6}")
     fern = load_scene(scene)
     rows = []
-    for count in sorted({cores()} if quick else {1, cores()}, reverse=True):
+    for count in sorted({usable_cores()} if quick else {1, usable_cores()}, reverse=True):
         for sh_degree in (3,) if quick else (0, 3):
             for n in (1_000, 10_000) if quick else (*PEER, *LARGE):
                 if only not in (None, n):

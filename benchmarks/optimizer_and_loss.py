@@ -15,10 +15,11 @@ from typing import Any
 
 import torch
 import tyro
-from common import RESULTS, clock, cores, median_ms, provenance, relative_difference, threads, write_part
+from common import RESULTS, clock, median_ms, provenance, relative_difference, threads, write_part
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import l1_ssim_loss
+from skipgs_plug.fallback_raster.cores import usable_cores
 from skipgs_plug.fallback_raster.optimizer import Adam
 from skipgs_plug.trainer.loss import l1_ssim_loss as plain_loss
 
@@ -109,7 +110,7 @@ def main(quick: bool = False) -> None:
     """
     about = provenance() | {"quick": quick}
     print(f"{about['cpu']}, {about['cores']} cores, commit {about['commit']}")
-    counts, rows = sorted({1, cores()}), []
+    counts, rows = sorted({1, usable_cores()}), []
     for n, rounds in ((10_000, 40), (100_000, 15)) if quick else ((10_000, 40), (100_000, 15), (1_000_000, 7)):
         rows += adam_rows(n, counts, rounds)
     for width, height, rounds in ((504, 378, 40),) if quick else ((504, 378, 40), (1920, 1080, 7)):

@@ -28,7 +28,6 @@ import tyro
 from common import (
     PARAMETERS,
     RESULTS,
-    cores,
     exponents,
     frustum_scene,
     garden_scene,
@@ -45,6 +44,7 @@ from pairs import blended_pairs
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
+from skipgs_plug.fallback_raster.cores import usable_cores
 from skipgs_plug.fallback_raster.shortcuts import SHORTCUTS, without_shortcuts
 from skipgs_plug.fallback_raster.splats import rasterize_splats
 from skipgs_plug.trainer.loss import l1_ssim_loss as convolved_loss
@@ -134,7 +134,7 @@ def scene_maker(kind: str, n: int, size: str, sh_degree: int | None = None) -> C
 
 def part_scenes(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
     """The scenes that other implementations were timed on, on all cores and on one."""
-    counts = sorted({1, cores()}, reverse=True)
+    counts = sorted({1, usable_cores()}, reverse=True)
     peaks = {}
     for count in counts:
         with threads(count):
@@ -180,7 +180,7 @@ def part_threads(quick: bool, repeats: int, only: str | None) -> list[dict[str, 
     """How one scene speeds up with the number of threads."""
     make = scene_maker("random", 10_000 if quick else 50_000, "504x378")
     rows: list[dict[str, Any]] = []
-    for count in sorted({1, cores(), *(2**k for k in range(cores().bit_length()))}):
+    for count in sorted({1, usable_cores(), *(2**k for k in range(usable_cores().bit_length()))}):
         with threads(count):
             rows.append({"threads": count, **measure(make, repeats)})
         speedup = rows[0]["ms"] / rows[-1]["ms"]
@@ -245,7 +245,7 @@ def measure_point(point: str, repeats: int) -> None:
             ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5")
     before = peak_memory(torch.device("cpu")) or 0
-    with threads(cores()):
+    with threads(usable_cores()):
         result = measure(scene_maker("random", n, size, sh_degree), repeats)
     peak = peak_memory(torch.device("cpu")) or 0
     print(json.dumps({**result, "peak_mib": (peak - before) / 2**20}))
@@ -264,7 +264,7 @@ def part_order(quick: bool, repeats: int, only: str | None) -> list[dict[str, An
     scenes = {name: {**scene, **{key: scene[key][order] for key in PARAMETERS}} for name, order in orders.items()}
     times: dict[tuple[str, str], list[float]] = {}
     images: dict[tuple[str, str], Tensor] = {}
-    with threads(cores()):
+    with threads(usable_cores()):
         for seed in range(repeats + 2):  # in turns
             for name, ordered in scenes.items():
                 there, back, fast = one_pass(ordered, seed)
@@ -337,7 +337,7 @@ def part_loss(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any
         with threads(1):
             truths = [loss_pass(convolved_loss, a.double(), b.double())[1:] for a, b in pairs[:EXACT_IMAGES]]
             convolved = loss_figures("torch", convolved_loss, pairs[:EXACT_IMAGES], truths, warm_up=1)
-        for count in sorted({1, cores()}, reverse=True):
+        for count in sorted({1, usable_cores()}, reverse=True):
             with threads(count):
                 fused = loss_figures("fused", l1_ssim_loss, pairs, truths, warm_up=2)
             row = {"size": f"{width}x{height}", "threads": count, **fused, **convolved}

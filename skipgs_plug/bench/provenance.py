@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 import skipgs_plug
+from skipgs_plug.fallback_raster import get_num_threads
 from skipgs_plug.trainer import Scene, TrainConfig
 from skipgs_plug.trainer.backend import Backend
 from skipgs_plug.trainer.near_plane import near_plane
@@ -25,7 +26,7 @@ def machine(backend: Backend) -> dict[str, Any]:
     return {
         "cpu": cpu_name(),
         "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
+        "threads": get_num_threads() if backend.name == "warp" else torch.get_num_threads(),
         "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30)
         if hasattr(os, "sysconf")
         else None,

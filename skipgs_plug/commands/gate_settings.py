@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from skipgs_plug import SkipGate
+from skipgs_plug import SkipConfig, SkipGate
 from skipgs_plug.trainer import InputError
 
 
@@ -34,9 +34,10 @@ class GateSettings:
                 if before is None
                 else "The run was begun with a gate; resume it with --gate, or the settings of it that were given."
             )
+        # A run that is older than a setting was begun with what is its default now.
+        before = SkipConfig().as_dict() | (before or {})
         for name, value in (self._settings or {}).items():
-            if before.get(name) != value:
+            if before[name] != value:
                 raise InputError(
-                    f"The run was begun with gate.{name}={before.get(name)!r}, not {value!r}; "
-                    "resume it with its settings."
+                    f"The run was begun with gate.{name}={before[name]!r}, not {value!r}; resume it with its settings."
                 )

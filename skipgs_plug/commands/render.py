@@ -12,7 +12,6 @@ import tyro
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from skipgs_plug.trainer.backend import resolve_backend
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.scene import View
 from skipgs_plug.view.draw import Painter, colour_depth, depth_range, to_bytes
@@ -66,7 +65,7 @@ def run(args: Args) -> int:
     if args.cameras == "held-out" and not held_out:
         raise InputError(f"Scene {model.scene.name} holds out no view; use --cameras path.")
     splats = model.snapshots[-1].load()
-    painter = Painter(resolve_backend(args.backend), model.background, model.near_plane, model.antialiased)
+    painter = Painter.of(model, args.backend)
 
     if args.cameras == "path":
         lens = train[0]

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import tyro
 from torch import Tensor
 
-from skipgs_plug.trainer.backend import resolve_backend
 from skipgs_plug.trainer.exposure import fit_colours
 from skipgs_plug.trainer.scene import View
 from skipgs_plug.view.draw import Painter
@@ -40,7 +39,7 @@ def main(argv: list[str]) -> int:
 def run(args: Args) -> int:
     """Serve the page; see `Args`."""
     model = open_model(args.model, args.scene, args.data_factor)
-    painter = Painter(resolve_backend(args.backend), model.background, model.near_plane, model.antialiased)
+    painter = Painter.of(model, args.backend)
 
     def draw(splats: Splats, view: View) -> Tensor:
         image = painter.draw(splats, view.viewmat, view.K, view.width, view.height)[0]

@@ -46,6 +46,18 @@ def planes(near_plane: Any, far_plane: Any) -> tuple[float, float]:
     return max(as_float("near_plane", near_plane), 0.0), as_float("far_plane", far_plane)
 
 
+def camera_centre(viewmat: Tensor) -> Tensor:
+    """Returns where a camera [4, 4] stands in world space [3], differentiable.
+
+    Raises:
+        ValueError: The matrix has no inverse.
+    """
+    try:
+        return torch.linalg.inv(viewmat)[:3, 3]
+    except torch.linalg.LinAlgError:
+        raise ValueError(f"viewmats must be invertible, got {viewmat.tolist()} for a camera.") from None
+
+
 def as_int(value: Any) -> Any:
     """Returns a whole number of any kind, such as NumPy's, as kernels take it, and all else as it is."""
     try:

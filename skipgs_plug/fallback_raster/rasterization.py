@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from .arguments import as_float, as_int, check_tensors, planes, refuse_unsupported
+from .arguments import as_float, as_int, camera_centre, check_tensors, planes, refuse_unsupported
 from .autograd import Blend, Project, SphericalHarmonics
 from .constants import MAX_CHANNELS, TILE, tiles
 from .rows import all_rows
@@ -99,10 +99,10 @@ def rasterization(
     Returns:
         Colours [C, H, W, X], alphas [C, H, W, 1] and gsplat's dictionary: means2d (with a gradient after
         backward), radii, depths, conics, opacities, tiles_per_gauss, width, height, n_cameras, ...; not in it are
-        isect_ids and flatten_ids.
+        isect_ids, flatten_ids and isect_offsets.
 
     Raises:
-        ValueError: A shape, dtype, device or mode does not fit, or a camera is not finite.
+        ValueError: A shape, dtype, device or mode does not fit, or a camera is not finite or cannot be inverted.
         NotImplementedError: An option is not supported on the CPU.
     """
     refuse_unsupported(
@@ -168,7 +168,7 @@ def rasterization(
         for camera in range(n_cameras):
             of_camera = colors if shared_colors else colors[camera]
             if sh_degree is not None:
-                centre = torch.linalg.inv(viewmats[camera])[:3, 3]
+                centre = camera_centre(viewmats[camera])
                 of_camera = SphericalHarmonics.apply(
                     means, centre, of_camera, sh_rest, visible[camera], block_starts[camera], sh_degree
                 )

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .arguments import check_tensors, planes
+from .arguments import camera_centre, check_tensors, planes
 from .autograd import check_shapes
 from .buffers import floats, ints, zeros
 from .constants import TILE, blocks, tiles
@@ -92,7 +92,8 @@ def rasterize_splats(
         width, height, n_cameras.
 
     Raises:
-        ValueError: A shape, dtype or device does not fit, the camera is not finite, or a plane is no number.
+        ValueError: A shape, dtype or device does not fit, the camera is not finite or cannot be inverted, or a plane is
+            no number.
     """
     tensors = (means, quats, log_scales, logits, sh0, shN)
     check_tensors(
@@ -168,7 +169,7 @@ class _Render(torch.autograd.Function):
         sparse: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         p, n = projected, len(means)
-        camera = torch.linalg.inv(viewmat)[:3, 3].contiguous()
+        camera = camera_centre(viewmat).contiguous()
         colors = floats(n, 3)
         layout = (3, 3 * shN.shape[1], 0)
         sh_forward(means, camera, sh0, shN, p.visible, p.block_start, colors, n, *layout, degree, 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -30,6 +31,7 @@ from skipgs_plug.trainer.scene import Scene, View
 from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
 
 MEANS_LR_END = 0.01  # share of the positions' learning rate that is left at the end of the schedule
+DRAWING = threading.Lock()  # held by the trainer that draws: all threads share the generator that gsplat draws from
 
 
 class Stateful(Protocol):
@@ -399,7 +401,7 @@ class Trainer:
 
         So resuming is exact, and the caller's random state is left alone.
         """
-        with torch.random.fork_rng():
+        with DRAWING, torch.random.fork_rng():
             torch.manual_seed(derive_seed(self.config.seed, step))
             yield
 

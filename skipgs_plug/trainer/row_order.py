@@ -30,7 +30,7 @@ def sorts_rows(strategy: Any, step: int) -> bool:
 def sort_rows(
     splats: nn.ParameterDict, optimizers: dict[str, torch.optim.Optimizer], strategy_state: dict[str, Any]
 ) -> None:
-    """Put the rows of all parameters, of their moments and of the strategy's sums in the order of space.
+    """Put the rows of all parameters, of their gradients and moments and of the strategy's sums in the order of space.
 
     Parameters stay the same objects; their values move.
     """
@@ -41,6 +41,8 @@ def sort_rows(
         for tensor in (param, *state.values()):
             if isinstance(tensor, Tensor) and tensor.shape[:1] == (n,):
                 tensor.copy_(tensor[order])
+        if param.grad is not None:  # a gate may put the step off
+            param.grad = param.grad.index_select(0, order)
     for key, value in strategy_state.items():
         if isinstance(value, Tensor) and value.shape[:1] == (n,):
             strategy_state[key] = value[order]

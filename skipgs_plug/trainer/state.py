@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from skipgs_plug import schema
 from skipgs_plug.files import write_aside
+from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import DamagedCheckpointError, InputError, MissingFileError
 
 if TYPE_CHECKING:
@@ -215,12 +216,12 @@ def _check_tensors(content: dict[str, Any]) -> None:
 def _require_same_run(trainer: Trainer, content: dict[str, Any], path: str | Path) -> None:
     if content["scene"]["view_names"] != list(trainer.view_names):
         raise InputError(f"Checkpoint {path} was made with other training views; resume with its own scene and split.")
-    made_with = content["config"]
+    # A checkpoint that is older than a setting was made with what is its default now.
+    made_with = {field.name: field.default for field in dataclasses.fields(TrainConfig)} | content["config"]
     for name, value in dataclasses.asdict(trainer.config).items():
-        if name not in FREE_FIELDS and made_with.get(name) != value:
+        if name not in FREE_FIELDS and made_with[name] != value:
             raise InputError(
-                f"Checkpoint {path} was made with {name}={made_with.get(name)!r}, not {value!r}; "
-                "resume with its settings."
+                f"Checkpoint {path} was made with {name}={made_with[name]!r}, not {value!r}; resume with its settings."
             )
     schedule = made_with["schedule_steps"]
     if schedule != trainer.config.schedule:

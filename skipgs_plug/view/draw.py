@@ -8,7 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.backend import Backend
+from skipgs_plug.trainer.backend import Backend, resolve_backend
+from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.view.model import Model
 
 DEPTH_QUANTILES = (0.02, 0.98)
 
@@ -19,16 +21,28 @@ class Painter:
     Args:
         background: colour in [0, 1] behind the model.
         near_plane: in scene units.
-        antialiased: as the model was trained.
+        antialiased: as the model was trained, as the next.
+        far_plane: in scene units.
     """
 
     def __init__(
-        self, backend: Backend, background: tuple[float, float, float], near_plane: float, antialiased: bool = False
+        self,
+        backend: Backend,
+        background: tuple[float, float, float],
+        near_plane: float,
+        antialiased: bool = False,
+        far_plane: float = TrainConfig.far_plane,
     ) -> None:
         self._backend = backend
         self._background = background
-        self._near_plane = near_plane
+        self._near_plane, self._far_plane = near_plane, far_plane
         self._mode = "antialiased" if antialiased else "classic"
+
+    @classmethod
+    def of(cls, model: Model, backend: str) -> Painter:
+        """Return what draws a model as it was trained, on the backend of that name."""
+        settings = model.background, model.near_plane, model.antialiased, model.far_plane
+        return cls(resolve_backend(backend), *settings)
 
     @torch.no_grad()
     def draw(
@@ -55,6 +69,7 @@ class Painter:
                 width=width,
                 height=height,
                 near_plane=self._near_plane,
+                far_plane=self._far_plane,
                 sh_degree=round((1 + raw["shN"].shape[1]) ** 0.5) - 1,
                 render_mode="RGB+ED",
                 rasterize_mode=self._mode,

@@ -57,6 +57,7 @@ class Model:
     Attributes:
         near_plane: that it was trained with, or what suits the scene.
         exposure: whether photographs differ from the model by an exposure of their own.
+        far_plane: that it was trained with.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Model:
     near_plane: float = NEAR_PLANE
     antialiased: bool = False
     exposure: bool = False
+    far_plane: float = TrainConfig.far_plane
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -102,6 +104,7 @@ def open_model(path: str | Path, scene: str | None = None, data_factor: int | No
         near_plane(TrainConfig(near_plane=config.get("near_plane")), loaded) if loaded else NEAR_PLANE,
         bool(config.get("antialiased", False)),
         bool(config.get("exposure", False)),
+        float(config.get("far_plane", TrainConfig.far_plane)),
     )
 
 

@@ -92,9 +92,13 @@ class Page:
         return len(self._server.get_clients())
 
     def wait(self) -> None:
-        """Return when a visitor has chosen something."""
+        """Return when a visitor has chosen something since this returned last.
+
+        Whoever waits looks at the choices afterwards: one that is made meanwhile is not forgotten.
+        """
         while not self._asked.wait(0.5):  # with a timeout, so that Ctrl-C is heard on Windows too
             pass
+        self._asked.clear()
 
     def stop(self) -> None:
         self._server.stop()
@@ -112,7 +116,6 @@ class Page:
 
     def refresh(self) -> None:
         """Draw the chosen view of the model that is shown."""
-        self._asked.clear()
         if self._scene is None or self._splats is None:
             return
         view = self._views[self._choice.value]

@@ -8,16 +8,26 @@ import pytest
 import torch
 from bench_fixtures import MAX_STEPS, SEEDS, early_floor, make_bench
 
-from skipgs_plug.bench import runner
+from skipgs_plug.bench import provenance, runner
 from skipgs_plug.bench.policies import POLICIES, PolicySpec
 from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.bench.refine import PARTS, compressed, densify, peak_memory
 from skipgs_plug.bench.store import BenchFolder
 from skipgs_plug.bench.summary import summarise
+from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.backend import resolve_backend
 
 START = MAX_STEPS // 2
+
+
+def test_threads_are_those_that_render():
+    before = get_num_threads()
+    set_num_threads(before + 3)
+    try:
+        assert provenance.machine(resolve_backend("warp"))["threads"] == before + 3
+    finally:
+        set_num_threads(before)
 
 
 def test_every_policy_ran_from_the_same_point(finished):

@@ -7,9 +7,11 @@ import dataclasses
 import pytest
 import tyro
 
-from skipgs_plug import SkipConfig
+from skipgs_plug import SkipConfig, SkipGate
 from skipgs_plug.commands import run, train
 from skipgs_plug.commands.gate_options import GateOptions
+from skipgs_plug.commands.gate_settings import GateSettings
+from skipgs_plug.trainer import InputError
 
 GIVEN = {
     "start_iter": 7,
@@ -42,3 +44,11 @@ def test_what_is_given_reaches_the_gate(args, own) -> None:
     config = (tyro.conf.FlagCreatePairsOff,)
     assert tyro.cli(args, args=[*own, *options], config=config).gate_options.given() == GIVEN
     assert tyro.cli(args, args=own, config=config).gate_options.given() == {}
+
+
+def test_a_run_older_than_a_setting_was_begun_with_its_default() -> None:
+    state = GateSettings(SkipGate(start_iter=10)).state_dict()
+    del state["settings"]["tolerance"]
+    GateSettings(SkipGate(start_iter=10)).load_state_dict(state)
+    with pytest.raises(InputError, match=r"begun with gate\.tolerance=0\.05, not 0\.2"):
+        GateSettings(SkipGate(start_iter=10, tolerance=0.2)).load_state_dict(state)

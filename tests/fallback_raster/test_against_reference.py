@@ -158,6 +158,20 @@ def test_info_agrees(packed: bool, rasterize_mode: Any) -> None:
         torch.testing.assert_close(info[name][seen].double(), truth[name][seen], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("channels", [3, 6])
+def test_going_back_twice_adds_the_same_gradients_twice(channels: int) -> None:
+    inputs = leaves(random_scene(channels=channels, backgrounds=True), torch.float32)
+    image, _, info = rasterization(**inputs, absgrad=channels == 3)
+    once: list[torch.Tensor] = []
+    for _ in range(2):
+        image.square().sum().backward(retain_graph=True)
+        found = [t.grad for t in inputs.values() if torch.is_tensor(t) and t.grad is not None]
+        found += [info["means2d"].absgrad] if channels == 3 else []
+        once = once or [t.clone() for t in found]
+    assert len(once) == (7 if channels == 3 else 6)
+    assert all(torch.equal(t, 2 * first) for t, first in zip(found, once, strict=True))
+
+
 def test_coincident_depths_keep_the_order_of_the_input() -> None:
     scene = random_scene(n=60)
     scene["means"] = scene["means"] * torch.tensor([1.0, 1.0, 0.0])

@@ -135,5 +135,9 @@ def test_distances_that_are_no_numbers(name: str, value: Any) -> None:
     refuse(f"{name} must be a number", **{name: value})
 
 
+def test_a_camera_that_stands_nowhere() -> None:
+    refuse("viewmats must be invertible, got .* for a camera", viewmats=torch.zeros(2, 4, 4))
+
+
 def test_a_single_camera_without_its_dimension() -> None:
     refuse(r"viewmats must have shape \[C, 4, 4\]", viewmats=torch.eye(4))

@@ -188,6 +188,18 @@ def test_gradients_may_be_added_up_or_dense_or_missing() -> None:
     assert_equal(lazy, dense)
 
 
+def test_a_row_that_two_gradients_share_gets_one_step_with_both() -> None:
+    start = torch.randn(6, 4, generator=torch.Generator().manual_seed(0))
+    lazy, plain = start.clone().requires_grad_(), start.clone().requires_grad_()
+    lazy.grad = torch.sparse_coo_tensor(
+        torch.tensor([[3, 3]]), torch.tensor([[0.5] * 4, [-0.7] * 4]), (6, 4), check_invariants=False
+    )
+    plain.grad = lazy.grad.to_dense()
+    for optimizer in (LazyAdam([lazy], lr=0.1), Adam([plain], lr=0.1)):
+        optimizer.step()
+    assert torch.equal(lazy, plain)
+
+
 def test_its_state_dict_is_adams() -> None:
     lazy, dense = train(SHAPES[0], 40, 0.1)
     found, truth = lazy.state_dict()["state"][0], dense.state_dict()["state"][0]

@@ -80,6 +80,21 @@ def test_any_end_of_the_first_lists_gives_the_same_image(
     assert lists[0] > 0  # some tiles went on
 
 
+def test_what_only_just_reaches_an_open_tile_is_listed_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(3)
+    scene = deep_scene(600)
+    # As wide as tiles, and so faint that no pixel is finished.
+    scene["scales"] = 0.1 + 0.4 * torch.rand(600, 3, generator=generator)
+    scene["opacities"] = 0.02 + 0.08 * torch.rand(600, generator=generator)
+    with without_shortcuts("near_first"):
+        whole = rendered(scene)
+    # Nothing is listed at first in the tiles of one column, and everything in all others, which so are not open.
+    everything = torch.tensor(near_first.NO_DEPTH, dtype=torch.int32).view(torch.float32)
+    lists = ending_at(monkeypatch, lambda count: torch.where(torch.arange(count) % 5 == 1, 0.5, everything))
+    assert_same(rendered(scene), whole)
+    assert lists[0] > 100
+
+
 @pytest.mark.parametrize("end", [0.5, 100.0], ids=["nothing at first", "everything at first"])
 def test_first_lists_that_hold_nothing_or_everything(monkeypatch: pytest.MonkeyPatch, end: float) -> None:
     scene = deep_scene(1000)

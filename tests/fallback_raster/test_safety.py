@@ -64,6 +64,37 @@ def test_an_exception_waits_for_the_other_threads(two_threads: None) -> None:
     assert len(done) >= 2
 
 
+def test_threads_that_a_second_exception_left_at_work_are_awaited_before_the_next_kernel(
+    two_threads: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started, release, done = threading.Event(), threading.Event(), []
+
+    class Interrupted:
+        """A queue whose reader is interrupted."""
+
+        def put(self, item: object) -> None:
+            done.append("first")
+
+        def get(self) -> None:
+            raise KeyboardInterrupt
+
+    def work() -> None:
+        if threading.current_thread() is threading.main_thread():
+            assert started.wait(10)
+            raise KeyboardInterrupt
+        started.set()
+        assert release.wait(10)
+
+    threads.on_all_threads(lambda: None)
+    monkeypatch.setattr(threads._crew, "_done", Interrupted())
+    with pytest.raises(KeyboardInterrupt):
+        threads.on_all_threads(work)
+    assert not done
+    threading.Timer(0.2, release.set).start()
+    threads.on_all_threads(lambda: done.append("second"))
+    assert done[0] == "first" and "second" in done
+
+
 INTERRUPTED = """
 import gc, signal, time, torch
 from raster_scenes import leaves, random_scene
@@ -185,10 +216,12 @@ def test_images_beyond_what_kernels_can_count_are_refused(width: int, height: in
         rasterization(**{**random_scene(n=3), "width": width, "height": height})
 
 
-@pytest.mark.parametrize("name", ["means", "quats", "scales", "colors"])
+@pytest.mark.parametrize(
+    ("name", "sh_degree"), [("means", 1), ("quats", 1), ("scales", 1), ("colors", 1), ("colors", None)]
+)
 @pytest.mark.parametrize("n", [20, 200])
-def test_data_replaced_between_forward_and_backward_is_an_error(name: str, n: int) -> None:
-    inputs = leaves(random_scene(n=100, sh_degree=1), torch.float32)
+def test_data_replaced_between_forward_and_backward_is_an_error(name: str, sh_degree: int | None, n: int) -> None:
+    inputs = leaves(random_scene(n=100, sh_degree=sh_degree), torch.float32)
     image, _, _ = rasterization(**inputs, packed=False)
     inputs[name].data = torch.ones(n, *inputs[name].shape[1:])
     with pytest.raises(RuntimeError, match=rf"{name} had shape \[100, .* has \[{n}, .* before the number"):

@@ -40,10 +40,20 @@ def test_fitted_colours_undo_any_affine_map() -> None:
     mask[:10] = True
     spoilt = torch.where(mask[..., None], target, torch.ones(()))
     assert torch.allclose(fit_colours(changed, spoilt, mask), target, atol=1e-3)
+    assert measure(chosen(fitted=True), changed, spoilt, mask)["cc_psnr"] > 50
     grey = torch.full((20, 30, 3), 0.5)
     assert torch.allclose(fit_colours(grey, grey), grey, atol=1e-5)
     values = measure(chosen(fitted=True), changed, target)
     assert values["cc_psnr"] > values["psnr"] + 20 and values["cc_ssim"] > 0.999 > values["ssim"]
+
+
+def test_its_rate_falls_to_a_tenth_over_the_schedule(changing: Scene) -> None:
+    trainer = Trainer(TrainConfig(max_steps=150, exposure=True), changing)
+    rates = []
+    for step in (0, 75, 150, 200):
+        trainer.set_learning_rate(step)
+        rates.append(trainer.exposure.optimizer.param_groups[0]["lr"])
+    assert rates == pytest.approx([0.01, 0.01 * 0.1**0.5, 0.001, 0.001])
 
 
 def test_changes_of_exposure_cost_less_with_it(changing: Scene) -> None:

@@ -15,6 +15,7 @@ from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
 from skipgs_plug.fallback_raster.optimizer import Adam
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.loop import Iteration
+from skipgs_plug.trainer.row_order import sort_rows
 from skipgs_plug.trainer.scene import View
 from skipgs_plug.trainer.synthetic import make_scene
 
@@ -152,6 +153,29 @@ def test_a_gate_leaves_steps_out_of_both(
         SkipGate(trainer, warmup=2, **settings)
         trainer.train(progress=False)
     assert_same(*trainers)
+
+
+def test_gradients_that_wait_for_their_step_are_sorted_with_their_rows(
+    monkeypatch: pytest.MonkeyPatch, narrow_scene: Scene
+) -> None:
+    config = dataclasses.replace(CONFIGS["higher bands at once"], refine_stop_iter=1)  # no densification
+    trainer = Trainer(config, narrow_scene)
+    trainer.train(until=20, progress=False)
+    snapshot, found = trainer.snapshot(), []
+    for sorts in (False, True):
+        trainer.restore(snapshot)
+        with monkeypatch.context() as context:
+            context.setattr(trainer, "_optimizer_step", lambda info: False)  # as a gate that accumulates
+            trainer.train_step()
+        assert trainer._splats["shN"].grad.is_sparse and not trainer._splats["means"].grad.is_sparse
+        if sorts:
+            sort_rows(trainer.splats, trainer.optimizers, trainer.strategy_state)
+            assert not torch.equal(trainer.splats["means"], snapshot["splats"]["means"])
+        trainer.train(until=24, progress=False)
+        order = trainer.splats["means"][:, 0].argsort()
+        found.append({name: param.detach()[order] for name, param in trainer.splats.items()})
+    for name, tensor in found[0].items():
+        assert torch.equal(tensor, found[1][name]), name
 
 
 def test_only_plain_adam_on_the_cpu_is_lazy(narrow_scene: Scene) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 
 import pytest
 import torch
@@ -151,6 +152,21 @@ def test_callers_random_state_is_left_alone(trainer: Trainer) -> None:
     torch.manual_seed(5)
     trainer.train(until=12, progress=False)
     assert torch.equal(torch.rand(3), expected)
+
+
+def test_trainers_in_other_threads_wait_while_one_draws(trainer: Trainer) -> None:
+    def draw(step: int) -> torch.Tensor:
+        with trainer._seeded(step):
+            return torch.rand(3)
+
+    alone, drawn = draw(5), []
+    other = threading.Thread(target=lambda: drawn.append(draw(9)))
+    with trainer._seeded(5):
+        other.start()
+        other.join(0.2)
+        assert torch.equal(torch.rand(3), alone) and not drawn
+    other.join(10)
+    assert torch.equal(drawn[0], draw(9))
 
 
 def test_no_held_out_views(tiny_scene: Scene, tiny_config: TrainConfig) -> None:

@@ -64,8 +64,9 @@ def test_points_that_nothing_would_ever_draw_do_not_become_gaussians() -> None:
     trainer = Trainer(TrainConfig(max_steps=3), scene_)
     assert len(trainer.splats["means"]) == 998
     other = scene()
+    other.points[0] = torch.tensor([0.5, 0.0, 0.2])
+    assert before_a_lens(other.train, other.points, 0.4).nonzero().flatten().tolist() == [0]
     other.train[1].viewmat[2, 3] = 3.0  # stands back: it shows what lies before the lens of the other
-    other.points[0] = torch.tensor([0.0, 0.0, 0.2])
     assert not before_a_lens(other.train, other.points, 0.4).any()
 
 

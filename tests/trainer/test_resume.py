@@ -139,6 +139,19 @@ def test_an_extended_run_keeps_its_schedule(tmp_path: Path, tiny_scene: Scene, t
         shorter.load_checkpoint(tmp_path / "c.pt")
 
 
+def test_a_checkpoint_older_than_a_setting_was_made_with_its_default(
+    tmp_path: Path, trainer: Trainer, tiny_scene: Scene
+) -> None:
+    path = tmp_path / "c.pt"
+    trainer.save_checkpoint(path)
+    content = torch.load(path, weights_only=True)
+    del content["config"]["exposure"]
+    torch.save(content, path)
+    trainer.load_checkpoint(path)
+    with pytest.raises(InputError, match="was made with exposure=False, not True"):
+        Trainer(dataclasses.replace(trainer.config, exposure=True), tiny_scene).load_checkpoint(path)
+
+
 WRONG = (None, "text", {"a": None}, torch.zeros(3), torch.full((160, 3), math.nan))
 CHECKED_ELSEWHERE = ("config", "skipgs")  # compared one by one; see tests/core/test_state.py
 

@@ -65,6 +65,7 @@ def test_a_run_sorts_and_resumes_in_that_order(
     whole.train(progress=False)
     assert sorted_at and all(sorts_rows(whole.strategy or whole.mcmc, step) for step in sorted_at)
     assert not sorts_rows(whole.strategy or whole.mcmc, sorted_at[0] + 1)
+    assert sorted_at[-1] >= whole.refine_stop_iter - (whole.strategy or whole.mcmc).refine_every  # the last refinement
     monkeypatch.undo()
     for stop in (sorted_at[0], sorted_at[0] + 1):
         first = Trainer(tiny_config, tiny_scene)

@@ -98,18 +98,18 @@ def test_a_run_whose_scene_has_gone_says_so(run_folder, tmp_path, capsys):
 def test_a_model_is_shown_with_the_settings_of_its_training(scene_file, ply, tmp_path, monkeypatch):
     """Also from another folder than that in which it was trained."""
     monkeypatch.chdir(scene_file.parent)
-    options = ["--near-plane", "0.3", "--exposure", "--init-ply", str(ply)]
+    options = ["--near-plane", "0.3", "--far-plane", "90", "--exposure", "--init-ply", str(ply)]
     assert main(["train", scene_file.name, "--out", str(tmp_path / "run"), "--max-steps", "3", *options]) == 0
     monkeypatch.chdir(tmp_path)
     model = open_model(tmp_path / "run")
-    assert (model.near_plane, model.exposure, model.antialiased) == (0.3, True, False)
+    assert (model.near_plane, model.far_plane, model.exposure, model.antialiased) == (0.3, 90.0, True, False)
     assert len(model.scene.points) == len(read_ply(ply)["means"])
     alone, with_scene = open_model(ply), open_model(ply, str(scene_file))
     assert alone.near_plane == 0.01 and not with_scene.exposure
     assert with_scene.near_plane == Trainer(TrainConfig(), load_scene(scene_file)).near_plane
 
 
-def test_nothing_nearer_than_the_near_plane_is_drawn(scene_file):
+def test_only_what_lies_between_the_planes_is_drawn(scene_file):
     view = load_scene(scene_file).train[0]
     pose = torch.linalg.inv(view.viewmat)
     splats = {
@@ -121,10 +121,10 @@ def test_nothing_nearer_than_the_near_plane_is_drawn(scene_file):
         "shN": torch.zeros(1, 0, 3),
     }
     drawn = []
-    for near in (0.01, 0.3):
-        painter = Painter(resolve_backend("warp"), (0.0, 0.0, 0.0), near)
+    for near, far in ((0.01, 1e10), (0.3, 1e10), (0.01, 0.1)):
+        painter = Painter(resolve_backend("warp"), (0.0, 0.0, 0.0), near, far_plane=far)
         drawn.append(float(painter.draw(splats, view.viewmat, view.K, view.width, view.height)[0].max()))
-    assert drawn[0] > 0.5 and drawn[1] == 0
+    assert drawn[0] > 0.5 and drawn[1:] == [0, 0]
 
 
 def test_the_path_begins_and_ends_at_the_views_and_moves_evenly(scene_file):
