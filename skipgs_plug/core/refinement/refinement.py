@@ -117,8 +117,13 @@ class Refinement:
         return self._driver is None and not self._removed
 
     @property
+    def lacks_loop(self) -> bool:
+        """Whether iterations are to be left out and no loop runs that could do so: none was given, or it is over."""
+        return self.number is None and not self._removed
+
+    @property
     def number(self) -> int | None:
-        """Number of the present iteration; None while the loop is not known."""
+        """Number of the present iteration; None while the loop is not known, and when it is over."""
         return None if self._driver is None else self._driver.current
 
     def follow(self, loop: LoopRange) -> LoopRange:
@@ -194,16 +199,16 @@ class Refinement:
     @property
     def watching(self) -> bool:
         """Whether watched views are left out of training at present."""
-        return self.foresight is not None and self.foresight.watching
+        return self.foresight is not None and self.foresight.watching and not self._removed
 
     @property
     def over(self) -> bool:
         """Whether steps have shrunk to nothing, so that what still runs need not train."""
-        return self._over
+        return self._over and not self._removed
 
     def notify_event(self, n_views: int) -> None:
         """A structural change happened; when refinement has ended, the model is given time to recover."""
-        if self.over:
+        if self.foresight is not None and self.foresight.ended:
             pause = self._config.pause_iters
             self._recovery, self._recovered = max(n_views, RECOVERY) if pause is None else pause, 0
 
