@@ -114,7 +114,7 @@ class Refinement:
     @property
     def wants_loop(self) -> bool:
         """Whether it is not known yet which loop trains."""
-        return self._driver is None and not self._removed
+        return self._driver is None
 
     @property
     def lacks_loop(self) -> bool:
@@ -175,7 +175,7 @@ class Refinement:
             return True
         if not self._begun:
             self._begin(loop, number)
-        self._set_pace(number)
+        self._set_pace()
         must = number in self._must or number == self._last
         if not self.thinning.runs(must):
             self._left_out += 1
@@ -274,23 +274,21 @@ class Refinement:
                 "refine_share='auto' decides by the losses of one process", "give a share, such as 0.4"
             )
 
-    def _set_pace(self, number: int) -> None:
-        """Set the share and the factor with which this number is decided on."""
+    def _set_pace(self) -> None:
+        """Set the share and the factor with which the next number is decided on; without larger steps both stay."""
+        if self.foresight is None:
+            return
         assert self._first is not None and self._last is not None and self.share is not None
-        total = self._last + 1 - self._first
         if self._recovered < self._recovery:
-            self.thinning.share, factor = 1.0, 1.0 - self._recovered / self._recovery
+            factor = 1.0 - self._recovered / self._recovery
             self._recovered += 1
             self._over = False
         else:
-            progress = (number - self._first) / total
-            if self.foresight is not None:
-                progress = self.foresight.progress(self.thinning.run / (self.share * total))
-                self._over = self.foresight.ended
-                self.thinning.share = 0.0 if self._over else 1.0
+            progress = self.foresight.progress(self.thinning.run / (self.share * (self._last + 1 - self._first)))
             factor = path_factor(self.share, progress, self._config.rate_peak)
-        if self._scales:
-            self._rates.scale(factor)
+            self._over = self.foresight.ended
+        self.thinning.share = 0.0 if self._over else 1.0
+        self._rates.scale(factor)
 
     # State and report.
 

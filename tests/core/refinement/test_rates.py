@@ -145,6 +145,10 @@ def test_a_step_that_raises_gives_its_rate_back_in_the_next_iteration(rates):
         optimizer.step()
     rates.scale(5.0)
     assert optimizer.param_groups[0]["lr"] == 0.1
+    with pytest.raises(ZeroDivisionError):
+        optimizer.step()
+    rates.remove()
+    assert optimizer.param_groups[0]["lr"] == 0.1
 
 
 def test_a_wrapped_optimizer_with_the_same_groups_is_scaled_once(rates):
@@ -204,4 +208,6 @@ def test_other_threads_and_removed_hooks_are_left_alone(rates):
     thread.join()
     assert seen == [0.1] and moved() == 0.3
     rates.remove()
+    assert moved() == 0.1
+    rates.scale(3.0)
     assert moved() == 0.1
