@@ -277,6 +277,11 @@ def _tests(body: list[ast.stmt], path: list[ast.expr]) -> Iterator[tuple[ast.exp
             yield from _tests(statement.body, [*path, statement.test])
             yield from _tests(statement.orelse, [*path, ast.UnaryOp(ast.Not(), statement.test)])
             continue
+        if isinstance(statement, ast.Match):
+            for part in (part for case in statement.cases for part in ast.walk(case.pattern)):
+                if isinstance(part, ast.MatchValue):
+                    equal = ast.Compare(statement.subject, [ast.Eq()], [part.value])
+                    yield ast.copy_location(equal, part.value), path
         inner = [part for part in ast.iter_child_nodes(statement) if isinstance(part, ast.stmt)]
         for part in (*getattr(statement, "handlers", ()), *getattr(statement, "cases", ())):
             inner += part.body

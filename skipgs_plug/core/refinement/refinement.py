@@ -218,7 +218,7 @@ class Refinement:
         # Of a run that goes on, those behind it too: conditions are judged by how often they hold.
         numbers = range(self._first, loop.numbers.stop)
         self._begun = True
-        found = {}
+        found = dict(self.always)  # of this loop, where a state is loaded within it
         if loop.source is not None:
             code, names = loop.source
             found = milestones(code, line_of(code), numbers, names, self._pure)

@@ -118,6 +118,18 @@ def test_names_that_stand_for_the_number():
     assert found(loop) == {"step % len(views) == 0": [51, 68, 85]}
 
 
+def test_cases_of_the_number():
+    def loop(stop):
+        for step in stop():
+            match step % 40:
+                case 0 | 13 if step:
+                    print("save")
+                case _:
+                    print("as ever")
+
+    assert found(loop) == {"step % 40 == 0": [80], "step % 40 == 13": [53, 93]}
+
+
 def test_every_way_to_give_a_name_to_the_number():
     def loop(stop):
         for i in stop():

@@ -182,6 +182,23 @@ def test_a_condition_that_holds_half_the_time_says_the_same_after_a_resume():
         assert rest == [n for n in whole if n > step] and list(again.values()) == list(always.values())
 
 
+def test_a_state_that_is_loaded_within_the_loop_leaves_what_hangs_on_numbers():
+    with SkipGate(start_iter=10, refine_share=0.2) as gate:
+        for step in gate.iterations(range(26), always=()):
+            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
+        state = gate.state_dict()
+    loaded, saved = False, []
+    with SkipGate(start_iter=10, refine_share=0.2) as gate:
+        for step in gate.iterations(range(26, 100)):
+            if not loaded:
+                gate.load_state_dict(state)
+                loaded = True
+            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
+            if step % 25 == 0:
+                saved.append(step)
+    assert saved == [50, 75]
+
+
 def first_part(loop, gate, middle, options):
     """Train up to `middle`, giving the gate's state at the end of each iteration."""
     for step in gate.iterations(range(loop.begin, loop.end), always=range(0, 400, 25), **options):
