@@ -156,7 +156,7 @@ class SkipGate:
         self._require_manual("backward")
         engine, now, step = self._engine, self._iteration, int(step)
         self._check_losses(loss, view)
-        if engine.refinement is not None and engine.refinement.wants_loop and step >= engine.start:
+        if engine.refinement is not None and engine.refinement.lacks_loop and step >= engine.start:
             raise SkipGSError(
                 "refine_share leaves out iterations of a loop that it is given: write the loop as "
                 "for step in gate.iterations(range(...))."
@@ -225,7 +225,7 @@ class SkipGate:
         Raises:
             GateOrderError: No iteration was seen yet and no step is given.
         """
-        step = self._iteration.step if step is None else step
+        step = self._iteration.step if step is None else int(step)
         if step is None or self._engine.policy is None:
             raise GateOrderError("notify_event() came before the first iteration; give its step.")
         self._engine.notify_event(kind, step)

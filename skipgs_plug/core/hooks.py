@@ -80,6 +80,7 @@ class Hooks:
 
     def iteration(self, step: int) -> None:
         """Iteration `step` begins: its first training backward will be gated."""
+        step = int(step)  # a NumPy number would get into saved states
         with self._detaching_on_error():
             if not self._ready:
                 raise self._mismatch("the trainer iterates before it said when densification ends")

@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 
 from skipgs_plug import SkipConfig, SkipGate, SkipGSError
+from skipgs_plug.core.policy import SkipPolicy
 
 
 @pytest.mark.parametrize(
@@ -52,3 +53,9 @@ def test_gate_names_unknown_settings() -> None:
         SkipGate()
     with pytest.raises(SkipGSError, match="str is no policy; derive it from"):
         SkipGate(start_iter=0, policy="random")  # type: ignore[arg-type]
+
+
+def test_a_policy_of_its_own_checks_its_settings_too() -> None:
+    for settings in ({"start_iter": -1}, {"start_iter": 0, "ema_decay": 1.0}, {"start_iter": None}):
+        with pytest.raises(SkipGSError, match=list(settings)[-1]):
+            SkipPolicy(**settings)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import json
+
+import numpy as np
 import pytest
 import torch
 
@@ -137,6 +141,17 @@ def test_events_reach_the_policy_with_the_number_of_views() -> None:
     gate.notify_event("opacity reset", step=6)
     assert policy.events == [(4, 2), (6, 2)]
     assert gate.stats()["events"] == {"prune": 1, "opacity reset": 1}
+
+
+def test_a_saved_state_holds_plain_values_whatever_the_loop_counts_with() -> None:
+    gate = SkipGate(start_iter=0, warmup=0)
+    gate.backward(loss_of(1.0), view=np.array(["a.png"])[0], step=np.int64(4))
+    gate.notify_event("prune", step=np.int64(4))
+    saved = io.BytesIO()
+    torch.save(gate.state_dict(), saved)
+    saved.seek(0)
+    state = torch.load(saved, weights_only=True)  # refuses anything else
+    SkipGate(start_iter=0, warmup=0).load_state_dict(json.loads(json.dumps(state)))
 
 
 def test_optimizer_steps_on_pending_gradients_only() -> None:

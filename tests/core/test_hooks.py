@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+
+import numpy as np
 import pytest
 import torch
 from always import Always
@@ -288,6 +291,17 @@ def test_state_of_another_scene_is_refused() -> None:
 def test_verbs_belong_to_loops_of_ones_own() -> None:
     with attach(ToyTrainer()) as gate, pytest.raises(GateOrderError, match="adapter 'toy'"):
         gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
+
+
+def test_a_trainer_may_count_with_numpy() -> None:
+    class Counted(Toy):
+        def attach(self, hooks) -> None:
+            super().attach(hooks)
+            hooks.iteration(np.int64(7))
+
+    trainer = ToyTrainer()
+    with SkipGate(trainer, adapter=Counted(trainer)) as gate:
+        assert json.loads(json.dumps(gate.state_dict()))["step"] == 7
 
 
 def test_training_anew_with_one_gate_is_refused() -> None:

@@ -22,6 +22,7 @@ from skipgs_plug.core.views import require_unique, view_key
         (Path("images") / "a.png", "images/a.png"),
         (7, "7"),
         (np.int64(7), "7"),
+        (np.str_("a.png"), "a.png"),
         (torch.tensor(7), "7"),
         (torch.tensor([7]), "7"),
         (np.array([7]), "7"),
@@ -29,7 +30,7 @@ from skipgs_plug.core.views import require_unique, view_key
     ],
 )
 def test_one_view_has_one_text(view, key: str) -> None:
-    assert view_key(view) == key
+    assert view_key(view) == key and type(view_key(view)) is str
 
 
 @pytest.mark.parametrize("view", [torch.tensor([1, 2]), torch.tensor(0.5), object(), None, 1.5, ()])

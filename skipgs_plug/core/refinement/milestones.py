@@ -12,6 +12,7 @@ import copy
 import inspect
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
+from numbers import Integral
 from types import CodeType
 from typing import Any, NamedTuple
 
@@ -109,10 +110,11 @@ class _Loop:
         self.file, self.first_line = file, first_line
         self._pure = pure | SAFE
         parts = [node for one in statement.body for node in ast.walk(one)]
+        own = {id(name) for node in parts if isinstance(node, ast.comprehension) for name in ast.walk(node.target)}
         stored = [
             ast.unparse(node)
             for node in parts
-            if isinstance(node, _PLACE) and not isinstance(node.ctx, ast.Load) and ast.unparse(node) != self.target
+            if isinstance(node, _PLACE) and not isinstance(node.ctx, ast.Load) and id(node) not in own
         ]
         called = [node.func for node in parts if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
         self._changing = {*stored, *(ast.unparse(method.value) for method in called if method.attr in CHANGES)}
@@ -120,15 +122,13 @@ class _Loop:
 
     def _spelled_out(self, body: list[ast.stmt], stored: list[str]) -> list[ast.stmt]:
         """Replace names and attributes that stand for something of the number: `epoch_step = step % len(views)`."""
-        for statement in body:
-            if not (isinstance(statement, ast.Assign) and len(statement.targets) == 1):
-                continue
-            (place,), value = statement.targets, statement.value
+        for index in range(len(_assigned(body))):
+            place, value = _assigned(body)[index]  # what came before it is spelled out in it
             text = ast.unparse(place)
             if not isinstance(place, (ast.Name, ast.Attribute)) or stored.count(text) != 1:
                 continue
             if self.mentions(value) and not self.leaf(value).unforeseeable:
-                body = [_Inline(text, value).visit(copy.deepcopy(one)) for one in body]
+                body = [_Inline(text, value, place.lineno).visit(copy.deepcopy(one)) for one in body]
         return body
 
     def leaf(self, node: ast.expr) -> _Leaf:
@@ -169,14 +169,31 @@ class _Loop:
                     yield from (value for value in given if isinstance(value, (ast.Name, ast.Attribute)))
 
 
-class _Inline(ast.NodeTransformer):
-    """Puts an expression where a name or an attribute is read."""
+def _assigned(body: list[ast.stmt]) -> list[tuple[ast.expr, ast.expr]]:
+    """Places that these statements give a value to in every iteration, each with the value, in their order."""
+    found: list[tuple[ast.expr, ast.expr]] = []
+    for node in body:
+        if isinstance(node, (ast.With, ast.AsyncWith)):
+            found += _assigned(node.body)
+        elif isinstance(node, ast.AnnAssign) and node.value is not None:
+            found.append((node.target, node.value))
+        elif isinstance(node, ast.Assign) and len(node.targets) == 1:
+            place, value = node.targets[0], node.value
+            if isinstance(place, ast.Tuple) and isinstance(value, ast.Tuple) and len(place.elts) == len(value.elts):
+                found += zip(place.elts, value.elts, strict=True)
+            else:
+                found.append((place, value))
+    return found
 
-    def __init__(self, place: str, value: ast.expr) -> None:
-        self._place, self._value = place, value
+
+class _Inline(ast.NodeTransformer):
+    """Puts an expression where a name or an attribute is read below a line; above, it is of the iteration before."""
+
+    def __init__(self, place: str, value: ast.expr, line: int) -> None:
+        self._place, self._value, self._line = place, value, line
 
     def visit_Name(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        if isinstance(node.ctx, ast.Load) and ast.unparse(node) == self._place:
+        if isinstance(node.ctx, ast.Load) and node.lineno > self._line and ast.unparse(node) == self._place:
             return ast.copy_location(copy.deepcopy(self._value), node)
         return self.generic_visit(node)
 
@@ -212,11 +229,18 @@ def milestones(
             value = eval(compile(ast.Expression(node), loop.file, "eval"), dict(names))
         except Exception:
             continue
-        if isinstance(value, (list, tuple, set, frozenset)) and all(type(entry) is int for entry in value):
-            hits = {entry for entry in value if entry in numbers}
+        if _is_list(value):
+            hits = {int(entry) for entry in value if entry in numbers}
             if hits:
                 found[f"line {loop.first_line + node.lineno - 1}: {ast.unparse(node)}"] = hits
     return found
+
+
+def _is_list(value: Any) -> bool:
+    """Whether this can be a list of iterations; a range without gaps is the whole run."""
+    if isinstance(value, range):
+        return value.step != 1
+    return isinstance(value, (list, tuple, set, frozenset)) and all(isinstance(entry, Integral) for entry in value)
 
 
 def _loop_at(code: CodeType, line: int, pure: frozenset[str]) -> _Loop:
@@ -253,6 +277,11 @@ def _tests(body: list[ast.stmt], path: list[ast.expr]) -> Iterator[tuple[ast.exp
             yield from _tests(statement.body, [*path, statement.test])
             yield from _tests(statement.orelse, [*path, ast.UnaryOp(ast.Not(), statement.test)])
             continue
+        if isinstance(statement, ast.Match):
+            for part in (part for case in statement.cases for part in ast.walk(case.pattern)):
+                if isinstance(part, ast.MatchValue):
+                    equal = ast.Compare(statement.subject, [ast.Eq()], [part.value])
+                    yield ast.copy_location(equal, part.value), path
         inner = [part for part in ast.iter_child_nodes(statement) if isinstance(part, ast.stmt)]
         for part in (*getattr(statement, "handlers", ()), *getattr(statement, "cases", ())):
             inner += part.body

@@ -10,6 +10,8 @@ import torch
 from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
 from torch.utils.hooks import RemovableHandle
 
+from skipgs_plug.core.errors import SkipGSError
+
 Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
 Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 
@@ -25,6 +27,9 @@ MOST = 8.0  # beyond, scenes of many overlapping Gaussians lose more by steps th
 # Of Adam's running mean of squares (beta2), at most. By the gradient of a single view a parameter can move its rate
 # over the root of 1 - beta2: 32 times the rate at the usual 0.999, too far where rates are larger.
 SQUARES_KEPT = 0.98
+SETTINGS = ("lr", "betas")  # of a group, that are other ones for the length of a step
+
+_hooked: list[ScaledRates] = []  # all whose hooks PyTorch holds
 
 
 def path_factor(share: float, progress: float, peak: float | None = None) -> float:
@@ -91,12 +96,25 @@ class ScaledRates:
         self._removed = False
 
     def scale(self, factor: float) -> None:
-        """Scale the steps of the thread that calls this, which is the one that trains; see `group_factor`."""
+        """Scale the steps of the thread that calls this, which is the one that trains; see `group_factor`.
+
+        Raises:
+            SkipGSError: Another one scales steps in this thread, and one of the two does not know which are its own.
+        """
         self.rest()
         if self._removed:
             return
-        self._factor, self._thread = factor, threading.get_ident()
+        thread = threading.get_ident()
+        for other in _hooked:
+            at_work = other is not self and other._factor is not None and other._thread == thread
+            if at_work and (other.only is None or self.only is None):
+                raise SkipGSError(
+                    "Another gate makes steps larger in this thread, and each would scale those of both: detach() it "
+                    "first, or train in threads of their own."
+                )
+        self._factor, self._thread = factor, thread
         if not self._handles:
+            _hooked.append(self)
             self._handles = [
                 register_optimizer_step_pre_hook(self._scale),
                 register_optimizer_step_post_hook(self._put_back),
@@ -116,6 +134,8 @@ class ScaledRates:
         self._removed = True
         while self._handles:
             self._handles.pop().remove()
+        if self in _hooked:
+            _hooked.remove(self)
 
     def _scale(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         if self._factor is None or threading.get_ident() != self._thread:
@@ -129,12 +149,13 @@ class ScaledRates:
         self._depth[key] = self._depth.get(key, 0) + 1
         if self._depth[key] > 1:
             return
-        self._before[key] = [
-            (group, {setting: group[setting] for setting in ("lr", "betas") if setting in group})
-            for group in optimizer.param_groups
-        ]
-        for group in optimizer.param_groups:
-            group["lr"] = group["lr"] * group_factor(group, self._factor, names[0])
+        # An optimizer can be wrapped in another one, which has the same groups.
+        scaled = {id(group) for saved in self._before.values() for group, _ in saved}
+        groups = [group for group in optimizer.param_groups if id(group) not in scaled]
+        self._before[key] = [(group, {name: group[name] for name in SETTINGS if name in group}) for group in groups]
+        for group in groups:
+            if "lr" in group:
+                group["lr"] = group["lr"] * group_factor(group, self._factor, names[0])
             if "betas" in group:
                 first, second, *others = group["betas"]
                 group["betas"] = (first, min(second, SQUARES_KEPT), *others)

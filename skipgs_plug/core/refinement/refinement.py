@@ -114,11 +114,16 @@ class Refinement:
     @property
     def wants_loop(self) -> bool:
         """Whether it is not known yet which loop trains."""
-        return self._driver is None and not self._removed
+        return self._driver is None
+
+    @property
+    def lacks_loop(self) -> bool:
+        """Whether iterations are to be left out and no loop runs that could do so: none was given, or it is over."""
+        return self.number is None and not self._removed
 
     @property
     def number(self) -> int | None:
-        """Number of the present iteration; None while the loop is not known."""
+        """Number of the present iteration; None while the loop is not known, and when it is over."""
         return None if self._driver is None else self._driver.current
 
     def follow(self, loop: LoopRange) -> LoopRange:
@@ -170,7 +175,7 @@ class Refinement:
             return True
         if not self._begun:
             self._begin(loop, number)
-        self._set_pace(number)
+        self._set_pace()
         must = number in self._must or number == self._last
         if not self.thinning.runs(must):
             self._left_out += 1
@@ -194,16 +199,16 @@ class Refinement:
     @property
     def watching(self) -> bool:
         """Whether watched views are left out of training at present."""
-        return self.foresight is not None and self.foresight.watching
+        return self.foresight is not None and self.foresight.watching and not self._removed
 
     @property
     def over(self) -> bool:
         """Whether steps have shrunk to nothing, so that what still runs need not train."""
-        return self._over
+        return self._over and not self._removed
 
     def notify_event(self, n_views: int) -> None:
         """A structural change happened; when refinement has ended, the model is given time to recover."""
-        if self.over:
+        if self.foresight is not None and self.foresight.ended:
             pause = self._config.pause_iters
             self._recovery, self._recovered = max(n_views, RECOVERY) if pause is None else pause, 0
 
@@ -213,7 +218,7 @@ class Refinement:
         # Of a run that goes on, those behind it too: conditions are judged by how often they hold.
         numbers = range(self._first, loop.numbers.stop)
         self._begun = True
-        found = {}
+        found = dict(self.always)  # of this loop, where a state is loaded within it
         if loop.source is not None:
             code, names = loop.source
             found = milestones(code, line_of(code), numbers, names, self._pure)
@@ -269,23 +274,21 @@ class Refinement:
                 "refine_share='auto' decides by the losses of one process", "give a share, such as 0.4"
             )
 
-    def _set_pace(self, number: int) -> None:
-        """Set the share and the factor with which this number is decided on."""
+    def _set_pace(self) -> None:
+        """Set the share and the factor with which the next number is decided on; without larger steps both stay."""
+        if self.foresight is None:
+            return
         assert self._first is not None and self._last is not None and self.share is not None
-        total = self._last + 1 - self._first
         if self._recovered < self._recovery:
-            self.thinning.share, factor = 1.0, 1.0 - self._recovered / self._recovery
+            factor = 1.0 - self._recovered / self._recovery
             self._recovered += 1
             self._over = False
         else:
-            progress = (number - self._first) / total
-            if self.foresight is not None:
-                progress = self.foresight.progress(self.thinning.run / (self.share * total))
-                self._over = self.foresight.ended
-                self.thinning.share = 0.0 if self._over else 1.0
+            progress = self.foresight.progress(self.thinning.run / (self.share * (self._last + 1 - self._first)))
             factor = path_factor(self.share, progress, self._config.rate_peak)
-        if self._scales:
-            self._rates.scale(factor)
+            self._over = self.foresight.ended
+        self.thinning.share = 0.0 if self._over else 1.0
+        self._rates.scale(factor)
 
     # State and report.
 

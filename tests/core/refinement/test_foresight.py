@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.refinement.foresight import CYCLE_ENDS, Foresight, mean_gain, needed_share, watched_views
 
 VIEWS = [f"{i}.png" for i in range(6)]
@@ -98,3 +99,16 @@ def test_watched_views_are_few_and_always_the_same():
 def test_gain_in_decibels():
     assert mean_gain({"a": 0.1, "b": 0.1}, {"a": 0.01, "b": 0.01, "c": 1.0}) == pytest.approx((20.0, 0.0))
     assert mean_gain({"a": 0.1}, {"a": 0.1}) is None
+    # 0, 20 and 40 dB: their deviation is 20, the error of their mean 20 / sqrt(3)
+    before, after = dict.fromkeys("abc", 0.1), {"a": 0.1, "b": 0.01, "c": 0.001}
+    assert mean_gain(before, after) == pytest.approx((20.0, 20.0 / 3**0.5))
+
+
+def test_a_state_of_other_cycles_is_refused():
+    state = Foresight(0.05).state_dict()
+    for damage in ({"ends": [0.5, 1.0]}, {"cycle": -1}, {"cycle": 3}):
+        with pytest.raises(SkipGSError, match=r"which no run has; start the gate afresh"):
+            Foresight(0.05).load_state_dict({**state, **damage})
+    again = Foresight(0.05)
+    again.load_state_dict({**state, "cycle": 0})
+    assert again.cycle == 0

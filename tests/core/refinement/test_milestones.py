@@ -4,6 +4,7 @@ import re
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from skipgs_plug import SkipGSError
@@ -117,14 +118,69 @@ def test_names_that_stand_for_the_number():
     assert found(loop) == {"step % len(views) == 0": [51, 68, 85]}
 
 
+def test_cases_of_the_number():
+    def loop(stop):
+        for step in stop():
+            match step % 40:
+                case 0 | 13 if step:
+                    print("save")
+                case _:
+                    print("as ever")
+
+    assert found(loop) == {"step % 40 == 0": [80], "step % 40 == 13": [53, 93]}
+
+
+def test_every_way_to_give_a_name_to_the_number():
+    def loop(stop):
+        for i in stop():
+            with open("/dev/null") as _:
+                step = i + 1
+                rest: int = step % 30
+                epoch, place = step // 45, step % 45
+            if rest == 0:
+                print("of a name with a type, which stands for another name")
+            if place == 0:
+                print("of several at once", epoch)
+
+    assert found(loop) == {"(i + 1) % 30 == 0": [59, 89], "(i + 1) % 45 == 0": [89]}
+
+
+def test_a_name_that_is_given_below_is_of_the_iteration_before():
+    def loop(stop):
+        before = 0
+        for step in stop(before=before):
+            if step - before == 10:
+                print("save")
+            before = step
+
+    with pytest.raises(SkipGSError, match=r"cannot be foreseen \(step - before == 10\)"):
+        found(loop)
+
+
+def test_a_number_that_the_loop_changes_is_refused():
+    def loop(stop):
+        for step in stop():
+            print([step * 2 for step in range(3)])  # another one
+            step += 1
+            if step % 25 == 0:
+                print("save")
+
+    with pytest.raises(SkipGSError, match=r"cannot be foreseen \(step % 25 == 0\)"):
+        found(loop)
+
+
 def test_lists_of_iterations_that_are_handed_on_with_the_number():
     def loop(stop):
         saves, sizes = [7, 70], [1.5, 60]
-        for step in stop(saves=saves, sizes=sizes):
+        tests, rest, own = list(np.array([7, 80])), range(40, 100, 25), range(50, 100)
+        for step in stop(saves=saves, sizes=sizes, tests=tests, rest=rest, own=own):
             report(step, saves)
             report(step, saves=sizes)
+            report(step, tests)
+            report(step, rest)
+            report(step, own)
 
-    assert found(loop) == {"saves": [70]}
+    assert found(loop) == {"saves": [70], "tests": [80], "rest": [65, 90]}
 
 
 def test_functions_that_only_look_at_numbers():

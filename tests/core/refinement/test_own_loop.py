@@ -70,6 +70,43 @@ def test_a_change_after_the_end_is_followed_by_iterations_that_train():
     assert [row for row in ran if row[0] >= 55] == [(70, True), *((n, False) for n in range(71, 77)), (99, True)]
 
 
+def test_a_change_while_the_model_recovers_is_recovered_from_as_well():
+    trained = []
+    with SkipGate(start_iter=40, refine_share=0.25, pause_iters=6) as gate:
+        for step in gate.iterations(range(100), always=[70]):
+            if gate.backward(torch.ones((), requires_grad=True) * 1.0, view="a", step=step) and step >= 55:
+                trained.append(step)
+            if step in (70, 73, 79):  # the last one in the last iteration that still trains
+                gate.notify_event("prune")
+    assert trained == list(range(71, 86))
+
+
+def test_a_loop_that_goes_on_after_detach_trains_in_all_its_iterations():
+    gate = SkipGate(start_iter=40, refine_share=0.25)
+    trained = []
+    for step in gate.iterations(range(100), always=[70]):
+        if gate.backward(torch.ones((), requires_grad=True) * 1.0, view="a", step=step):
+            trained.append(step)
+        if step == 70:
+            gate.detach()
+    assert trained == [*range(55), *range(71, 100)]
+    assert gate.backward(torch.ones((), requires_grad=True), view="a", step=100)
+
+
+def test_after_detach_no_view_is_only_watched():
+    names = [f"{i}.png" for i in range(40)]
+    gate, trained = SkipGate(start_iter=0, refine_share="auto"), set()
+    for step in gate.iterations(range(2000), always=(), views=names):
+        ran = gate.backward(torch.ones((), requires_grad=True) * 1.0, view=names[step % 40], step=step)
+        if step == 1:
+            gate.detach()
+        elif step > 1 and ran:
+            trained.add(names[step % 40])
+        if step == 80:
+            break
+    assert trained == set(names)
+
+
 def test_steps_are_larger_while_the_gate_is_attached():
     loop, moved = Loop(), {}
 
@@ -143,6 +180,23 @@ def test_a_condition_that_holds_half_the_time_says_the_same_after_a_resume():
     for step in (7, 11, 20):
         rest, _, again = train(step + 1, states[step])
         assert rest == [n for n in whole if n > step] and list(again.values()) == list(always.values())
+
+
+def test_a_state_that_is_loaded_within_the_loop_leaves_what_hangs_on_numbers():
+    with SkipGate(start_iter=10, refine_share=0.2) as gate:
+        for step in gate.iterations(range(26), always=()):
+            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
+        state = gate.state_dict()
+    loaded, saved = False, []
+    with SkipGate(start_iter=10, refine_share=0.2) as gate:
+        for step in gate.iterations(range(26, 100)):
+            if not loaded:
+                gate.load_state_dict(state)
+                loaded = True
+            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
+            if step % 25 == 0:
+                saved.append(step)
+    assert saved == [50, 75]
 
 
 def first_part(loop, gate, middle, options):
@@ -322,5 +376,14 @@ def test_a_loop_that_forgot_iterations_is_told():
         assert gate.backward(loss, view="a", step=step)
     with pytest.raises(SkipGSError, match=r"refine_share .* for step in gate\.iterations\(range\(\.\.\.\)\)"):
         gate.backward(loss, view="a", step=3)
+    for step in gate.iterations(range(3, 10), always=()):  # a loop that is over, and one run through beforehand
+        gate.backward(loss, view="a", step=step)
+    with pytest.raises(SkipGSError, match=r"refine_share leaves out iterations of a loop"):
+        gate.backward(loss, view="a", step=10)
+    early = SkipGate(start_iter=3, refine_share=0.5)
+    numbers = list(early.iterations(range(10), always=()))
+    with pytest.raises(SkipGSError, match=r"refine_share leaves out iterations of a loop"):
+        for step in numbers:
+            early.backward(loss, view="a", step=step)
     off = SkipGate(start_iter=3, refine_share=0.5, enabled=False)
     assert off.backward(loss, view="a", step=9)

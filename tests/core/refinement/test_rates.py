@@ -5,6 +5,7 @@ import threading
 import pytest
 import torch
 
+from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.refinement.rates import ScaledRates, group_factor, path_factor
 
 
@@ -145,6 +146,54 @@ def test_a_step_that_raises_gives_its_rate_back_in_the_next_iteration(rates):
         optimizer.step()
     rates.scale(5.0)
     assert optimizer.param_groups[0]["lr"] == 0.1
+    with pytest.raises(ZeroDivisionError):
+        optimizer.step()
+    rates.remove()
+    assert optimizer.param_groups[0]["lr"] == 0.1
+
+
+def test_a_wrapped_optimizer_with_the_same_groups_is_scaled_once(rates):
+    class Wrapper(torch.optim.Optimizer):
+        def __init__(self, base):
+            super().__init__(base.param_groups, {})
+            self.base, self.param_groups = base, base.param_groups
+
+        def step(self):
+            self.base.step()
+
+    value = parameter()
+    base = torch.optim.SGD([value], lr=0.1)
+    rates.scale(3.0)
+    Wrapper(base).step()
+    torch.testing.assert_close(1.0 - value.detach(), torch.full((3,), 0.3))
+    assert base.param_groups[0]["lr"] == 0.1
+
+
+def test_an_optimizer_without_a_rate_steps_as_ever(rates):
+    class Constant(torch.optim.Optimizer):
+        def step(self):
+            for group in self.param_groups:
+                group["params"][0].data -= 0.1
+
+    value = parameter()
+    rates.scale(3.0)
+    Constant([value], {}).step()
+    torch.testing.assert_close(1.0 - value.detach(), torch.full((3,), 0.1))
+
+
+def test_a_second_one_that_scales_the_same_optimizers_is_refused(rates):
+    second, own = ScaledRates(), ScaledRates(list)
+    rates.scale(3.0)
+    for other in (second, own):
+        with pytest.raises(SkipGSError, match=r"each would scale those of both: detach\(\) it first"):
+            other.scale(2.0)
+    rates.rest()
+    second.scale(2.0)  # one after the other
+    second.remove()
+    rates.only = list
+    rates.scale(3.0)
+    own.scale(2.0)  # each knows its own
+    own.remove()
 
 
 def test_other_threads_and_removed_hooks_are_left_alone(rates):
@@ -160,4 +209,6 @@ def test_other_threads_and_removed_hooks_are_left_alone(rates):
     thread.join()
     assert seen == [0.1] and moved() == 0.3
     rates.remove()
+    assert moved() == 0.1
+    rates.scale(3.0)
     assert moved() == 0.1
