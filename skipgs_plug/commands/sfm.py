@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -73,7 +74,9 @@ def reconstruct(args: Args) -> Path:
     work = Path(tempfile.mkdtemp(prefix=f".{scene.name}.", dir=scene.parent))
 
     def bar(title: str, total: int | None = None, **options: Any) -> tqdm:
-        return tqdm(total=total, desc=title, disable=args.no_progress, unit="", leave=False, **options)
+        # Where nothing can be wiped out, bars end with a line break, before whatever is printed next.
+        leave = not sys.stderr.isatty()
+        return tqdm(total=total, desc=title, disable=args.no_progress, unit="", leave=leave, **options)
 
     try:
         with bar("Reading photographs") as shown:

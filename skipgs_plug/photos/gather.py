@@ -58,7 +58,7 @@ def gather(source: Path, folder: Path, frames: int, progress: Callable[[int], No
         progress: called with 1 for every photograph.
 
     Raises:
-        MissingFileError: `source` does not exist.
+        MissingFileError: `source` does not exist, or what a link among the photographs points to.
         InputError: a photograph or the video cannot be decoded, or there are fewer than three photographs.
     """
     if not source.exists():
@@ -70,7 +70,9 @@ def gather(source: Path, folder: Path, frames: int, progress: Callable[[int], No
     else:
         gathered = gather_folder(source, folder, progress)
     if len(gathered.names) < LEAST:
-        raise InputError(f"{source} gives {len(gathered.names)} photographs; take at least 20 that overlap.")
+        count = len(gathered.names)
+        what = "only 1 photograph" if count == 1 else f"only {count} photographs" if count else "no photograph"
+        raise InputError(f"{source} gives {what}; take at least 20 that overlap.")
     return gathered
 
 
@@ -85,16 +87,18 @@ def gather_video(source: Path, folder: Path, frames: int, progress: Callable[[in
 
 
 def gather_folder(source: Path, folder: Path, progress: Callable[[int], None]) -> Gathered:
-    files = [path for path in sorted(source.rglob("*")) if path.is_file() and not path.name.startswith(".")]
+    known = AS_THEY_ARE + CONVERTED + UNREADABLE
+    found = [path for path in sorted(source.rglob("*")) if path.suffix.lower() in known]
+    files = [path for path in found if not path.is_dir() and not path.name.startswith(".")]
     unreadable = [path for path in files if path.suffix.lower() in UNREADABLE]
     if unreadable:
-        raise InputError(
-            f"{unreadable[0]} has a format that cannot be read here ({len(unreadable)} such files); export as JPEG."
-        )
+        others = f", like {len(unreadable) - 1} more" if len(unreadable) > 1 else ""
+        raise InputError(f"{unreadable[0]} has a format that cannot be read here{others}; export as JPEG.")
+    for path in files:
+        if not path.exists():
+            raise MissingFileError(f"{path} links to a file that does not exist; restore that or remove the link.")
     names, cameras = [], set()
     for path in files:
-        if path.suffix.lower() not in AS_THEY_ARE + CONVERTED:
-            continue
         name, camera = place(path, source, folder)
         names.append(name)
         cameras.add(camera)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from skipgs_plug.cli import main
 from skipgs_plug.photos.gather import gather
 from skipgs_plug.photos.video import sharpest_frames, sharpness
 from skipgs_plug.trainer import InputError
@@ -59,6 +60,40 @@ def test_other_formats_are_converted_and_sizes_tell_cameras_apart(pattern, tmp_p
     gathered = gather(source, tmp_path / "photos", 10, lambda n: None)
     assert gathered.names == ["a.bmp.jpg", "a.webp.jpg", "b.png"] and not gathered.one_camera
     assert (gathered.folder / "a.bmp.jpg").read_bytes()[:2] == b"\xff\xd8"  # JPEG
+
+
+def test_a_link_to_nothing_is_named(pattern, tmp_path):
+    for name in "abc":
+        Image.fromarray(pattern).save(tmp_path / f"{name}.png")
+    (tmp_path / "d.JPG").symlink_to(tmp_path / "elsewhere.jpg")
+    with pytest.raises(InputError, match=r"d\.JPG links to a file that does not exist"):
+        gather(tmp_path, tmp_path / "photos", 10, lambda n: None)
+
+
+@pytest.mark.parametrize(
+    ("names", "sentence"),
+    [
+        ((), "gives no photograph;"),
+        (("a.png",), "gives only 1 photograph;"),
+        (("a.png", "b.png"), "gives only 2 photographs;"),
+        (("a.heic",), "a.heic has a format that cannot be read here; export as JPEG."),
+        (("a.heic", "b.NEF"), "a.heic has a format that cannot be read here, like 1 more; export as JPEG."),
+    ],
+)
+def test_too_few_or_unreadable_photographs_are_counted(pattern, tmp_path, names, sentence):
+    source = tmp_path / "source"
+    source.mkdir()
+    for name in names:
+        Image.fromarray(pattern).save(source / name, format="PNG")
+    with pytest.raises(InputError) as refused:
+        gather(source, tmp_path / "photos", 10, lambda n: None)
+    assert sentence in str(refused.value)
+
+
+def test_an_error_has_a_line_of_its_own_where_bars_cannot_be_wiped_out(tmp_path, capsys):
+    (tmp_path / "photographs").mkdir()
+    assert main(["sfm", str(tmp_path / "photographs"), str(tmp_path / "scene")]) == 2
+    assert "\nskipgs-plug: " in capsys.readouterr().err
 
 
 @pytest.mark.filterwarnings(LEAVES_PIPES)
