@@ -123,7 +123,7 @@ def test_photographs_are_told_from_scenes(fern, tmp_path, capsys):
     [
         (lambda p: None, (), "nowhere does not exist; give a folder of photographs or a video"),
         (lambda p: p.write_text("x"), (), "nowhere is neither a folder nor a video"),
-        (lambda p: p.mkdir(), (), "gives 0 photographs"),
+        (lambda p: p.mkdir(), (), "gives no photograph"),
         (lambda p: (p.mkdir(), (p / "a.jpg").write_bytes(b"no")), (), "a.jpg cannot be decoded"),
         (lambda p: (p.mkdir(), (p / "a.HEIC").write_bytes(b"no")), (), "export as JPEG"),
         (lambda p: p.mkdir(), ("--frames", "2"), "--frames 2 is too few"),
