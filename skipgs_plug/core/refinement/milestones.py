@@ -244,15 +244,17 @@ def _is_list(value: Any) -> bool:
 
 
 def _loop_at(code: CodeType, line: int, pure: frozenset[str]) -> _Loop:
+    function = code.co_flags & inspect.CO_NEWLOCALS
     try:
-        source = textwrap.dedent(inspect.getsource(code))
-        tree = ast.parse(source)
+        # Of a module, getsource gives what stands before its first function alone.
+        source = inspect.getsource(code) if function else "".join(inspect.findsource(code)[0])
+        tree = ast.parse(textwrap.dedent(source))
     except (OSError, TypeError, SyntaxError) as error:
         raise SkipGSError(
             f"The source of {code.co_name}() in {code.co_filename} cannot be read ({error}), so it cannot be known "
             "which iterations must run; gate without refine_share, or name them (always=)."
         ) from error
-    first = code.co_firstlineno
+    first = code.co_firstlineno if function else 1
     for node in ast.walk(tree):
         # Loops inside and around it do not stand there.
         if (

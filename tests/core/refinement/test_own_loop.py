@@ -1,6 +1,7 @@
 """`for step in gate.iterations(range(...))`: loops of one's own."""
 
 import json
+import runpy
 
 import pytest
 import torch
@@ -387,3 +388,33 @@ def test_a_loop_that_forgot_iterations_is_told():
             early.backward(loss, view="a", step=step)
     off = SkipGate(start_iter=3, refine_share=0.5, enabled=False)
     assert off.backward(loss, view="a", step=9)
+
+
+SCRIPT = """
+import torch
+from skipgs_plug import SkipGate
+
+def evaluate(step):
+    evaluated.append(step)
+
+evaluated, ran = [], []
+value = torch.nn.Parameter(torch.ones(2))
+optimizer = torch.optim.Adam([value], lr=0.1)
+gate = SkipGate(start_iter=40, refine_share=0.25)
+if True:
+    for step in gate.iterations(range(100)):
+        ran.append(step)
+        (value**2).sum().backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        if step % 30 == 0:
+            evaluate(step)
+"""
+
+
+def test_a_loop_can_stand_in_the_script_itself(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    names = runpy.run_path(str(script), run_name="__main__")
+    assert names["evaluated"] == [0, 30, 60, 90] and len(names["ran"]) < 70
+    names["gate"].detach()
