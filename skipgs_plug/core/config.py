@@ -38,8 +38,9 @@ class SkipConfig:
         tolerance: Decibels that the rest of refinement may be worth when "auto" ends it.
         compensate: Make up for what is left out with larger, shrinking steps. None: with `refine_share`, not
             with the paper's gate.
-        rate_peak: Factor on learning rates when refinement begins, falling linearly to 0; the higher SH bands and
-            positions take more of it, opacities at most 1. None for twice the inverse of the share that runs.
+        rate_peak: Factor on learning rates when refinement begins, falling linearly to 0; the higher SH bands,
+            positions and scales take more of it, the constant band less, opacities at most 1. None for twice the
+            inverse of the share that runs, at most 8.
 
     Raises:
         SkipGSError: A value is out of its range; names the field and the range.
