@@ -28,7 +28,7 @@ def view_key(view: Any) -> str:
         SkipGSError: Something else, which might not be the same for the same view in the next run.
     """
     if isinstance(view, str):
-        return view if type(view) is str else str.__str__(view)  # a NumPy text would get into saved states
+        return str.__str__(view)  # a NumPy text would get into saved states
     if isinstance(view, numbers.Integral):
         return str(int(view))
     if isinstance(view, os.PathLike):
