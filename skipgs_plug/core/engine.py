@@ -249,6 +249,7 @@ class Engine:
             "clock": self.clock.state_dict(),
             "step": self.iteration.step,
             "refinement": None if self.refinement is None else self.refinement.state_dict(),
+            "shown": self.rates.shown.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -257,13 +258,13 @@ class Engine:
         if self.policy is None:
             self._pending_state = dict(state)
             # The loop asks about its first number before the trainer says anything else.
-            self._load_refinement(gate_state(state).get("refinement"))
+            self._load_pace(gate_state(state))
             return
         pending, self._pending_state = self._pending_state is not None, None
         accumulator = self.steps.accumulator
         state = gate_state(state)
         if is_release_state(state):
-            self._load_refinement(None)
+            self._load_pace(state)
             self._refuse_other_scene(state["view_loss_ema"])
             self.policy.load_state_dict(state)
             self.stats.load_release_state(state)
@@ -272,7 +273,7 @@ class Engine:
         else:
             self._refuse_other_scene(state["stats"]["views"])
             if not pending:
-                self._load_refinement(state["refinement"])
+                self._load_pace(state)
             self.policy.load_state_dict(state["policy"])
             self.stats.load_state_dict(state["stats"])
             accumulator.load_state_dict(state["accumulator"])
@@ -290,13 +291,17 @@ class Engine:
             self._saved_state = None
             self.load_state_dict(state)
 
-    def _load_refinement(self, state: dict[str, Any] | None) -> None:
+    def _load_pace(self, whole: dict[str, Any]) -> None:
+        """Load which iterations run, and how long steps are; the authors' controller has neither."""
+        state = whole.get("refinement")
         if (state is None) != (self.refinement is None):
             saved = None if state is None else state["asked"]
             raise SkipGSError(
                 f"The gate state was saved with refine_share={saved!r}, not {self.config.refine_share!r}; "
                 "go on with its setting, or start the gate afresh."
             )
+        if "shown" in whole:
+            self.rates.shown.load_state_dict(whole["shown"])
         if state is not None and self.refinement is not None:
             self.refinement.load_state_dict(state)
 

@@ -110,6 +110,7 @@ class GateState(TypedDict):
     clock: ClockState
     step: int | None
     refinement: RefinementState | None
+    shown: tuple[float, int]  # as `ShownShare.state_dict`
 
 
 class ReleaseStats(TypedDict):
@@ -181,7 +182,8 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
         _require(state, ReleaseGateState, "state")
     else:
         _require_version(state, GATE_VERSION)
-        state = {"refinement": None, **state}  # states from before iterations could be left out
+        # Of states from before iterations could be left out, and before steps hung on what a view shows.
+        state = {"refinement": None, "shown": [0.0, 0], **state}
         _require(state, GateState, "state")
     return dict(state)
 

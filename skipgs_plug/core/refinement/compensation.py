@@ -31,4 +31,4 @@ class Compensation:
             return
         # A trainer may go on after the end that it told: with steps of length 0.
         progress = min((step - self._start) / max(self.last + 1 - self._start, 1), 1.0)
-        self._rates.scale(path_factor(floor or 1.0, progress, self._peak))
+        self._rates.scale(path_factor(floor or 1.0, progress, self._peak, self._rates.shown.share))

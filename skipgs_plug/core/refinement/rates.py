@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -11,6 +12,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 from torch.utils.hooks import RemovableHandle
 
 from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.refinement.shown import UNKNOWN, ShownShare
 
 Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
 Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
@@ -23,7 +25,7 @@ NAMED = {
     **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
-MOST = 8.0  # beyond, scenes of many overlapping Gaussians lose more by steps than by a shorter path
+LEAST_SHARE = 0.25  # below, steps that are longer still lose more than the path gains
 # Of Adam's running mean of squares (beta2), at most. By the gradient of a single view a parameter can move its rate
 # over the root of 1 - beta2: 32 times the rate at the usual 0.999, too far where rates are larger.
 SQUARES_KEPT = 0.98
@@ -32,20 +34,25 @@ SETTINGS = ("lr", "betas")  # of a group, that are other ones for the length of 
 _hooked: list[ScaledRates] = []  # all whose hooks PyTorch holds
 
 
-def path_factor(share: float, progress: float, peak: float | None = None) -> float:
+def path_factor(share: float, progress: float, peak: float | None = None, shown: float = UNKNOWN) -> float:
     """Factor on learning rates at some progress through refinement, when a share of the iterations runs.
 
     Adam's steps are about as long as its learning rate, and refinement is limited by how far parameters travel: a
-    share of the steps goes as far as all of them when their mean length is 1 / share. The factor falls linearly from
-    twice that, at most 8, to 0, the shape that averages the noise of the last steps out (Defazio et al., arXiv
-    2310.07831).
+    share of the steps goes as far as all of them when their mean length is 1 / share. Chance is as large in each step
+    of a Gaussian, however rarely a view shows it, and what the views agree on grows with the root of how often they do:
+    with it grows what steps bear. So the factor is 4 sqrt(shown) / share, which conserves the path where a view shows
+    a quarter of the Gaussians. It falls linearly to 0, the shape that averages the noise of the last steps out
+    (Defazio et al., arXiv 2310.07831).
 
     Args:
-        share: Share of the iterations that run, in (0, 1].
+        share: Share of the iterations that run, in (0, 1]; one below a quarter gets the steps of a quarter.
         progress: Share of refinement that is over, in [0, 1].
         peak: Factor at the beginning, instead of that.
+        shown: Share of the Gaussians that a view shows, in (0, 1].
     """
-    return (min(2.0 / share, MOST) if peak is None else peak) * (1.0 - progress)
+    if peak is None:
+        peak = 4.0 * math.sqrt(shown) / max(share, LEAST_SHARE)
+    return peak * (1.0 - progress)
 
 
 def group_factor(group: dict[str, Any], factor: float, name: str | None = None) -> float:
@@ -84,10 +91,12 @@ class ScaledRates:
 
     Attributes:
         only: as given.
+        shown: share of the Gaussians that a view shows, by the steps scaled so far.
     """
 
     def __init__(self, only: Optimizers | None = None) -> None:
         self.only = only
+        self.shown = ShownShare()
         self._factor: float | None = None
         self._thread = threading.get_ident()
         self._depth: dict[int, int] = {}  # a step can call the step of its base class
@@ -152,6 +161,7 @@ class ScaledRates:
         # An optimizer can be wrapped in another one, which has the same groups.
         scaled = {id(group) for saved in self._before.values() for group, _ in saved}
         groups = [group for group in optimizer.param_groups if id(group) not in scaled]
+        self.shown.see(groups, names[0])
         self._before[key] = [(group, {name: group[name] for name in SETTINGS if name in group}) for group in groups]
         for group in groups:
             if "lr" in group:

@@ -285,7 +285,7 @@ class Refinement:
             self._over = False
         else:
             progress = self.foresight.progress(self.thinning.run / (self.share * (self._last + 1 - self._first)))
-            factor = path_factor(self.share, progress, self._config.rate_peak)
+            factor = path_factor(self.share, progress, self._config.rate_peak, self._rates.shown.share)
             self._over = self.foresight.ended
         self.thinning.share = 0.0 if self._over else 1.0
         self._rates.scale(factor)

@@ -1,0 +1,58 @@
+"""Share of the Gaussians that a view shows, read off the gradients of a trainer that does not tell."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+POSITIONS = ("xyz", "means")  # no regulariser fills their gradient, as some do that of opacities and scales
+UNKNOWN = 0.25  # of a model without such a group, and before the first step: what rooms photographed from within have
+STEPS = 100  # that are looked at
+ROWS = 8192  # of a gradient that are looked at
+
+
+class ShownShare:
+    """Mean over the first steps of the share of Gaussians whose positions have a gradient."""
+
+    def __init__(self) -> None:
+        self._sum = 0.0
+        self._steps = 0
+
+    @property
+    def share(self) -> float:
+        """In (0, 1]."""
+        return self._sum / self._steps if self._steps else UNKNOWN
+
+    def see(self, groups: list[dict[str, Any]], name: str | None) -> None:
+        """An optimizer is about to step; `name` is that of groups without a `name`, if it is known.
+
+        Without names the first parameter [N, 3] is taken for the positions.
+        """
+        if self._steps == STEPS:
+            return
+        for group in groups:
+            known = group.get("name", name)
+            for param in group["params"] if known is None or known in POSITIONS else ():
+                if param.ndim == 2 and param.shape[1] == 3 and param.grad is not None:
+                    reached = reached_share(param.grad)
+                    if reached > 0.0:  # else the step has no view
+                        self._sum += reached
+                        self._steps += 1
+                    return
+
+    def state_dict(self) -> list[float]:
+        return [self._sum, self._steps]
+
+    def load_state_dict(self, state: list[float]) -> None:
+        self._sum, self._steps = float(state[0]), int(state[1])
+
+
+def reached_share(gradient: Tensor) -> float:
+    """Return the share of rows of a gradient [N, K], dense or sparse, that are not all 0."""
+    if gradient.is_sparse:
+        rows, of = gradient._values(), len(gradient)
+    else:
+        rows = gradient[:: max(len(gradient) // ROWS, 1)]
+        of = len(rows)
+    return int((rows != 0.0).any(1).sum()) / max(of, 1)
