@@ -51,8 +51,8 @@ class ShownShare:
 def reached_share(gradient: Tensor) -> float:
     """Return the share of rows of a gradient [N, K], dense or sparse, that are not all 0."""
     if gradient.is_sparse:
-        rows, of = gradient._values(), len(gradient)
-    else:
-        rows = gradient[:: max(len(gradient) // ROWS, 1)]
-        of = len(rows)
-    return int((rows != 0.0).any(1).sum()) / max(of, 1)
+        values = gradient._values()
+        listed = gradient._indices()[0][values.reshape(len(values), -1).any(1)]
+        return len(listed.unique()) / max(len(gradient), 1)
+    rows = gradient[:: max(len(gradient) // ROWS, 1)]
+    return int(rows.any(1).sum()) / max(len(rows), 1)
