@@ -40,9 +40,9 @@ def path_factor(share: float, progress: float, peak: float | None = None, shown:
     Adam's steps are about as long as its learning rate, and refinement is limited by how far parameters travel: a
     share of the steps goes as far as all of them when their mean length is 1 / share. Chance is as large in each step
     of a Gaussian, however rarely a view shows it, and what the views agree on grows with the root of how often they do:
-    with it grows what steps bear. So the factor is 4 sqrt(shown) / share, which conserves the path where a view shows
-    a quarter of the Gaussians. It falls linearly to 0, the shape that averages the noise of the last steps out
-    (Defazio et al., arXiv 2310.07831).
+    with it grows what steps bear. So the factor begins with 2 sqrt(3 shown) / share, which conserves the path where a
+    view shows a third of the Gaussians, and falls linearly to 0, the shape that averages the noise of the last steps
+    out (Defazio et al., arXiv 2310.07831).
 
     Args:
         share: Share of the iterations that run, in (0, 1]; one below a quarter gets the steps of a quarter.
@@ -51,7 +51,7 @@ def path_factor(share: float, progress: float, peak: float | None = None, shown:
         shown: Share of the Gaussians that a view shows, in (0, 1].
     """
     if peak is None:
-        peak = 4.0 * math.sqrt(shown) / max(share, LEAST_SHARE)
+        peak = 2.0 * math.sqrt(3.0 * shown) / max(share, LEAST_SHARE)
     return peak * (1.0 - progress)
 
 

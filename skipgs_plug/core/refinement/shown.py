@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 POSITIONS = ("xyz", "means")  # no regulariser fills their gradient, as some do that of opacities and scales
-UNKNOWN = 0.25  # of a model without such a group, and before the first step: what rooms photographed from within have
+UNKNOWN = 1 / 3  # of a model without such a group, and before the first step: what rooms photographed from within have
 STEPS = 100  # that are looked at
 ROWS = 8192  # of a gradient that are looked at
 

@@ -83,8 +83,8 @@ def test_steps_are_longer_where_a_view_shows_more():
     rates.scale(1.0)
     optimizer.step()
     rates.remove()
-    assert path_factor(0.4, 0.25, shown=rates.shown.share) == pytest.approx(7.5 * math.sqrt(0.9))
-    assert path_factor(0.4, 0.25) == 3.75
+    assert path_factor(0.4, 0.25, shown=rates.shown.share) == pytest.approx(3.75 * math.sqrt(2.7))
+    assert path_factor(0.4, 0.25) == pytest.approx(3.75)
     assert path_factor(0.4, 0.25, peak=3.0, shown=0.9) == 2.25
 
 
