@@ -120,7 +120,7 @@ POLICIES = {
         ),
         PolicySpec(
             "ungated-larger",
-            "every iteration runs, with the larger, shrinking steps of thinned",
+            "every iteration runs, with larger, shrinking steps (rate_peak 5)",
             gate_with(refine_share=1.0, rate_peak=2.0 / SHARE),
         ),
         PolicySpec(

@@ -37,7 +37,7 @@ class GateOptions:
     compensate: bool | None = None
     """Larger, shrinking steps for what is left out; default: with --refine-share only."""
     rate_peak: float | None = None
-    """Factor on learning rates when refinement begins, falling to 0; default: 2 / share."""
+    """Factor on learning rates when refinement begins, falling to 0; default: by the share that runs and what views show."""
 
     def given(self) -> dict[str, Any]:
         """The settings that the user gave, by name."""

@@ -39,8 +39,9 @@ class SkipConfig:
         compensate: Make up for what is left out with larger, shrinking steps. None: with `refine_share`, not
             with the paper's gate.
         rate_peak: Factor on learning rates when refinement begins, falling linearly to 0; the higher SH bands,
-            positions and scales take more of it, the constant band less, opacities at most 1. None for twice the
-            inverse of the share that runs, at most 8.
+            positions and scales take more of it, the constant band less, opacities at most 1. None for
+            2 / share * sqrt(3 * shown), with at least a quarter for the share that runs, and the share of the
+            Gaussians that a view shows, measured.
 
     Raises:
         SkipGSError: A value is out of its range; names the field and the range.

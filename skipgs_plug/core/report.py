@@ -12,7 +12,13 @@ from skipgs_plug.core.stats import GateStats
 from skipgs_plug.files import write_aside
 
 SCHEMA_VERSION = 1
-NO_REFINEMENT: dict[str, Any] = {"refine_share": None, "iterations_skipped": 0, "always_run": {}, "foresight": None}
+NO_REFINEMENT: dict[str, Any] = {
+    "refine_share": None,
+    "gaussians_shown": None,
+    "iterations_skipped": 0,
+    "always_run": {},
+    "foresight": None,
+}
 
 
 class Reporting(Protocol):
@@ -32,7 +38,8 @@ def counters(
         without); `paused`, `non_finite` (gated iterations with that reason); `reasons` (all of them);
         `events` (structural changes by kind); `t_total`, `t_post` (seconds of training, and of its part from
         start_iter on); `refine_share` (share of the iterations from start_iter on that run or may run, None when
-        none is left out), `iterations_run`, `iterations_skipped`, `always_run`, `foresight` (see `Refinement.report`).
+        none is left out), `gaussians_shown` (share of the Gaussians that a view shows, by which steps are longer, None
+        where they are not), `iterations_run`, `iterations_skipped`, `always_run`, `foresight` (see `Refinement.report`).
     """
     left_out = None if refinement is None else refinement.report()
     return {
@@ -81,6 +88,10 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
         f"SkipGS: {run:,} of {run + skipped:,} iterations run ({share:.1f} %) since iteration "
         f"{config.start_iter or 0:,}, {skipped:,} left out whole."
     ]
+    if counted["gaussians_shown"] is not None:
+        lines.append(
+            f"  a view shows {100 * counted['gaussians_shown']:.0f} % of the Gaussians: steps are as long for it"
+        )
     foresight = counted["foresight"]
     if foresight is not None and not foresight["watched"]:
         lines.append("  too few views to leave some out and judge by them: the whole share runs")

@@ -26,6 +26,7 @@ KEYS = {
     "t_total",
     "t_post",
     "refine_share",
+    "gaussians_shown",
     "iterations_run",
     "iterations_skipped",
     "always_run",

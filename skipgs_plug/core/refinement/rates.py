@@ -12,7 +12,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 from torch.utils.hooks import RemovableHandle
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.refinement.shown import UNKNOWN, ShownShare
+from skipgs_plug.core.refinement.shown import ShownShare
 
 Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
 Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
@@ -26,6 +26,7 @@ NAMED = {
 }
 OPACITIES = ("opacity", "opacities")
 LEAST_SHARE = 0.25  # below, steps that are longer still lose more than the path gains
+SHOWN = 1 / 3  # of the Gaussians by a view, where it is not known: as in a room photographed from within
 # Of Adam's running mean of squares (beta2), at most. By the gradient of a single view a parameter can move its rate
 # over the root of 1 - beta2: 32 times the rate at the usual 0.999, too far where rates are larger.
 SQUARES_KEPT = 0.98
@@ -34,7 +35,7 @@ SETTINGS = ("lr", "betas")  # of a group, that are other ones for the length of 
 _hooked: list[ScaledRates] = []  # all whose hooks PyTorch holds
 
 
-def path_factor(share: float, progress: float, peak: float | None = None, shown: float = UNKNOWN) -> float:
+def path_factor(share: float, progress: float, peak: float | None = None, shown: float | None = None) -> float:
     """Factor on learning rates at some progress through refinement, when a share of the iterations runs.
 
     Adam's steps are about as long as its learning rate, and refinement is limited by how far parameters travel: a
@@ -48,10 +49,10 @@ def path_factor(share: float, progress: float, peak: float | None = None, shown:
         share: Share of the iterations that run, in (0, 1]; one below a quarter gets the steps of a quarter.
         progress: Share of refinement that is over, in [0, 1].
         peak: Factor at the beginning, instead of that.
-        shown: Share of the Gaussians that a view shows, in (0, 1].
+        shown: Share of the Gaussians that a view shows, in (0, 1]; None where it is not known.
     """
     if peak is None:
-        peak = 2.0 * math.sqrt(3.0 * shown) / max(share, LEAST_SHARE)
+        peak = 2.0 * math.sqrt(3.0 * (SHOWN if shown is None else shown)) / max(share, LEAST_SHARE)
     return peak * (1.0 - progress)
 
 

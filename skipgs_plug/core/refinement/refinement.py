@@ -293,10 +293,11 @@ class Refinement:
     # State and report.
 
     def report(self) -> dict[str, Any]:
-        """`refine_share`, `iterations_run`, `iterations_skipped`, and what was foreseen."""
+        """`refine_share`, `gaussians_shown` by a view, `iterations_run`, `iterations_skipped`, and what was foreseen."""
         foresight = self.foresight
         return {
             "refine_share": self.share,
+            "gaussians_shown": self._rates.shown.share,
             "iterations_run": self.thinning.run,
             "iterations_skipped": self.thinning.left_out,
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},

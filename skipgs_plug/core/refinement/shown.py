@@ -7,7 +7,6 @@ from typing import Any
 from torch import Tensor
 
 POSITIONS = ("xyz", "means")  # no regulariser fills their gradient, as some do that of opacities and scales
-UNKNOWN = 1 / 3  # of a model without such a group, and before the first step: what rooms photographed from within have
 STEPS = 100  # that are looked at
 ROWS = 8192  # of a gradient that are looked at
 
@@ -20,9 +19,9 @@ class ShownShare:
         self._steps = 0
 
     @property
-    def share(self) -> float:
-        """In (0, 1]."""
-        return self._sum / self._steps if self._steps else UNKNOWN
+    def share(self) -> float | None:
+        """In (0, 1]; None before the first step, and of a model without such a group."""
+        return self._sum / self._steps if self._steps else None
 
     def see(self, groups: list[dict[str, Any]], name: str | None) -> None:
         """An optimizer is about to step; `name` is that of groups without a `name`, if it is known.

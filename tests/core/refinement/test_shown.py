@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from skipgs_plug.core.refinement.rates import ScaledRates, path_factor
-from skipgs_plug.core.refinement.shown import ROWS, STEPS, UNKNOWN, ShownShare, reached_share
+from skipgs_plug.core.refinement.shown import ROWS, STEPS, ShownShare, reached_share
 
 
 def positions(rows, reached, width=3):
@@ -36,7 +36,7 @@ def test_of_many_rows_some_are_looked_at():
 
 def test_the_mean_over_the_first_steps_counts():
     shown = ShownShare()
-    assert shown.share == UNKNOWN
+    assert shown.share is None
     for step in range(2 * STEPS):
         reached = 10 if step < STEPS else 40
         shown.see([{"name": "rotation", "params": [positions(40, 20, 4)]}], None)
@@ -53,9 +53,9 @@ def test_the_mean_over_the_first_steps_counts():
         ({"name": "means"}, None, 0.5),
         ({}, "means", 0.5),
         ({}, None, 0.5),
-        ({"name": "scaling"}, None, UNKNOWN),  # a regulariser may fill it
-        ({}, "scales", UNKNOWN),
-        ({"name": "anchor"}, "means", UNKNOWN),
+        ({"name": "scaling"}, None, None),  # a regulariser may fill it
+        ({}, "scales", None),
+        ({"name": "anchor"}, "means", None),
     ],
 )
 def test_positions_are_known_by_name_or_by_shape(group, name, expected):
@@ -71,7 +71,7 @@ def test_what_has_no_gradient_says_nothing():
         shown.see([{"params": [empty]}], "means")
         shown.see([{"params": [positions(40, 0)]}], "means")
         shown.see([{"params": [positions(0, 0)]}], "means")
-    assert shown.share == UNKNOWN
+    assert shown.share is None
     shown.see([{"params": [positions(40, 30)]}], "means")
     assert shown.share == 0.75
 
