@@ -45,7 +45,7 @@ class Args:
     """
 
     scene: tyro.conf.Positional[str]
-    """Folder with sparse/0 or transforms_train.json, or packed .npz."""
+    """Folder with sparse/0, transforms.json or transforms_train.json, or packed .npz."""
     out: str = "skipgs_bench"
     """Folder for table, plots and runs."""
     seeds: tuple[int, ...] = (0, 1, 2)

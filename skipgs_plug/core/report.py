@@ -38,8 +38,8 @@ def counters(
         without); `paused`, `non_finite` (gated iterations with that reason); `reasons` (all of them);
         `events` (structural changes by kind); `t_total`, `t_post` (seconds of training, and of its part from
         start_iter on); `refine_share` (share of the iterations from start_iter on that run or may run, None when
-        none is left out), `gaussians_shown` (share of the Gaussians that a view shows, by which steps are longer, None
-        where they are not), `iterations_run`, `iterations_skipped`, `always_run`, `foresight` (see `Refinement.report`).
+        none is left out), `gaussians_shown` (share of the Gaussians that a view shows, None where it is not known),
+        `iterations_run`, `iterations_skipped`, `always_run`, `foresight` (see `Refinement.report`).
     """
     left_out = None if refinement is None else refinement.report()
     return {

@@ -7,7 +7,9 @@ import dataclasses
 import pytest
 import tyro
 
+from benchmarks.soak_runs import make_tiny_scene
 from skipgs_plug import SkipConfig, SkipGate
+from skipgs_plug.cli import main
 from skipgs_plug.commands import run, train
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.commands.gate_settings import GateSettings
@@ -44,6 +46,14 @@ def test_what_is_given_reaches_the_gate(args, own) -> None:
     config = (tyro.conf.FlagCreatePairsOff,)
     assert tyro.cli(args, args=[*own, *options], config=config).gate_options.given() == GIVEN
     assert tyro.cli(args, args=own, config=config).gate_options.given() == {}
+
+
+@pytest.mark.parametrize("share", ["40%", "AUTO", "", "0,4", "2"])
+def test_what_is_no_share_is_refused_in_one_sentence(share, tmp_path, capsys) -> None:
+    scene = make_tiny_scene(tmp_path)
+    assert main(["train", str(scene), "--out", str(tmp_path / "run"), "--refine-share", share]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith('skipgs-plug: refine_share must be "auto" or in (0, 1], not ') and said.count("\n") == 1
 
 
 def test_a_run_older_than_a_setting_was_begun_with_its_default() -> None:

@@ -293,7 +293,7 @@ class Refinement:
     # State and report.
 
     def report(self) -> dict[str, Any]:
-        """`refine_share`, `gaussians_shown` by a view, `iterations_run`, `iterations_skipped`, and what was foreseen."""
+        """`refine_share`, `gaussians_shown`, `iterations_run`, `iterations_skipped`, and what was foreseen."""
         foresight = self.foresight
         return {
             "refine_share": self.share,
