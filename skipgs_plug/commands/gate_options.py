@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from skipgs_plug.core.errors import SkipGSError
+
 
 def shown(kind: str, default: str) -> Any:
     """How --help shows an option that may be left out, and what holds then."""
@@ -48,7 +50,18 @@ class GateOptions:
     """Factor on learning rates when refinement begins, falling to 0."""
 
     def given(self) -> dict[str, Any]:
-        """The settings that the user gave, by name; what is no share is left for SkipConfig to refuse."""
+        """The settings that the user gave, by name; what is no share is left for SkipConfig to refuse.
+
+        Raises:
+            SkipGSError: One of them does nothing without another, which is missing.
+        """
+        if self.refine_share is None:
+            if self.tolerance is not None:
+                raise SkipGSError("--tolerance is for --refine-share auto; give that too, or leave it out.")
+            if self.rate_peak is not None and not self.compensate:
+                raise SkipGSError(
+                    "--rate-peak is for --refine-share or --compensate True; give one too, or leave it out."
+                )
         settings = {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
         for name in ("min_bwd_ratio", "refine_share"):
             if name in settings:

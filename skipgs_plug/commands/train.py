@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from skipgs_plug import SkipGate
+from skipgs_plug import SkipConfig, SkipGate
 from skipgs_plug.commands import sfm
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.commands.gate_settings import GateSettings
@@ -107,8 +107,10 @@ def check(args: Args, checkpoints: list[Path]) -> None:
 
     Raises:
         InputError: LPIPS cannot be computed, --resume does not fit what --out holds, or --sfm what SCENE is.
+        SkipGSError: A setting of the gate is out of its range.
     """
     require_names(("SCENE", args.scene), ("--out", args.out))
+    SkipConfig(**args.gate_options.given())
     given = Path(args.scene).expanduser()
     if args.sfm and not are_photographs(given):
         what = "is a scene already" if is_scene(given) else "is neither a video nor a folder with photographs"

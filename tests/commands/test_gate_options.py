@@ -7,8 +7,7 @@ import dataclasses
 import pytest
 import tyro
 
-from benchmarks.soak_runs import make_tiny_scene
-from skipgs_plug import SkipConfig, SkipGate
+from skipgs_plug import SkipConfig, SkipGate, SkipGSError
 from skipgs_plug.cli import main
 from skipgs_plug.commands import run, train
 from skipgs_plug.commands.gate_options import GateOptions
@@ -50,10 +49,21 @@ def test_what_is_given_reaches_the_gate(args, own) -> None:
 
 @pytest.mark.parametrize("share", ["40%", "AUTO", "", "0,4", "2"])
 def test_what_is_no_share_is_refused_in_one_sentence(share, tmp_path, capsys) -> None:
-    scene = make_tiny_scene(tmp_path)
-    assert main(["train", str(scene), "--out", str(tmp_path / "run"), "--refine-share", share]) == 2
+    (tmp_path / "photograph.jpg").touch()  # a place finding that would fail
+    assert main(["train", str(tmp_path), "--sfm", "--out", str(tmp_path / "run"), "--refine-share", share]) == 2
     said = capsys.readouterr().err
     assert said.startswith('skipgs-plug: refine_share must be "auto" or in (0, 1], not ') and said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "other"), [(["--tolerance", "0.1"], "--refine-share auto"), (["--rate-peak", "5"], "--compensate True")]
+)
+@COMMANDS
+def test_what_does_nothing_without_another_is_refused(args, own, options, other) -> None:
+    given = tyro.cli(args, args=[*own, *options], config=(tyro.conf.FlagCreatePairsOff,)).gate_options
+    with pytest.raises(SkipGSError, match=f"{options[0]} is for .*{other}; give"):
+        given.given()
+    assert dataclasses.replace(given, refine_share="auto").given()["refine_share"] == "auto"
 
 
 def test_a_run_older_than_a_setting_was_begun_with_its_default() -> None:
