@@ -55,7 +55,7 @@ def test_parameters_are_known_by_the_names_of_their_optimizers():
         name = next(name for name, one in trainer.optimizers.optimizers.items() if one is optimizer)
         rates.setdefault(name, []).append(optimizer.param_groups[0]["lr"])
 
-    with SkipGate(trainer, refine_share=0.4):
+    with SkipGate(trainer, refine_share=0.4, rate_peak=5.0):
         for optimizer in trainer.optimizers.optimizers.values():
             optimizer.register_step_pre_hook(note)
         trainer.train()
