@@ -44,7 +44,7 @@ class Args:
     the same command is given again.
     """
 
-    scene: tyro.conf.Positional[str]
+    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
     """Folder with sparse/0, transforms.json or transforms_train.json, or packed .npz."""
     out: str = "skipgs_bench"
     """Folder for table, plots and runs."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -26,9 +26,9 @@ RANGE_FRAMES = 8  # frames that the colours of depth are fitted to
 class Args:
     """Render the last model of a run folder, or any 3DGS PLY, along a camera path or from the held-out cameras."""
 
-    model: tyro.conf.Positional[str]
+    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
     """Run folder or PLY."""
-    out: tyro.conf.Positional[Path]
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PATH")]
     """Film to write (.mp4), or folder for PNG files."""
     scene: str | None = None
     """Scene that gives the cameras; default: the one the run folder names."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import tyro
 
@@ -16,7 +17,7 @@ from skipgs_plug.trainer.files import write_aside
 class Args:
     """Turn run folders into one self-contained HTML page: tables and plots inside, nothing loaded from a network."""
 
-    runs: tyro.conf.Positional[tuple[str, ...]]
+    runs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN ...")]
     """Folders of `skipgs-plug train`, `run` or `bench`, or their skipgs.json."""
     out: str = "report.html"
     """Page to write."""

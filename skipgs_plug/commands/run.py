@@ -39,7 +39,7 @@ class Args:
     Exit code, output and files are the script's own; skipgs.json is added to its output folder.
     """
 
-    adapter: tyro.conf.Positional[str]
+    adapter: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ADAPTER -- SCRIPT ...")]
     """Name of the trainer: inria, fastgs, taming, ...; or auto, to recognise it by its script."""
     gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
     resume_gate: str = "auto"

@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 from tqdm.auto import tqdm
@@ -33,9 +33,9 @@ class Args:
     neighbours in the order of names and placed all at once.
     """
 
-    photos: tyro.conf.Positional[Path]
+    photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")]
     """Folder of photographs, or a video."""
-    scene: tyro.conf.Positional[Path]
+    scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
     """COLMAP folder to write: images, images_2, images_4, images_8, sparse/0."""
     frames: int = 100
     """Frames to take from a video, each the sharpest of its group."""

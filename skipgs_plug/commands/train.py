@@ -46,7 +46,7 @@ class Args:
     --refine-share 0.4 (or auto) refines in fewer iterations with larger, shrinking steps.
     """
 
-    scene: tyro.conf.Positional[str]
+    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
     """Folder with sparse/0, transforms.json or transforms_train.json, packed .npz; with --sfm: photographs, a video."""
     out: str
     """Run folder to write."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import tyro
 from torch import Tensor
@@ -18,7 +19,7 @@ from skipgs_plug.view.page import Page, Splats
 class Args:
     """Serve a page with the model, its cameras, and photographs beside renders and errors, until Ctrl-C."""
 
-    model: tyro.conf.Positional[str]
+    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
     """Run folder or PLY."""
     scene: str | None = None
     """Scene with the photographs; default: the one the run folder names. A PLY is shown without, too."""
