@@ -83,8 +83,8 @@ def test_a_saved_state_goes_on():
 
 def test_the_share_follows_from_the_visits():
     assert needed_share(15_000, 100) == needed_share(3000, 255) == 0.25
-    assert needed_share(1500, 255) == pytest.approx(0.2806, abs=1e-4)
-    assert needed_share(300, 300) == 0.4
+    assert needed_share(1500, 255) == pytest.approx(0.2954, abs=1e-4)
+    assert needed_share(300, 300) == 0.46
     assert needed_share(299, 300) == 1.0
 
 
