@@ -13,6 +13,7 @@ from typing import Any
 from skipgs_plug import SkipGate
 from skipgs_plug.bench.controls import PlannedSkipping, periodic_skipping, random_skipping
 from skipgs_plug.bench.record import RunRecord
+from skipgs_plug.core.refinement.rates import path_factor
 from skipgs_plug.trainer import Trainer
 from skipgs_plug.trainer.errors import InputError
 
@@ -49,6 +50,16 @@ def as_long_as(name: str) -> Callable[[Trainer, Earlier], int]:
         return max(1, round(full * share_of_time(name, earlier)))
 
     return iterations
+
+
+def stepping_as(name: str, share: float) -> GateMaker:
+    """Return what runs every iteration, with the factors on rates of policy `name`, which runs `share` of them."""
+
+    def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
+        peak = path_factor(share, 0.0, shown=earlier[name].gaussians_shown)
+        return gate_with(refine_share=1.0, rate_peak=peak)(trainer, earlier)  # type: ignore[return-value]
+
+    return make
 
 
 def thinned_as_long_as(name: str) -> GateMaker:
@@ -120,8 +131,9 @@ POLICIES = {
         ),
         PolicySpec(
             "ungated-larger",
-            "every iteration runs, with larger, shrinking steps (rate_peak 5)",
-            gate_with(refine_share=1.0, rate_peak=2.0 / SHARE),
+            "every iteration runs, with the larger, shrinking steps of thinned",
+            stepping_as("thinned", SHARE),
+            needs=("thinned",),
         ),
         PolicySpec(
             "thinned", "40 % of the iterations run, with larger, shrinking steps", gate_with(refine_share=SHARE)

@@ -107,6 +107,7 @@ class RunRecord:
         backwards: of refinement.
         warm_up: refinement iterations that the gate kept from skipping; 0 without a gate.
         floor: least share of backwards in force at the end; None without a gate.
+        gaussians_shown: share of them that a view shows, which larger steps hang on; None where none were taken.
         reasons: gated decisions by reason; empty without a gate.
         t_post, t_total: seconds of training, of refinement and in all.
         phases: seconds of refinement in forward, loss, backward, optimizer, strategy.
@@ -126,6 +127,7 @@ class RunRecord:
     backwards: int = 0
     warm_up: int = 0
     floor: float | None = None
+    gaussians_shown: float | None = None
     reasons: dict[str, int] = field(default_factory=dict)
     t_post: float = 0.0
     t_total: float = 0.0

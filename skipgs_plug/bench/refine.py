@@ -93,6 +93,7 @@ def refine(
         record.backwards -= report["backwards_skipped"]
         record.warm_up = sum(row.reason == "warm-up" for row in gate.trace)
         record.floor = report["min_bwd_ratio_effective"]
+        record.gaussians_shown = report["gaussians_shown"]
         record.reasons = report["reasons"]
     return record
 

@@ -42,3 +42,12 @@ def test_shortened_takes_the_time_of_the_gate(scene):
     assert shortened(60.0) == 600
     assert shortened(110.0) == 1000
     assert shortened(0.001) == 1
+
+
+@pytest.mark.parametrize(("shown", "peak"), [(None, 5.0), (1 / 3, 5.0), (0.75, 7.5)])
+def test_ungated_larger_has_the_factors_of_thinned(scene, shown, peak):
+    trainer = Trainer(TrainConfig(max_steps=2000), scene)
+    gate = POLICIES["ungated-larger"].gate(trainer, {"thinned": RunRecord(0, "thinned", gaussians_shown=shown)})
+    with gate:
+        assert gate.config.rate_peak == pytest.approx(peak)
+        assert gate.config.refine_share == 1.0
