@@ -18,12 +18,12 @@ from collections.abc import Iterable
 from typing import Any
 
 from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.refinement.rates import LEAST_SHARE
 
 CYCLE_ENDS = (0.125, 0.25, 1.0)
 ONE_CYCLE = (1.0,)  # where nothing is to be foreseen: the share is given, or no view is watched
-LEAST_SHARE = 0.25
-# Share at one visit of each view in all of refinement; it falls with the fourth root of the visits. On bonsai nothing is
-# lost from 0.35, 0.3 and 0.25 on, at 2, 6 and 12 visits.
+# Share at one visit of each view in all of refinement; it falls with the fourth root of the visits. On bonsai nothing
+# is lost from 0.35, 0.3 and 0.25 on, at 2, 6 and 12 visits.
 RARE_SHARE = 0.46
 WATCHED_SHARE = 1 / 12  # of the views
 LEAST_WATCHED, MOST_WATCHED = 3, 12  # fewer than three cannot tell a twentieth of a decibel: none then
