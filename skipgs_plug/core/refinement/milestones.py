@@ -11,6 +11,7 @@ import ast
 import copy
 import inspect
 import textwrap
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from numbers import Integral
 from types import CodeType
@@ -117,6 +118,7 @@ class _Loop:
             if isinstance(node, _PLACE) and not isinstance(node.ctx, ast.Load) and id(node) not in own
         ]
         called = [node.func for node in parts if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
+        self._counters = {text for text in _counted(statement.body) if stored.count(text) == 1}
         self._changing = {*stored, *(ast.unparse(method.value) for method in called if method.attr in CHANGES)}
         self.body = self._spelled_out(statement.body, stored)
 
@@ -158,6 +160,15 @@ class _Loop:
             if self.mentions(test) and any(_is_point(leaf) and self.mentions(leaf) for leaf in _leaves(test)):
                 yield Condition(test, path, self)
 
+    def counted_by_itself(self) -> Iterator[ast.expr]:
+        """All conditions on what the loop counts up by itself, which stands still where an iteration is left out."""
+        for test, _ in _tests(self.body, []):
+            for leaf in _leaves(test):
+                read = {ast.unparse(part) for part in ast.walk(leaf) if isinstance(part, _PLACE)}
+                picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and _is_point(leaf)
+                if picks and read & self._counters and not self.mentions(leaf):
+                    yield leaf
+
     def lists(self) -> Iterator[ast.expr]:
         """What is handed on together with the number, where it may be a list of iterations."""
         for statement in self.body:
@@ -184,6 +195,15 @@ def _assigned(body: list[ast.stmt]) -> list[tuple[ast.expr, ast.expr]]:
             else:
                 found.append((place, value))
     return found
+
+
+def _counted(body: list[ast.stmt]) -> Iterator[str]:
+    """Places to which these statements add a constant in every iteration."""
+    for node in body:
+        if isinstance(node, (ast.With, ast.AsyncWith)):
+            yield from _counted(node.body)
+        elif isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add) and isinstance(node.value, ast.Constant):
+            yield ast.unparse(node.target)
 
 
 class _Inline(ast.NodeTransformer):
@@ -215,10 +235,20 @@ def milestones(
     Returns:
         By "line N: condition", or "line N: list" of iterations that is handed to a function with the number.
 
+    Warns:
+        RuntimeWarning: A condition is on what the loop counts by itself, and comes less often for each number left out.
+
     Raises:
         SkipGSError: The source cannot be read, no loop is there, or a condition cannot be foreseen.
     """
     loop = _loop_at(code, line, frozenset(pure))
+    for leaf in loop.counted_by_itself():
+        warnings.warn(
+            f"Line {loop.first_line + leaf.lineno - 1} of {loop.file} ({ast.unparse(leaf)}) counts the iterations "
+            f"that run; where others are left out it happens less often. Decide by {loop.target} if that matters.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
     found: dict[str, set[int]] = {}
     for condition in loop.conditions():
         hits = condition.numbers(numbers, names)

@@ -271,3 +271,40 @@ def test_a_source_that_cannot_be_read_is_refused():
     exec("def loop(stop):\n    for step in stop():\n        pass\n", names)
     with pytest.raises(SkipGSError, match=r"source of loop\(\) .* cannot be read"):
         found(names["loop"])
+
+
+def test_what_the_loop_counts_by_itself_is_warned_of():
+    def counting(stop):
+        images = 0
+        for step in stop():
+            if step == 70:
+                print("by the number")
+            images += 4
+            if not images % 20:
+                print("save")
+
+    def attribute(stop):
+        run = SimpleNamespace(done=0)
+        for _step in stop(run=run):
+            run.done += 1
+            if run.done in (10, 20):
+                print("save")
+
+    for loop, condition in ((counting, "images % 20"), (attribute, "run.done in (10, 20)")):
+        with pytest.warns(RuntimeWarning, match=rf"Line \d+ of .*\({re.escape(condition)}\) counts the iterations"):
+            found(loop)
+
+
+def test_gathering_over_a_few_iterations_is_nothing_to_warn_of():
+    def loop(stop):
+        gathered, images = 0, 0
+        for step in stop():
+            gathered += 1
+            if gathered == 4:  # of those that run
+                gathered = 0
+            if step % 2 == 0:
+                images += 1
+            if images > 10 and images:
+                print("a stretch")
+
+    assert found(loop) == {"step % 2 == 0": list(range(50, 100, 2))}
