@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 
 from skipgs_plug.install import next_command
 from skipgs_plug.photos import global_mapping
-from skipgs_plug.photos.gather import gather
+from skipgs_plug.photos.gather import check_source, gather
 from skipgs_plug.photos.reconstruct import Mapping, Matching, Reconstruction
 from skipgs_plug.photos.scene_folder import check_target, write_scene
 from skipgs_plug.photos.unplaced import explain_unplaced
@@ -69,6 +69,7 @@ def reconstruct(args: Args) -> Path:
         raise InputError(f"--frames {args.frames} is too few to reconstruct from; give at least 3, better 100.")
     scene = args.scene.expanduser()
     photos = args.photos.expanduser()
+    check_source(photos)  # before anything is shown or made
     check_target(scene, photos)
     scene.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=f".{scene.name}.", dir=scene.parent))

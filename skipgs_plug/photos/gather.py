@@ -48,6 +48,19 @@ def are_photographs(source: Path) -> bool:
     return any(path.suffix.lower() in known and not path.name.startswith(".") for path in source.rglob("*"))
 
 
+def check_source(source: Path) -> None:
+    """Refuse what is neither a folder nor a video.
+
+    Raises:
+        MissingFileError: `source` does not exist.
+        InputError: it is a file of another kind.
+    """
+    if not source.exists():
+        raise MissingFileError(f"{source} does not exist; give a folder of photographs or a video.")
+    if source.is_file() and source.suffix.lower() not in VIDEO_SUFFIXES:
+        raise InputError(f"{source} is neither a folder nor a video ({' '.join(VIDEO_SUFFIXES)}).")
+
+
 def gather(source: Path, folder: Path, frames: int, progress: Callable[[int], None]) -> Gathered:
     """Put the photographs of `source` (a folder or a video) into `folder`.
 
@@ -61,11 +74,8 @@ def gather(source: Path, folder: Path, frames: int, progress: Callable[[int], No
         MissingFileError: `source` does not exist, or what a link among the photographs points to.
         InputError: a photograph or the video cannot be decoded, or there are fewer than three photographs.
     """
-    if not source.exists():
-        raise MissingFileError(f"{source} does not exist; give a folder of photographs or a video.")
+    check_source(source)
     if source.is_file():
-        if source.suffix.lower() not in VIDEO_SUFFIXES:
-            raise InputError(f"{source} is neither a folder nor a video ({' '.join(VIDEO_SUFFIXES)}).")
         gathered = gather_video(source, folder, frames, progress)
     else:
         gathered = gather_folder(source, folder, progress)

@@ -137,6 +137,11 @@ def test_bad_input_is_one_sentence(tmp_path, capsys, make, arguments, sentence):
     assert [path.name for path in tmp_path.iterdir() if path.name != "nowhere"] == []
 
 
+def test_no_bar_is_shown_for_what_is_not_there(tmp_path, capsys):
+    assert main(["sfm", str(tmp_path / "nowhere"), str(tmp_path / "scene")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
 def test_where_all_at_once_fails_photographs_are_placed_one_after_another(fern, tmp_path, capsys, monkeypatch):
     photos, scene = tmp_path / "photos", tmp_path / "scene"
     photos.mkdir()
