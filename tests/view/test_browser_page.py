@@ -135,3 +135,15 @@ def test_gaussians_have_the_covariances_of_their_parameters():
     turn = Rotation.from_quat(splats["quats"][:, [1, 2, 3, 0]].numpy()).as_matrix()
     expected = turn @ (np.eye(3) * (2 * splats["scales"].exp().numpy()[:, None]) ** 2) @ turn.transpose(0, 2, 1)
     assert np.allclose(shown.covariances, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_gaussians_larger_than_half_precision_holds_stay_finite():
+    splats = {
+        "means": torch.zeros(1, 3),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 1.0]]),  # a quarter turn: covariances beside the diagonal too
+        "scales": torch.tensor([[8.0, 1.0, 1.0]]),
+        "opacities": torch.zeros(1),
+        "sh0": torch.zeros(1, 1, 3),
+    }
+    halves = to_gaussians(splats, unit=1.0).covariances.astype(np.float16)
+    assert np.isfinite(halves).all() and halves.max() == np.finfo(np.float16).max
