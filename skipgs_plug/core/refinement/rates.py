@@ -25,7 +25,7 @@ NAMED = {
     **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
-LEAST_SHARE = 0.25  # below, steps that are longer still lose more than the path gains
+LONGEST_AT = 0.25  # of the iterations; below, steps that are longer still lose more than the path gains
 SHOWN = 1 / 3  # of the Gaussians by a view, where it is not known: as in a room photographed from within
 # Of Adam's running mean of squares (beta2), at most. By the gradient of a single view a parameter can move its rate
 # over the root of 1 - beta2: 32 times the rate at the usual 0.999, too far where rates are larger.
@@ -52,7 +52,7 @@ def path_factor(share: float, progress: float, peak: float | None = None, shown:
         shown: Share of the Gaussians that a view shows, in (0, 1]; None where it is not known.
     """
     if peak is None:
-        peak = 2.0 * math.sqrt(3.0 * (SHOWN if shown is None else shown)) / max(share, LEAST_SHARE)
+        peak = 2.0 * math.sqrt(3.0 * (SHOWN if shown is None else shown)) / max(share, LONGEST_AT)
     return peak * (1.0 - progress)
 
 

@@ -82,10 +82,17 @@ def test_a_saved_state_goes_on():
 
 
 def test_the_share_follows_from_the_visits():
-    assert needed_share(15_000, 100) == needed_share(3000, 255) == 0.25
+    assert needed_share(15_000, 100) == needed_share(1500, 17) == 0.2
+    assert needed_share(3000, 255) == pytest.approx(0.2484, abs=1e-4)
     assert needed_share(1500, 255) == pytest.approx(0.2954, abs=1e-4)
-    assert needed_share(300, 300) == 0.46
-    assert needed_share(299, 300) == 1.0
+    assert needed_share(2000, 2000) == 0.46
+    assert needed_share(1999, 2000) == 1.0
+
+
+def test_a_short_refinement_needs_more_of_its_iterations():
+    assert needed_share(1000, 17) == 0.3
+    assert needed_share(400, 17) == 0.75
+    assert needed_share(300, 17) == needed_share(20, 17) == 1.0
 
 
 def test_watched_views_are_few_and_always_the_same():
