@@ -103,7 +103,7 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
             f"the rest was {judged} (tolerance {config.tolerance} dB), {len(foresight['watched'])} views watched"
         )
     elif config.refine_share == "auto":
-        lines.append("  each view comes up too seldom in this schedule to leave out iterations: all of them run")
+        lines.append("  refinement is too short, or views come up too seldom, to leave out iterations: all of them run")
     return "\n".join(lines)
 
 

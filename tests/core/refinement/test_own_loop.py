@@ -265,6 +265,16 @@ def test_auto_runs_the_whole_share_where_views_are_too_few_to_watch():
     assert "too few views" in gate.summary()
 
 
+def test_auto_leaves_a_short_refinement_as_it_is():
+    plain, same = Loop(end=300), Loop(end=300)
+    with SkipGate(start_iter=1000) as gate:
+        plain.train(gate)
+    with SkipGate(start_iter=40, refine_share="auto") as gate:
+        same.train(gate, views=VIEWS)
+    assert same.ran == plain.ran and torch.equal(same.value, plain.value)
+    assert "refinement is too short, or views come up too seldom" in gate.summary()
+
+
 def test_auto_must_know_the_views():
     sentence = r"give their names to gate\.iterations\(\) as views=, or a share"
     with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match=sentence):
