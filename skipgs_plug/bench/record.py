@@ -107,7 +107,7 @@ class RunRecord:
         backwards: of refinement.
         warm_up: refinement iterations that the gate kept from skipping; 0 without a gate.
         floor: least share of backwards in force at the end; None without a gate.
-        gaussians_shown: share of them that a view shows, which larger steps hang on; None where none were taken, or not known.
+        gaussians_shown: share of them that a view shows, as larger steps know it; None without these.
         reasons: gated decisions by reason; empty without a gate.
         t_post, t_total: seconds of training, of refinement and in all.
         phases: seconds of refinement in forward, loss, backward, optimizer, strategy.
