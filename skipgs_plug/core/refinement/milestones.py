@@ -180,13 +180,20 @@ class _Loop:
                     yield from (value for value in given if isinstance(value, (ast.Name, ast.Attribute)))
 
 
+def _always(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """These statements, and in place of a `with` block those inside it."""
+    for node in body:
+        if isinstance(node, (ast.With, ast.AsyncWith)):
+            yield from _always(node.body)
+        else:
+            yield node
+
+
 def _assigned(body: list[ast.stmt]) -> list[tuple[ast.expr, ast.expr]]:
     """Places that these statements give a value to in every iteration, each with the value, in their order."""
     found: list[tuple[ast.expr, ast.expr]] = []
-    for node in body:
-        if isinstance(node, (ast.With, ast.AsyncWith)):
-            found += _assigned(node.body)
-        elif isinstance(node, ast.AnnAssign) and node.value is not None:
+    for node in _always(body):
+        if isinstance(node, ast.AnnAssign) and node.value is not None:
             found.append((node.target, node.value))
         elif isinstance(node, ast.Assign) and len(node.targets) == 1:
             place, value = node.targets[0], node.value
@@ -199,10 +206,8 @@ def _assigned(body: list[ast.stmt]) -> list[tuple[ast.expr, ast.expr]]:
 
 def _counted(body: list[ast.stmt]) -> Iterator[str]:
     """Places to which these statements add a constant in every iteration."""
-    for node in body:
-        if isinstance(node, (ast.With, ast.AsyncWith)):
-            yield from _counted(node.body)
-        elif isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add) and isinstance(node.value, ast.Constant):
+    for node in _always(body):
+        if isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add) and isinstance(node.value, ast.Constant):
             yield ast.unparse(node.target)
 
 
