@@ -6,26 +6,26 @@ for (int t = first; t < last; ++t) {
 
     // behind = (the colour one would see without the current Gaussian and those before it) . v_image, so that it is not
     // divided by 1 - alpha; at the end of the list that is what alpha and background receive.
-    alignas(64) v16 T[16], behind[16], v[16][D];
-    alignas(64) i16 stop[16];
-    for (int b = 0; b < 16; ++b) {
-        T[b] = (v16)1.0f;
-        behind[b] = (v16)0.0f;
-        stop[b] = (i16)0;
-        for (int c = 0; c < D; ++c) v[b][c] = (v16)0.0f;
+    alignas(64) vblock T[BLOCKS], behind[BLOCKS], v[BLOCKS][D];
+    alignas(64) iblock stop[BLOCKS];
+    for (int b = 0; b < BLOCKS; ++b) {
+        T[b] = (vblock)1.0f;
+        behind[b] = (vblock)0.0f;
+        stop[b] = (iblock)0;
+        for (int c = 0; c < D; ++c) v[b][c] = (vblock)0.0f;
     }
     for (int y = 0; y < tile.rows; ++y)
         for (int x = 0; x < tile.columns; ++x) {
             const long long at = (long long)(y0 + y) * width + x0 + x;
-            const int b = y / 4 * 4 + x / 4, l = y % 4 * 4 + x % 4;
+            const int b = block_of(x, y), l = lane_of(x, y);
             T[b][l] = transmittance[at];
             behind[b][l] = v_transmittance[at];
             stop[b][l] = pixel_stop[at];
             for (int c = 0; c < channels; ++c) v[b][c][l] = v_image[at * stride + channel + c];
         }
     unsigned open = 0;  // blocks with incoming gradient
-    for (int b = 0; b < 16; ++b) {
-        i16 wanted = behind[b] != 0.0f;
+    for (int b = 0; b < BLOCKS; ++b) {
+        iblock wanted = behind[b] != 0.0f;
         for (int c = 0; c < D; ++c) wanted |= v[b][c] != 0.0f;
         // A block without incoming gradient adds exact zeros.
         if (any(wanted) || !(shortcuts & ZERO_GRADIENT)) open |= 1u << b;
@@ -37,27 +37,33 @@ for (int t = first; t < last; ++t) {
         for (int k = tile_end - 1; k >= begin; --k) {
             __builtin_prefetch(records + (long long)RECORD * tile_list[larger(k - 8, begin)]);
             if (!pair_blocks[k]) continue;
-            unsigned todo = pair_blocks[k] & open;
             const float* r = records + (long long)RECORD * tile_list[k];
-            v16 m[8], abs_x = (v16)0.0f, abs_y = (v16)0.0f, v_color[D];
-            for (int j = 0; j < 8; ++j) m[j] = (v16)0.0f;
-            for (int c = 0; c < D; ++c) v_color[c] = (v16)0.0f;
-            for (; todo; todo &= todo - 1) {
-                const int b = __builtin_ctz(todo);
-                const Falloff seen(tile, b, r);
+            vblock m[8], abs_x = (vblock)0.0f, abs_y = (vblock)0.0f, v_color[D];
+            for (int j = 0; j < 8; ++j) m[j] = (vblock)0.0f;
+            for (int c = 0; c < D; ++c) v_color[c] = (vblock)0.0f;
+            unsigned todo = pair_blocks[k] & open;
+            // The falloff in the next block is on its way while this one's chain of instructions waits for itself.
+            int b = todo ? __builtin_ctz(todo) : 0;
+            Falloff seen(tile, b, r);
+            while (todo) {
+                todo &= todo - 1;
+                const int following = todo ? __builtin_ctz(todo) : 0;
+                const Falloff then(tile, following, r);
 
-                const i16 hit = (seen.log2_alpha >= LOG2_ALPHA_MIN) & (stop[b] > k);
-                const v16 full = exp2(seen.log2_alpha);
-                const v16 alpha = hit ? vmin((v16)ALPHA_MAX, full) : (v16)0.0f;
-                v16 shade = r[8] * v[b][0];
+                const iblock hit = (seen.log2_alpha >= LOG2_ALPHA_MIN) & (stop[b] > k);
+                const vblock full = exp2(seen.log2_alpha);
+                const vblock alpha = hit ? vmin((vblock)ALPHA_MAX, full) : (vblock)0.0f;
+                vblock shade = r[8] * v[b][0];
                 for (int c = 1; c < D; ++c) shade += r[8 + c] * v[b][c];
-                T[b] = T[b] * (1.0f / (1.0f - alpha));  // from behind the Gaussian to before it
-                const v16 weight = alpha * T[b], less = behind[b] - shade;
-                behind[b] = hit ? behind[b] - alpha * less : behind[b];
+                const vblock before = T[b] * (1.0f / (1.0f - alpha));  // from behind the Gaussian to before it
+                // Zero where it was not blended: a store of some lanes only takes long on some processors.
+                const vblock weight = alpha * before, less = hit ? behind[b] - shade : (vblock)0.0f;
+                T[b] = before;
+                behind[b] = behind[b] - alpha * less;
                 // Where alpha is clamped, neither opacity nor shape moves it.
-                const v16 v_sigma = (hit & (full <= ALPHA_MAX)) ? weight * less : (v16)0.0f;
+                const vblock v_sigma = full <= ALPHA_MAX ? weight * less : (vblock)0.0f;
                 for (int c = 0; c < D; ++c) v_color[c] += weight * v[b][c];
-                const v16 v_x = v_sigma * seen.dx, v_y = v_sigma * seen.dy;
+                const vblock v_x = v_sigma * seen.dx, v_y = v_sigma * seen.dy;
                 m[0] += v_sigma;
                 m[1] += v_x;
                 m[2] += v_y;
@@ -68,6 +74,8 @@ for (int t = first; t < last; ++t) {
                     abs_x += vabs(v_sigma * seen.p);
                     abs_y += vabs(v_sigma * (r[3] * seen.p + r[4] * seen.w));
                 }
+                seen = then;
+                b = following;
             }
             float* out = v_pairs + (long long)PAIR * --slot;
             for (int c = 0; c < D && c < 2; ++c) m[6 + c] = v_color[c];

@@ -84,6 +84,7 @@ for (int item = first; item < last; ++item) {
         for (int vector = 0; vector < wide; ++vector) {
             const int at = 16 * (vector + side) - reach;
             v16 along[4] = {(v16)0.0f, (v16)0.0f, (v16)0.0f, (v16)0.0f};
+#pragma clang loop unroll(full)
             for (int k = 0; k < WINDOW; ++k)
                 for (int m = 0; m < 4; ++m) along[m] += w[k] * load(maps[m] + at + k * channels);
             v16* out = blurred + ((row + AHEAD) % WINDOW * wide + vector) * 4;
@@ -99,6 +100,7 @@ for (int item = first; item < last; ++item) {
         for (int vector = 0; vector < wide; ++vector) {
             const int i = left + 16 * vector;
             v16 blur[4] = {(v16)0.0f, (v16)0.0f, (v16)0.0f, (v16)0.0f};
+#pragma clang loop unroll(full)
             for (int k = 0; k < WINDOW; ++k)
                 for (int m = 0; m < 4; ++m) blur[m] += w[k] * line[k][4 * vector + m];
             const v16 column = lane + (float)i;
@@ -127,6 +129,7 @@ for (int item = first; item < last; ++item) {
         for (int vector = 0; vector < own; ++vector) {
             const int at = 16 * (vector + more) - reach;
             v16 along[3] = {(v16)0.0f, (v16)0.0f, (v16)0.0f};
+#pragma clang loop unroll(full)
             for (int k = 0; k < WINDOW; ++k)
                 for (int m = 0; m < 3; ++m) along[m] += w[k] * load(slopes[m] + at + k * channels);
             v16* out = sloping + ((centre + AHEAD) % WINDOW * CHUNK + vector) * 3;
@@ -139,6 +142,7 @@ for (int item = first; item < last; ++item) {
         for (int vector = 0; vector < own; ++vector) {
             const int i = 16 * (begin + vector);
             v16 blur[3] = {(v16)0.0f, (v16)0.0f, (v16)0.0f};
+#pragma clang loop unroll(full)
             for (int k = 0; k < WINDOW; ++k)
                 for (int m = 0; m < 3; ++m) blur[m] += w[k] * line[k][3 * vector + m];
             const v16 a = piece(x + (long long)done * span, i), d = a - piece(y + (long long)done * span, i);

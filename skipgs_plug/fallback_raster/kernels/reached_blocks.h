@@ -1,14 +1,19 @@
-// The blocks of a tile that the ellipses at ALPHA_MIN of four Gaussians reach, as bits; a little more than exact, because
+// The blocks of a tile that the ellipses at ALPHA_MIN of some Gaussians reach, as bits; a little more than exact, because
 // every pixel is tested again.
 //
-// A lane is a Gaussian and a row of blocks. The part of an ellipse inside a row is convex, so it meets the columns between
-// its leftmost and its rightmost point: that of the whole ellipse, or as near to it as the row allows.
-static constexpr i16 row_shift = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12};
-static constexpr auto reached_blocks = [](const float* const* r, int x0, int y0) INLINE -> i16 {
+// A lane is a Gaussian and a line of blocks. The part of an ellipse inside a line is convex, so it meets the columns between
+// its leftmost and its rightmost point: that of the whole ellipse, or as near to it as the line allows.
+static constexpr int TESTED = 16 / LINES;  // Gaussians at a time
+#ifdef __AVX512F__
+static constexpr v16 line = {0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f};
+#else
+static constexpr v16 line = {0.f, 1.f, 2.f, 3.f, 4.f, 5.f, 6.f, 7.f, 0.f, 1.f, 2.f, 3.f, 4.f, 5.f, 6.f, 7.f};
+#endif
+static constexpr auto reached_blocks = [](const float* const* r, int x0, int y0, unsigned* reached) INLINE {
 #pragma clang fp contract(fast)
-    typedef float v4 __attribute__((ext_vector_type(4), aligned(4)));
-    // One value of each record, four times each.
+    // One value of each record, once for each line.
     auto column = [r](int c) INLINE -> v16 {
+#ifdef __AVX512F__
         v4 of[4];
         for (int g = 0; g < 4; ++g) of[g] = *(const v4*)(r[g] + c / 4 * 4);
         const auto low = __builtin_shufflevector(of[0], of[1], 0, 1, 2, 3, 4, 5, 6, 7);
@@ -20,12 +25,15 @@ static constexpr auto reached_blocks = [](const float* const* r, int x0, int y0)
             case 2: return __builtin_shufflevector(all, all, 2, 2, 2, 2, 6, 6, 6, 6, 10, 10, 10, 10, 14, 14, 14, 14);
             default: return __builtin_shufflevector(all, all, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11, 11, 15, 15, 15, 15);
         }
+#else
+        return __builtin_shufflevector((v8)r[0][c], (v8)r[1][c], 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+#endif
     };
     const v16 half_h = column(6), slope = column(12), across = column(4), chord = column(15);
     const v16 extreme = column(13) * column(7), reach = column(14) + 0.01f;
     // From the centre to the first and to the last row of pixels.
-    const v16 first = 4.0f * lane_x + (y0 + 0.5f) - column(1);
-    const v16 low = vmax(first, -half_h), high = vmin(first + 3.0f, half_h);
+    const v16 first = (float)ROWS * line + (y0 + 0.5f) - column(1);
+    const v16 low = vmax(first, -half_h), high = vmin(first + (ROWS - 1.0f), half_h);
     const v16 dy_left = vmin(vmax(-extreme, low), high), dy_right = vmin(vmax(extreme, low), high);
     const v16 w_left = across * dy_left, w_right = across * dy_right;
     const v16 half_left = vsqrt(vmax(reach - w_left * w_left, (v16)0.0f));
@@ -37,7 +45,10 @@ static constexpr auto reached_blocks = [](const float* const* r, int x0, int y0)
     const v16 begin = __builtin_elementwise_ceil(vmax(vmin(left, (v16)4.0f), (v16)0.0f));
     const v16 end = __builtin_elementwise_floor(vmax(vmin(right, (v16)3.0f), (v16)-1.0f)) + 1.0f;
     i16 columns = ((i16)15 << __builtin_convertvector(begin, i16)) & (((i16)1 << __builtin_convertvector(end, i16)) - 1);
-    columns = low <= high ? columns << row_shift : (i16)0;
+    columns = low <= high ? columns << 4 * __builtin_convertvector(line, i16) : (i16)0;
     columns |= __builtin_shufflevector(columns, columns, 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14);
-    return columns | __builtin_shufflevector(columns, columns, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13);
+    columns |= __builtin_shufflevector(columns, columns, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13);
+    if (LINES == 8)
+        columns |= __builtin_shufflevector(columns, columns, 4, 5, 6, 7, 0, 1, 2, 3, 12, 13, 14, 15, 8, 9, 10, 11);
+    for (int g = 0; g < TESTED; ++g) reached[g] = (unsigned)columns[LINES * g];
 };

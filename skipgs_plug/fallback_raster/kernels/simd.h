@@ -1,9 +1,9 @@
 // Vector code that every kernel begins with.
 //
 // Warp compiles kernels with its own Clang, also on machines without a compiler, and takes C++ that may use Clang's
-// vector extension. A value of `v16` holds 16 neighbouring pixels (or 16 Gaussians); arithmetic on it reads like scalar
+// vector extension. A value of `v16` holds 16 Gaussians (or 16 neighbouring pixels); arithmetic on it reads like scalar
 // code and becomes one AVX-512 instruction, two of AVX2 or four of SSE or NEON. Scalar Warp code does not vectorise
-// across pixels.
+// across pixels. The blends keep most values in registers and use as many floats as these hold (`vblock`).
 //
 // A kernel is the body of one function, where C++ allows no other: functions are lambdas without captures. The text of
 // this file comes first in every kernel, the constants of `constants.py` follow by name.
@@ -18,48 +18,55 @@ typedef float v16 __attribute__((ext_vector_type(16), aligned(4)));
 typedef int i16 __attribute__((ext_vector_type(16), aligned(4)));
 typedef bool b16 __attribute__((ext_vector_type(16)));
 typedef float v8 __attribute__((ext_vector_type(8), aligned(4)));
+typedef int i8 __attribute__((ext_vector_type(8), aligned(4)));
 
 static constexpr float LOG2_E = 1.44269504f, LN_4 = 1.38629436f;
 
 static constexpr v16 lane = {0.f, 1.f, 2.f, 3.f, 4.f, 5.f, 6.f, 7.f, 8.f, 9.f, 10.f, 11.f, 12.f, 13.f, 14.f, 15.f};
-// Where each lane lies in a block of 4 x 4.
-static constexpr v16 lane_x = {0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f};
-static constexpr v16 lane_y = {0.f, 0.f, 0.f, 0.f, 1.f, 1.f, 1.f, 1.f, 2.f, 2.f, 2.f, 2.f, 3.f, 3.f, 3.f, 3.f};
 static constexpr auto fmaxf = [](float a, float b) -> float { return a > b ? a : b; };
 static constexpr auto fminf = [](float a, float b) -> float { return a < b ? a : b; };
 static constexpr auto larger = [](int a, int b) -> int { return a > b ? a : b; };
 static constexpr auto smaller = [](int a, int b) -> int { return a < b ? a : b; };
-static constexpr auto any = [](i16 mask) -> bool { return __builtin_reduce_or(mask) != 0; };
+static constexpr auto any = [](auto mask) -> bool { return __builtin_reduce_or(mask) != 0; };
 // Bit l is set where lane l of the mask is.
 static constexpr auto bits = [](i16 mask) -> unsigned {
     return __builtin_bit_cast(unsigned short, __builtin_convertvector(mask != 0, b16));
 };
 // One instruction each; where one of the two is NaN, the second is taken.
-static constexpr auto vmin = [](v16 a, v16 b) -> v16 { return a < b ? a : b; };
-static constexpr auto vmax = [](v16 a, v16 b) -> v16 { return a > b ? a : b; };
-static constexpr auto vabs = [](v16 a) -> v16 { return __builtin_elementwise_abs(a); };
-static constexpr auto vsqrt = [](v16 a) -> v16 { return __builtin_elementwise_sqrt(a); };
+static constexpr auto vmin = [](auto a, decltype(a) b) { return a < b ? a : b; };
+static constexpr auto vmax = [](auto a, decltype(a) b) { return a > b ? a : b; };
+static constexpr auto vabs = [](auto a) { return __builtin_elementwise_abs(a); };
+static constexpr auto vsqrt = [](auto a) { return __builtin_elementwise_sqrt(a); };
 // Pairwise, so that the order of additions (and the result to the bit) is fixed.
-static constexpr auto sum = [](v16 a) -> float {
-    auto b = a.lo + a.hi;
+static constexpr auto sum = [](auto a) -> float {
+    v8 b;
+    if constexpr (sizeof(a) == sizeof(v8)) b = a;
+    else b = a.lo + a.hi;
     auto c = b.lo + b.hi;
     auto d = c.lo + c.hi;
     return d.x + d.y;
 };
 // Eight sums at a time, folded together: a third of the instructions of eight calls of `sum`.
-static constexpr auto sum8 = [](const v16* a) -> v8 {
-    v16 b[4], c[2];
-    for (int i = 0; i < 4; ++i)
-        b[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23)
-             + __builtin_shufflevector(a[2 * i], a[2 * i + 1], 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30,
-                                       31);
+static constexpr auto sum8 = [](const auto* a) INLINE -> v8 {
+    v8 b[4], c[2];
+    for (int i = 0; i < 4; ++i) {
+        const auto x = a[2 * i], y = a[2 * i + 1];
+        if constexpr (sizeof(x) == sizeof(v8))
+            b[i] = __builtin_shufflevector(x, y, 0, 1, 2, 3, 8, 9, 10, 11)
+                 + __builtin_shufflevector(x, y, 4, 5, 6, 7, 12, 13, 14, 15);
+        else {
+            const auto both = __builtin_shufflevector(x, y, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23)
+                            + __builtin_shufflevector(x, y, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+            b[i] = __builtin_shufflevector(both, both, 0, 1, 2, 3, 8, 9, 10, 11)
+                 + __builtin_shufflevector(both, both, 4, 5, 6, 7, 12, 13, 14, 15);
+        }
+    }
     for (int i = 0; i < 2; ++i)
-        c[i] = __builtin_shufflevector(b[2 * i], b[2 * i + 1], 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27)
-             + __builtin_shufflevector(b[2 * i], b[2 * i + 1], 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30,
-                                       31);
-    v16 d = __builtin_shufflevector(c[0], c[1], 0, 1, 4, 5, 8, 9, 12, 13, 16, 17, 20, 21, 24, 25, 28, 29)
-          + __builtin_shufflevector(c[0], c[1], 2, 3, 6, 7, 10, 11, 14, 15, 18, 19, 22, 23, 26, 27, 30, 31);
-    return d.even + d.odd;
+        c[i] = __builtin_shufflevector(b[2 * i], b[2 * i + 1], 0, 1, 8, 9, 4, 5, 12, 13)
+             + __builtin_shufflevector(b[2 * i], b[2 * i + 1], 2, 3, 10, 11, 6, 7, 14, 15);
+    const v8 d = __builtin_shufflevector(c[0], c[1], 0, 2, 8, 10, 4, 6, 12, 14)
+               + __builtin_shufflevector(c[0], c[1], 1, 3, 9, 11, 5, 7, 13, 15);
+    return __builtin_shufflevector(d, d, 0, 4, 1, 5, 2, 6, 3, 7);
 };
 static constexpr auto load = [](const float* p) -> v16 { return *(const v16*)p; };
 static constexpr auto store = [](float* p, v16 a) { *(v16*)p = a; };
@@ -216,16 +223,18 @@ static constexpr auto transpose = [](v16* a) INLINE {
 
 // 2^t for t in [-126, 126]: the integer part goes into the exponent, a degree-5 minimax polynomial gives the rest
 // in [-0.5, 0.5] (relative error 7.5e-8). Adding 1.5 * 2^23 leaves the rounded integer in the low mantissa bits.
-static constexpr auto exp2 = [](v16 t) -> v16 {
-    const v16 magic = (v16)12582912.0f;
-    v16 r = t + magic;
-    v16 f = t - (r - magic);
-    v16 p = 1.327645461e-3f * f + 9.675540368e-3f;
+static constexpr auto exp2 = [](auto t) INLINE {
+    using V = decltype(t);
+    using I = decltype(t < t);
+    const V magic = (V)12582912.0f;
+    V r = t + magic;
+    V f = t - (r - magic);
+    V p = 1.327645461e-3f * f + 9.675540368e-3f;
     p = p * f + 5.550713310e-2f;
     p = p * f + 2.402211974e-1f;
     p = p * f + 6.931469671e-1f;
     p = p * f + 1.000000072f;
-    return (v16)((i16)p + ((i16)r << 23));
+    return (V)((I)p + ((I)r << 23));
 };
 // e^x, with the product by log2(e) in two parts; saturates where float's range ends.
 static constexpr auto vexp = [](v16 x) INLINE -> v16 {
@@ -239,21 +248,6 @@ static constexpr auto vexp = [](v16 x) INLINE -> v16 {
 };
 static constexpr auto sigmoid = [](v16 x) INLINE -> v16 { return 1.0f / (1.0f + vexp(-x)); };
 
-// BATCH of them, step by step, so that their chains of instructions lie side by side.
-static constexpr int BATCH = 4;
-static constexpr auto exp2s = [](const v16* t, v16* result) INLINE {
-#pragma clang fp contract(fast)
-    constexpr float coefficients[] = {9.675540368e-3f, 5.550713310e-2f, 2.402211974e-1f, 6.931469671e-1f, 1.000000072f};
-    const v16 magic = (v16)12582912.0f;
-    v16 r[BATCH], f[BATCH], p[BATCH];
-    for (int i = 0; i < BATCH; ++i) r[i] = t[i] + magic;
-    for (int i = 0; i < BATCH; ++i) f[i] = r[i] - magic;
-    for (int i = 0; i < BATCH; ++i) f[i] = t[i] - f[i];
-    for (int i = 0; i < BATCH; ++i) p[i] = (v16)1.327645461e-3f;
-    for (float coefficient : coefficients)
-        for (int i = 0; i < BATCH; ++i) p[i] = p[i] * f[i] + coefficient;
-    for (int i = 0; i < BATCH; ++i) result[i] = (v16)((i16)p[i] + ((i16)r[i] << 23));
-};
 // log2(a) for positive, normal a: exponent bits plus the atanh series of the mantissa in [sqrt(1/2), sqrt(2)).
 static constexpr auto log2 = [](v16 a) -> v16 {
     i16 bits = (i16)a + (0x3f800000 - 0x3f3504f3);
