@@ -15,7 +15,7 @@ from .buffers import floats, ints, zeros
 from .constants import blocks
 from .project import project_backward, project_forward
 from .rendering import blend, blend_adjoint
-from .rows import all_rows, visible_rows
+from .rows import all_rows, put_rows, take_rows, visible_rows
 from .sh import sh_backward, sh_forward
 from .shortcuts import SHORTCUTS, active_shortcuts
 
@@ -156,6 +156,22 @@ class SphericalHarmonics(torch.autograd.Function):
         )  # fmt: skip
         v_camera = v_cameras.sum(0) if ctx.needs_input_grad[1] else None
         return v_means, v_camera, v_base, None if ctx.joined else v_rest, None, None, None
+
+
+class Pack(torch.autograd.Function):
+    """The visible rows [M, ...] of a tensor [N, ...] of one camera, as gsplat's `packed` has them."""
+
+    @staticmethod
+    def forward(ctx: Any, tensor: Tensor, visible: Tensor, block_start: Tensor) -> Tensor:  # type: ignore[override]
+        ctx.save_for_backward(visible, block_start)
+        ctx.n = len(tensor)
+        return take_rows(tensor, visible)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_packed: Tensor) -> Any:  # type: ignore[override]
+        visible, block_start = ctx.saved_tensors
+        return put_rows(v_packed, ctx.n, visible, block_start), None, None
 
 
 class Blend(torch.autograd.Function):

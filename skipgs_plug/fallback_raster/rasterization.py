@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from .arguments import as_float, as_int, camera_centre, check_tensors, planes, refuse_unsupported
-from .autograd import Blend, Project, SphericalHarmonics
+from .autograd import Blend, Pack, Project, SphericalHarmonics
 from .constants import MAX_CHANNELS, TILE, tiles
 from .rows import all_rows
 
@@ -176,12 +176,17 @@ def rasterization(
 
     camera_ids = gaussian_ids = counts = None
     if packed:
-        camera_ids, gaussian_ids = radii[..., 0].nonzero(as_tuple=True)
-        features = [f[gaussian_ids[camera_ids == c]] for c, f in enumerate(features)]
+        counts = [len(rows) for rows in visible]
+        camera_ids = torch.cat([torch.full((count,), camera, device="cpu") for camera, count in enumerate(counts)])
+        gaussian_ids = torch.cat(visible).long()
+
+        def pack(of_cameras: Sequence[Tensor]) -> list[Tensor]:
+            return [Pack.apply(*rows) for rows in zip(of_cameras, visible, block_starts, strict=True)]
+
+        features = pack(features) if features else []
         means2d, depths, conics, opacities, radii, sigmas = (
-            t[camera_ids, gaussian_ids] for t in (means2d, depths, conics, opacities, radii, sigmas)
+            _join(pack(_unstack(t, None))) for t in (means2d, depths, conics, opacities, radii, sigmas)
         )
-        counts = torch.bincount(camera_ids, minlength=n_cameras).tolist()
         visible, block_starts = map(list, zip(*map(all_rows, counts), strict=True))
     absolute = None
     if absgrad:
@@ -217,7 +222,7 @@ def rasterization(
         "opacities": opacities,
         "tile_width": tile_width,
         "tile_height": tile_height,
-        "tiles_per_gauss": torch.cat(tiles_per_gauss) if packed else _stack(tiles_per_gauss),
+        "tiles_per_gauss": _join(list(tiles_per_gauss)) if packed else _stack(tiles_per_gauss),
         "width": width,
         "height": height,
         "tile_size": TILE,
@@ -263,6 +268,10 @@ def _render_camera(
 # One camera is the rule in training: views, whose gradients are views too, spare copies of everything.
 def _stack(tensors: Any) -> Tensor:
     return tensors[0].unsqueeze(0) if len(tensors) == 1 else torch.stack(list(tensors))
+
+
+def _join(tensors: list[Tensor]) -> Tensor:
+    return tensors[0] if len(tensors) == 1 else torch.cat(tensors)
 
 
 def _unstack(tensor: Tensor, counts: list[int] | None) -> Sequence[Tensor]:

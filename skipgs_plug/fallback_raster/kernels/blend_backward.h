@@ -47,8 +47,9 @@ for (int t = first; t < last; ++t) {
             Falloff seen(tile, b, r);
             while (todo) {
                 todo &= todo - 1;
-                const int following = todo ? __builtin_ctz(todo) : 0;
-                const Falloff then(tile, following, r);
+                const int following = todo ? __builtin_ctz(todo) : b;
+                Falloff then = seen;
+                if (todo) then = Falloff(tile, following, r);
 
                 const iblock hit = (seen.log2_alpha >= LOG2_ALPHA_MIN) & (stop[b] > k);
                 const vblock full = exp2(seen.log2_alpha);

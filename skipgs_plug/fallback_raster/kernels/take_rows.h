@@ -1,2 +1,3 @@
-// Some rows of two numbers.
-for (int i = first; i < last; ++i) *(v2*)(taken + 2ll * i) = *(const v2*)(source + 2ll * rows[i]);
+// Some rows of an array, packed.
+#include "copy_row.h"
+for (int i = first; i < last; ++i) copy_row(taken + (long long)width * i, source + (long long)width * rows[i], width);
