@@ -74,6 +74,19 @@ def test_invalid_json_and_missing_image(folder: Path) -> None:
         load_scene(folder)
 
 
+@pytest.mark.parametrize(
+    "name", ["train/r_0.5", "train/r_0.5.png", "train/view", "train/view.png", "train/view.v2.jpg"]
+)
+def test_suffix_is_found(folder: Path, name: str) -> None:
+    path = folder / "transforms_train.json"
+    content = json.loads(path.read_text())
+    content["frames"][0]["file_path"] = name
+    path.write_text(json.dumps(content))
+    file = name if name.endswith((".png", ".jpg")) else name + ".png"
+    (folder / "train/view_001.png").rename(folder / file)
+    assert file in [view.name for view in load_scene(folder).train]
+
+
 @pytest.mark.parametrize("name", ["../secret.png", "/etc/x.png", "a/../../x.png", "C:\\x.png", "..\\x.png"])
 def test_names_that_leave_the_scene(folder: Path, name: str) -> None:
     (folder.parent / "secret.png").write_bytes((folder / "train/view_001.png").read_bytes())

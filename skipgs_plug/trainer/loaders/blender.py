@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.loaders.json_file import read_number, read_object, read_pose, read_string
-from skipgs_plug.trainer.loaders.paths import find_image
+from skipgs_plug.trainer.loaders.paths import IMAGE_SUFFIXES, find_image, inside
 from skipgs_plug.trainer.scene import BLACK, WHITE, Scene, View, assemble_scene, split_views
 
 BOX = 1.3  # half edge of the cube of initial points, as in 3DGS
@@ -46,7 +47,7 @@ def read_transforms(path: Path, file_name: str, data_factor: int) -> tuple[list[
     for frame in frames:
         file_path = read_string(frame.get("file_path"), "file_path of a frame", source)
         pose = read_pose(frame.get("transform_matrix"), file_path, source)
-        image_path = find_image(path, file_path if Path(file_path).suffix else file_path + ".png")
+        image_path = find_image(path, _with_suffix(path, file_path))
         pixels, alpha = read_image(image_path, image_path, WHITE, data_factor)
         any_alpha |= alpha is not None
         height, width = pixels.shape[:2]
@@ -55,6 +56,12 @@ def read_transforms(path: Path, file_name: str, data_factor: int) -> tuple[list[
         viewmat = torch.from_numpy(opencv_viewmat(pose)).float()
         views.append(View(image_path.relative_to(path).as_posix(), pixels, K, viewmat))
     return views, any_alpha
+
+
+def _with_suffix(folder: Path, name: str) -> str:
+    """NeRF-synthetic leaves the images' suffix out, and what is left may hold a dot ("train/r_0.5")."""
+    whole = Path(name).suffix in IMAGE_SUFFIXES or os.path.isfile(inside(folder, name))
+    return name if whole else name + ".png"
 
 
 def opencv_viewmat(camera_to_world: np.ndarray) -> np.ndarray:
