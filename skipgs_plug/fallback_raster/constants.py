@@ -38,8 +38,8 @@ LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 # The loss: pixels of the window of SSIM; rows and vectors of 16 floats of a tile; channels that the buffers which
 # extend a row beyond the image have room for.
 WINDOW = 11
-BAND = 64
-CHUNK = 8
+BAND = 128
+CHUNK = 12
 LOSS_CHANNELS = 32
 
 
