@@ -1,11 +1,12 @@
-"""Front-to-back compositing of one image and its adjoint, one tile at a time, 16 pixels as one value.
+"""Front-to-back compositing of one image and its adjoint, one tile at a time, a block of pixels as one value.
 
 Cut-offs as in gsplat and Inria's rasterizer: alpha is at most 0.999, a contribution under 1/255 is dropped, and a
 pixel is finished when the next Gaussian would bring its transmittance to 1e-4 or less.
 
-A tile is 4 x 4 blocks of 4 x 4 pixels, and a block is one value: small Gaussians fill more of a square than of a row.
-Which blocks a Gaussian reaches is found for four Gaussians at once (`kernels/reached_blocks.h`). The forward pass then
-takes block after block, so that its pixels stay in registers while the Gaussians pass, four of them side by side.
+A tile is 16 blocks of 4 x 4 pixels, or 32 of 4 x 2 where registers hold eight floats, and a block is one value: small
+Gaussians fill more of a square than of a row. Which blocks a Gaussian reaches is found for several Gaussians at once
+(`kernels/reached_blocks.h`). The forward pass then takes block after block, so that its pixels stay in registers while
+the Gaussians pass, four of them side by side.
 
 The adjoint walks the same lists back to front, Gaussian after Gaussian, so that here its sums stay in registers, and
 visits only blocks in which the forward pass blended the Gaussian. It needs, beside the colour, the moments of v_sigma

@@ -2,7 +2,7 @@
 
 import math
 
-# Pixels along the side of a tile, which is 4 x 4 blocks of 4 x 4 pixels.
+# Pixels along the side of a tile, which is blocks of 4 x 4 or 4 x 2 pixels (`kernels/blend_tile.h`).
 TILE = 16
 
 # Rows that one core clears and fills at a time, and that one partial sum of the camera's gradients covers.

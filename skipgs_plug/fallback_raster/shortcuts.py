@@ -10,7 +10,7 @@ from contextlib import contextmanager
 # Each has a bit of the int that kernels read from their parameter `shortcuts`; there its name is in capitals.
 SHORTCUTS = {
     "exact_tiles": 1,  # list a Gaussian only in tiles that its ellipse at alpha 1/255 crosses, not in its whole box
-    "block_bounds": 2,  # visit only the 4 x 4 blocks of a tile that the ellipse reaches
+    "block_bounds": 2,  # visit only the blocks of a tile that the ellipse reaches
     "saturation": 4,  # leave blocks and tiles whose pixels are all finished
     "zero_gradient": 8,  # leave blocks and tiles whose incoming gradient is zero in the backward pass
     "visible_only": 16,  # evaluate SH and its adjoint only for Gaussians on screen

@@ -2,7 +2,7 @@
 #include "blend_tile.h"
 #include "reached_blocks.h"
 #include "sorted_tile.h"
-static constexpr int GROUP = 64;      // Gaussians at a time, one bit each
+static constexpr int GROUP = 64;        // Gaussians at a time, one bit each
 static constexpr int SIDE_BY_SIDE = 4;  // of these in the chains of one block
 typedef unsigned char bytes __attribute__((ext_vector_type(32)));
 typedef bool b32 __attribute__((ext_vector_type(32)));
@@ -52,7 +52,7 @@ for (int t = first; t < last; ++t) {
     }
     int blended_here = 0;
     for (int base = begin; base < end && open; base += GROUP) {
-        alignas(64) float chunk[(GROUP + 1) * RECORD];        // their records, and one that no pixel sees
+        alignas(64) float chunk[(GROUP + 1) * RECORD];              // their records, and one that no pixel sees
         alignas(32) unsigned char reached[BLOCKS / 8][GROUP] = {};  // the blocks that each reaches, eight to a byte
         const int count = smaller(GROUP, end - base);
         list.sort(base - begin + GROUP);
