@@ -78,6 +78,22 @@ def test_shortcuts_change_nothing(case: str) -> None:
     assert tiles < plain_tiles  # some were left out
 
 
+def test_blocks_without_gradient_change_no_bit() -> None:
+    """What a pixel adds does not hang on which blocks are visited before it."""
+    scene = random_scene(n=3000, width=64, height=48)
+    gradients = []
+    for left_out in ((), ("zero_gradient",)):
+        inputs = leaves(scene, torch.float32)
+        with without_shortcuts(*left_out):
+            image, _, _ = rasterization(**inputs, packed=False)
+            upstream = torch.randn(image.shape, generator=torch.Generator().manual_seed(1))
+            upstream[:, : image.shape[1] // 2] = 0.0
+            image.backward(upstream)
+        gradients.append([t.grad for t in inputs.values() if torch.is_tensor(t) and t.grad is not None])
+    assert len(gradients[0]) >= 5
+    assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
+
+
 @pytest.mark.parametrize("case", ["SH 3", "antialiased", "RGB+ED", "three cameras", "packed", "near and far"])
 def test_camera_gradients(case: str) -> None:
     scene, options = CASES[case]

@@ -43,7 +43,14 @@ struct Falloff {
     Falloff(const Tile& tile, int block, const float* r) {
 #pragma clang fp contract(fast)
         dx = tile.px[block & 3] - r[0], dy = tile.py[block >> 2] - r[1];
-        p = r[2] * dx + r[3] * dy, w = r[4] * dy;
+        // Rounded by itself. Clang would fuse p's sum with one of its products, here with this one and there with the
+        // other, and what the adjoint sees has to be what was blended.
+        vblock slant;
+        {
+#pragma clang fp contract(off)
+            slant = r[3] * dy;
+        }
+        p = r[2] * dx + slant, w = r[4] * dy;
         log2_alpha = r[5] - w * w - p * p;  // p takes longest
     }
 };
