@@ -1,28 +1,23 @@
 // Adjoint of blend_forward, back to front, one tile at a time.
 #include "blend_tile.h"
+#include "pixels.h"
 for (int t = first; t < last; ++t) {
     const Tile tile(t, tile_start, tiles_x, width, height);
-    const int x0 = tile.x0, y0 = tile.y0;
 
     // behind = (the colour one would see without the current Gaussian and those before it) . v_image, so that it is not
-    // divided by 1 - alpha; at the end of the list that is what alpha and background receive.
+    // divided by 1 - alpha; at the end of the list that is what alpha and background receive. All are 0 outside the image,
+    // where no list has a Gaussian before place 0.
     alignas(64) vblock T[BLOCKS], behind[BLOCKS], v[BLOCKS][D];
     alignas(64) iblock stop[BLOCKS];
-    for (int b = 0; b < BLOCKS; ++b) {
-        T[b] = (vblock)1.0f;
-        behind[b] = (vblock)0.0f;
-        stop[b] = (iblock)0;
-        for (int c = 0; c < D; ++c) v[b][c] = (vblock)0.0f;
+    for (int q = 0; q < QUADS; ++q) {
+        const Quad quad(tile, q, width);
+        v16 v_color[D];
+        read_channels(v_image + channel, quad, stride, channels, v_color);
+        set_blocks(T, quad, 1, read_pixels(transmittance, quad));
+        set_blocks(behind, quad, 1, read_pixels(v_transmittance, quad));
+        set_blocks((vblock*)stop, quad, 1, read_pixels((const float*)pixel_stop, quad));
+        for (int c = 0; c < D; ++c) set_blocks(&v[0][c], quad, D, v_color[c]);
     }
-    for (int y = 0; y < tile.rows; ++y)
-        for (int x = 0; x < tile.columns; ++x) {
-            const long long at = (long long)(y0 + y) * width + x0 + x;
-            const int b = block_of(x, y), l = lane_of(x, y);
-            T[b][l] = transmittance[at];
-            behind[b][l] = v_transmittance[at];
-            stop[b][l] = pixel_stop[at];
-            for (int c = 0; c < channels; ++c) v[b][c][l] = v_image[at * stride + channel + c];
-        }
     unsigned open = 0;  // blocks with incoming gradient
     for (int b = 0; b < BLOCKS; ++b) {
         iblock wanted = behind[b] != 0.0f;

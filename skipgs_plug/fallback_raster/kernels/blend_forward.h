@@ -1,5 +1,6 @@
 // Front-to-back compositing, one tile at a time.
 #include "blend_tile.h"
+#include "pixels.h"
 #include "reached_blocks.h"
 #include "sorted_tile.h"
 static constexpr int GROUP = 64;        // Gaussians at a time, one bit each
@@ -22,7 +23,7 @@ for (int t = first; t < last; ++t) {
         tile_blended[t] = 0;
         continue;
     }
-    const int x0 = tile.x0, y0 = tile.y0, begin = tile.begin, end = tile.end;
+    const int begin = tile.begin, end = tile.end;
     SortedTile list(begin, sorted ? begin : end, unsorted, buffer, tile_list, tile_place, pair_row, records);
 
     alignas(64) vblock P[BLOCKS], T[BLOCKS], C[BLOCKS][D];
@@ -38,15 +39,15 @@ for (int t = first; t < last; ++t) {
     }
     // What lies behind the lists of an earlier pass: its places count from `before` on.
     if (continued) {
-        for (int y = 0; y < tile.rows; ++y)
-            for (int x = 0; x < tile.columns; ++x) {
-                const long long at = (long long)(y0 + y) * width + x0 + x;
-                const int b = block_of(x, y), l = lane_of(x, y);
-                P[b][l] = product_left[at];
-                T[b][l] = transmittance[at];
-                stop[b][l] = pixel_stop[at] - before;
-                for (int c = 0; c < channels; ++c) C[b][c][l] = image[at * stride + channel + c];
-            }
+        for (int q = 0; q < QUADS; ++q) {
+            const Quad quad(tile, q, width);
+            v16 colors[D];
+            read_channels(image + channel, quad, stride, channels, colors);
+            set_blocks(P, quad, 1, read_pixels(product_left, quad));
+            set_blocks(T, quad, 1, read_pixels(transmittance, quad));
+            set_blocks((vblock*)stop, quad, 1, (v16)((i16)read_pixels((const float*)pixel_stop, quad) - before));
+            for (int c = 0; c < D; ++c) set_blocks(&C[0][c], quad, D, colors[c]);
+        }
         for (int b = 0; b < BLOCKS; ++b)
             if (!any(P[b] > TRANSMITTANCE_MIN)) open &= ~(1u << b);
     }
@@ -147,13 +148,13 @@ for (int t = first; t < last; ++t) {
     for (int b = 0; b < BLOCKS; ++b) tile_end = larger(tile_end, __builtin_reduce_max(stop[b]));
     tile_stop[t] = tile_end;
     tile_blended[t] = blended_here;
-    for (int y = 0; y < tile.rows; ++y)
-        for (int x = 0; x < tile.columns; ++x) {
-            const long long at = (long long)(y0 + y) * width + x0 + x;
-            const int b = block_of(x, y), l = lane_of(x, y);
-            transmittance[at] = T[b][l];
-            pixel_stop[at] = stop[b][l] + before;
-            if (unfinished) product_left[at] = P[b][l];
-            for (int c = 0; c < channels; ++c) image[at * stride + channel + c] = C[b][c][l];
-        }
+    for (int q = 0; q < QUADS; ++q) {
+        const Quad quad(tile, q, width);
+        v16 colors[D];
+        for (int c = 0; c < D; ++c) colors[c] = of_blocks(&C[0][c], quad, D);
+        write_channels(image + channel, quad, stride, channels, colors);
+        write_pixels(transmittance, quad, of_blocks(T, quad, 1));
+        write_pixels((float*)pixel_stop, quad, (v16)((i16)of_blocks((const vblock*)stop, quad, 1) + before));
+        if (unfinished) write_pixels(product_left, quad, of_blocks(P, quad, 1));
+    }
 }

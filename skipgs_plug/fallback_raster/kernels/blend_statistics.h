@@ -1,5 +1,6 @@
 // What the forks of Inria's rasterizer count inside their blend, one tile at a time, without the colours.
 #include "blend_tile.h"
+#include "pixels.h"
 for (int t = first; t < last; ++t) {
     const Tile tile(t, tile_start, tiles_x, width, height);
     vblock T[BLOCKS], value[BLOCKS], most[BLOCKS];
@@ -14,9 +15,10 @@ for (int t = first; t < last; ++t) {
         who[b] = (iblock)-1;
         if (any(inside)) open |= 1u << b;
     }
-    for (int y = 0; y < tile.rows; ++y)
-        for (int x = 0; x < tile.columns; ++x)
-            value[block_of(x, y)][lane_of(x, y)] = values[(long long)(tile.y0 + y) * width + tile.x0 + x];
+    for (int q = 0; q < QUADS; ++q) {
+        const Quad quad(tile, q, width);
+        set_blocks(value, quad, 1, read_pixels(values, quad));
+    }
 
     for (int k = tile.begin; k < tile.end; ++k) {
         const int g = tile_list[k];
@@ -47,10 +49,9 @@ for (int t = first; t < last; ++t) {
         }
         *(v8*)(pair_sums + (long long)SUMS * k) = sum8(sums);
     }
-    for (int y = 0; y < tile.rows; ++y)
-        for (int x = 0; x < tile.columns; ++x) {
-            const long long at = (long long)(tile.y0 + y) * width + tile.x0 + x;
-            contributions[at] = count[block_of(x, y)][lane_of(x, y)];
-            strongest[at] = who[block_of(x, y)][lane_of(x, y)];
-        }
+    for (int q = 0; q < QUADS; ++q) {
+        const Quad quad(tile, q, width);
+        write_pixels((float*)contributions, quad, of_blocks((const vblock*)count, quad, 1));
+        write_pixels((float*)strongest, quad, of_blocks((const vblock*)who, quad, 1));
+    }
 }

@@ -14,9 +14,6 @@ static constexpr vblock lane_x = {0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f};
 static constexpr vblock lane_y = {0.f, 0.f, 0.f, 0.f, 1.f, 1.f, 1.f, 1.f};
 #endif
 static constexpr int LINES = TILE / ROWS, BLOCKS = 4 * LINES;  // lines of four blocks; at most 32 blocks, for bits of an int
-// The block of a pixel of the tile, and its lane there.
-static constexpr auto block_of = [](int x, int y) -> int { return y / ROWS * 4 + x / 4; };
-static constexpr auto lane_of = [](int x, int y) -> int { return y % ROWS * 4 + x % 4; };
 
 struct Tile {
     int x0, y0, rows, columns;  // of its pixels that lie in the image
