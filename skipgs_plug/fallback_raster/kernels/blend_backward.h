@@ -12,7 +12,7 @@ for (int t = first; t < last; ++t) {
     for (int q = 0; q < QUADS; ++q) {
         const Quad quad(tile, q, width);
         v16 v_color[D];
-        read_channels(v_image + channel, quad, stride, channels, v_color);
+        read_channels(v_image + channel, quad, stride, channels, v_color, D);
         set_blocks(T, quad, 1, read_pixels(transmittance, quad));
         set_blocks(behind, quad, 1, read_pixels(v_transmittance, quad));
         set_blocks((vblock*)stop, quad, 1, read_pixels((const float*)pixel_stop, quad));

@@ -42,7 +42,7 @@ for (int t = first; t < last; ++t) {
         for (int q = 0; q < QUADS; ++q) {
             const Quad quad(tile, q, width);
             v16 colors[D];
-            read_channels(image + channel, quad, stride, channels, colors);
+            read_channels(image + channel, quad, stride, channels, colors, D);
             set_blocks(P, quad, 1, read_pixels(product_left, quad));
             set_blocks(T, quad, 1, read_pixels(transmittance, quad));
             set_blocks((vblock*)stop, quad, 1, (v16)((i16)read_pixels((const float*)pixel_stop, quad) - before));
@@ -152,7 +152,7 @@ for (int t = first; t < last; ++t) {
         const Quad quad(tile, q, width);
         v16 colors[D];
         for (int c = 0; c < D; ++c) colors[c] = of_blocks(&C[0][c], quad, D);
-        write_channels(image + channel, quad, stride, channels, colors);
+        write_channels(image + channel, quad, stride, channels, colors, D);
         write_pixels(transmittance, quad, of_blocks(T, quad, 1));
         write_pixels((float*)pixel_stop, quad, (v16)((i16)of_blocks((const vblock*)stop, quad, 1) + before));
         if (unfinished) write_pixels(product_left, quad, of_blocks(P, quad, 1));

@@ -17,16 +17,23 @@ struct Quad {
     long long pixel(int l) const { return first + (long long)(l / 4) * width + l % 4; }
 };
 // `blocks` are `step` values apart.
+#ifdef __AVX512F__
 static constexpr auto set_blocks = [](vblock* blocks, const Quad& quad, int step, v16 a) INLINE {
-    if constexpr (ROWS == 4) blocks[quad.block * step] = a;
-    else blocks[quad.block * step] = a.lo, blocks[(quad.block + 4) * step] = a.hi;
+    blocks[quad.block * step] = a;
 };
 static constexpr auto of_blocks = [](const vblock* blocks, const Quad& quad, int step) INLINE -> v16 {
-    if constexpr (ROWS == 4) return blocks[quad.block * step];
-    else
-        return __builtin_shufflevector(blocks[quad.block * step], blocks[(quad.block + 4) * step], 0, 1, 2, 3, 4, 5, 6, 7,
-                                       8, 9, 10, 11, 12, 13, 14, 15);
+    return blocks[quad.block * step];
 };
+#else
+static constexpr auto set_blocks = [](vblock* blocks, const Quad& quad, int step, v16 a) INLINE {
+    blocks[quad.block * step] = a.lo;
+    blocks[(quad.block + 4) * step] = a.hi;
+};
+static constexpr auto of_blocks = [](const vblock* blocks, const Quad& quad, int step) INLINE -> v16 {
+    return __builtin_shufflevector(blocks[quad.block * step], blocks[(quad.block + 4) * step], 0, 1, 2, 3, 4, 5, 6, 7, 8, 9,
+                                   10, 11, 12, 13, 14, 15);
+};
+#endif
 
 // Four numbers of each row of a quad, `stride` a pixel, from number `c` on.
 static constexpr auto read_rows = [](const float* image, const Quad& quad, int stride, int c) INLINE -> v16 {
@@ -59,20 +66,20 @@ static constexpr auto write_pixels = [](float* image, const Quad& quad, v16 a) I
 #define SHUFFLE_QUARTERS(a, b, ...) \
     __builtin_shufflevector(a, b, QUARTERS(0, __VA_ARGS__), QUARTERS(1, __VA_ARGS__), QUARTERS(2, __VA_ARGS__), \
                             QUARTERS(3, __VA_ARGS__))
-// `channels` of `stride`, from the first of `image` on, as columns; more columns become 0, as all do outside the image.
-static constexpr auto read_channels = [](const float* image, const Quad& quad, int stride, int channels,
-                                         auto& columns) INLINE {
-    constexpr int count = sizeof(columns) / sizeof(v16);
+// `channels` of `stride`, from the first of `image` on, as columns; more of these `count` become 0, as all do outside the
+// image.
+static constexpr auto read_channels = [](const float* image, const Quad& quad, int stride, int channels, v16* columns,
+                                         int count) INLINE {
     if (quad.whole() && count == stride && count == channels) {
-        v16 a[count];
+        v16 a[4];
         for (int i = 0; i < count; ++i) a[i] = read_rows(image, quad, stride, 4 * i);
-        if constexpr (count == 1) columns[0] = a[0];
-        if constexpr (count == 3) {
+        if (count == 1) columns[0] = a[0];
+        if (count == 3) {
             columns[0] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(a[0], a[1], 0, 3, 6, 6), a[2], 0, 1, 2, 5);
             columns[1] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(a[0], a[1], 1, 4, 7, 7), a[2], 0, 1, 2, 6);
             columns[2] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(a[0], a[1], 2, 5, 5, 5), a[2], 0, 1, 4, 7);
         }
-        if constexpr (count == 4) quarters(a, columns);
+        if (count == 4) quarters(a, columns);
         return;
     }
     for (int c = 0; c < count; ++c) {
@@ -81,18 +88,17 @@ static constexpr auto read_channels = [](const float* image, const Quad& quad, i
             if (c < channels && quad.inside(l)) columns[c][l] = image[quad.pixel(l) * stride + c];
     }
 };
-static constexpr auto write_channels = [](float* image, const Quad& quad, int stride, int channels,
-                                          const auto& columns) INLINE {
-    constexpr int count = sizeof(columns) / sizeof(v16);
+static constexpr auto write_channels = [](float* image, const Quad& quad, int stride, int channels, const v16* columns,
+                                          int count) INLINE {
     if (quad.whole() && count == stride && count == channels) {
-        v16 a[count];
-        if constexpr (count == 1) a[0] = columns[0];
-        if constexpr (count == 3) {
+        v16 a[4];
+        if (count == 1) a[0] = columns[0];
+        if (count == 3) {
             a[0] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(columns[0], columns[1], 0, 4, 4, 1), columns[2], 0, 1, 4, 3);
             a[1] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(columns[0], columns[1], 5, 5, 2, 6), columns[2], 0, 5, 2, 3);
             a[2] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(columns[0], columns[1], 3, 3, 7, 7), columns[2], 6, 0, 2, 7);
         }
-        if constexpr (count == 4) quarters(columns, a);
+        if (count == 4) quarters(columns, a);
         for (int i = 0; i < count; ++i) write_rows(image, quad, stride, 4 * i, a[i]);
         return;
     }
