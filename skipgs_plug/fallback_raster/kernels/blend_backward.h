@@ -37,17 +37,21 @@ for (int t = first; t < last; ++t) {
             for (int j = 0; j < 8; ++j) m[j] = (vblock)0.0f;
             for (int c = 0; c < D; ++c) v_color[c] = (vblock)0.0f;
             unsigned todo = pair_blocks[k] & open;
-            // The falloff in the next block is on its way while this one's chain of instructions waits for itself.
+            // What the next block sees is on its way while this one's chain of instructions waits for itself.
             int b = todo ? __builtin_ctz(todo) : 0;
             Falloff seen(tile, b, r);
+            vblock full = exp2(seen.log2_alpha);
             while (todo) {
                 todo &= todo - 1;
                 const int following = todo ? __builtin_ctz(todo) : b;
                 Falloff then = seen;
-                if (todo) then = Falloff(tile, following, r);
+                vblock full_then = full;
+                if (todo) {
+                    then = Falloff(tile, following, r);
+                    full_then = exp2(then.log2_alpha);
+                }
 
                 const iblock hit = (seen.log2_alpha >= LOG2_ALPHA_MIN) & (stop[b] > k);
-                const vblock full = exp2(seen.log2_alpha);
                 const vblock alpha = hit ? vmin((vblock)ALPHA_MAX, full) : (vblock)0.0f;
                 vblock shade = r[8] * v[b][0];
                 for (int c = 1; c < D; ++c) shade += r[8 + c] * v[b][c];
@@ -71,6 +75,7 @@ for (int t = first; t < last; ++t) {
                     abs_y += vabs(v_sigma * (r[3] * seen.p + r[4] * seen.w));
                 }
                 seen = then;
+                full = full_then;
                 b = following;
             }
             float* out = v_pairs + (long long)PAIR * --slot;
