@@ -12,6 +12,9 @@ import pytest
 import torch
 
 from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.engine import Engine
+from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.policy import SkipPolicy
 
 RELEASE = {
@@ -185,3 +188,29 @@ def test_a_state_of_the_authors_controller_has_no_refinement() -> None:
         pytest.raises(SkipGSError, match=r"refine_share=None, not 0\.4"),
     ):
         gate.load_state_dict(RELEASE)
+
+
+def test_a_loaded_state_is_handed_on_until_the_trainer_says_when_densification_ends() -> None:
+    state = resumed(1.0).state_dict()
+    engine = Engine(SkipConfig(warmup=2))
+    assert engine.state_dict() == {}
+    engine.load_state_dict(state)
+    assert engine.state_dict() == state
+    engine.configure(TrainerFacts(start_iter=0))
+    assert engine.state_dict()["policy"] == state["policy"]
+
+
+def test_nothing_but_a_state_is_loaded() -> None:
+    for wrong in (None, [], "state", 3):
+        with pytest.raises(SkipGSError, match="state"):
+            SkipGate(start_iter=0).load_state_dict(wrong)  # type: ignore[arg-type]
+
+
+def test_a_state_from_before_shares_were_looked_at_has_seen_no_step() -> None:
+    gate = SkipGate(start_iter=0, warmup=2)
+    gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
+    state = gate.state_dict()
+    del state["shown"], state["refinement"]
+    gate = SkipGate(start_iter=0, warmup=2)
+    gate.load_state_dict(state)
+    assert gate.state_dict()["shown"] == [0.0, 0]
