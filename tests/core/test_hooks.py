@@ -379,6 +379,38 @@ def test_accumulation_holds_back_the_trainers_own_steps() -> None:
         assert at_once <= len(steps) < 20 + gate.stats()["backwards_run"]
 
 
+def test_a_step_uses_the_gradients_since_the_last_one() -> None:
+    class Recording(torch.optim.SGD):
+        """Of rate 0, so that a gradient does not hang on when steps were taken."""
+
+        def step(self, visible: torch.Tensor) -> None:  # type: ignore[override]
+            used.append((self.param_groups[0]["params"][0].grad.clone(), visible.clone()))
+            super().step()
+
+    class Masked(ToyTrainer):
+        """One number is visible in each iteration; gradients are dropped right after the step, as trainers do."""
+
+        def train(self) -> None:
+            for step in range(self.steps):
+                self.begin(step)
+                visible = torch.arange(3) == step % 3
+                loss = (self.render("v0") * visible).sum()
+                loss.backward()
+                self.optimizer.step(visible)
+                self.optimizer.zero_grad(set_to_none=True)
+
+    used: list[tuple[torch.Tensor, torch.Tensor]] = []
+    trainer = Masked(1000)
+    trainer.optimizer = Recording([trainer.parameter], lr=0.0)  # type: ignore[assignment]
+    with attach(trainer, step_mode="adaptive_norm", step_trigger="ref_k", min_bwd_ratio=1.0, warmup=2) as gate:
+        trainer.train()
+    # Of gradients of length 1 in three directions in turn, 16 is the length after 28: sqrt(9^2 + 9^2 + 10^2) = 16.2.
+    windows = used[22:]
+    assert len(windows) == (gate.stats()["backwards_run"] - 2) // 28 > 20
+    assert all(visible.all() and gradient.sum() == 28 for gradient, visible in windows)
+    assert all(visible.sum() == gradient.sum() == 1 for gradient, visible in used[:22])
+
+
 def test_accumulation_needs_optimizers() -> None:
     class OwnSchedule(Toy):
         def optimizers(self):
