@@ -106,7 +106,6 @@ def fill_pairs(
 
 @worker(read_kernel("sort_tiles.h"), items="tiles", grain="2")
 def sort_tiles(
-    records: Annotated[FloatArray, "R, RECORD"],
     tile_start: Annotated[IntArray, "tiles + 1"],
     pair_row: Annotated[IntArray, "P"],
     unsorted: Annotated[LongArray, "P"],
@@ -147,7 +146,7 @@ class Bins:
         """Sorts the lists of all tiles to their ends."""
         buffer = longs(len(self.unsorted))
         sort_tiles(
-            self.records, self.tile_start, self.pair_row, self.unsorted, buffer, self.tile_list, self.tile_place,
+            self.tile_start, self.pair_row, self.unsorted, buffer, self.tile_list, self.tile_place,
             len(self.tile_start) - 1,
         )  # fmt: skip
 

@@ -24,7 +24,7 @@ for (int t = first; t < last; ++t) {
         continue;
     }
     const int begin = tile.begin, end = tile.end;
-    SortedTile list(begin, sorted ? begin : end, unsorted, buffer, tile_list, tile_place, pair_row, records);
+    SortedTile list(begin, sorted ? begin : end, unsorted, buffer, tile_list, tile_place, pair_row);
 
     alignas(64) vblock P[BLOCKS], T[BLOCKS], C[BLOCKS][D];
     alignas(64) iblock stop[BLOCKS];
@@ -51,12 +51,17 @@ for (int t = first; t < last; ++t) {
         for (int b = 0; b < BLOCKS; ++b)
             if (!any(P[b] > TRANSMITTANCE_MIN)) open &= ~(1u << b);
     }
+    // A record lies anywhere. Those of a group are sent for one by one while the group before it is looked through: all at
+    // once are more than a core can wait for.
+    const auto send_for = [&](int k) INLINE { __builtin_prefetch(records + (long long)RECORD * tile_list[k]); };
+    list.sort(GROUP);
+    for (int k = begin; k < smaller(begin + GROUP, end); ++k) send_for(k);
     int blended_here = 0;
     for (int base = begin; base < end && open; base += GROUP) {
         alignas(64) float chunk[(GROUP + 1) * RECORD];              // their records, and one that no pixel sees
         alignas(32) unsigned char reached[BLOCKS / 8][GROUP] = {};  // the blocks that each reaches, eight to a byte
         const int count = smaller(GROUP, end - base);
-        list.sort(base - begin + GROUP);
+        list.sort(base - begin + 2 * GROUP);
         const int listed = sorted ? end : begin + list.done;
         clear(chunk + GROUP * RECORD, RECORD);
         chunk[GROUP * RECORD + 5] = -100.0f;
@@ -67,6 +72,7 @@ for (int t = first; t < last; ++t) {
                 const int k = base + j + g;
                 r[g] = records + (long long)RECORD * tile_list[smaller(k, listed - 1)];
                 store(chunk + RECORD * (j + g), load(r[g]));
+                send_for(smaller(k + GROUP, listed - 1));
                 blocks[g] = ~0u;
             }
             if (shortcuts & BLOCK_BOUNDS) reached_blocks(r, tile.x0, tile.y0, blocks);

@@ -7,14 +7,13 @@ struct SortedTile {
     long long *dealt, *other;  // the tile's pairs in buckets, and as much room again
     int *rows, *places;        // out: row and number of each pair
     const int* pair_row;
-    const float* records;
     int count, done, next, shift;  // pairs, those that are sorted, the next bucket, and bits of depth in one
     int start[BUCKETS + 1];
 
     SortedTile(int begin, int end, long long* unsorted, long long* buffer, int* tile_list, int* tile_place,
-               const int* pair_row, const float* records)
+               const int* pair_row)
         : dealt(buffer + begin), other(unsorted + begin), rows(tile_list + begin), places(tile_place + begin),
-          pair_row(pair_row), records(records), count(end - begin), done(0), next(0) {
+          pair_row(pair_row), count(end - begin), done(0), next(0) {
         // Twice as many buckets as pairs: most of them hold one or none.
         int buckets = 64;
         while (buckets < 2 * count && buckets < BUCKETS) buckets *= 2;
@@ -38,10 +37,7 @@ struct SortedTile {
             dealt[j] = pair;
         }
         for (int i = done; i < end; ++i) places[i] = (int)dealt[i];
-        for (int i = done; i < end; ++i) {
-            rows[i] = pair_row[places[i]];
-            __builtin_prefetch(records + (long long)RECORD * rows[i]);
-        }
+        for (int i = done; i < end; ++i) rows[i] = pair_row[places[i]];
         done = end;
     }
 
