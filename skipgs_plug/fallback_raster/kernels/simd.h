@@ -227,28 +227,29 @@ static constexpr auto transpose = [](v16* a) INLINE {
     exchange(1, low1, high1);
 };
 
-// 2^t for t in [-126, 126]: the integer part goes into the exponent, a degree-5 minimax polynomial gives the rest
-// in [-0.5, 0.5] (relative error 7.5e-8). Adding 1.5 * 2^23 leaves the rounded integer in the low mantissa bits.
+// 2^t for t in [-126, 126]: the rounded integer goes into the exponent, a degree-5 minimax polynomial gives the rest in
+// [-0.5, 0.5] (relative error 7.5e-8).
 static constexpr auto exp2 = [](auto t) INLINE {
     using V = decltype(t);
     using I = decltype(t < t);
-    const auto power = [](V f) INLINE -> V {
+    const auto rest = [](V f) INLINE -> V {
         V p = 1.327645461e-3f * f + 9.675540368e-3f;
         p = p * f + 5.550713310e-2f;
         p = p * f + 2.402211974e-1f;
         p = p * f + 6.931469671e-1f;
         return p * f + 1.000000072f;
     };
-#ifdef __AVX512F__
+#if defined(__AVX512F__) && __has_builtin(__builtin_ia32_scalefps512_mask)
     if constexpr (sizeof(V) == 64) {
         typedef float whole __attribute__((vector_size(64)));
-        const V n = (V)__builtin_ia32_rndscaleps_mask((whole)t, 0, (whole)t, (unsigned short)-1, 4);
-        return (V)__builtin_ia32_scalefps512_mask((whole)power(t - n), (whole)n, (whole)t, (unsigned short)-1, 4);
+        const V n = __builtin_elementwise_roundeven(t);
+        return (V)__builtin_ia32_scalefps512_mask((whole)rest(t - n), (whole)n, (whole)t, (unsigned short)-1, 4);
     }
 #endif
+    // Adding 1.5 * 2^23 leaves the rounded integer in the low mantissa bits.
     const V magic = (V)12582912.0f;
     const V r = t + magic;
-    return (V)((I)power(t - (r - magic)) + ((I)r << 23));
+    return (V)((I)rest(t - (r - magic)) + ((I)r << 23));
 };
 // e^x, with the product by log2(e) in two parts; saturates where float's range ends.
 static constexpr auto vexp = [](v16 x) INLINE -> v16 {
