@@ -108,3 +108,21 @@ def test_all_but_its_length_and_what_it_hands_out_is_as_in_the_range():
         9,
         "range(1, 9)",
     )
+
+
+def test_a_range_that_a_module_has_of_its_own_is_used_and_comes_back():
+    made = []
+
+    def own(*numbers):
+        made.append(numbers)
+        return range(*numbers)
+
+    names = {"range": own, "Bar": Bar}
+    exec("def train(end):\n    return list(range(0, end))", names)
+    patches = Patches()
+    replace_range(patches, names, ("train",), Every3rd())
+    assert names["train"](9) == [0, 3, 6]
+    assert made == [(0, 9)]
+    patches.restore()
+    assert names["range"] is own
+    assert names["train"](3) == [0, 1, 2]
