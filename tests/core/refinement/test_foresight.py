@@ -1,6 +1,5 @@
 """How much of refinement a scene needs."""
 
-import itertools
 import json
 
 import pytest
@@ -53,8 +52,7 @@ def test_views_that_get_worse_say_nothing():
 def test_progress_runs_from_zero_to_one_in_every_cycle():
     foresight = Foresight(0.05)
     seen = [foresight.progress(i / 80) for i in range(80)]
-    assert [i for i, (a, b) in enumerate(itertools.pairwise(seen), 1) if b < a] == [10, 20]
-    assert min(seen) == 0.0 and max(seen) < 1.0
+    assert seen == pytest.approx([i / 10 for i in range(10)] * 2 + [i / 60 for i in range(60)])
 
 
 def test_without_two_watched_views_nothing_is_judged():
@@ -98,7 +96,7 @@ def test_a_short_refinement_needs_more_of_its_iterations():
 def test_watched_views_are_few_and_always_the_same():
     names = [f"{i:03}.jpg" for i in range(255)]
     assert watched_views(names, 3750) == watched_views(reversed(names), 3000) and len(watched_views(names, 3000)) == 12
-    assert len(watched_views(names[:46], 1000)) == 4
+    assert len(watched_views(names[:46], 1000)) == 4 and len(watched_views(names[:31], 1000)) == 3
     assert watched_views(names[:17], 1000) == watched_views(names[:1], 1000) == frozenset()
     assert len(watched_views(names, 8 * 255)) == 12 and not watched_views(names, 8 * 255 - 1)  # a cycle shows not all
 
