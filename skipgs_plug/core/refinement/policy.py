@@ -35,11 +35,7 @@ class RefinementPolicy(Policy):
         return self._means.get(view)
 
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
-        """Run the backward, unless the view is watched or refinement is over."""
-        if step < self.start_iter:
-            return decision.INACTIVE
-        if loss - loss != 0.0:  # NaN or infinite
-            return decision.NON_FINITE
+        """Run the backward, unless the view is watched or refinement is over; the loss is finite."""
         self._means.update(view, loss)
         refinement = self._refinement
         if refinement.over:
