@@ -331,6 +331,38 @@ def test_what_the_adapter_knows_of_numbers_holds_beside_what_the_user_chose() ->
     assert ran == [*range(28), 29, 59, 70, 89, 99]
 
 
+def test_where_the_trainer_has_a_loop_of_its_own_no_other_optimizer_takes_larger_steps() -> None:
+    class Numbered(ToyTrainer):
+        def numbers(self) -> range:
+            return range(self.steps)
+
+    class OwnLoop(Toy):
+        def attach(self, hooks) -> None:
+            super().attach(hooks)
+            hooks.own_loop(self.trainer, "numbers")
+
+    trainer, own, others = Numbered(), [], []
+    pose = torch.nn.Parameter(torch.zeros(1))
+    pose.grad = torch.ones(1)
+    of_the_pose = torch.optim.SGD([pose], lr=0.5)
+
+    def train() -> None:
+        for step in trainer.numbers():
+            trainer.begin(step)
+            (trainer.render("v0") ** 2).mean().backward()
+            steps = (trainer.optimizer, trainer.parameter, own), (of_the_pose, pose, others)
+            for optimizer, parameter, moved in steps:
+                before = parameter.detach().clone()
+                optimizer.step()
+                moved.append(float((parameter.detach() - before).abs().max()))
+
+    with SkipGate(trainer, adapter=OwnLoop(trainer), refine_share=0.5) as gate:
+        train()
+    assert gate.stats()["iterations_skipped"] == len(range(100)) - len(own) == 39
+    assert max(own[:20]) < 0.06 and max(own) > 0.1  # the rate is 0.05, and Adam's steps are about as long
+    assert set(others) == {0.5}
+
+
 SCHEDULERS = {
     "one": lambda optimizer: schedulers.ExponentialLR(optimizer, 0.99),
     "chained": lambda optimizer: schedulers.ChainedScheduler(
