@@ -412,12 +412,23 @@ def test_accumulation_holds_back_the_trainers_own_steps() -> None:
 
 
 def test_a_step_uses_the_gradients_since_the_last_one() -> None:
-    class Recording(torch.optim.SGD):
+    class Resting(torch.optim.SGD):
         """Of rate 0, so that a gradient does not hang on when steps were taken."""
 
+        def __init__(self, parameter: torch.nn.Parameter) -> None:
+            super().__init__([parameter], lr=0.0)
+
+        def step(self, visible: torch.Tensor) -> None:  # type: ignore[override]
+            super().step()
+
+    class Recording(Resting):
         def step(self, visible: torch.Tensor) -> None:  # type: ignore[override]
             used.append((self.param_groups[0]["params"][0].grad.clone(), visible.clone()))
-            super().step()
+            super().step(visible)
+
+    class Both(Toy):
+        def optimizers(self):
+            return [self.trainer.optimizer, self.trainer.other]
 
     class Masked(ToyTrainer):
         """One number is visible in each iteration; gradients are dropped right after the step, as trainers do."""
@@ -428,13 +439,16 @@ def test_a_step_uses_the_gradients_since_the_last_one() -> None:
                 visible = torch.arange(3) == step % 3
                 loss = (self.render("v0") * visible).sum()
                 loss.backward()
-                self.optimizer.step(visible)
-                self.optimizer.zero_grad(set_to_none=True)
+                for optimizer in (self.optimizer, self.other):
+                    optimizer.step(visible)
+                    optimizer.zero_grad(set_to_none=True)
 
     used: list[tuple[torch.Tensor, torch.Tensor]] = []
     trainer = Masked(1000)
-    trainer.optimizer = Recording([trainer.parameter], lr=0.0)  # type: ignore[assignment]
-    with attach(trainer, step_mode="adaptive_norm", step_trigger="ref_k", min_bwd_ratio=1.0, warmup=2) as gate:
+    trainer.optimizer = Recording(trainer.parameter)  # type: ignore[assignment]
+    trainer.other = Resting(torch.nn.Parameter(torch.zeros(1)))  # type: ignore[attr-defined]
+    settings: dict = {"step_mode": "adaptive_norm", "step_trigger": "ref_k", "min_bwd_ratio": 1.0, "warmup": 2}
+    with SkipGate(trainer, adapter=Both(trainer), **settings) as gate:
         trainer.train()
     # Of gradients of length 1 in three directions in turn, 16 is the length after 28: sqrt(9^2 + 9^2 + 10^2) = 16.2.
     windows = used[22:]

@@ -8,9 +8,11 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skipgs_plug import SkipGate
 from skipgs_plug.core.budget import MIN_SAMPLES
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.policy import SkipPolicy
@@ -115,6 +117,20 @@ def test_auto_floor_follows_warm_up() -> None:
     assert policy.floor == 0.5
     policy.decide("a", 0.5, 5)
     assert policy.floor == 1.0 - 0.5 * (2 / 4)
+
+
+def test_a_floor_that_was_given_stays() -> None:
+    policy = SkipPolicy(start_iter=0, warmup=5, min_bwd_ratio=0.1)
+    for step in range(20):
+        policy.decide("a", 1.0, step)
+    assert policy.floor == 0.1
+
+
+def test_a_gate_without_a_trainer_begins_where_its_policy_does() -> None:
+    gate = SkipGate(policy=SkipPolicy(start_iter=5, warmup=0))
+    for step in range(9):
+        gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=step)
+    assert gate.stats()["backwards_run"] + gate.stats()["backwards_skipped"] == 4
 
 
 def test_auto_floor_stays_without_repeated_views_in_warm_up() -> None:
