@@ -1,6 +1,10 @@
 // Adjoint of blend_forward, back to front, one tile at a time.
 #include "blend_tile.h"
 #include "pixels.h"
+struct Seen : Falloff {
+    vblock full;  // alpha before it is clamped
+    Seen(const Tile& tile, int block, const float* r) : Falloff(tile, block, r), full(exp2(log2_alpha)) {}
+};
 for (int t = first; t < last; ++t) {
     const Tile tile(t, tile_start, tiles_x, width, height);
 
@@ -11,12 +15,10 @@ for (int t = first; t < last; ++t) {
     alignas(64) iblock stop[BLOCKS];
     for (int q = 0; q < QUADS; ++q) {
         const Quad quad(tile, q, width);
-        v16 v_color[D];
-        read_channels(v_image + channel, quad, stride, channels, v_color, D);
-        set_blocks(T, quad, 1, read_pixels(transmittance, quad));
-        set_blocks(behind, quad, 1, read_pixels(v_transmittance, quad));
-        set_blocks((vblock*)stop, quad, 1, read_pixels((const float*)pixel_stop, quad));
-        for (int c = 0; c < D; ++c) set_blocks(&v[0][c], quad, D, v_color[c]);
+        read_blocks(v_image + channel, quad, stride, channels, v[0], D);
+        read_blocks(transmittance, quad, 1, 1, T, 1);
+        read_blocks(v_transmittance, quad, 1, 1, behind, 1);
+        read_blocks((const float*)pixel_stop, quad, 1, 1, (vblock*)stop, 1);
     }
     unsigned open = 0;  // blocks with incoming gradient
     for (int b = 0; b < BLOCKS; ++b) {
@@ -39,20 +41,15 @@ for (int t = first; t < last; ++t) {
             unsigned todo = pair_blocks[k] & open;
             // What the next block sees is on its way while this one's chain of instructions waits for itself.
             int b = todo ? __builtin_ctz(todo) : 0;
-            Falloff seen(tile, b, r);
-            vblock full = exp2(seen.log2_alpha);
+            Seen seen(tile, b, r);
             while (todo) {
                 todo &= todo - 1;
                 const int following = todo ? __builtin_ctz(todo) : b;
-                Falloff then = seen;
-                vblock full_then = full;
-                if (todo) {
-                    then = Falloff(tile, following, r);
-                    full_then = exp2(then.log2_alpha);
-                }
+                Seen then = seen;
+                if (todo) then = Seen(tile, following, r);
 
                 const iblock hit = (seen.log2_alpha >= LOG2_ALPHA_MIN) & (stop[b] > k);
-                const vblock alpha = hit ? vmin((vblock)ALPHA_MAX, full) : (vblock)0.0f;
+                const vblock alpha = hit ? vmin((vblock)ALPHA_MAX, seen.full) : (vblock)0.0f;
                 vblock shade = r[8] * v[b][0];
                 for (int c = 1; c < D; ++c) shade += r[8 + c] * v[b][c];
                 const vblock before = T[b] * (1.0f / (1.0f - alpha));  // from behind the Gaussian to before it
@@ -61,7 +58,7 @@ for (int t = first; t < last; ++t) {
                 T[b] = before;
                 behind[b] = behind[b] - alpha * less;
                 // Where alpha is clamped, neither opacity nor shape moves it.
-                const vblock v_sigma = full <= ALPHA_MAX ? weight * less : (vblock)0.0f;
+                const vblock v_sigma = seen.full <= ALPHA_MAX ? weight * less : (vblock)0.0f;
                 for (int c = 0; c < D; ++c) v_color[c] += weight * v[b][c];
                 const vblock v_x = v_sigma * seen.dx, v_y = v_sigma * seen.dy;
                 m[0] += v_sigma;
@@ -75,7 +72,6 @@ for (int t = first; t < last; ++t) {
                     abs_y += vabs(v_sigma * (r[3] * seen.p + r[4] * seen.w));
                 }
                 seen = then;
-                full = full_then;
                 b = following;
             }
             float* out = v_pairs + (long long)PAIR * --slot;

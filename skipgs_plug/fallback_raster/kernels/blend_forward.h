@@ -41,15 +41,15 @@ for (int t = first; t < last; ++t) {
     if (continued) {
         for (int q = 0; q < QUADS; ++q) {
             const Quad quad(tile, q, width);
-            v16 colors[D];
-            read_channels(image + channel, quad, stride, channels, colors, D);
-            set_blocks(P, quad, 1, read_pixels(product_left, quad));
-            set_blocks(T, quad, 1, read_pixels(transmittance, quad));
-            set_blocks((vblock*)stop, quad, 1, (v16)((i16)read_pixels((const float*)pixel_stop, quad) - before));
-            for (int c = 0; c < D; ++c) set_blocks(&C[0][c], quad, D, colors[c]);
+            read_blocks(image + channel, quad, stride, channels, C[0], D);
+            read_blocks(product_left, quad, 1, 1, P, 1);
+            read_blocks(transmittance, quad, 1, 1, T, 1);
+            read_blocks((const float*)pixel_stop, quad, 1, 1, (vblock*)stop, 1);
         }
-        for (int b = 0; b < BLOCKS; ++b)
+        for (int b = 0; b < BLOCKS; ++b) {
+            stop[b] -= before;
             if (!any(P[b] > TRANSMITTANCE_MIN)) open &= ~(1u << b);
+        }
     }
     // A record lies anywhere. Those of a group are sent for one by one while the group before it is looked through: all at
     // once are more than a core can wait for.
@@ -151,16 +151,17 @@ for (int t = first; t < last; ++t) {
     }
     if (unfinished) still_open[t] = open != 0;
     int tile_end = begin;
-    for (int b = 0; b < BLOCKS; ++b) tile_end = larger(tile_end, __builtin_reduce_max(stop[b]));
+    for (int b = 0; b < BLOCKS; ++b) {
+        tile_end = larger(tile_end, __builtin_reduce_max(stop[b]));
+        stop[b] += before;
+    }
     tile_stop[t] = tile_end;
     tile_blended[t] = blended_here;
     for (int q = 0; q < QUADS; ++q) {
         const Quad quad(tile, q, width);
-        v16 colors[D];
-        for (int c = 0; c < D; ++c) colors[c] = of_blocks(&C[0][c], quad, D);
-        write_channels(image + channel, quad, stride, channels, colors, D);
-        write_pixels(transmittance, quad, of_blocks(T, quad, 1));
-        write_pixels((float*)pixel_stop, quad, (v16)((i16)of_blocks((const vblock*)stop, quad, 1) + before));
-        if (unfinished) write_pixels(product_left, quad, of_blocks(P, quad, 1));
+        write_blocks(image + channel, quad, stride, channels, C[0], D);
+        write_blocks(transmittance, quad, 1, 1, T, 1);
+        write_blocks((float*)pixel_stop, quad, 1, 1, (const vblock*)stop, 1);
+        if (unfinished) write_blocks(product_left, quad, 1, 1, P, 1);
     }
 }

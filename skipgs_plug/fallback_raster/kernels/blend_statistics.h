@@ -17,7 +17,7 @@ for (int t = first; t < last; ++t) {
     }
     for (int q = 0; q < QUADS; ++q) {
         const Quad quad(tile, q, width);
-        set_blocks(value, quad, 1, read_pixels(values, quad));
+        read_blocks(values, quad, 1, 1, value, 1);
     }
 
     for (int k = tile.begin; k < tile.end; ++k) {
@@ -51,7 +51,7 @@ for (int t = first; t < last; ++t) {
     }
     for (int q = 0; q < QUADS; ++q) {
         const Quad quad(tile, q, width);
-        write_pixels((float*)contributions, quad, of_blocks((const vblock*)count, quad, 1));
-        write_pixels((float*)strongest, quad, of_blocks((const vblock*)who, quad, 1));
+        write_blocks((float*)contributions, quad, 1, 1, (const vblock*)count, 1);
+        write_blocks((float*)strongest, quad, 1, 1, (const vblock*)who, 1);
     }
 }

@@ -39,37 +39,17 @@ static constexpr auto of_blocks = [](const vblock* blocks, const Quad& quad, int
 static constexpr auto read_rows = [](const float* image, const Quad& quad, int stride, int c) INLINE -> v16 {
     v4 r[4];
     for (int y = 0; y < 4; ++y) r[y] = *(const v4*)(image + quad.pixel(4 * y) * stride + c);
-    const auto low = __builtin_shufflevector(r[0], r[1], 0, 1, 2, 3, 4, 5, 6, 7);
-    const auto high = __builtin_shufflevector(r[2], r[3], 0, 1, 2, 3, 4, 5, 6, 7);
-    return __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    return join(r);
 };
 static constexpr auto write_rows = [](float* image, const Quad& quad, int stride, int c, v16 a) INLINE {
     v4 r[4] = {a.lo.lo, a.lo.hi, a.hi.lo, a.hi.hi};
     for (int y = 0; y < 4; ++y) *(v4*)(image + quad.pixel(4 * y) * stride + c) = r[y];
 };
-// One number a pixel, 0 outside the image.
-static constexpr auto read_pixels = [](const float* image, const Quad& quad) INLINE -> v16 {
-    if (quad.whole()) return read_rows(image, quad, 1, 0);
-    v16 a = (v16)0.0f;
-    for (int l = 0; l < 16; ++l)
-        if (quad.inside(l)) a[l] = image[quad.pixel(l)];
-    return a;
-};
-static constexpr auto write_pixels = [](float* image, const Quad& quad, v16 a) INLINE {
-    if (quad.whole()) return write_rows(image, quad, 1, 0, a);
-    for (int l = 0; l < 16; ++l)
-        if (quad.inside(l)) image[quad.pixel(l)] = a[l];
-};
-// Numbers of each quarter of `a` (0 to 3) and of `b` (4 to 7).
-#define QUARTER(q, i) (i) + 4 * (q) + ((i) < 4 ? 0 : 12)
-#define QUARTERS(q, i, j, k, l) QUARTER(q, i), QUARTER(q, j), QUARTER(q, k), QUARTER(q, l)
-#define SHUFFLE_QUARTERS(a, b, ...) \
-    __builtin_shufflevector(a, b, QUARTERS(0, __VA_ARGS__), QUARTERS(1, __VA_ARGS__), QUARTERS(2, __VA_ARGS__), \
-                            QUARTERS(3, __VA_ARGS__))
-// `channels` of `stride`, from the first of `image` on, as columns; more of these `count` become 0, as all do outside the
-// image.
-static constexpr auto read_channels = [](const float* image, const Quad& quad, int stride, int channels, v16* columns,
-                                         int count) INLINE {
+// `channels` of `stride`, from the first of `image` on, and `count` values of each block, 1, 3 or 4: more than there are
+// channels become 0, as all do outside the image.
+static constexpr auto read_blocks = [](const float* image, const Quad& quad, int stride, int channels, vblock* blocks,
+                                       int count) INLINE {
+    v16 columns[4];
     if (quad.whole() && count == stride && count == channels) {
         v16 a[4];
         for (int i = 0; i < count; ++i) a[i] = read_rows(image, quad, stride, 4 * i);
@@ -80,16 +60,18 @@ static constexpr auto read_channels = [](const float* image, const Quad& quad, i
             columns[2] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(a[0], a[1], 2, 5, 5, 5), a[2], 0, 1, 4, 7);
         }
         if (count == 4) quarters(a, columns);
-        return;
-    }
-    for (int c = 0; c < count; ++c) {
-        columns[c] = (v16)0.0f;
-        for (int l = 0; l < 16; ++l)
-            if (c < channels && quad.inside(l)) columns[c][l] = image[quad.pixel(l) * stride + c];
-    }
+    } else
+        for (int c = 0; c < count; ++c) {
+            columns[c] = (v16)0.0f;
+            for (int l = 0; l < 16; ++l)
+                if (c < channels && quad.inside(l)) columns[c][l] = image[quad.pixel(l) * stride + c];
+        }
+    for (int c = 0; c < count; ++c) set_blocks(blocks + c, quad, count, columns[c]);
 };
-static constexpr auto write_channels = [](float* image, const Quad& quad, int stride, int channels, const v16* columns,
-                                          int count) INLINE {
+static constexpr auto write_blocks = [](float* image, const Quad& quad, int stride, int channels, const vblock* blocks,
+                                        int count) INLINE {
+    v16 columns[4];
+    for (int c = 0; c < count; ++c) columns[c] = of_blocks(blocks + c, quad, count);
     if (quad.whole() && count == stride && count == channels) {
         v16 a[4];
         if (count == 1) a[0] = columns[0];
@@ -100,9 +82,8 @@ static constexpr auto write_channels = [](float* image, const Quad& quad, int st
         }
         if (count == 4) quarters(columns, a);
         for (int i = 0; i < count; ++i) write_rows(image, quad, stride, 4 * i, a[i]);
-        return;
-    }
-    for (int c = 0; c < count; ++c)
-        for (int l = 0; l < 16; ++l)
-            if (c < channels && quad.inside(l)) image[quad.pixel(l) * stride + c] = columns[c][l];
+    } else
+        for (int c = 0; c < count; ++c)
+            for (int l = 0; l < 16; ++l)
+                if (c < channels && quad.inside(l)) image[quad.pixel(l) * stride + c] = columns[c][l];
 };

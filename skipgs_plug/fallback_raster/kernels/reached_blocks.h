@@ -16,9 +16,7 @@ static constexpr auto reached_blocks = [](const float* const* r, int x0, int y0,
 #ifdef __AVX512F__
         v4 of[4];
         for (int g = 0; g < 4; ++g) of[g] = *(const v4*)(r[g] + c / 4 * 4);
-        const auto low = __builtin_shufflevector(of[0], of[1], 0, 1, 2, 3, 4, 5, 6, 7);
-        const auto high = __builtin_shufflevector(of[2], of[3], 0, 1, 2, 3, 4, 5, 6, 7);
-        const v16 all = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+        const v16 all = join(of);
         switch (c % 4) {
             case 0: return __builtin_shufflevector(all, all, 0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12);
             case 1: return __builtin_shufflevector(all, all, 1, 1, 1, 1, 5, 5, 5, 5, 9, 9, 9, 9, 13, 13, 13, 13);

@@ -46,6 +46,12 @@ static constexpr auto sum = [](auto a) -> float {
     auto d = c.lo + c.hi;
     return d.x + d.y;
 };
+// Numbers of each quarter of `a` (0 to 3) and of `b` (4 to 7), quarter by quarter.
+#define QUARTER(q, i) (i) + 4 * (q) + ((i) < 4 ? 0 : 12)
+#define QUARTERS(q, i, j, k, l) QUARTER(q, i), QUARTER(q, j), QUARTER(q, k), QUARTER(q, l)
+#define SHUFFLE_QUARTERS(a, b, ...) \
+    __builtin_shufflevector(a, b, QUARTERS(0, __VA_ARGS__), QUARTERS(1, __VA_ARGS__), QUARTERS(2, __VA_ARGS__), \
+                            QUARTERS(3, __VA_ARGS__))
 // Eight sums at a time, folded together: a third of the instructions of eight calls of `sum`. First inside quarters, two
 // values and then four to a quarter, then across them.
 static constexpr auto sum8 = [](const auto* a) INLINE -> v8 {
@@ -62,13 +68,9 @@ static constexpr auto sum8 = [](const auto* a) INLINE -> v8 {
     } else {
         v16 b[4], c[2];
         for (int i = 0; i < 4; ++i)
-            b[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29)
-                 + __builtin_shufflevector(a[2 * i], a[2 * i + 1], 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15,
-                                           31);
+            b[i] = SHUFFLE_QUARTERS(a[2 * i], a[2 * i + 1], 0, 4, 1, 5) + SHUFFLE_QUARTERS(a[2 * i], a[2 * i + 1], 2, 6, 3, 7);
         for (int i = 0; i < 2; ++i)
-            c[i] = __builtin_shufflevector(b[2 * i], b[2 * i + 1], 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29)
-                 + __builtin_shufflevector(b[2 * i], b[2 * i + 1], 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30,
-                                           31);
+            c[i] = SHUFFLE_QUARTERS(b[2 * i], b[2 * i + 1], 0, 1, 4, 5) + SHUFFLE_QUARTERS(b[2 * i], b[2 * i + 1], 2, 3, 6, 7);
         const v8 low = c[0].lo + c[0].hi, high = c[1].lo + c[1].hi;
         return __builtin_shufflevector(low, high, 0, 1, 2, 3, 8, 9, 10, 11)
              + __builtin_shufflevector(low, high, 4, 5, 6, 7, 12, 13, 14, 15);
@@ -115,24 +117,26 @@ typedef float v2 __attribute__((ext_vector_type(2), aligned(4)));
 static constexpr auto quarters = [](const v16* a, v16* b) INLINE {
     v16 low[2], high[2];
     for (int i = 0; i < 2; ++i) {
-        low[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
-        high[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15,
-                                          31);
+        low[i] = SHUFFLE_QUARTERS(a[2 * i], a[2 * i + 1], 0, 4, 1, 5);
+        high[i] = SHUFFLE_QUARTERS(a[2 * i], a[2 * i + 1], 2, 6, 3, 7);
     }
     for (int i = 0; i < 2; ++i) {
         const v16 *c = i ? high : low;
-        b[2 * i] = __builtin_shufflevector(c[0], c[1], 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
-        b[2 * i + 1] = __builtin_shufflevector(c[0], c[1], 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+        b[2 * i] = SHUFFLE_QUARTERS(c[0], c[1], 0, 1, 4, 5);
+        b[2 * i + 1] = SHUFFLE_QUARTERS(c[0], c[1], 2, 3, 6, 7);
     }
+};
+static constexpr auto join = [](const v4* r) INLINE -> v16 {
+    const auto low = __builtin_shufflevector(r[0], r[1], 0, 1, 2, 3, 4, 5, 6, 7);
+    const auto high = __builtin_shufflevector(r[2], r[3], 0, 1, 2, 3, 4, 5, 6, 7);
+    return __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
 };
 static constexpr auto fours = [](const float* p, const int* row, int width, v16* columns) INLINE {
     v16 a[4];
     for (int i = 0; i < 4; ++i) {
         v4 r[4];
         for (int k = 0; k < 4; ++k) r[k] = *(const v4*)(p + row[4 * k + i] * width);
-        const auto low = __builtin_shufflevector(r[0], r[1], 0, 1, 2, 3, 4, 5, 6, 7);
-        const auto high = __builtin_shufflevector(r[2], r[3], 0, 1, 2, 3, 4, 5, 6, 7);
-        a[i] = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+        a[i] = join(r);
     }
     quarters(a, columns);
 };
@@ -155,9 +159,7 @@ static constexpr auto gather2 = [](const float* p, const int* row, v16* columns)
             const v2 a = *(const v2*)(p + 2 * row[8 * i + 2 * k]), b = *(const v2*)(p + 2 * row[8 * i + 2 * k + 1]);
             r[k] = __builtin_shufflevector(a, b, 0, 1, 2, 3);
         }
-        const auto low = __builtin_shufflevector(r[0], r[1], 0, 1, 2, 3, 4, 5, 6, 7);
-        const auto high = __builtin_shufflevector(r[2], r[3], 0, 1, 2, 3, 4, 5, 6, 7);
-        half[i] = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+        half[i] = join(r);
     }
     columns[0] = __builtin_shufflevector(half[0], half[1], 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
     columns[1] = __builtin_shufflevector(half[0], half[1], 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
@@ -209,18 +211,10 @@ static constexpr auto transpose = [](v16* a) INLINE {
     auto high4 = [](v16 a, v16 b) -> v16 {
         return __builtin_shufflevector(a, b, 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
     };
-    auto low2 = [](v16 a, v16 b) -> v16 {
-        return __builtin_shufflevector(a, b, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
-    };
-    auto high2 = [](v16 a, v16 b) -> v16 {
-        return __builtin_shufflevector(a, b, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
-    };
-    auto low1 = [](v16 a, v16 b) -> v16 {
-        return __builtin_shufflevector(a, b, 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30);
-    };
-    auto high1 = [](v16 a, v16 b) -> v16 {
-        return __builtin_shufflevector(a, b, 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
-    };
+    auto low2 = [](v16 a, v16 b) -> v16 { return SHUFFLE_QUARTERS(a, b, 0, 1, 4, 5); };
+    auto high2 = [](v16 a, v16 b) -> v16 { return SHUFFLE_QUARTERS(a, b, 2, 3, 6, 7); };
+    auto low1 = [](v16 a, v16 b) -> v16 { return SHUFFLE_QUARTERS(a, b, 0, 4, 2, 6); };
+    auto high1 = [](v16 a, v16 b) -> v16 { return SHUFFLE_QUARTERS(a, b, 1, 5, 3, 7); };
     exchange(8, low8, high8);
     exchange(4, low4, high4);
     exchange(2, low2, high2);
