@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -18,6 +18,7 @@ from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.trainer.densification import densify
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.exposure import Exposure
 from skipgs_plug.trainer.mask import leave_out
@@ -364,15 +365,15 @@ class Trainer:
         return visible
 
     def _densify(self, strategy: Any, step: int, info: dict[str, Any]) -> None:
-        due = step % strategy.refine_every == 0
-        if due:
-            release_memory()  # of gradients, while copies of all parameters and moments are made
-            self._catch_up()
-        with self._seeded(step) if due else nullcontext():
-            args = (self._splats, self._optimizers, self.strategy_state, step)
+        args = (self._splats, self._optimizers, self.strategy_state, step)
+        if step % strategy.refine_every:
             strategy.step_post_backward(*args, info, packed=info["gaussian_ids"] is not None)
-            reset_opacity_if_missed(strategy, *args)
-        self._sort_rows(strategy, step)
+        else:
+            release_memory()  # of gradients, while copies of parameters and moments are made
+            self._catch_up()
+            with self._seeded(step):
+                densify(strategy, *args, info, in_order=sorts_rows(strategy, step))
+        reset_opacity_if_missed(strategy, *args)
 
     def _move(self, mcmc: Mcmc, step: int, updated: bool) -> None:
         # The noise belongs to the update: alone it is a random walk.
@@ -384,16 +385,13 @@ class Trainer:
             rate = self._optimizers["means"].param_groups[0]["lr"] if updated else 0.0
             with self._seeded(step):
                 mcmc.after_update(self._splats, self._optimizers, step, rate)
-        self._sort_rows(mcmc, step)
+        if sorts_rows(mcmc, step):
+            sort_rows(self.splats, self.optimizers, self.strategy_state)
 
     def _catch_up(self) -> None:
         """Advance what the last views did not show, before somebody else looks at it."""
         if self._lazy is not None:
             self._lazy.catch_up()
-
-    def _sort_rows(self, strategy: Any, step: int) -> None:
-        if sorts_rows(strategy, step):
-            sort_rows(self.splats, self.optimizers, self.strategy_state)
 
     @contextmanager
     def _seeded(self, step: int) -> Iterator[None]:

@@ -13,6 +13,7 @@ from skipgs_plug.fallback_raster import (
     adam,
     binning,
     blend,
+    gradient_norms,
     guard,
     l1_ssim_loss,
     lazy_adam,
@@ -32,7 +33,7 @@ from skipgs_plug.fallback_raster.splats import rasterize_splats
 
 WORKERS = {
     found._name: found
-    for module in (adam, binning, blend, lazy_adam, loss, near_first, project, rows, sh, statistics)
+    for module in (adam, binning, blend, gradient_norms, lazy_adam, loss, near_first, project, rows, sh, statistics)
     for value in vars(module).values()
     for found in (value.values() if isinstance(value, dict) else [value])
     if isinstance(found, Worker)
@@ -45,7 +46,7 @@ def test_every_kernel_file_is_used_and_tested() -> None:
     texts = [PRELUDE, *(found._code for found in WORKERS.values())]
     unused = [path.name for path in KERNELS.glob("*.h") if not any(f'kernels/{path.name}"' in text for text in texts)]
     assert not unused
-    assert len(WORKERS) == 29
+    assert len(WORKERS) == 30
 
 
 @pytest.mark.parametrize("name", WORKERS)
@@ -105,6 +106,8 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker, list[A
         adam.adam_rows(torch.ones(5) > 0, param, torch.zeros(5, 3), torch.zeros(5, 3), 0.1, (0.9, 0.999), 1e-15)
         param.grad = param.grad.to_sparse(1)
         lazy_adam.LazyAdam([param]).step()
+        sums = torch.zeros(5), torch.zeros(5)
+        gradient_norms.sum_norms(torch.tensor([1, 3], dtype=torch.int32), torch.ones(2, 2), (1.0, 1.0), *sums)
         with torch.no_grad():
             statistics.gather(render(GaussianRasterizationSettings(**camera()), splats(**gaussians())).footprint)
     return list(calls.values())

@@ -10,7 +10,7 @@ import torch
 from test_resume import assert_same
 from torch import Tensor
 
-from skipgs_plug.trainer import Scene, TrainConfig, Trainer, loop
+from skipgs_plug.trainer import Scene, TrainConfig, Trainer, densification, row_order
 from skipgs_plug.trainer.row_order import morton_order, sort_rows, sorts_rows
 
 
@@ -56,11 +56,12 @@ def test_a_run_sorts_and_resumes_in_that_order(
     tiny_config = dataclasses.replace(tiny_config, strategy=strategy)
     sorted_at: list[int] = []
 
-    def noted(*args: object) -> None:
+    def noted(means: Tensor) -> Tensor:
         sorted_at.append(whole.step)
-        sort_rows(*args)  # type: ignore[arg-type]
+        return morton_order(means)
 
-    monkeypatch.setattr(loop, "sort_rows", noted)
+    for module in (densification, row_order):
+        monkeypatch.setattr(module, "morton_order", noted)
     whole = Trainer(tiny_config, tiny_scene)
     whole.train(progress=False)
     assert sorted_at and all(sorts_rows(whole.strategy or whole.mcmc, step) for step in sorted_at)

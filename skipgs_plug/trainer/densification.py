@@ -1,0 +1,89 @@
+"""Densification that moves every row once.
+
+gsplat's strategy clones, splits and prunes one after the other, and each of these copies all parameters and both of
+their moments; putting rows in the order of space copies them once more. Here the strategy works on what it decides by,
+beside the numbers of the rows, and everything else follows these numbers at the end. With 110,000 Gaussians that
+takes half of the time on one core, and a third on two.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from skipgs_plug.fallback_raster.rows import take_rows
+from skipgs_plug.trainer.row_order import morton_order, sort_rows
+
+DECIDING = ("means", "quats", "scales", "opacities")  # what gsplat looks at or changes; other rows are copies
+ROWS = "rows"
+
+
+@torch.no_grad()
+def densify(
+    strategy: Any,
+    splats: nn.ParameterDict,
+    optimizers: dict[str, torch.optim.Optimizer],
+    strategy_state: dict[str, Any],
+    step: int,
+    info: dict[str, Any],
+    in_order: bool,
+) -> None:
+    """Do what `strategy.step_post_backward` does, with the same result.
+
+    Parameters are new objects where their rows changed, with moments of zero for new rows, as gsplat has it.
+
+    Args:
+        strategy: gsplat's DefaultStrategy.
+        splats: All with an optimizer of the same name.
+        optimizers: One for each of them.
+        strategy_state: Its sums, changed in place.
+        step: Iteration that just ended.
+        info: Of the rasterizer.
+        in_order: Put rows in the order of space afterwards.
+    """
+    n = len(splats["means"])
+    decided = {name: splats[name].detach() for name in DECIDING}
+    decided[ROWS] = torch.arange(n, device=splats["means"].device)
+    before = {name: nn.Parameter(tensor, requires_grad=False) for name, tensor in decided.items()}
+    after: dict[str, Tensor] = dict(before)
+    # Stand-ins for optimizers, with a 1 for each row whose moments stay.
+    ones = {name: torch.ones(n, device=param.device) for name, param in before.items()}
+    followers = {
+        name: SimpleNamespace(param_groups=[{"params": [param]}], state={param: {"kept": ones[name]}})
+        for name, param in before.items()
+    }
+    packed = info["gaussian_ids"] is not None
+    strategy.step_post_backward(after, followers, strategy_state, step, info, packed=packed)
+    if all(after[name] is before[name] for name in before):
+        if in_order:
+            sort_rows(splats, optimizers, strategy_state)
+        return
+    kept = {name: followers[name].state[param]["kept"] for name, param in after.items()}
+    if in_order:
+        order = morton_order(after["means"])
+        after, kept = ({name: tensor[order] for name, tensor in each.items()} for each in (after, kept))
+        for key, value in strategy_state.items():
+            if isinstance(value, Tensor):
+                strategy_state[key] = value[order]
+    rows = after[ROWS].detach()
+    for name, param in list(splats.items()):
+        values = after[name].detach() if name in after else _take(param.detach(), rows)
+        splats[name] = nn.Parameter(values)
+        fresh = (kept[name if name in kept else ROWS] == 0.0).nonzero()[:, 0]
+        moments = optimizers[name].state.pop(param, None)
+        optimizers[name].param_groups[0]["params"] = [splats[name]]
+        if moments is None:
+            continue
+        for key, moment in moments.items():
+            if moment.shape == param.shape:
+                moments[key] = _take(moment, rows).index_fill_(0, fresh, 0.0)
+        optimizers[name].state[splats[name]] = moments
+
+
+def _take(tensor: Tensor, rows: Tensor) -> Tensor:
+    if tensor.device.type == "cpu":
+        return take_rows(tensor, rows.to(torch.int32))
+    return tensor[rows]
