@@ -70,17 +70,21 @@ def densify(
                 strategy_state[key] = value[order]
     rows = after[ROWS].detach()
     for name, param in list(splats.items()):
-        values = after[name].detach() if name in after else _take(param.detach(), rows)
-        splats[name] = nn.Parameter(values)
-        fresh = (kept[name if name in kept else ROWS] == 0.0).nonzero()[:, 0]
-        moments = optimizers[name].state.pop(param, None)
-        optimizers[name].param_groups[0]["params"] = [splats[name]]
-        if moments is None:
-            continue
-        for key, moment in moments.items():
-            if moment.shape == param.shape:
-                moments[key] = _take(moment, rows).index_fill_(0, fresh, 0.0)
-        optimizers[name].state[splats[name]] = moments
+        splats[name] = nn.Parameter(after[name].detach() if name in after else _take(param.detach(), rows))
+        fresh = (kept.get(name, kept[ROWS]) == 0.0).nonzero()[:, 0]
+        _hand_over(optimizers[name], param, splats[name], rows, fresh)
+
+
+def _hand_over(optimizer: torch.optim.Optimizer, old: Tensor, new: Tensor, rows: Tensor, fresh: Tensor) -> None:
+    """Let an optimizer go on with another parameter: moments are those of `rows` of the old one, 0 where `fresh`."""
+    optimizer.param_groups[0]["params"] = [new]
+    state = optimizer.state.pop(old, None)
+    if state is None:
+        return
+    for key, moment in state.items():
+        if isinstance(moment, Tensor) and moment.shape == old.shape:
+            state[key] = _take(moment, rows).index_fill_(0, fresh, 0.0)
+    optimizer.state[new] = state
 
 
 def _take(tensor: Tensor, rows: Tensor) -> Tensor:
