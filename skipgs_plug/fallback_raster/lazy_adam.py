@@ -144,6 +144,15 @@ class LazyAdam(Adam):
         self.catch_up()
         super().load_state_dict(state_dict)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What copies and pickles hold: rows that are all up to date."""
+        self.catch_up()
+        return super().__getstate__()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._missed = None
+
     def _step(self, group: dict[str, Any]) -> None:
         (param,) = group["params"]
         if param.grad is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pickle
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -216,6 +217,32 @@ def test_its_state_dict_is_adams() -> None:
     other.catch_up()
     lazy.catch_up()
     assert_equal(lazy, other)
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda lazy: pickle.loads(pickle.dumps(lazy))])
+def test_a_copy_goes_on_as_the_original(again: Callable[[LazyAdam], LazyAdam]) -> None:
+    generator = torch.Generator().manual_seed(4)
+    param = parameter((60, 15, 3), generator)
+    lazy = LazyAdam([param], eps=EPS)
+    gradients = [gradient((60, 15, 3), 0.3, generator) for _ in range(8)]
+
+    def steps(optimizer: LazyAdam, some: list[Tensor]) -> Tensor:
+        (own,) = optimizer.param_groups[0]["params"]
+        for each in some:
+            own.grad = each
+            optimizer.step()
+        optimizer.catch_up()
+        return own.detach()
+
+    for each in gradients[:4]:
+        param.grad = each
+        lazy.step()
+    other = again(lazy)
+    assert other.param_groups[0]["params"][0] is not param
+    before = param.detach().clone()
+    after = steps(other, gradients[4:])
+    assert torch.equal(param, before)
+    assert torch.equal(steps(lazy, gradients[4:]).view(torch.int32), after.view(torch.int32))
 
 
 @pytest.mark.parametrize(
