@@ -32,12 +32,14 @@ def _with_kernel(strategy: type[Any]) -> type[Any]:
     """Return the class with sums over views that a kernel adds to on the CPU: torch takes five times as long."""
 
     class Strategy(strategy):  # type: ignore[misc]
-        def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
+        def _update_state(
+            self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False, **more: Any
+        ) -> None:
             means2d: Any = info[self.key_for_gradient]
             norms, counts = state["grad2d"], state["count"]
             begun = norms is not None and counts is not None
-            if not begun or not packed or not means2d.is_cpu or self.refine_scale2d_stop_iter > 0:
-                super()._update_state(params, state, info, packed)
+            if more or not begun or not packed or not means2d.is_cpu or self.refine_scale2d_stop_iter > 0:
+                super()._update_state(params, state, info, packed=packed, **more)
                 return
             scale = 0.5 * info["width"] * info["n_cameras"], 0.5 * info["height"] * info["n_cameras"]
             gradient = means2d.absgrad if self.absgrad else means2d.grad
