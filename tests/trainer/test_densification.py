@@ -86,6 +86,17 @@ def test_where_no_row_changes_parameters_stay_and_only_move(
     assert torch.equal(before.sort(dim=0).values, parameters["means"].sort(dim=0).values)
 
 
+def test_an_optimizer_that_never_stepped_goes_on_with_the_new_parameter(
+    tiny_config: TrainConfig, tiny_scene: Scene
+) -> None:
+    trainer = trained(tiny_config, tiny_scene)
+    trainer.optimizers["quats"].state.clear()
+    args = (trainer.strategy, trainer.splats, trainer.optimizers, trainer.strategy_state)
+    densify(*args, 8, seen(trainer.num_gaussians), False)
+    assert trainer.optimizers["quats"].param_groups[0]["params"][0] is trainer.splats["quats"]
+    assert not trainer.optimizers["quats"].state
+
+
 def test_an_opacity_reset_within_forgets_the_moments_of_opacities_alone(
     tiny_config: TrainConfig, tiny_scene: Scene
 ) -> None:
