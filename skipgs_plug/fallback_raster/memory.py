@@ -2,7 +2,9 @@
 
 Allocators give pieces beyond some size (32 MiB at most in glibc) back to the system at once, and the system fills
 every page that it hands out with zeros, at a fault each: for the gradients of 1,000,000 Gaussians that took longer than
-Adam. Here the pages stay mapped. A piece is free when the last tensor that lies in it is gone, whoever held it.
+Adam. Here the pages stay mapped. A piece is free when the last tensor that lies in it is gone, whoever held it. It is a
+little longer than asked for, since densification makes each tensor a little longer than the one before, and of large
+pages, whose addresses a processor finds sooner.
 """
 
 import math
@@ -13,8 +15,9 @@ from collections import deque
 import torch
 from torch import Tensor
 
-LARGE = 1 << 25  # bytes; smaller tensors are the allocator's
-SLACK = 8  # a tensor may leave an eighth of its piece unused
+LARGE = 1 << 23  # bytes; smaller tensors are the allocator's
+GROWTH = 8  # a piece has room for a tensor larger by an eighth: pages that nobody writes to cost nothing
+SLACK = 4  # a tensor may leave a fifth of its piece unused
 
 # Windows has no private pages without a file.
 SUPPORTED = hasattr(mmap, "MAP_PRIVATE")
@@ -76,6 +79,7 @@ class Pool:
         return piece
 
     def _map(self, size: int) -> mmap.mmap:
+        size += size // GROWTH
         size = -(-size // mmap.PAGESIZE) * mmap.PAGESIZE
         self._drop(max(self._most - self._used - size, 0))
         piece = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)

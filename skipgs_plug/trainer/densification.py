@@ -14,8 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from skipgs_plug.fallback_raster.rows import take_rows
-from skipgs_plug.trainer.row_order import morton_order, sort_rows
+from skipgs_plug.trainer.row_order import morton_order, sort_rows, take
 
 DECIDING = ("means", "quats", "scales", "opacities")  # what gsplat looks at or changes; other rows are copies
 ROWS = "rows"
@@ -70,7 +69,7 @@ def densify(
                 strategy_state[key] = value[order]
     rows = after[ROWS].detach()
     for name, param in list(splats.items()):
-        splats[name] = nn.Parameter(after[name].detach() if name in after else _take(param.detach(), rows))
+        splats[name] = nn.Parameter(after[name].detach() if name in after else take(param.detach(), rows))
         fresh = (kept.get(name, kept[ROWS]) == 0.0).nonzero()[:, 0]
         _hand_over(optimizers[name], param, splats[name], rows, fresh)
 
@@ -83,11 +82,5 @@ def _hand_over(optimizer: torch.optim.Optimizer, old: Tensor, new: Tensor, rows:
         return
     for key, moment in state.items():
         if isinstance(moment, Tensor) and moment.shape == old.shape:
-            state[key] = _take(moment, rows).index_fill_(0, fresh, 0.0)
+            state[key] = take(moment, rows).index_fill_(0, fresh, 0.0)
     optimizer.state[new] = state
-
-
-def _take(tensor: Tensor, rows: Tensor) -> Tensor:
-    if tensor.device.type == "cpu":
-        return take_rows(tensor, rows.to(torch.int32))
-    return tensor[rows]

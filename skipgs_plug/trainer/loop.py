@@ -369,7 +369,6 @@ class Trainer:
         if step % strategy.refine_every:
             strategy.step_post_backward(*args, info, packed=info["gaussian_ids"] is not None)
         else:
-            release_memory()  # of gradients, while copies of parameters and moments are made
             self._catch_up()
             with self._seeded(step):
                 densify(strategy, *args, info, in_order=sorts_rows(strategy, step))

@@ -11,6 +11,7 @@ from skipgs_plug.fallback_raster.optimizer import Adam
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.near_plane import before_a_lens
+from skipgs_plug.trainer.row_order import morton_order, take
 from skipgs_plug.trainer.scene import Scene
 from skipgs_plug.trainer.selective_adam import SelectiveAdam
 
@@ -21,7 +22,7 @@ ADAM_EPS = 1e-15
 def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near: float = 0.0) -> nn.ParameterDict:
     """Return `means [N, 3]`, `scales [N, 3]` (log), `quats [N, 4]` (wxyz), `opacities [N]` (logit),
     `sh0 [N, 1, 3]` and `shN [N, K - 1, 3]`: the Gaussians of the scene, else an isotropic one per point,
-    without those of points that lie before a lens, nearer than the near plane `near`.
+    without those of points that lie before a lens, nearer than the near plane `near`, in the order of space.
 
     Raises:
         InputError: all points do.
@@ -41,7 +42,8 @@ def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near:
                 "lower --near-plane or leave it out."
             )
         tensors = {name: tensor[~wrong] for name, tensor in tensors.items()}
-    return nn.ParameterDict({name: nn.Parameter(t.to(device)) for name, t in tensors.items()})
+    order = morton_order(tensors["means"])
+    return nn.ParameterDict({name: nn.Parameter(take(tensor, order).to(device)) for name, tensor in tensors.items()})
 
 
 def one_per_point(scene: Scene, config: TrainConfig) -> dict[str, Tensor]:

@@ -2,8 +2,8 @@
 
 A camera sees part of a scene. The CPU rasterizer leaves out 16 rows at a time that lie outside its view, and what it
 gathers for a tile lies close together, when rows follow a Morton curve (Morton 1966) through space. Densification
-appends rows; from time to time all are put in order again, with the state of optimizers and strategy. PLY files and
-checkpoints hold the rows in the order of training.
+appends rows; from time to time all are put in order again, with the state of optimizers and strategy. So training begins
+with another order than that of the points, and PLY files and checkpoints hold the rows in the order of training.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+from skipgs_plug.fallback_raster.rows import take_rows
 
 EVERY = 4  # refinements between two sorts; those in between add few rows at the end
 BITS = 10  # of a coordinate
@@ -61,3 +63,10 @@ def morton_order(means: Tensor) -> Tensor:
         for axis in range(3):
             code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
     return torch.argsort(code, stable=True)
+
+
+def take(tensor: Tensor, rows: Tensor) -> Tensor:
+    """Return `tensor[rows]`; on the CPU on all cores, and in large pages if it is large, which kernels read faster."""
+    if tensor.device.type == "cpu":
+        return take_rows(tensor, rows.to(torch.int32))
+    return tensor[rows]

@@ -34,6 +34,17 @@ def test_a_tensor_that_died_makes_room_for_the_next(pool: Pool) -> None:
     assert pool.mapped == mapped
 
 
+def test_a_piece_serves_tensors_that_are_somewhat_longer_or_shorter(pool: Pool) -> None:
+    address = numbers(pool, 80 * PAGE).data_ptr()
+    for count in (85 * PAGE, 90 * PAGE, 73 * PAGE, 80 * PAGE):
+        assert numbers(pool, count).data_ptr() == address
+    mapped = pool.mapped
+    kept = numbers(pool, 60 * PAGE)  # which would leave a third of it unused
+    assert kept.data_ptr() != address and pool.mapped < 2 * mapped
+    other = numbers(pool, 95 * PAGE)
+    assert other.data_ptr() != address
+
+
 @pytest.mark.parametrize(
     "hold",
     [

@@ -50,6 +50,8 @@ def test_rows_and_moments_are_those_of_gsplat(tiny_config: TrainConfig, tiny_sce
     ours, theirs = trained(tiny_config, tiny_scene), trained(tiny_config, tiny_scene)
     assert_same(ours, theirs)
     n, parameters = ours.num_gaussians, dict(ours.splats.items())
+    for trainer in (ours, theirs):
+        trainer.strategy_state["more"] = torch.arange(n)  # gsplat lets every tensor there follow the rows
     info = seen(n)
     torch.manual_seed(5)
     densify(ours.strategy, ours.splats, ours.optimizers, ours.strategy_state, 8, copy.copy(info), in_order)
@@ -66,6 +68,7 @@ def test_rows_and_moments_are_those_of_gsplat(tiny_config: TrainConfig, tiny_sce
         assert held is param and list(ours.optimizers[name].state) == [param]
         moment = ours.optimizers[name].state[param]["exp_avg"]
         assert moment.shape == param.shape and moment.any()
+    assert torch.equal(ours.strategy_state["more"], theirs.strategy_state["more"])
     assert not ours.strategy_state["grad2d"].any() and len(ours.strategy_state["count"]) == ours.num_gaussians
 
 

@@ -33,7 +33,7 @@ def test_training_goes_on_with_the_same_gaussians(tiny_scene: Scene, tiny_config
     trainer.restore(before)
     parameters = dict(trainer.splats.items())
     sort_rows(trainer.splats, trainer.optimizers, trainer.strategy_state)
-    assert not torch.equal(trainer.splats["means"], before["splats"]["means"])
+    assert not torch.equal(trainer.splats["means"], before["splats"]["means"])  # they have moved since the beginning
     assert all(trainer.splats[name] is param for name, param in parameters.items())
     trainer.train(until=26, progress=False)
     for name, tensor in ranked(trainer).items():
@@ -87,6 +87,12 @@ def test_neighbours_in_space_become_neighbours_in_memory() -> None:
     near = means[order][means[order].norm(dim=1) < 10]
     steps = (near[1:] - near[:-1]).norm(dim=1).median()
     assert steps < 0.2 * (means[1:] - means[:-1]).norm(dim=1).median()
+
+
+def test_a_run_begins_in_the_order_of_space(trainer: Trainer) -> None:
+    n = trainer.num_gaussians
+    assert torch.equal(morton_order(trainer.splats["means"].detach()), torch.arange(n))
+    assert not torch.equal(morton_order(trainer.scene.points), torch.arange(n))
 
 
 def test_one_place_keeps_the_order() -> None:
