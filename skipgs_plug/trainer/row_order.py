@@ -2,8 +2,8 @@
 
 A camera sees part of a scene. The CPU rasterizer leaves out 16 rows at a time that lie outside its view, and what it
 gathers for a tile lies close together, when rows follow a Morton curve (Morton 1966) through space. Densification
-appends rows; from time to time all are put in order again, with the state of optimizers and strategy. So training begins
-with another order than that of the points, and PLY files and checkpoints hold the rows in the order of training.
+appends rows; from time to time all are put in order again, with the state of optimizers and strategy. So training
+begins with another order than that of the points, and PLY files and checkpoints hold the rows as training has them.
 """
 
 from __future__ import annotations
