@@ -12,7 +12,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 from torch.utils.hooks import RemovableHandle
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.refinement.shown import ShownShare
+from skipgs_plug.core.refinement.shown import ShownShare, positions
 
 Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
 Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
@@ -86,6 +86,10 @@ class ScaledRates:
     PyTorch's own hooks around `step` are used, so fused, sparse and selective optimizers are reached alike, the
     trainer's schedule is never disturbed, and a checkpoint holds the trainer's rates.
 
+    Only what has a row for each Gaussian takes larger steps, as soon as an optimizer has shown how many there are by
+    their positions. The steps of exposures, camera poses and networks, which a trainer takes beside them, are never
+    raised but shrink with the others at the end.
+
     Args:
         only: Gives the optimizers that are meant, by name where their groups have none; None for all that step, of
             which the trainer alone knows.
@@ -99,6 +103,7 @@ class ScaledRates:
         self.only = only
         self.shown = ShownShare()
         self._factor: float | None = None
+        self._rows = self._rows_now = 0  # Gaussians in the iteration before and in this one; 0 where not known
         self._thread = threading.get_ident()
         self._depth: dict[int, int] = {}  # a step can call the step of its base class
         self._before: dict[int, list[tuple[dict[str, Any], dict[str, Any]]]] = {}
@@ -123,6 +128,7 @@ class ScaledRates:
                     "first, or train in threads of their own."
                 )
         self._factor, self._thread = factor, thread
+        self._rows, self._rows_now = self._rows_now or self._rows, 0
         if not self._handles:
             _hooked.append(self)
             self._handles = [
@@ -163,13 +169,21 @@ class ScaledRates:
         scaled = {id(group) for saved in self._before.values() for group, _ in saved}
         groups = [group for group in optimizer.param_groups if id(group) not in scaled]
         self.shown.see(groups, names[0])
+        # Without names a camera's position has the shape of a Gaussian's, but there are fewer.
+        self._rows_now = max([self._rows_now, *map(len, positions(groups, names[0]))])
         self._before[key] = [(group, {name: group[name] for name in SETTINGS if name in group}) for group in groups]
         for group in groups:
+            longer = self._of_gaussians(group)
             if "lr" in group:
-                group["lr"] = group["lr"] * group_factor(group, self._factor, names[0])
-            if "betas" in group:
+                factor = group_factor(group, self._factor, names[0]) if longer else min(self._factor, 1.0)
+                group["lr"] = group["lr"] * factor
+            if longer and "betas" in group:
                 first, second, *others = group["betas"]
                 group["betas"] = (first, min(second, SQUARES_KEPT), *others)
+
+    def _of_gaussians(self, group: dict[str, Any]) -> bool:
+        rows = max(self._rows, self._rows_now)
+        return not rows or all(param.shape[:1] == (rows,) for param in group["params"])
 
     def _put_back(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         key = id(optimizer)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from torch import Tensor
@@ -30,21 +31,28 @@ class ShownShare:
         """
         if self._steps == STEPS:
             return
-        for group in groups:
-            known = group.get("name", name)
-            for param in group["params"] if known is None or known in POSITIONS else ():
-                if param.ndim == 2 and param.shape[1] == 3 and param.grad is not None:
-                    reached = reached_share(param.grad)
-                    if reached > 0.0:  # else the step has no view
-                        self._sum += reached
-                        self._steps += 1
-                    return
+        param = next((param for param in positions(groups, name) if param.grad is not None), None)
+        if param is None or param.grad is None:
+            return
+        reached = reached_share(param.grad)
+        if reached > 0.0:  # else the step has no view
+            self._sum += reached
+            self._steps += 1
 
     def state_dict(self) -> list[float]:
         return [self._sum, self._steps]
 
     def load_state_dict(self, state: list[float]) -> None:
         self._sum, self._steps = float(state[0]), int(state[1])
+
+
+def positions(groups: list[dict[str, Any]], name: str | None) -> Iterator[Tensor]:
+    """Yield the parameters that may be positions [N, 3]; arguments as for `ShownShare.see`."""
+    for group in groups:
+        known = group.get("name", name)
+        for param in group["params"] if known is None or known in POSITIONS else ():
+            if param.ndim == 2 and param.shape[1] == 3:
+                yield param
 
 
 def reached_share(gradient: Tensor) -> float:

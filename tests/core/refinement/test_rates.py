@@ -36,6 +36,64 @@ def test_optimizers_have_names_where_their_groups_have_none():
     assert all("name" not in optimizer.param_groups[0] for optimizer in optimizers.values())
 
 
+def stepped(scaled, factor, optimizers):
+    """How far each parameter moves at a gradient of 1, in units of the rate."""
+    scaled.scale(factor)
+    moved = []
+    for optimizer in optimizers:
+        (param,) = optimizer.param_groups[0]["params"]
+        param.grad = torch.ones_like(param)
+        before = param.detach().flatten()[0].item()
+        optimizer.step()
+        moved.append(round((before - param.detach().flatten()[0].item()) / 0.1, 3))
+    return moved
+
+
+@pytest.mark.parametrize(
+    "shape", [(7, 3, 4), (7, 9), (64, 32), (5,)], ids=["exposures", "poses", "a layer", "its bias"]
+)
+def test_what_has_no_row_for_each_gaussian_takes_no_larger_steps(rates, shape):
+    groups = {"xyz": (6, 3), "rotation": (6, 4), "another": shape}
+    optimizers = [
+        torch.optim.SGD([{"params": [torch.nn.Parameter(torch.zeros(size))], "name": name}], lr=0.1)
+        for name, size in groups.items()
+    ]
+    assert stepped(rates, 8.0, optimizers) == [16.0, 8.0, 1.0]
+    assert stepped(rates, 0.5, optimizers) == [1.0, 0.5, 0.5]
+    assert all(optimizer.param_groups[0]["lr"] == 0.1 for optimizer in optimizers)
+
+
+def test_without_names_the_positions_are_those_with_more_rows(rates):
+    cameras, means, rotations = (
+        torch.optim.SGD([torch.nn.Parameter(torch.zeros(size))], lr=0.1) for size in ((4, 3), (9, 3), (9, 4))
+    )
+    assert stepped(rates, 8.0, [means, cameras, rotations]) == [8.0, 1.0, 8.0]
+    assert stepped(rates, 8.0, [cameras, means, rotations]) == [1.0, 8.0, 8.0]
+
+
+def test_after_a_prune_the_new_number_of_rows_is_known_from_the_next_iteration_on(rates):
+    before, after = (torch.optim.SGD([torch.nn.Parameter(torch.zeros(n, 3))], lr=0.1) for n in (9, 6))
+    assert stepped(rates, 8.0, [before]) == [8.0]
+    assert stepped(rates, 8.0, [after]) == [1.0]
+    assert stepped(rates, 8.0, [after]) == [8.0]
+
+
+def test_the_memory_of_what_takes_no_larger_steps_stays(rates):
+    seen = []
+
+    class Noting(torch.optim.Adam):
+        def step(self, closure=None):
+            seen.append(self.param_groups[0]["betas"][1])
+            return super().step(closure)
+
+    for name, size in (("means", (5, 3)), ("exposure", (7, 3, 4))):
+        param = torch.nn.Parameter(torch.zeros(size))
+        param.grad = torch.ones(size)
+        rates.scale(8.0)
+        Noting([{"params": [param], "name": name}], lr=0.1).step()
+    assert seen == [0.98, 0.999]
+
+
 def test_the_path_is_conserved():
     steps = 1000
     for share in (0.25, 0.4, 1.0):
