@@ -25,6 +25,7 @@ NAMED = {
     **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
+BESIDE = 0.25  # of the trainer's rate, at most, for what has no row for each Gaussian
 LONGEST_AT = 0.25  # of the iterations; below, steps that are longer still lose more than the path gains
 SHOWN = 1 / 3  # of the Gaussians by a view, where it is not known: as in a room photographed from within
 # Of Adam's running mean of squares (beta2), at most. By the gradient of a single view a parameter can move its rate
@@ -87,8 +88,8 @@ class ScaledRates:
     trainer's schedule is never disturbed, and a checkpoint holds the trainer's rates.
 
     Only what has a row for each Gaussian takes larger steps, as soon as an optimizer has shown how many there are by
-    their positions. The steps of exposures, camera poses and networks, which a trainer takes beside them, are never
-    raised but shrink with the others at the end.
+    their positions. Exposures, camera poses and networks, which a trainer steps beside them, must not run after a model
+    that is far off meanwhile: their steps are a quarter as long as the trainer's, and shrink with the others.
 
     Args:
         only: Gives the optimizers that are meant, by name where their groups have none; None for all that step, of
@@ -175,7 +176,7 @@ class ScaledRates:
         for group in groups:
             longer = self._of_gaussians(group)
             if "lr" in group:
-                factor = group_factor(group, self._factor, names[0]) if longer else min(self._factor, 1.0)
+                factor = group_factor(group, self._factor, names[0]) if longer else BESIDE * min(self._factor, 1.0)
                 group["lr"] = group["lr"] * factor
             if longer and "betas" in group:
                 first, second, *others = group["betas"]

@@ -58,8 +58,8 @@ def test_what_has_no_row_for_each_gaussian_takes_no_larger_steps(rates, shape):
         torch.optim.SGD([{"params": [torch.nn.Parameter(torch.zeros(size))], "name": name}], lr=0.1)
         for name, size in groups.items()
     ]
-    assert stepped(rates, 8.0, optimizers) == [16.0, 8.0, 1.0]
-    assert stepped(rates, 0.5, optimizers) == [1.0, 0.5, 0.5]
+    assert stepped(rates, 8.0, optimizers) == [16.0, 8.0, 0.25]
+    assert stepped(rates, 0.5, optimizers) == [1.0, 0.5, 0.125]
     assert all(optimizer.param_groups[0]["lr"] == 0.1 for optimizer in optimizers)
 
 
@@ -67,14 +67,14 @@ def test_without_names_the_positions_are_those_with_more_rows(rates):
     cameras, means, rotations = (
         torch.optim.SGD([torch.nn.Parameter(torch.zeros(size))], lr=0.1) for size in ((4, 3), (9, 3), (9, 4))
     )
-    assert stepped(rates, 8.0, [means, cameras, rotations]) == [8.0, 1.0, 8.0]
-    assert stepped(rates, 8.0, [cameras, means, rotations]) == [1.0, 8.0, 8.0]
+    assert stepped(rates, 8.0, [means, cameras, rotations]) == [8.0, 0.25, 8.0]
+    assert stepped(rates, 8.0, [cameras, means, rotations]) == [0.25, 8.0, 8.0]
 
 
 def test_after_a_prune_the_new_number_of_rows_is_known_from_the_next_iteration_on(rates):
     before, after = (torch.optim.SGD([torch.nn.Parameter(torch.zeros(n, 3))], lr=0.1) for n in (9, 6))
     assert stepped(rates, 8.0, [before]) == [8.0]
-    assert stepped(rates, 8.0, [after]) == [1.0]
+    assert stepped(rates, 8.0, [after]) == [0.25]
     assert stepped(rates, 8.0, [after]) == [8.0]
 
 
