@@ -2,8 +2,8 @@
 
 gsplat's strategy clones, splits and prunes one after the other, and each of these copies all parameters and both of
 their moments; putting rows in the order of space copies them once more. Here the strategy works on what it decides by,
-beside the numbers of the rows, and everything else follows these numbers at the end. With 110,000 Gaussians that
-takes half of the time on one core, and a third on two.
+beside the numbers of the rows, and everything else follows these numbers at the end, into memory that gradients leave
+free. With 110,000 Gaussians that takes a third of the time.
 """
 
 from __future__ import annotations
