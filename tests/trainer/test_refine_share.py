@@ -69,3 +69,27 @@ def test_multiples_are_met_where_numbers_are_left_out(scene) -> None:
         trainer.train(progress=False)
     # 84 iterations up to 83, then the last one alone passes the multiples that are left.
     assert sum(passed) == 9 + 1 and sum(completed) == 8 + 1 and len(passed) == trainer.ran
+
+
+def test_exposures_take_shorter_steps_not_larger_ones(scene) -> None:
+    trainer = Trainer(TrainConfig(max_steps=STEPS, seed=3, exposure=True), scene)
+    assert trainer.exposure is not None
+    taken: dict[int, float] = {}
+    own: dict[int, float] = {}
+    schedule = trainer.exposure.set_learning_rate
+
+    def note(optimizer: torch.optim.Optimizer, *_: object) -> None:
+        taken[trainer.step] = optimizer.param_groups[0]["lr"]
+
+    def scheduled(progress: float) -> None:
+        schedule(progress)
+        own[trainer.step] = trainer.all_optimizers[-1].param_groups[0]["lr"]
+
+    trainer.exposure.optimizer.register_step_pre_hook(note)
+    trainer.exposure.set_learning_rate = scheduled  # type: ignore[method-assign]
+    with SkipGate(trainer, refine_share=0.4):
+        trainer.train(progress=False)
+    part = {step: lr / own[step] for step, lr in taken.items()}
+    refined = [part[step] for step in sorted(part) if step >= trainer.refine_stop_iter]
+    assert all(value == 1.0 for step, value in part.items() if step < trainer.refine_stop_iter)
+    assert max(refined) == pytest.approx(0.25) and refined == sorted(refined, reverse=True) and refined[-1] < 0.05

@@ -26,6 +26,7 @@ NAMED = {
 }
 OPACITIES = ("opacity", "opacities")
 BESIDE = 0.25  # of the trainer's rate, at most, for what has no row for each Gaussian
+OF_A_GAUSSIAN = ((), (1,), (2,), (3,), (4,))  # shapes of its parameters beside colours [K, 3]
 LONGEST_AT = 0.25  # of the iterations; below, steps that are longer still lose more than the path gains
 SHOWN = 1 / 3  # of the Gaussians by a view, where it is not known: as in a room photographed from within
 # Of Adam's running mean of squares (beta2), at most. By the gradient of a single view a parameter can move its rate
@@ -174,7 +175,7 @@ class ScaledRates:
         self._rows_now = max([self._rows_now, *map(len, positions(groups, names[0]))])
         self._before[key] = [(group, {name: group[name] for name in SETTINGS if name in group}) for group in groups]
         for group in groups:
-            longer = self._of_gaussians(group)
+            longer = self._of_gaussians(group, names[0])
             if "lr" in group:
                 factor = group_factor(group, self._factor, names[0]) if longer else BESIDE * min(self._factor, 1.0)
                 group["lr"] = group["lr"] * factor
@@ -182,9 +183,14 @@ class ScaledRates:
                 first, second, *others = group["betas"]
                 group["betas"] = (first, min(second, SQUARES_KEPT), *others)
 
-    def _of_gaussians(self, group: dict[str, Any]) -> bool:
+    def _of_gaussians(self, group: dict[str, Any], name: str | None) -> bool:
         rows = max(self._rows, self._rows_now)
-        return not rows or all(param.shape[:1] == (rows,) for param in group["params"])
+        if rows:
+            return all(param.shape[:1] == (rows,) for param in group["params"])
+        # Inria's exposures step before the positions do. Groups with names are a model's, of anchors for example.
+        shapes = [tuple(param.shape[1:]) for param in group["params"]]
+        known = group.get("name", name) is not None
+        return known or all(shape in OF_A_GAUSSIAN or (len(shape) == 2 and shape[1] == 3) for shape in shapes)
 
     def _put_back(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         key = id(optimizer)

@@ -63,6 +63,22 @@ def test_what_has_no_row_for_each_gaussian_takes_no_larger_steps(rates, shape):
     assert all(optimizer.param_groups[0]["lr"] == 0.1 for optimizer in optimizers)
 
 
+@pytest.mark.parametrize(
+    "group, shape, moved",
+    [
+        ({}, (7, 3, 4), 0.25),  # exposures
+        ({}, (7, 9), 0.25),  # poses
+        ({}, (7, 4), 8.0),  # rotations
+        ({}, (7,), 8.0),
+        ({}, (7, 15, 3), 32.0),
+        ({"name": "anchor_feat"}, (7, 32), 8.0),  # Scaffold-GS has no group of positions
+    ],
+)
+def test_before_the_positions_are_known_shapes_tell(rates, group, shape, moved):
+    optimizer = torch.optim.SGD([{"params": [torch.nn.Parameter(torch.zeros(shape))], **group}], lr=0.1)
+    assert stepped(rates, 8.0, [optimizer]) == [moved]
+
+
 def test_without_names_the_positions_are_those_with_more_rows(rates):
     cameras, means, rotations = (
         torch.optim.SGD([torch.nn.Parameter(torch.zeros(size))], lr=0.1) for size in ((4, 3), (9, 3), (9, 4))
