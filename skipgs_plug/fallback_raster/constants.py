@@ -39,7 +39,7 @@ LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 # extend a row beyond the image have room for.
 WINDOW = 11
 BAND = 128
-CHUNK = 12
+CHUNK = 16
 LOSS_CHANNELS = 32
 
 

@@ -12,9 +12,10 @@ For the same reason the parts of the gradient count x and d from there: where bo
 times larger than their sum.
 
 Images stay channels-last, as the rasterizer returns them: a blur along a row is a blur with stride C over a flat
-row. A tile is 192 floats wide and 128 rows high, and is gone through once for value and gradient: what the windows need
-of rows above stays in two rings in the first two caches. Tiles compute what they need beyond their borders
-themselves, a fifth more, which costs less than writing it down for another pass: no core reads what another one wrote.
+row. A tile is at most 256 floats wide and 128 rows high, and is gone through once for value and gradient: what the
+windows need of rows above stays in two rings in the first two caches, of which four rows at a time read most numbers
+once. Tiles compute what they need beyond their borders themselves, a fifth more, which costs less than writing it down
+for another pass: no core reads what another one wrote.
 """
 
 from typing import Annotated, Any, Literal

@@ -72,7 +72,7 @@ def beyond_one(shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
 
 
 PICTURES = [noisy, unrelated, nearly_constant, offset_constant, offset_colours, half_black, beyond_one]
-# Around one vector (16 floats), one band (64 rows), one chunk (128 floats), and the window (11).
+# Around one vector (16 floats), the window (11), one band (128 rows) and one chunk (256 floats).
 SHAPES = [
     (1, 1, 3),
     (1, 40, 3),
@@ -83,6 +83,9 @@ SHAPES = [
     (33, 47, 3),
     (70, 90, 4),
     (2, 67, 17, 3),
+    (129, 87, 3),
+    (259, 5, 3),
+    (5, 260, 1),
     (14, 13, 32),
 ]
 
