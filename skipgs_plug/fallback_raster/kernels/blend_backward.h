@@ -52,7 +52,7 @@ for (int t = first; t < last; ++t) {
                 const vblock alpha = hit ? vmin((vblock)ALPHA_MAX, seen.full) : (vblock)0.0f;
                 vblock shade = r[8] * v[b][0];
                 for (int c = 1; c < D; ++c) shade += r[8 + c] * v[b][c];
-                const vblock before = T[b] * (1.0f / (1.0f - alpha));  // from behind the Gaussian to before it
+                const vblock before = T[b] / (1.0f - alpha);  // from behind the Gaussian to before it
                 // Zero where it was not blended: a store of some lanes only takes long on some processors.
                 const vblock weight = alpha * before, less = hit ? behind[b] - shade : (vblock)0.0f;
                 T[b] = before;
