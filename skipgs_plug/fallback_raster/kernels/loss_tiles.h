@@ -101,14 +101,14 @@ for (int item = first; item < last; ++item) {
     v16 l1 = (v16)0.0f, unlike = (v16)0.0f;
     alignas(64) float maps[4][16 * (CHUNK + 4 * MOST)], slopes[STEP][3][16 * (CHUNK + 2 * MOST)];
     alignas(64) v16 blurred[RING * (CHUNK + 2 * MOST) * 4], sloping[RING * CHUNK * 3];
-    const int rows = bottom - top + 2 * (more_rows + RADIUS);
+    // Without a gradient the rows are grouped as with one, so that sums are added in the same order.
+    const int start_row = top - 2 * RADIUS + (RADIUS - more_rows) / STEP * STEP;
     // Vectors that lie in the row as a whole.
     const int whole_begin = side - left / 16, whole_end = whole_begin + span / 16;
     // Rows before the first are read and count for nothing.
     for (int i = 0; i < RING * wide * 4; ++i) blurred[i] = (v16)0.0f;
     for (int i = 0; i < RING * CHUNK * 3; ++i) sloping[i] = (v16)0.0f;
-    for (int begun = 0; begun < rows; begun += STEP) {
-        const int first_row = top - more_rows - RADIUS + begun;
+    for (int first_row = start_row; first_row < bottom + more_rows + RADIUS; first_row += STEP) {
         for (int row = first_row; row < first_row + STEP; ++row) {
             const bool inside = row >= 0 && row < height, own_row = row >= top && row < bottom;
             const float *line_x = x + (long long)row * span + left - 16 * side, *line_y = y + (line_x - x);
