@@ -209,12 +209,17 @@ class Blend(torch.autograd.Function):
         ctx.absolute = absolute
         tiles_per_gauss = ctx.blended.near.bins.tiles_per_gauss
         ctx.mark_non_differentiable(tiles_per_gauss)
+        ctx.set_materialize_grads(False)  # no zeros for tiles_per_gauss, which has a number for each row
         return image, transmittance, tiles_per_gauss
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor, _: Any) -> Any:  # type: ignore[override]
+    def backward(  # type: ignore[override]
+        ctx: Any, v_image: Tensor | None, v_transmittance: Tensor | None, _: Any
+    ) -> Any:
         means2d, conics, opacities, colors, transmittance = check_shapes(ctx.saved_tensors, **ctx.shapes)
+        v_image = zeros(*transmittance.shape, colors.shape[1]) if v_image is None else v_image
+        v_transmittance = zeros(*transmittance.shape) if v_transmittance is None else v_transmittance
         gradients = blend_adjoint(
             ctx.blended, means2d, conics, opacities, colors, transmittance, v_image, v_transmittance, ctx.absolute
         )

@@ -159,7 +159,8 @@ def rasterization(
     ]  # fmt: skip
     *stacked, visible, block_starts = map(list, zip(*projected, strict=True))
     means2d, depths, conics, compensations, radii, sigmas = (_stack(parts) for parts in stacked)
-    opacities = opacities.expand(n_cameras, n)
+    # The adjoint of `expand` adds up, of one camera too.
+    opacities = opacities[None] if n_cameras == 1 else opacities.expand(n_cameras, n)
     if antialiased:
         opacities = opacities * compensations
 
