@@ -60,6 +60,7 @@ def rasterize_splats(
     antialiased: bool = False,
     absgrad: bool = False,
     catch_up: Callable[[Tensor], None] | None = None,
+    for_densification: bool = True,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Renders raw parameters of 3DGS into one camera, as `rasterization` renders their activations.
 
@@ -85,6 +86,7 @@ def rasterize_splats(
         catch_up: Called with the visible rows [M], int32, before their `shN` is read, which it may change in place.
             With it the gradient of `shN` is row-sparse, of these rows in that order, when they are less than two
             thirds of all; at degree 0 it has no row, and nothing is called.
+        for_densification: Whether the dictionary holds `radii` and `means2d`, which only densification reads.
 
     Returns:
         Image [H, W, 3], alpha [H, W, 1] and a dictionary as gsplat's packed mode has it, one row for each of M visible
@@ -107,18 +109,19 @@ def rasterize_splats(
     with torch.no_grad():
         projected = _project(means, quats, log_scales, logits, viewmat, K, size, near_plane, far_plane, antialiased)
         ids = projected.visible.to(torch.int64)
-        centres = take_rows(projected.means2d, projected.visible)
     sparse = None
     if catch_up is not None and sh_degree == 0:
         sparse = ids[:0]
     elif catch_up is not None:
         catch_up(projected.visible)
         sparse = ids if len(ids) < MOST_SPARSE * len(means) else None
-    # A leaf that goes in with the parameters, so that its gradient comes out with theirs.
-    centres.requires_grad_(torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
-    absolute = None
-    if absgrad:
-        absolute = centres.absgrad = zeros(len(ids), 2)  # type: ignore[attr-defined]
+    centres = absolute = None
+    if for_densification:
+        # A leaf that goes in with the parameters, so that its gradient comes out with theirs.
+        centres = take_rows(projected.means2d, projected.visible)
+        centres.requires_grad_(torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
+        if absgrad:
+            absolute = centres.absgrad = zeros(len(ids), 2)  # type: ignore[attr-defined]
     image, transmittance = _Render.apply(
         means, quats, log_scales, logits, sh0, shN, centres, absolute, projected, viewmat, K, size, sh_degree,
         antialiased, sparse,
@@ -130,8 +133,6 @@ def rasterize_splats(
     info = {
         "camera_ids": torch.zeros_like(ids),
         "gaussian_ids": ids,
-        "radii": take_rows(projected.radii, projected.visible),
-        "means2d": centres,
         "width": width,
         "height": height,
         "n_cameras": 1,
@@ -139,6 +140,8 @@ def rasterize_splats(
         "tile_width": tile_width,
         "tile_height": tile_height,
     }
+    if centres is not None:
+        info |= {"radii": take_rows(projected.radii, projected.visible), "means2d": centres}
     return image, alpha, info
 
 
@@ -158,7 +161,7 @@ class _Render(torch.autograd.Function):
         logits: Tensor,
         sh0: Tensor,
         shN: Tensor,
-        centres: Tensor,
+        centres: Tensor | None,
         absolute: Tensor | None,
         projected: _Projected,
         viewmat: Tensor,
@@ -182,6 +185,7 @@ class _Render(torch.autograd.Function):
             for name, tensor in zip(("means", "quats", "scales", "opacities", "sh0", "shN"), ctx.to_save, strict=False)
         }
         ctx.projected, ctx.colors, ctx.absolute = projected, colors, absolute
+        ctx.with_centres = centres is not None
         ctx.camera = camera, viewmat, K, size, antialiased
         ctx.sh = layout, degree, sparse
         return image, transmittance
@@ -216,7 +220,8 @@ class _Render(torch.autograd.Function):
             floats(0), v_activated, v_means, v_quats, v_scales, v_logits, floats(0),
             n, *map(float, size), EPS2D, 0, int(antialiased), 0, 1, active_shortcuts(),
         )  # fmt: skip
-        return *gradients, take_rows(v_means2d, p.visible), *[None] * 8
+        v_centres = take_rows(v_means2d, p.visible) if ctx.with_centres else None
+        return *gradients, v_centres, *[None] * 8
 
 
 def _project(

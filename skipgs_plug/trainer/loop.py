@@ -183,13 +183,14 @@ class Trainer:
         if not self._warm:
             self._warm_up(view)
         densifying = step < self.refine_stop_iter
+        strategy = self.strategy if densifying else None
         self.set_learning_rate(step)
 
         self.clock.start()
-        image, target, info = self._forward(view, self.active_sh_degree(step), step)
+        image, target, info = self._forward(view, self.active_sh_degree(step), step, strategy is not None)
         self.clock.mark("forward")
-        if densifying and self.strategy is not None:
-            self.strategy.step_pre_backward(self._splats, self._optimizers, self.strategy_state, step, info)
+        if strategy is not None:
+            strategy.step_pre_backward(self._splats, self._optimizers, self.strategy_state, step, info)
         loss = self._loss(image, target)
         value = float(loss.detach())
         self.clock.mark("loss")
@@ -200,8 +201,8 @@ class Trainer:
         if self.mcmc is not None:
             self._move(self.mcmc, step, updated)
         # A gate may have left this iteration without gradients, which densification averages.
-        elif densifying and info["means2d"].grad is not None:
-            self._densify(self.strategy, step, info)
+        elif strategy is not None and info["means2d"].grad is not None:
+            self._densify(strategy, step, info)
         self.clock.mark("strategy")
         self.clock.stop(after_densification=not densifying)
 
@@ -297,18 +298,22 @@ class Trainer:
         """Continue from a checkpoint of the same scene and settings."""
         state.load_checkpoint(self, path)
 
-    def _forward(self, view: View, degree: int, step: int) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    def _forward(
+        self, view: View, degree: int, step: int, for_densification: bool
+    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
         background = self._background()
         if self.config.random_bkgd:
             generator = torch.Generator().manual_seed(derive_seed(self.config.seed, step))
             background = torch.rand(3, generator=generator).to(self.backend.device)
-        image, info = self._rasterize(view, degree, background)
+        image, info = self._rasterize(view, degree, background, for_densification)
         return (*leave_out(self._exposed(image, view), self._target(view), view.mask), info)
 
     def _exposed(self, image: Tensor, view: View) -> Tensor:
         return image if self.exposure is None else self.exposure.apply(image, view.name)
 
-    def _rasterize(self, view: View, degree: int, background: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+    def _rasterize(
+        self, view: View, degree: int, background: Tensor | None, for_densification: bool = False
+    ) -> tuple[Tensor, dict[str, Any]]:
         lazy = {} if self._lazy is None else {"catch_up": self._lazy.catch_up}
         return self.backend.render(
             self._splats,
@@ -316,6 +321,7 @@ class Trainer:
             view.K,
             background,
             antialiased=self.config.antialiased,
+            for_densification=for_densification,
             width=view.width,
             height=view.height,
             sh_degree=degree,
@@ -403,9 +409,10 @@ class Trainer:
             yield
 
     def _warm_up(self, view: View) -> None:
-        """Compile kernels before the clock runs: one forward and backward whose gradients are dropped."""
-        image, target, _ = self._forward(view, self.config.sh_degree, 0)
-        self._loss(image, target).backward()
-        for optimizer in self.all_optimizers:
-            optimizer.zero_grad(set_to_none=True)
+        """Compile kernels before the clock runs: a forward and backward of each kind, whose gradients are dropped."""
+        for for_densification in (True, False):
+            image, target, _ = self._forward(view, self.config.sh_degree, 0, for_densification)
+            self._loss(image, target).backward()
+            for optimizer in self.all_optimizers:
+                optimizer.zero_grad(set_to_none=True)
         self._warm = True

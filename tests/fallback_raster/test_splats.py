@@ -135,6 +135,22 @@ def test_without_gradients_the_centres_want_none() -> None:
     assert not info["means2d"].requires_grad
 
 
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_what_only_densification_reads_can_be_left_out(absgrad: bool) -> None:
+    found = []
+    for for_densification in (True, False):
+        raw, camera = raw_scene()
+        for tensor in raw.values():
+            tensor.requires_grad_()
+        image, _, info = splatted(raw, camera, absgrad=absgrad, for_densification=for_densification)
+        image.square().sum().backward()
+        assert ("means2d" in info) == ("radii" in info) == for_densification
+        found.append([image.detach(), info["gaussian_ids"], *(tensor.grad for tensor in raw.values())])
+    for whole, part in zip(*found, strict=True):
+        assert part is not None and torch.allclose(whole, part, rtol=1e-5, atol=1e-7)
+        assert absgrad or torch.equal(whole, part)
+
+
 def test_a_parameter_that_grew_before_backward_is_an_error() -> None:
     raw, camera = raw_scene()
     leaf = raw["log_scales"].requires_grad_()
