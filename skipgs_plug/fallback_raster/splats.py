@@ -86,7 +86,8 @@ def rasterize_splats(
         catch_up: Called with the visible rows [M], int32, before their `shN` is read, which it may change in place.
             With it the gradient of `shN` is row-sparse, of these rows in that order, when they are less than two
             thirds of all; at degree 0 it has no row, and nothing is called.
-        for_densification: Whether the dictionary holds `radii` and `means2d`, which only densification reads.
+        for_densification: Whether the dictionary holds `radii` and `means2d`, which only densification reads; `absgrad`
+            needs it.
 
     Returns:
         Image [H, W, 3], alpha [H, W, 1] and a dictionary as gsplat's packed mode has it, one row for each of M visible
