@@ -409,8 +409,11 @@ class Trainer:
             yield
 
     def _warm_up(self, view: View) -> None:
-        """Compile kernels before the clock runs: a forward and backward of each kind, whose gradients are dropped."""
-        for for_densification in (True, False):
+        """Compile kernels before the clock runs: a forward and backward of each kind, whose gradients are dropped.
+
+        Densification needs all that refinement does, but for the blend's adjoint with absolute gradients.
+        """
+        for for_densification in {True, not self.config.absgrad}:
             image, target, _ = self._forward(view, self.config.sh_degree, 0, for_densification)
             self._loss(image, target).backward()
             for optimizer in self.all_optimizers:

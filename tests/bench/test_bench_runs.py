@@ -211,10 +211,8 @@ def test_a_killed_bench_continues_where_it_stopped(scene, finished, tmp_path):
 
 def test_a_run_that_diverges_is_named_and_its_copies_are_not_run(scene, tmp_path):
     bench = make_bench(scene, tmp_path, seeds=(5,))
-    compiling = 2  # losses before the first iteration of a trainer
-    turn = compiling + (MAX_STEPS - START) // PARTS  # the iterations of a part
-    # Densification, ungated's turn, the gate's third loss.
-    bench.backend = failing_backend(compiling + START + turn + compiling + 3)
+    turn = 1 + (MAX_STEPS - START) // PARTS  # compilation, and the iterations of a part
+    bench.backend = failing_backend(1 + START + turn + 1 + 3)  # densification, ungated's turn, the gate's third loss
     found = {record.policy: record for record in bench.run()}
     assert found["ungated"].status == "done"
     assert found["gate"].status == "diverged"

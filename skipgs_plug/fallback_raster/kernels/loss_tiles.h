@@ -103,26 +103,21 @@ for (int item = first; item < last; ++item) {
     alignas(64) v16 blurred[RING * (CHUNK + 2 * MOST) * 4], sloping[RING * CHUNK * 3];
     // Without a gradient the rows are grouped as with one, so that sums are added in the same order.
     const int start_row = top - 2 * RADIUS + (RADIUS - more_rows) / STEP * STEP;
-    // Vectors that lie in the row as a whole.
-    const int whole_begin = side - left / 16, whole_end = whole_begin + span / 16;
     // Rows before the first are read and count for nothing.
     for (int i = 0; i < RING * wide * 4; ++i) blurred[i] = (v16)0.0f;
-    for (int i = 0; i < RING * CHUNK * 3; ++i) sloping[i] = (v16)0.0f;
     for (int first_row = start_row; first_row < bottom + more_rows + RADIUS; first_row += STEP) {
         for (int row = first_row; row < first_row + STEP; ++row) {
             const bool inside = row >= 0 && row < height, own_row = row >= top && row < bottom;
-            const float *line_x = x + (long long)row * span + left - 16 * side, *line_y = y + (line_x - x);
+            const float *line_x = x + (long long)row * span, *line_y = y + (long long)row * span;
             for (int vector = 0; vector < all; ++vector) {
+                const int i = left + 16 * (vector - side);
                 v16 a = (v16)0.0f, b = a;
-                if (inside && vector >= whole_begin && vector < whole_end) {
-                    a = load(line_x + 16 * vector);
-                    b = load(line_y + 16 * vector);
+                if (inside) {
+                    a = piece(line_x, i);
+                    b = piece(line_y, i);
                     // Rows lie on pages of their own, where nothing foresees what is read next.
-                    __builtin_prefetch(line_x + 16 * vector + STEP * span);
-                    __builtin_prefetch(line_y + 16 * vector + STEP * span);
-                } else if (inside) {
-                    a = piece(x + (long long)row * span, left + 16 * (vector - side));
-                    b = piece(y + (long long)row * span, left + 16 * (vector - side));
+                    __builtin_prefetch(line_x + i + STEP * span);
+                    __builtin_prefetch(line_y + i + STEP * span);
                 }
                 if (own_row && vector >= more + side && vector < more + side + own) l1 += vabs(a - b);
                 const v16 from_x = load(shift_x + 16 * vector), from_d = load(shift_d + 16 * vector);
