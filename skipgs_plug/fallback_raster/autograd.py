@@ -218,8 +218,6 @@ class Blend(torch.autograd.Function):
         ctx: Any, v_image: Tensor | None, v_transmittance: Tensor | None, _: Any
     ) -> Any:
         means2d, conics, opacities, colors, transmittance = check_shapes(ctx.saved_tensors, **ctx.shapes)
-        v_image = zeros(*transmittance.shape, colors.shape[1]) if v_image is None else v_image
-        v_transmittance = zeros(*transmittance.shape) if v_transmittance is None else v_transmittance
         gradients = blend_adjoint(
             ctx.blended, means2d, conics, opacities, colors, transmittance, v_image, v_transmittance, ctx.absolute
         )

@@ -82,7 +82,7 @@ def _backward(channels: int, absgrad: bool) -> Worker:
         transmittance: Annotated[FloatArray, "height, width"],
         pixel_stop: Annotated[IntArray, "height, width"],
         v_image: Annotated[FloatArray, "height, width, stride"],
-        v_transmittance: Annotated[FloatArray, "height, width"],  # gradient of the final transmittance
+        v_transmittance: Annotated[FloatArray, "height if with_transmittance else 0, width"],  # of the final one
         v_pairs: Annotated[FloatArray, "Q, PAIR"],  # out
         width: int,
         height: int,
@@ -91,6 +91,7 @@ def _backward(channels: int, absgrad: bool) -> Worker:
         stride: int,
         channel: int,
         channels: int,
+        with_transmittance: int,
         parts: int,
         shortcuts: int,
     ) -> None: ...

@@ -66,8 +66,8 @@ class _L1Ssim(torch.autograd.Function):
         loss_tiles(image, target, gradient, sums, tiles, *size, int(valid), int(with_gradient), *weights)
         ctx.save_for_backward(gradient)
         # Tiles were summed in float32; adding them in float64, in a fixed order, keeps the last digits of the mean.
-        l1, unlike = sums.sum(dim=0, dtype=torch.float64)
-        return (weights[0] * l1 + weights[1] * unlike).to(torch.float32)
+        l1, unlike = sums.sum(dim=0, dtype=torch.float64).tolist()
+        return torch.tensor(weights[0] * l1 + weights[1] * unlike, dtype=torch.float32, device="cpu")
 
     @staticmethod
     @once_differentiable

@@ -138,22 +138,23 @@ def blend_adjoint(
     opacities: Tensor,  # [R]
     colors: Tensor,  # [R, D]
     transmittance: Tensor,  # [H, W]
-    v_image: Tensor,  # [H, W, D]
-    v_transmittance: Tensor,  # [H, W]
+    v_image: Tensor | None,  # [H, W, D], None for zeros, as the next
+    v_transmittance: Tensor | None,  # [H, W]
     absolute: Tensor | None,  # [R, 2]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Gradients of means2d, conics, opacities and colors; `absolute` receives the sum over pixels of |v_means2d|."""
     near, last = blended.near, blended.last
     bins, lists, parts = near.bins, last.bins, 1 if last is near else 2
-    height, width, channels = v_image.shape
+    (height, width), channels = transmittance.shape, colors.shape[1]
     size = (width, height, *tiles(width, height))
-    v_image, v_transmittance = v_image.contiguous(), v_transmittance.contiguous()
+    v_image = zeros(height, width, channels) if v_image is None else v_image.contiguous()
+    v_transmittance = floats(0, width) if v_transmittance is None else v_transmittance.contiguous()
     v_means2d, v_conics, v_opacities, v_colors = (floats(*t.shape) for t in (means2d, conics, opacities, colors))
     with_absolute = absolute is not None
     absolute = floats(0) if absolute is None else absolute
     pairs = len(lists.tile_list)
     # Behind the surface most pairs are not blended: they have no sums.
-    per_tile = torch.cat([part.tile_blended for part in (near, last)[:parts]])
+    per_tile = near.tile_blended if parts == 1 else torch.cat([near.tile_blended, last.tile_blended])
     slot_start, pair_slot = zeros(len(per_tile) + 1, dtype=torch.int32), zeros(pairs, dtype=torch.int32)
     torch.cumsum(per_tile, 0, out=slot_start[1:])
     number_pairs(
@@ -168,7 +169,7 @@ def blend_adjoint(
         backward_worker(some, with_absolute)(
             bins.records, bins.tile_start, near.tile_stop, lists.tile_start, last.tile_stop, lists.tile_list,
             last.pair_blocks, slot_start, transmittance, blended.pixel_stop, v_image, v_transmittance,
-            v_pairs, *size, channels, channel, some, parts, active_shortcuts(),
+            v_pairs, *size, channels, channel, some, int(len(v_transmittance) > 0), parts, active_shortcuts(),
         )  # fmt: skip
         reduce_pairs(
             bins.visible, near.block_start, bins.pair_start, lists.visible, last.block_start, lists.pair_start,
@@ -176,5 +177,5 @@ def blend_adjoint(
             v_colors, len(means2d), channels, channel, some, int(with_absolute), int(blended.dense), parts,
         )  # fmt: skip
         # The gradient of the transmittance belongs to the first pass alone.
-        v_transmittance = torch.zeros_like(v_transmittance) if channels > MAX_CHANNELS else v_transmittance
+        v_transmittance = floats(0, width)
     return v_means2d, v_conics, v_opacities, v_colors

@@ -60,7 +60,7 @@ def rasterize_splats(
     antialiased: bool = False,
     absgrad: bool = False,
     catch_up: Callable[[Tensor], None] | None = None,
-    for_densification: bool = True,
+    with_rows: bool = True,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Renders raw parameters of 3DGS into one camera, as `rasterization` renders their activations.
 
@@ -86,13 +86,13 @@ def rasterize_splats(
         catch_up: Called with the visible rows [M], int32, before their `shN` is read, which it may change in place.
             With it the gradient of `shN` is row-sparse, of these rows in that order, when they are less than two
             thirds of all; at degree 0 it has no row, and nothing is called.
-        for_densification: Whether the dictionary holds `radii` and `means2d`, which only densification reads; `absgrad`
-            needs it.
+        with_rows: Whether the dictionary has a row for each of M visible Gaussians, as densification and optimizers of
+            visible rows want it; `absgrad` needs it.
 
     Returns:
-        Image [H, W, 3], alpha [H, W, 1] and a dictionary as gsplat's packed mode has it, one row for each of M visible
-        Gaussians: gaussian_ids [M], radii [M, 2], means2d [M, 2], a leaf with a gradient after the backward pass;
-        width, height, n_cameras.
+        Image [H, W, 3], transmittance [H, W], which is 1 - alpha, and a dictionary as gsplat's packed mode has it:
+        camera_ids [M], gaussian_ids [M], radii [M, 2], means2d [M, 2], a leaf with a gradient after the backward pass,
+        all four only `with_rows`; width, height, n_cameras.
 
     Raises:
         ValueError: A shape, dtype or device does not fit, the camera is not finite or cannot be inverted, or a plane is
@@ -109,31 +109,15 @@ def rasterize_splats(
     size = (width, height)
     with torch.no_grad():
         projected = _project(means, quats, log_scales, logits, viewmat, K, size, near_plane, far_plane, antialiased)
-        ids = projected.visible.to(torch.int64)
+    visible = projected.visible
     sparse = None
     if catch_up is not None and sh_degree == 0:
-        sparse = ids[:0]
+        sparse = visible[:0]
     elif catch_up is not None:
-        catch_up(projected.visible)
-        sparse = ids if len(ids) < MOST_SPARSE * len(means) else None
-    centres = absolute = None
-    if for_densification:
-        # A leaf that goes in with the parameters, so that its gradient comes out with theirs.
-        centres = take_rows(projected.means2d, projected.visible)
-        centres.requires_grad_(torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
-        if absgrad:
-            absolute = centres.absgrad = zeros(len(ids), 2)  # type: ignore[attr-defined]
-    image, transmittance = _Render.apply(
-        means, quats, log_scales, logits, sh0, shN, centres, absolute, projected, viewmat, K, size, sh_degree,
-        antialiased, sparse,
-    )  # fmt: skip
-    alpha = (1.0 - transmittance).unsqueeze(-1)
-    if background is not None:
-        image = image + transmittance.unsqueeze(-1) * background.to(torch.float32)
+        catch_up(visible)
+        sparse = visible if len(visible) < MOST_SPARSE * len(means) else None
     tile_width, tile_height = tiles(width, height)
-    info = {
-        "camera_ids": torch.zeros_like(ids),
-        "gaussian_ids": ids,
+    info: dict[str, Any] = {
         "width": width,
         "height": height,
         "n_cameras": 1,
@@ -141,9 +125,27 @@ def rasterize_splats(
         "tile_width": tile_width,
         "tile_height": tile_height,
     }
-    if centres is not None:
-        info |= {"radii": take_rows(projected.radii, projected.visible), "means2d": centres}
-    return image, alpha, info
+    centres = absolute = None
+    if with_rows:
+        # A leaf that goes in with the parameters, so that its gradient comes out with theirs.
+        centres = take_rows(projected.means2d, visible)
+        centres.requires_grad_(torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
+        if absgrad:
+            absolute = centres.absgrad = zeros(len(visible), 2)  # type: ignore[attr-defined]
+        ids = visible.to(torch.int64)
+        info |= {
+            "camera_ids": torch.zeros_like(ids),
+            "gaussian_ids": ids,
+            "radii": take_rows(projected.radii, visible),
+            "means2d": centres,
+        }
+    image, transmittance = _Render.apply(
+        means, quats, log_scales, logits, sh0, shN, centres, absolute, projected, viewmat, K, size, sh_degree,
+        antialiased, sparse,
+    )  # fmt: skip
+    if background is not None:
+        image = image + transmittance.unsqueeze(-1) * background.to(torch.float32)
+    return image, transmittance, info
 
 
 class _Render(torch.autograd.Function):
@@ -189,11 +191,14 @@ class _Render(torch.autograd.Function):
         ctx.with_centres = centres is not None
         ctx.camera = camera, viewmat, K, size, antialiased
         ctx.sh = layout, degree, sparse
+        ctx.set_materialize_grads(False)  # the transmittance has a gradient where there is a background
         return image, transmittance
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_image: Tensor, v_transmittance: Tensor) -> Any:  # type: ignore[override]
+    def backward(  # type: ignore[override]
+        ctx: Any, v_image: Tensor | None, v_transmittance: Tensor | None
+    ) -> Any:
         means, quats, log_scales, logits, sh0, shN, transmittance = check_shapes(ctx.saved_tensors, **ctx.shapes)
         p, n = ctx.projected, len(means)
         camera, viewmat, K, size, antialiased = ctx.camera
@@ -210,7 +215,7 @@ class _Render(torch.autograd.Function):
             # Part of a tensor of full size, so that gradients of different lengths lie in the same memory.
             v_shN = v_shN[: len(p.visible)]
             gradients[-1] = torch.sparse_coo_tensor(
-                sparse[None], v_shN[: len(sparse)], shN.shape, is_coalesced=True, check_invariants=False
+                sparse[None].to(torch.int64), v_shN[: len(sparse)], shN.shape, is_coalesced=True, check_invariants=False
             )
         sh_backward(
             means, camera, sh0, shN, p.visible, p.block_start, ctx.colors, v_colors, v_means, v_sh0, v_shN,

@@ -30,7 +30,7 @@ class Backend:
         K: Tensor,  # [3, 3]
         background: Tensor | None,  # [3]
         antialiased: bool = False,
-        for_densification: bool = True,
+        with_rows: bool = True,
         **options: Any,
     ) -> tuple[Tensor, dict[str, Any]]:
         """Render raw parameters, as `create_splats` names them, into one camera.
@@ -44,7 +44,7 @@ class Backend:
             K: intrinsics in pixels.
             background: colour behind everything; None for black, which needs no compositing.
             antialiased: compensate opacities for the blur.
-            for_densification: whether the dictionary has to hold what only densification reads.
+            with_rows: whether the dictionary has to hold rows of Gaussians.
             options: `width height sh_degree near_plane far_plane absgrad` of `rasterization`, and
                 `catch_up` of `rasterize_splats` on the CPU.
 
@@ -66,7 +66,7 @@ class Backend:
                 K,
                 background=background,
                 antialiased=antialiased,
-                for_densification=for_densification,
+                with_rows=with_rows,
                 **options,
             )
             return image, info

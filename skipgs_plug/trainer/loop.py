@@ -187,7 +187,8 @@ class Trainer:
         self.set_learning_rate(step)
 
         self.clock.start()
-        image, target, info = self._forward(view, self.active_sh_degree(step), step, strategy is not None)
+        with_rows = strategy is not None or self.config.visible_adam
+        image, target, info = self._forward(view, self.active_sh_degree(step), step, with_rows)
         self.clock.mark("forward")
         if strategy is not None:
             strategy.step_pre_backward(self._splats, self._optimizers, self.strategy_state, step, info)
@@ -298,21 +299,19 @@ class Trainer:
         """Continue from a checkpoint of the same scene and settings."""
         state.load_checkpoint(self, path)
 
-    def _forward(
-        self, view: View, degree: int, step: int, for_densification: bool
-    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    def _forward(self, view: View, degree: int, step: int, with_rows: bool) -> tuple[Tensor, Tensor, dict[str, Any]]:
         background = self._background()
         if self.config.random_bkgd:
             generator = torch.Generator().manual_seed(derive_seed(self.config.seed, step))
             background = torch.rand(3, generator=generator).to(self.backend.device)
-        image, info = self._rasterize(view, degree, background, for_densification)
+        image, info = self._rasterize(view, degree, background, with_rows)
         return (*leave_out(self._exposed(image, view), self._target(view), view.mask), info)
 
     def _exposed(self, image: Tensor, view: View) -> Tensor:
         return image if self.exposure is None else self.exposure.apply(image, view.name)
 
     def _rasterize(
-        self, view: View, degree: int, background: Tensor | None, for_densification: bool = False
+        self, view: View, degree: int, background: Tensor | None, with_rows: bool = False
     ) -> tuple[Tensor, dict[str, Any]]:
         lazy = {} if self._lazy is None else {"catch_up": self._lazy.catch_up}
         return self.backend.render(
@@ -321,7 +320,7 @@ class Trainer:
             view.K,
             background,
             antialiased=self.config.antialiased,
-            for_densification=for_densification,
+            with_rows=with_rows,
             width=view.width,
             height=view.height,
             sh_degree=degree,
@@ -413,8 +412,8 @@ class Trainer:
 
         Densification needs all that refinement does, but for the blend's adjoint with absolute gradients.
         """
-        for for_densification in {True, not self.config.absgrad}:
-            image, target, _ = self._forward(view, self.config.sh_degree, 0, for_densification)
+        for with_rows in {True, not self.config.absgrad}:
+            image, target, _ = self._forward(view, self.config.sh_degree, 0, with_rows)
             self._loss(image, target).backward()
             for optimizer in self.all_optimizers:
                 optimizer.zero_grad(set_to_none=True)

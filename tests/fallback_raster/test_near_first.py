@@ -174,10 +174,10 @@ def test_raw_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
         raw += [scene["colors"][:, None], torch.zeros(2000, 15, 3)]
         raw = [t.clone().requires_grad_() for t in raw]
         camera = scene["viewmats"][0], scene["Ks"][0], scene["width"], scene["height"], 3
-        image, alpha, info = rasterize_splats(*raw, *camera, absgrad=True)
-        (image.square().sum() + alpha.sum()).backward()
+        image, transmittance, info = rasterize_splats(*raw, *camera, absgrad=True)
+        (image.square().sum() - transmittance.sum()).backward()
         of_centres = [info["means2d"].grad, info["means2d"].absgrad]
-        return [image.detach(), alpha.detach()], [t.grad for t in raw if t.grad is not None] + of_centres
+        return [image.detach(), transmittance.detach()], [t.grad for t in raw if t.grad is not None] + of_centres
 
     with without_shortcuts("near_first"):
         whole = gradients()

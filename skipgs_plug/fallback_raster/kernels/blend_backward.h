@@ -13,11 +13,12 @@ for (int t = first; t < last; ++t) {
     // where no list has a Gaussian before place 0.
     alignas(64) vblock T[BLOCKS], behind[BLOCKS], v[BLOCKS][D];
     alignas(64) iblock stop[BLOCKS];
+    for (int b = 0; b < BLOCKS; ++b) behind[b] = (vblock)0.0f;
     for (int q = 0; q < QUADS; ++q) {
         const Quad quad(tile, q, width);
         read_blocks(v_image + channel, quad, stride, channels, v[0], D);
         read_blocks(transmittance, quad, 1, 1, T, 1);
-        read_blocks(v_transmittance, quad, 1, 1, behind, 1);
+        if (with_transmittance) read_blocks(v_transmittance, quad, 1, 1, behind, 1);
         read_blocks((const float*)pixel_stop, quad, 1, 1, (vblock*)stop, 1);
     }
     unsigned open = 0;  // blocks with incoming gradient
