@@ -3,9 +3,9 @@
 import math
 import numbers
 import operator
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -53,12 +53,26 @@ def camera_centre(viewmat: Tensor) -> Tensor:
     Raises:
         ValueError: The matrix has no inverse.
     """
+    rows = viewmat.tolist()
+    if not viewmat.requires_grad and rows[3] == [0.0, 0.0, 0.0, 1.0]:
+        # By Cramer's rule, in float64: torch takes longer to look the matrix over than some kernels run.
+        *axes, shift = zip(*rows[:3], strict=True)
+        across = [_cross(axes[1], axes[2]), _cross(axes[2], axes[0]), _cross(axes[0], axes[1])]
+        volume = _dot(axes[0], across[0])
+        if volume != 0.0:
+            return torch.tensor([-_dot(shift, c) / volume for c in across], dtype=torch.float32, device="cpu")
     try:
-        if not viewmat.requires_grad:  # in a third of the time
-            return torch.from_numpy(np.linalg.inv(viewmat.numpy())[:3, 3].copy())
         return torch.linalg.inv(viewmat)[:3, 3]
-    except (np.linalg.LinAlgError, torch.linalg.LinAlgError):
-        raise ValueError(f"viewmats must be invertible, got {viewmat.tolist()} for a camera.") from None
+    except torch.linalg.LinAlgError:
+        raise ValueError(f"viewmats must be invertible, got {rows} for a camera.") from None
+
+
+def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def as_int(value: Any) -> Any:

@@ -123,14 +123,14 @@ def poison(fresh: Tensor) -> Tensor:
 
 
 def _surrounded(value: Tensor, pattern: int) -> Tensor:
-    words = value.numel() * value.element_size() // 4
+    words = -(-value.numel() * value.element_size() // 4)
     buffer = torch.full((words + 2 * _ZONE,), pattern, dtype=torch.int32, device="cpu")
     _middle(buffer, value).copy_(value.detach())
     return buffer
 
 
 def _middle(buffer: Tensor, like: Tensor) -> Tensor:
-    return buffer[_ZONE : len(buffer) - _ZONE].view(like.dtype).view(like.shape)
+    return buffer[_ZONE : len(buffer) - _ZONE].view(like.dtype)[: like.numel()].view(like.shape)
 
 
 def _check_zones(kernel: str, name: str, buffer: Tensor, pattern: int) -> None:

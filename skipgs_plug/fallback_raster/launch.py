@@ -43,6 +43,10 @@ class LongArray:
     """Marks a worker's parameter as a contiguous int64 tensor, passed flat."""
 
 
+class ByteArray:
+    """Marks a worker's parameter as a contiguous uint8 tensor, passed flat."""
+
+
 class _Kind(NamedTuple):
     """What a parameter is in Python, in Warp and in C++."""
 
@@ -56,6 +60,7 @@ _KINDS: dict[type, _Kind] = {
     FloatArray: _Kind(torch.float32, "wp.uint64", "float"),
     IntArray: _Kind(torch.int32, "wp.uint64", "int"),
     LongArray: _Kind(torch.int64, "wp.uint64", "long long"),
+    ByteArray: _Kind(torch.uint8, "wp.uint64", "unsigned char"),
     int: _Kind(None, "wp.int32", ""),
     float: _Kind(None, "wp.float32", ""),
 }
@@ -162,7 +167,7 @@ def worker(
 ) -> Callable[[Callable[..., None]], Worker]:
     """Turns a stub function into a `Worker`.
 
-    The stub's parameters are annotated `FloatArray`, `IntArray`, `LongArray`, `int` or `float`; arrays
+    The stub's parameters are annotated `FloatArray`, `IntArray`, `LongArray`, `ByteArray`, `int` or `float`; arrays
     also `Annotated[FloatArray, "n, 3"]` with the sizes that `guard.Sizes` checks.
 
     Args:

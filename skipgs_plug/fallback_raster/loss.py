@@ -18,6 +18,7 @@ once. Tiles compute what they need beyond their borders themselves, a fifth more
 for another pass: no core reads what another one wrote.
 """
 
+import math
 from typing import Annotated, Any, Literal
 
 import torch
@@ -26,29 +27,38 @@ from torch.autograd.function import once_differentiable
 
 from .buffers import floats
 from .constants import BAND, CHUNK, LOSS_CHANNELS, WINDOW
-from .launch import FloatArray, worker
+from .launch import ByteArray, FloatArray, Worker, worker
 from .source import read_kernel
 
 # Columns of float32 count no further exactly, and kernels find them in it.
 MAX_ROW = 2**24
 
 
-@worker(read_kernel("loss_tiles.h"), items="tiles", grain="1")
-def loss_tiles(
-    image: Annotated[FloatArray, "images, height, width, channels"],
-    target: Annotated[FloatArray, "images, height, width, channels"],
-    gradient: Annotated[FloatArray, "images if with_gradient else 0, height, width, channels"],  # out
-    sums: Annotated[FloatArray, "tiles, 2"],  # out, |image - target| and 1 - SSIM summed over each tile
-    tiles: int,
-    images: int,
-    height: int,
-    width: int,
-    channels: int,
-    valid: int,
-    with_gradient: int,
-    l1_weight: float,
-    ssim_weight: float,
-) -> None: ...
+def _loss_tiles(name: str, pixels: type) -> Worker:
+    @worker(read_kernel("loss_tiles.h"), items="tiles", grain="1", name=name)
+    def loss_tiles(
+        image: Annotated[FloatArray, "images, height, width, channels"],
+        target: Annotated[pixels, "images, height, width, channels"],  # type: ignore[valid-type]
+        gradient: Annotated[FloatArray, "images if with_gradient else 0, height, width, channels"],  # out
+        sums: Annotated[FloatArray, "tiles, 2"],  # out, |image - target| and 1 - SSIM summed over each tile
+        tiles: int,
+        images: int,
+        height: int,
+        width: int,
+        channels: int,
+        valid: int,
+        with_gradient: int,
+        l1_weight: float,
+        ssim_weight: float,
+    ) -> None: ...
+
+    return loss_tiles
+
+
+_LOSS_TILES = {
+    torch.float32: _loss_tiles("loss_tiles", FloatArray),
+    torch.uint8: _loss_tiles("loss_tiles_bytes", ByteArray),
+}
 
 
 class _L1Ssim(torch.autograd.Function):
@@ -63,10 +73,11 @@ class _L1Ssim(torch.autograd.Function):
         windows = images * (height - border) * (width - border) * channels
         weights = ((1.0 - ssim_lambda) / image.numel(), ssim_lambda / windows)
         gradient, sums = floats(*image.shape) if with_gradient else floats(0), floats(tiles, 2)
+        loss_tiles = _LOSS_TILES[target.dtype]
         loss_tiles(image, target, gradient, sums, tiles, *size, int(valid), int(with_gradient), *weights)
         ctx.save_for_backward(gradient)
         # Tiles were summed in float32; adding them in float64, in a fixed order, keeps the last digits of the mean.
-        l1, unlike = sums.sum(dim=0, dtype=torch.float64).tolist()
+        l1, unlike = map(math.fsum, zip(*sums.tolist(), strict=True))
         return torch.tensor(weights[0] * l1 + weights[1] * unlike, dtype=torch.float32, device="cpu")
 
     @staticmethod
@@ -89,7 +100,7 @@ def l1_ssim_loss(
 
     Args:
         image: Rendered image, usually in [0, 1].
-        target: Photograph of the same shape.
+        target: Photograph of the same shape; as uint8 it counts in 255ths, to the bit what `target / 255` gives.
         ssim_lambda: Weight of the SSIM term.
         padding: "same" continues the images with black (Inria, fused_ssim's default); "valid" averages SSIM over
             windows inside the image only (gsplat).
@@ -99,11 +110,13 @@ def l1_ssim_loss(
 
     Raises:
         ValueError: Shapes differ, there are more than 32 channels, a row has more than 2^24 numbers, an image is too
-            small for "valid", a tensor is not a CPU float tensor, or a gradient with respect to `target` is asked for.
+            small for "valid", a tensor is of another kind or not on the CPU, or a gradient with respect to `target` is
+            asked for.
     """
-    for name, tensor in (("image", image), ("target", target)):
-        if not tensor.is_floating_point() or tensor.device.type != "cpu":
-            raise ValueError(f"{name} must be a float tensor on the CPU, got {tensor.dtype} on {tensor.device}.")
+    in_bytes = target.dtype is torch.uint8
+    for name, tensor, kinds in (("image", image, "float"), ("target", target, "float or uint8")):
+        if not (tensor.is_floating_point() or (tensor is target and in_bytes)) or tensor.device.type != "cpu":
+            raise ValueError(f"{name} must be a {kinds} tensor on the CPU, got {tensor.dtype} on {tensor.device}.")
     if image.shape != target.shape or image.dim() < 3 or image.numel() == 0:
         raise ValueError(
             f"image and target must have one shape [..., H, W, C], got {list(image.shape)} and {list(target.shape)}."
@@ -126,7 +139,6 @@ def l1_ssim_loss(
         )
     if target.requires_grad:
         raise ValueError("l1_ssim_loss is differentiable in image only: pass target.detach().")
-    value = _L1Ssim.apply(
-        image.to(torch.float32).contiguous(), target.to(torch.float32).contiguous(), ssim_lambda, padding == "valid"
-    )
+    target = (target if in_bytes else target.to(torch.float32)).contiguous()
+    value = _L1Ssim.apply(image.to(torch.float32).contiguous(), target, ssim_lambda, padding == "valid")
     return value.to(image.dtype)

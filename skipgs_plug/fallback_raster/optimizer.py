@@ -32,7 +32,12 @@ class Adam(torch.optim.Adam):
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """As torch's."""
-        inspect.unwrap(torch.optim.Optimizer.zero_grad)(self, set_to_none)
+        if not set_to_none:
+            inspect.unwrap(torch.optim.Optimizer.zero_grad)(self, set_to_none)
+            return
+        for group in self.param_groups:
+            for param in group["params"]:
+                param.grad = None
 
     def step(self, closure: Any = None) -> Any:  # type: ignore[override]
         """Update every parameter that has a gradient.

@@ -21,7 +21,7 @@ class Backend:
     name: str
     device: torch.device
     rasterization: Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
-    loss: Callable[[Tensor, Tensor, float], Tensor]  # (image, target [..., H, W, C], ssim_lambda) -> scalar
+    loss: Callable[[Tensor, Tensor, float], Tensor]  # (image, target [..., H, W, C], also uint8; ssim_lambda) -> scalar
 
     def render(
         self,

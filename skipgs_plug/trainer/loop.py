@@ -51,7 +51,7 @@ class Iteration(NamedTuple):
     view: str
     loss: float
     image: Tensor  # [H, W, 3], detached
-    target: Tensor  # [H, W, 3]
+    target: Tensor  # [H, W, 3] uint8
 
     def passes(self, every: int) -> bool:
         """Whether a multiple of `every` lies among the numbers of this iteration and of those left out before it."""
@@ -272,7 +272,7 @@ class Trainer:
         }
 
     def _measure(self, wanted: Sequence[metrics.Metric], view: View) -> dict[str, float]:
-        image, target = leave_out(self.render(view), self._target(view), view.mask)
+        image, target = leave_out(self.render(view), self._target(view) / 255.0, view.mask)
         return metrics.measure(wanted, image, target, view.mask)
 
     def export_ply(self, path: str | Path) -> None:
@@ -337,7 +337,7 @@ class Trainer:
         return torch.tensor(self.scene.background, dtype=torch.float32, device=self.backend.device)
 
     def _target(self, view: View) -> Tensor:
-        return view.image.to(self.backend.device).float().div_(255.0)
+        return view.image.to(self.backend.device)
 
     def _loss(self, image: Tensor, target: Tensor) -> Tensor:
         loss = self.backend.loss(image, target, self.config.ssim_lambda)

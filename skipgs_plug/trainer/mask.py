@@ -14,5 +14,4 @@ def leave_out(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tenso
     if mask is None:
         return image, target
     kept = mask.to(image.device)[..., None]
-    black = torch.zeros((), dtype=image.dtype, device=image.device)
-    return torch.where(kept, image, black), torch.where(kept, target, black)
+    return torch.where(kept, image, torch.zeros_like(image)), torch.where(kept, target, torch.zeros_like(target))

@@ -10,6 +10,7 @@ import torch
 from raster_scenes import random_scene
 
 from skipgs_plug.fallback_raster import rasterization
+from skipgs_plug.fallback_raster.arguments import camera_centre
 
 # A type of its own per case is not worth having; NotImplementedError marks what gsplat can and we cannot.
 REFUSALS = (ValueError, TypeError, NotImplementedError)
@@ -137,6 +138,19 @@ def test_distances_that_are_no_numbers(name: str, value: Any) -> None:
 
 def test_a_camera_that_stands_nowhere() -> None:
     refuse("viewmats must be invertible, got .* for a camera", viewmats=torch.zeros(2, 4, 4))
+    flat = torch.eye(4)
+    flat[2, 2] = 0.0
+    refuse("viewmats must be invertible, got .* for a camera", viewmats=flat.expand(2, 4, 4))
+
+
+@pytest.mark.parametrize("last", [(0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 2.0), (0.1, 0.0, 0.2, 1.0)])
+def test_where_any_camera_stands(last: tuple[float, ...]) -> None:
+    for _ in range(50):
+        viewmat = torch.randn(4, 4)
+        viewmat[3] = torch.tensor(last)
+        truth = torch.linalg.inv(viewmat.double())[:3, 3]
+        error = (camera_centre(viewmat) - truth).abs().max()
+        assert error <= 1e-5 * torch.linalg.cond(viewmat.double()) * truth.abs().max()
 
 
 def test_a_single_camera_without_its_dimension() -> None:

@@ -27,7 +27,7 @@ from skipgs_plug.fallback_raster import (
 from skipgs_plug.fallback_raster.compat import statistics
 from skipgs_plug.fallback_raster.compat.inria import GaussianRasterizationSettings
 from skipgs_plug.fallback_raster.compat.rendering import render, splats
-from skipgs_plug.fallback_raster.launch import FloatArray, IntArray, LongArray, Worker, worker
+from skipgs_plug.fallback_raster.launch import ByteArray, FloatArray, IntArray, LongArray, Worker, worker
 from skipgs_plug.fallback_raster.source import KERNELS, PRELUDE, read_kernel
 from skipgs_plug.fallback_raster.splats import rasterize_splats
 
@@ -38,7 +38,7 @@ WORKERS = {
     for found in (value.values() if isinstance(value, dict) else [value])
     if isinstance(found, Worker)
 }
-DTYPES = {FloatArray: torch.float32, IntArray: torch.int32, LongArray: torch.int64}
+DTYPES = {FloatArray: torch.float32, IntArray: torch.int32, LongArray: torch.int64, ByteArray: torch.uint8}
 EXAMPLES: dict[type, Any] = {kind: torch.zeros(0, dtype=dtype) for kind, dtype in DTYPES.items()} | {int: 0, float: 0.0}
 
 
@@ -46,7 +46,7 @@ def test_every_kernel_file_is_used_and_tested() -> None:
     texts = [PRELUDE, *(found._code for found in WORKERS.values())]
     unused = [path.name for path in KERNELS.glob("*.h") if not any(f'kernels/{path.name}"' in text for text in texts)]
     assert not unused
-    assert len(WORKERS) == 30
+    assert len(WORKERS) == 31
 
 
 @pytest.mark.parametrize("name", WORKERS)
@@ -100,7 +100,8 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker, list[A
         raw = [deep[name] for name in ("means", "quats", "scales", "opacities")]
         sh = [deep["colors"][:, None], torch.zeros(6000, 0, 3)]
         rasterize_splats(*raw, *sh, deep["viewmats"][0], deep["Ks"][0], deep["width"], deep["height"], 0)
-        l1_ssim_loss(image, torch.zeros_like(image)).backward()
+        for dtype in (torch.float32, torch.uint8):
+            l1_ssim_loss(image, torch.zeros_like(image, dtype=dtype)).backward(retain_graph=True)
         param = torch.nn.Parameter(torch.ones(5, 3))
         param.grad = torch.ones(5, 3)
         adam.adam_rows(torch.ones(5) > 0, param, torch.zeros(5, 3), torch.zeros(5, 3), 0.1, (0.9, 0.999), 1e-15)

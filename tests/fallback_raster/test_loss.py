@@ -182,6 +182,23 @@ def test_any_strides_and_precisions() -> None:
     assert abs(double.item() - loss.item()) < 1e-7
 
 
+@pytest.mark.parametrize(
+    ("shape", "padding"),
+    [*((shape, "same") for shape in SHAPES), *(((16, width, 3), "valid") for width in (11, 16, 85, 90))],
+)
+def test_a_photograph_in_bytes_counts_in_255ths(shape: tuple[int, ...], padding: Any) -> None:
+    photograph = torch.randint(256, shape, dtype=torch.uint8)
+    every = photograph.view(-1)[:256]
+    every[:] = torch.arange(len(every), dtype=torch.uint8)
+    found = []
+    for target in (photograph, photograph / 255.0):
+        image = torch.full(shape, 0.5, requires_grad=True)
+        loss = l1_ssim_loss(image, target, 0.2, padding)
+        loss.backward()
+        found.append((loss.detach(), image.grad))
+    assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
+
+
 def test_nan_stays_visible() -> None:
     image, target = noisy((40, 50, 3))
     image[10, 20, 1] = torch.nan
@@ -196,7 +213,7 @@ def test_nan_stays_visible() -> None:
         (torch.rand(0, 8, 3), torch.rand(0, 8, 3), "same", "shape"),
         (torch.rand(3, 8, 40), torch.rand(3, 8, 40), "same", "channels"),
         (torch.ones(8, 8, 3, dtype=torch.uint8), torch.rand(8, 8, 3), "same", "image must be a float"),
-        (torch.rand(8, 8, 3), torch.ones(8, 8, 3, dtype=torch.uint8), "same", "target must be a float"),
+        (torch.rand(8, 8, 3), torch.ones(8, 8, 3, dtype=torch.int32), "same", "target must be a float or uint8"),
         (torch.rand(8, 8, 3, device="meta"), torch.rand(8, 8, 3), "same", "CPU"),
         (torch.rand(10, 11, 3), torch.rand(10, 11, 3), "valid", "11x10"),
         (torch.rand(11, 10, 3), torch.rand(11, 10, 3), "valid", "at least 11x11"),

@@ -11,6 +11,16 @@ static constexpr int STEP = 4;  // rows at a time: their windows share most of w
 static constexpr int RING = WINDOW - 1 + STEP;
 static constexpr int AHEAD = RING * 64;  // rows above an image have numbers below zero
 static_assert(4 * RADIUS % STEP == 0, "the gradient begins with the first row of a tile");
+// Numbers of an image, 16 at a time. Bytes count in 255ths: the first of two parts of 1 / 255 has so few digits that its
+// product is exact, so that the sum is rounded as the quotient is.
+typedef unsigned char c16 __attribute__((ext_vector_type(16), aligned(1)));
+static constexpr auto numbers = [](const auto* p) INLINE -> v16 {
+    if constexpr (sizeof(*p) == sizeof(float)) return load(p);
+    else {
+        const v16 a = __builtin_convertvector(__builtin_convertvector(*(const c16*)p, i16), v16);
+        return a * 0x1.01p-8f + a * 0x1.010102p-24f;
+    }
+};
 // The window down the rows, for STEP of them. Its halves are equal: sums of two rows, then half as many products.
 static constexpr auto blur_down = [](const v16* const* from, int at, v16* sums) INLINE {
     v16 row[RING];
@@ -56,15 +66,16 @@ for (int item = first; item < last; ++item) {
     const int top = smaller(item / chunks % bands * band, height), bottom = smaller(top + band, height);
     const int begin = smaller(item % chunks * chunk, vectors), own = smaller(begin + chunk, vectors) - begin;
     const long long start = (long long)(item / chunks / bands) * height;  // first row of its image
-    const float *x = image + start * span, *y = target + start * span;
+    const float* x = image + start * span;
+    const auto* y = target + start * span;
     const int wide = own + 2 * more, all = wide + 2 * side;
     const int left = 16 * (begin - more);  // column of the first slope, and beyond by `side` vectors of the first pixel
-    // Floats `i` to `i + 15` of a row, black beyond its ends.
-    const auto piece = [&](const float* row, int i) INLINE -> v16 {
-        if (i >= 0 && i + 16 <= span) return load(row + i);
-        v16 a = (v16)0.0f;
-        for (int j = larger(0, -i); j < 16 && i + j < span; ++j) a[j] = row[i + j];
-        return a;
+    // Numbers `i` to `i + 15` of a row, black beyond its ends.
+    const auto piece = [&](const auto* row, int i) INLINE -> v16 {
+        if (i >= 0 && i + 16 <= span) return numbers(row + i);
+        __remove_cvref(decltype(*row)) some[16] = {};
+        for (int j = larger(0, -i); j < 16 && i + j < span; ++j) some[j] = row[i + j];
+        return numbers(some);
     };
 
     // What x and d are counted from: about their mean in the tile, by channel.
@@ -108,7 +119,8 @@ for (int item = first; item < last; ++item) {
     for (int first_row = start_row; first_row < bottom + more_rows + RADIUS; first_row += STEP) {
         for (int row = first_row; row < first_row + STEP; ++row) {
             const bool inside = row >= 0 && row < height, own_row = row >= top && row < bottom;
-            const float *line_x = x + (long long)row * span, *line_y = y + (long long)row * span;
+            const float* line_x = x + (long long)row * span;
+            const auto* line_y = y + (long long)row * span;
             for (int vector = 0; vector < all; ++vector) {
                 const int i = left + 16 * (vector - side);
                 v16 a = (v16)0.0f, b = a;
