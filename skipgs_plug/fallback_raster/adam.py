@@ -5,9 +5,10 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from .buffers import ints
 from .launch import FloatArray, IntArray, worker
 from .source import read_kernel
+
+_ALL = torch.empty(0, dtype=torch.int32, device="cpu")  # in place of a mask
 
 
 @worker(read_kernel("adam.h"), items="n", grain="larger(1, 16384 / width)")
@@ -61,7 +62,7 @@ def adam_step(
         return
     n = values.numel() if seen is None else len(seen)
     numbers = map(float, (rate, root, 1 - betas[0], betas[1], 1 - betas[1], eps))
-    mask = ints(0) if seen is None else seen
+    mask = _ALL if seen is None else seen
     _adam(mask, gradient, values, mean, square, n, values.numel() // n, int(seen is not None), *numbers)
     # Past torch's count of changes, by which it knows what is out of date in a backward pass.
     torch.autograd.graph.increment_version(values)

@@ -19,6 +19,7 @@ _OPTIONS = (*_TORCHS[:-1], "lr", "eps", "foreach", "fused", "decoupled_weight_de
 
 _module: Any = importlib.import_module("torch.optim.adam")  # torch.optim deletes its own name for it
 _torchs_adam = _module.adam
+_torchs_base: Any = importlib.import_module("torch.optim.optimizer")
 
 
 class Adam(torch.optim.Adam):
@@ -48,6 +49,17 @@ class Adam(torch.optim.Adam):
         Returns:
             What `closure` returns.
         """
+        return self._hooked_step(closure) if self._somebody_looks_on() else self._plain_step(closure)
+
+    # Torch wraps a step that does not say so, for its hooks and its profiler, which takes as long as a small step.
+    step.hooked = True  # type: ignore[attr-defined]
+
+    def _somebody_looks_on(self) -> bool:
+        own = self._optimizer_step_pre_hooks or self._optimizer_step_post_hooks
+        everyone = _torchs_base._global_optimizer_pre_hooks or _torchs_base._global_optimizer_post_hooks
+        return bool(own or everyone or torch.autograd._profiler_enabled())
+
+    def _plain_step(self, closure: Any) -> Any:
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -57,18 +69,35 @@ class Adam(torch.optim.Adam):
                 self._step(group)
         return loss
 
+    _hooked_step = torch.optim.Optimizer.profile_hook_step(_plain_step)
+
     def _step(self, group: dict[str, Any]) -> None:
+        grad_scale, found_inf = getattr(self, "grad_scale", None), getattr(self, "found_inf", None)
+        left = group["params"]
+        if grad_scale is None and found_inf is None and _plain(group, *group["betas"]):
+            numbers = float(group["lr"]), group["betas"], group["eps"]
+            left = [param for param in left if not self._advance_param(param, *numbers)]
+        if not left:
+            return
         lists: tuple[list[Tensor], ...] = ([], [], [], [], [], [])
-        has_complex = self._init_group(group, *lists)
+        has_complex = self._init_group({**group, "params": left}, *lists)
         adam(
             *lists,
             has_complex=has_complex,
             beta1=group["betas"][0],
             beta2=group["betas"][1],
-            grad_scale=getattr(self, "grad_scale", None),
-            found_inf=getattr(self, "found_inf", None),
+            grad_scale=grad_scale,
+            found_inf=found_inf,
             **{name: group[name] for name in _OPTIONS if name in group},
         )
+
+    def _advance_param(self, param: Tensor, *numbers: Any) -> bool:
+        if param.grad is None:
+            return True
+        if not _fits(param, param):
+            return False
+        state = moments(self, param)
+        return _advance(param, param.grad, state["exp_avg"], state["exp_avg_sq"], state["step"], *numbers)
 
 
 def moments(optimizer: torch.optim.Optimizer, param: Tensor) -> dict[str, Tensor]:
@@ -112,19 +141,14 @@ def adam(
         options: More of torch's, by name.
     """
     everything = (params, grads, exp_avgs, exp_avg_sqs, max_exp_avg_sqs, state_steps)
-    if flags or not _plain(options):
+    betas = options["beta1"], options["beta2"]
+    scaled = options.get("grad_scale") is not None or options.get("found_inf") is not None
+    if flags or scaled or not _plain(options, *betas):
         _torchs_adam(*everything, *flags, **options)
         return
-    lr, eps = float(options["lr"]), options["eps"]
-    betas = options["beta1"], options["beta2"]
-    left = []
-    for number, tensors in enumerate(zip(params, grads, exp_avgs, exp_avg_sqs, strict=True)):
-        step = state_steps[number]
-        if step.device.type != "cpu" or not all(_fits(tensor, tensors[0]) for tensor in tensors):
-            left.append(number)
-            continue
-        step += 1
-        adam_step(None, *tensors, *corrected(lr, step, betas), betas, eps)
+    numbers = float(options["lr"]), betas, options["eps"]
+    each = enumerate(zip(params, grads, exp_avgs, exp_avg_sqs, state_steps, strict=True))
+    left = [number for number, tensors in each if not _advance(*tensors, *numbers)]
     if left:
         some = ([whole[i] for i in left] if whole else [] for whole in everything)
         _torchs_adam(*some, **options)
@@ -141,13 +165,21 @@ def instead_of_torchs_adam() -> Iterator[None]:
         _module.adam = before
 
 
-def _plain(options: dict[str, Any]) -> bool:
-    """Whether the options are those that `adam` knows, and numbers."""
-    if any(options.get(name) for name in _TORCHS):
+def _plain(options: dict[str, Any], *betas: Any) -> bool:
+    """Whether the options are those that `adam` knows, and the decays numbers."""
+    return not any(options.get(name) for name in _TORCHS) and not any(isinstance(beta, Tensor) for beta in betas)
+
+
+def _advance(
+    param: Tensor, grad: Tensor, mean: Tensor, square: Tensor, step: Tensor, lr: float, betas: tuple[float, float],
+    eps: float,
+) -> bool:  # fmt: skip
+    """Steps a parameter, if the kernel can read all that belongs to it; `step` is the number of steps so far."""
+    if step.device.type != "cpu" or not all(_fits(tensor, param) for tensor in (param, grad, mean, square)):
         return False
-    if options.get("grad_scale") is not None or options.get("found_inf") is not None:
-        return False
-    return not any(isinstance(options[name], Tensor) for name in ("beta1", "beta2"))
+    step += 1
+    adam_step(None, param, grad, mean, square, *corrected(lr, step, betas), betas, eps)
+    return True
 
 
 def _fits(tensor: Tensor, param: Tensor) -> bool:

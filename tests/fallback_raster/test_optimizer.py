@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
 
 from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
 from skipgs_plug.fallback_raster.optimizer import Adam, instead_of_torchs_adam
@@ -216,6 +217,23 @@ def test_hooks_see_every_step_once_and_may_change_the_rate() -> None:
     doubled = train(plain, grads, rates=lambda step: 0.02 * 2**step)
     assert seen == ["before", "after"] * 4
     assert torch.equal(ours[0], doubled[0])
+
+
+def test_hooks_of_all_optimizers_and_the_profiler_see_every_step_once() -> None:
+    seen = []
+    handles = [
+        register_optimizer_step_pre_hook(lambda *_: seen.append("before")),
+        register_optimizer_step_post_hook(lambda *_: seen.append("after")),
+    ]
+    try:
+        train(Adam([parameter((30,))]), gradients((30,), 7, 3))
+    finally:
+        for handle in handles:
+            handle.remove()
+    assert seen == ["before", "after"] * 3
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        train(Adam([parameter((30,))]), gradients((30,), 7, 3))
+    assert [event.count for event in profile.key_averages() if event.key == "Optimizer.step#Adam.step"] == [3]
 
 
 def test_a_closure_is_called_with_gradients_on() -> None:
