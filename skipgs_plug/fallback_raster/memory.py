@@ -18,13 +18,16 @@ from torch import Tensor
 LARGE = 1 << 23  # bytes; smaller tensors are the allocator's
 GROWTH = 8  # a piece has room for a tensor larger by an eighth: pages that nobody writes to cost nothing
 SLACK = 4  # a tensor may leave a fifth of its piece unused
+# Free pieces that fit nothing for a while may take an eighth of what was ever in use. Without it those that only the
+# forward pass needs push out the gradients, which are mapped and filled with zeros anew in every iteration.
+SPARE = 8
 
 # Windows has no private pages without a file.
 SUPPORTED = hasattr(mmap, "MAP_PRIVATE")
 
 
 class Pool:
-    """Pieces of memory: those in use, and free ones, of both never more bytes than were in use at one time.
+    """Pieces of memory: those in use, and free ones, of both an eighth more bytes at most than were in use at one time.
 
     Attributes:
         mapped: bytes of all pieces.
@@ -81,7 +84,7 @@ class Pool:
     def _map(self, size: int) -> mmap.mmap:
         size += size // GROWTH
         size = -(-size // mmap.PAGESIZE) * mmap.PAGESIZE
-        self._drop(max(self._most - self._used - size, 0))
+        self._drop(max(self._most + self._most // SPARE - self._used - size, 0))
         piece = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         if hasattr(mmap, "MADV_HUGEPAGE"):
             piece.madvise(mmap.MADV_HUGEPAGE)

@@ -1,4 +1,4 @@
-"""Memory that is used again: only where nothing lies in it any more, and never more than was needed at one time."""
+"""Memory that is used again: only where nothing lies in it any more, and little more than was needed at one time."""
 
 from __future__ import annotations
 
@@ -67,14 +67,28 @@ def test_what_is_still_held_is_not_used_again(pool: Pool, hold: Callable[[torch.
     assert numbers(pool).data_ptr() == address
 
 
-def test_no_more_is_mapped_than_was_in_use_at_one_time(pool: Pool) -> None:
+def test_little_more_is_mapped_than_was_in_use_at_one_time(pool: Pool) -> None:
     both = numbers(pool), numbers(pool, 3 * PAGE)
     most = pool.mapped
     del both
     for count in (2 * PAGE, 4 * PAGE, PAGE // 2, 3 * PAGE):  # as densification makes them
         tensor = numbers(pool, count)
-        assert pool.mapped <= most
+        assert pool.mapped <= most + most // memory.SPARE
         del tensor
+
+
+def test_an_iteration_like_the_last_maps_nothing(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most is in use at its end, and what only its beginning needs fits nothing then."""
+    mapped, map_one = [], pool._map
+    monkeypatch.setattr(pool, "_map", lambda size: mapped.append(size) or map_one(size))
+    for _ in range(4):
+        before = len(mapped)
+        lists = numbers(pool, 16 * PAGE)
+        kept = [numbers(pool, 40 * PAGE) for _ in range(3)]
+        del lists
+        gradients = [numbers(pool, 200 * PAGE), numbers(pool, 25 * PAGE)]
+        del kept, gradients
+    assert len(mapped) == before
 
 
 def test_a_release_gives_back_what_is_free_alone(pool: Pool) -> None:
