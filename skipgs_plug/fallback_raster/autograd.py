@@ -152,7 +152,7 @@ class SphericalHarmonics(torch.autograd.Function):
         v_cameras = zeros(blocks(len(means)), 3)
         sh_backward(
             means, camera, base, rest, visible, block_start, colors, v_colors.contiguous(), v_means, v_base, v_rest,
-            v_cameras, len(means), *ctx.layout, ctx.degree, 0, active_shortcuts(),
+            floats(0), floats(0), v_cameras, len(means), *ctx.layout, ctx.degree, 0, active_shortcuts(),
         )  # fmt: skip
         v_camera = v_cameras.sum(0) if ctx.needs_input_grad[1] else None
         return v_means, v_camera, v_base, None if ctx.joined else v_rest, None, None, None

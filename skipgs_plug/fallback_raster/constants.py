@@ -22,6 +22,10 @@ BOX = 5
 # makes it a cache line.
 PAIR = 16
 
+# Numbers of a row of an `OuterGradient`: bands, of which SH of degree 3 have 15 beside the constant one, and channels.
+BANDS = 16
+COLOR = 4
+
 # Most ranges of depth into which a tile deals its pairs before it sorts one after the other.
 BUCKETS = 4096
 

@@ -111,7 +111,10 @@ class Worker:
                 else:
                     if argument.dtype is not dtype or not argument.is_cpu or not argument.is_contiguous():
                         raise TypeError(self._wrong(parameter, argument))
-                    values.append(argument.data_ptr())
+                    address = argument.data_ptr()
+                    if not address and argument.numel():  # a tensor by name, which keeps its numbers elsewhere
+                        raise TypeError(self._wrong(parameter, argument))
+                    values.append(address)
         except ValueError:
             raise TypeError(f"{self._name} takes {len(self._checks)} arguments, got {len(arguments)}.") from None
         except AttributeError:

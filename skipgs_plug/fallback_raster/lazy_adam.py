@@ -7,11 +7,13 @@ import torch
 from torch import Tensor
 
 from .buffers import floats, zeros
+from .constants import BANDS
 from .launch import FloatArray, IntArray, worker
 from .optimizer import Adam, corrected, moments
+from .outer_gradient import Factors, OuterGradient
 from .source import read_kernel
 
-ROW = 48  # numbers of a row that the kernel holds, at most
+ROW = 3 * BANDS  # numbers of a row that the kernel holds, at most
 STEPS = 1024  # that a row may miss, for which rates are kept
 CHUNK = 32  # steps of a row between two looks at how small its numbers have become
 
@@ -20,7 +22,8 @@ CHUNK = 32  # steps of a row between two looks at how small its numbers have bec
 def _catch_up(
     rows: Annotated[IntArray, "n"],  # none of them twice
     done: Annotated[IntArray, "R"],  # steps that each row has, updated, as `values`, `mean` and `square`
-    gradient: Annotated[FloatArray, "n if with_gradient else 0, width"],
+    bands: Annotated[FloatArray, "n if with_gradient else 0, BANDS"],  # of the gradient, as the next
+    v_bands: Annotated[FloatArray, "n if with_gradient else 0, COLOR"],
     values: Annotated[FloatArray, "R, width"],
     mean: Annotated[FloatArray, "R, width"],  # as `adam_step` has it, as all that follow
     square: Annotated[FloatArray, "R, width"],
@@ -66,15 +69,16 @@ class _Missed:
         self._least = min(self._least, abs(rate) or math.inf)
         self._most = max(self._most, abs(rate))
 
-    def advance(self, rows: Tensor, gradient: Tensor, state: dict[str, Tensor]) -> None:
-        """Bring rows [n] to `now`, and on by the step that was noted last where there is a gradient [n, ...]."""
+    def advance(self, rows: Tensor, gradient: Factors | None, state: dict[str, Tensor]) -> None:
+        """Bring rows [n] to `now`, and on by the step that was noted last where there is a gradient of them."""
+        factors = (floats(0), floats(0)) if gradient is None else (gradient.bands, gradient.color)
         beta1, beta2 = self.betas
         smallest = self._least * beta1 ** (CHUNK + 1)
         longest = self._most if beta1**2 <= beta2 else math.inf
         _catch_up(
-            rows, self.done, gradient, self.param.detach(), state["exp_avg"], state["exp_avg_sq"],
+            rows, self.done, *factors, self.param.detach(), state["exp_avg"], state["exp_avg_sq"],
             self.rates, self.roots, self.inverse_roots, len(rows), self.param[0].numel(), self.now,
-            int(gradient.numel() > 0), 1 - beta1, beta2, 1 - beta2, self.eps, beta2**-0.5, longest,
+            int(gradient is not None), 1 - beta1, beta2, 1 - beta2, self.eps, beta2**-0.5, longest,
             2.0**-100 / smallest if smallest else math.inf, 2.0**60 / self._most if self._most else math.inf,
             max(2.0**-74, (2.0**13 * self.eps) ** 2) / beta2 ** (CHUNK + 1),
         )  # fmt: skip
@@ -83,14 +87,14 @@ class _Missed:
 
 
 class LazyAdam(Adam):
-    """`Adam` for one parameter [N, ...], to the bit, that advances only those rows that are asked for.
+    """`Adam` for one parameter [N, K, 3], to the bit, that advances only those rows that are asked for.
 
-    Rows without an entry in a row-sparse gradient miss the step: with a gradient of zero their moments decay and the
+    Rows that an `OuterGradient` does not name miss the step: with a gradient of zero their moments decay and the
     parameter moves on. `catch_up` makes up for that, whenever it is called and for whatever rows, with the same result.
     Before a row of the parameter is used, or anything of the optimizer's `state`, it has to be called.
 
     Args:
-        params: One float32 parameter on the CPU, or a group with one, of at most 48 numbers in a row.
+        params: One float32 parameter on the CPU, or a group with one, of at most 16 bands.
         lr: Learning rate, which may change from step to step.
         betas: Decay of the two means; the second is not 0.
         eps: Added to the root, more than 0.
@@ -107,7 +111,7 @@ class LazyAdam(Adam):
         given = [param for group in self.param_groups for param in group["params"]]
         if len(given) != 1 or not _fits(given[0]):
             raise ValueError(
-                f"LazyAdam takes one contiguous float32 parameter on the CPU with rows of 1 to {ROW} numbers, got "
+                f"LazyAdam takes one contiguous float32 parameter [N, K, 3] on the CPU with K of 1 to {BANDS}, got "
                 f"{[(tuple(param.shape), param.dtype, param.device.type) for param in given]}; use Adam for others."
             )
         if not eps > 0:
@@ -129,10 +133,10 @@ class LazyAdam(Adam):
         missed.require(param)
         if rows is None:
             every = torch.arange(len(param), dtype=torch.int32, device="cpu")
-            missed.advance(every, floats(0), self.state[param])
+            missed.advance(every, None, self.state[param])
             self._missed = None
         elif len(rows):
-            missed.advance(rows, floats(0), self.state[param])
+            missed.advance(rows, None, self.state[param])
 
     def state_dict(self) -> dict[str, Any]:
         """As torch's, of rows that are all up to date."""
@@ -157,7 +161,10 @@ class LazyAdam(Adam):
         (param,) = group["params"]
         if param.grad is None:
             return
-        if not param.grad.is_sparse:
+        factors = param.grad.factors if isinstance(param.grad, OuterGradient) else None
+        if factors is None:
+            if isinstance(param.grad, OuterGradient):
+                param.grad = param.grad.dense()
             self.catch_up()
             super()._step(group)
             return
@@ -171,9 +178,8 @@ class LazyAdam(Adam):
         missed.require(param)
         state["step"] += 1
         missed.add(*corrected(float(group["lr"]), state["step"], betas))
-        rows, gradient = _rows(param.grad)
-        if len(rows):
-            missed.advance(rows, gradient, state)
+        if len(factors.rows):
+            missed.advance(factors.rows, factors, state)
         missed.now += 1
 
 
@@ -182,16 +188,8 @@ def _fits(param: Tensor) -> bool:
         param.dtype is torch.float32
         and param.is_cpu
         and param.is_contiguous()
+        and param.dim() == 3
         and len(param) > 0
-        and 1 <= param[0].numel() <= ROW
+        and 1 <= param.shape[1] <= BANDS
+        and param.shape[2] == 3
     )
-
-
-def _rows(gradient: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows [M] of a row-sparse gradient, none of them twice, and their values [M, ...]."""
-    rows = gradient._indices()[0].to(torch.int32)
-    # Autograd forgets that a gradient was coalesced, and sorting it anew takes longer than the step.
-    if not bool((rows[1:] > rows[:-1]).all()):
-        gradient = gradient.coalesce()
-        rows = gradient._indices()[0].to(torch.int32)
-    return rows, gradient._values().contiguous()

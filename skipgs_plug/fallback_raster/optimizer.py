@@ -191,4 +191,5 @@ def _fits(tensor: Tensor, param: Tensor) -> bool:
         and tensor.is_contiguous()
         and tensor.shape == param.shape
         and tensor.numel() <= MAX_NUMBERS
+        and (tensor.data_ptr() != 0 or tensor.numel() == 0)
     )

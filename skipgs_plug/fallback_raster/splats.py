@@ -16,14 +16,14 @@ from torch.autograd.function import once_differentiable
 from .arguments import camera_centre, check_tensors, planes
 from .autograd import check_shapes
 from .buffers import floats, ints, zeros
-from .constants import TILE, blocks, tiles
+from .constants import BANDS, COLOR, TILE, blocks, tiles
+from .outer_gradient import Factors, OuterGradient
 from .project import project_backward, project_forward
 from .rendering import blend, blend_adjoint
 from .rows import take_rows, visible_rows
 from .sh import sh_backward, sh_forward
 from .shortcuts import active_shortcuts
 
-MOST_SPARSE = 2 / 3  # share of rows in a sparse gradient; updating more of them one by one takes longer than all
 EPS2D = 0.3  # added to the 2D covariance's diagonal, square pixels
 
 
@@ -84,8 +84,8 @@ def rasterize_splats(
         antialiased: Scale opacities by the area lost to the blur of 0.3 square pixels.
         absgrad: Also add up |gradient| of the 2D means over pixels, in `info["means2d"].absgrad`.
         catch_up: Called with the visible rows [M], int32, before their `shN` is read, which it may change in place.
-            With it the gradient of `shN` is row-sparse, of these rows in that order, when they are less than two
-            thirds of all; at degree 0 it has no row, and nothing is called.
+            With it the gradient of `shN` is an `OuterGradient` of these rows in that order; at degree 0 it has no
+            row, and nothing is called.
         with_rows: Whether the dictionary has a row for each of M visible Gaussians, as densification and optimizers of
             visible rows want it; `absgrad` needs it.
 
@@ -110,12 +110,8 @@ def rasterize_splats(
     with torch.no_grad():
         projected = _project(means, quats, log_scales, logits, viewmat, K, size, near_plane, far_plane, antialiased)
     visible = projected.visible
-    sparse = None
-    if catch_up is not None and sh_degree == 0:
-        sparse = visible[:0]
-    elif catch_up is not None:
+    if catch_up is not None and sh_degree > 0:
         catch_up(visible)
-        sparse = visible if len(visible) < MOST_SPARSE * len(means) else None
     tile_width, tile_height = tiles(width, height)
     info: dict[str, Any] = {
         "width": width,
@@ -141,7 +137,7 @@ def rasterize_splats(
         }
     image, transmittance = _Render.apply(
         means, quats, log_scales, logits, sh0, shN, centres, absolute, projected, viewmat, K, size, sh_degree,
-        antialiased, sparse,
+        antialiased, catch_up is not None,
     )  # fmt: skip
     if background is not None:
         image = image + transmittance.unsqueeze(-1) * background.to(torch.float32)
@@ -151,8 +147,8 @@ def rasterize_splats(
 class _Render(torch.autograd.Function):
     """Image [H, W, 3] of projected Gaussians and the transmittance [H, W] behind it.
 
-    `absolute` [M, 2] receives the sum over pixels of |v_centres| when it is not None. `sparse` names the rows of the
-    gradient of `shN`: the visible ones, or none at degree 0; all of them where it is None.
+    `absolute` [M, 2] receives the sum over pixels of |v_centres| when it is not None. Where `outer`, the gradient of
+    `shN` is an `OuterGradient`.
     """
 
     @staticmethod
@@ -172,7 +168,7 @@ class _Render(torch.autograd.Function):
         size: tuple[int, int],
         degree: int,
         antialiased: bool,
-        sparse: Tensor | None,
+        outer: bool,
     ) -> tuple[Tensor, Tensor]:
         p, n = projected, len(means)
         camera = camera_centre(viewmat).contiguous()
@@ -190,7 +186,7 @@ class _Render(torch.autograd.Function):
         ctx.projected, ctx.colors, ctx.absolute = projected, colors, absolute
         ctx.with_centres = centres is not None
         ctx.camera = camera, viewmat, K, size, antialiased
-        ctx.sh = layout, degree, sparse
+        ctx.sh = layout, degree, outer
         ctx.set_materialize_grads(False)  # the transmittance has a gradient where there is a background
         return image, transmittance
 
@@ -202,24 +198,22 @@ class _Render(torch.autograd.Function):
         means, quats, log_scales, logits, sh0, shN, transmittance = check_shapes(ctx.saved_tensors, **ctx.shapes)
         p, n = ctx.projected, len(means)
         camera, viewmat, K, size, antialiased = ctx.camera
-        layout, degree, sparse = ctx.sh
+        layout, degree, outer = ctx.sh
         absolute = None if ctx.absolute is None else zeros(n, 2)
         v_means2d, v_conics, v_activated, v_colors = blend_adjoint(
             ctx.blended, p.means2d, p.conics, p.opacities, ctx.colors, transmittance, v_image, v_transmittance, absolute
         )
         if absolute is not None:
             ctx.absolute += take_rows(absolute, p.visible)
-        gradients = [floats(*t.shape) for t in (means, quats, log_scales, logits, sh0, shN)]
-        v_means, v_quats, v_scales, v_logits, v_sh0, v_shN = gradients
-        if sparse is not None:
-            # Part of a tensor of full size, so that gradients of different lengths lie in the same memory.
-            v_shN = v_shN[: len(p.visible)]
-            gradients[-1] = torch.sparse_coo_tensor(
-                sparse[None].to(torch.int64), v_shN[: len(sparse)], shN.shape, is_coalesced=True, check_invariants=False
-            )
+        gradients = [floats(*t.shape) for t in (means, quats, log_scales, logits, sh0)]
+        v_means, v_quats, v_scales, v_logits, v_sh0 = gradients
+        rows = p.visible[: 0 if degree == 0 else None] if outer else p.visible[:0]
+        factors = Factors(rows, floats(len(rows), BANDS), floats(len(rows), COLOR))
+        v_shN = floats(0) if outer else floats(*shN.shape)
+        gradients.append(OuterGradient(shN.shape, [factors]) if outer else v_shN)
         sh_backward(
             means, camera, sh0, shN, p.visible, p.block_start, ctx.colors, v_colors, v_means, v_sh0, v_shN,
-            zeros(blocks(n), 3), n, *layout, degree, int(sparse is not None), active_shortcuts(),
+            factors.bands, factors.color, zeros(blocks(n), 3), n, *layout, degree, int(outer), active_shortcuts(),
         )  # fmt: skip
         project_backward(
             means, quats, log_scales, logits, viewmat, K, p.visible, p.block_start, v_means2d, floats(0), v_conics,

@@ -28,6 +28,7 @@ from skipgs_plug.fallback_raster.compat import statistics
 from skipgs_plug.fallback_raster.compat.inria import GaussianRasterizationSettings
 from skipgs_plug.fallback_raster.compat.rendering import render, splats
 from skipgs_plug.fallback_raster.launch import ByteArray, FloatArray, IntArray, LongArray, Worker, worker
+from skipgs_plug.fallback_raster.outer_gradient import Factors, OuterGradient
 from skipgs_plug.fallback_raster.source import KERNELS, PRELUDE, read_kernel
 from skipgs_plug.fallback_raster.splats import rasterize_splats
 
@@ -105,8 +106,11 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker, list[A
         param = torch.nn.Parameter(torch.ones(5, 3))
         param.grad = torch.ones(5, 3)
         adam.adam_rows(torch.ones(5) > 0, param, torch.zeros(5, 3), torch.zeros(5, 3), 0.1, (0.9, 0.999), 1e-15)
-        param.grad = param.grad.to_sparse(1)
-        lazy_adam.LazyAdam([param]).step()
+        bands = torch.nn.Parameter(torch.ones(5, 15, 3))
+        bands.grad = OuterGradient(
+            bands.shape, [Factors(torch.tensor([1, 3], dtype=torch.int32), torch.ones(2, 16), torch.ones(2, 4))]
+        )
+        lazy_adam.LazyAdam([bands]).step()
         sums = torch.zeros(5), torch.zeros(5)
         gradient_norms.sum_norms(torch.tensor([1, 3], dtype=torch.int32), torch.ones(2, 2), (1.0, 1.0), *sums)
         with torch.no_grad():

@@ -37,12 +37,30 @@ const auto distance = [&](v16 m, v16 s, v16 half, int step) INLINE -> v16 {
     return fma(fma(-below, quotient, moved), inverse, quotient);
 };
 constexpr int VECTORS = ROW / 16;
+static_assert(ROW == 3 * BANDS && BANDS == 16 && COLOR == 4, "an outer product fills a row");
+// Bands times three channels, channel by channel.
+const auto outer_product = [](v16 bands, v4 color, v16* to) INLINE {
+    const v16 x = bands * color.x, y = bands * color.y, z = bands * color.z;
+    to[0] = __builtin_shufflevector(__builtin_shufflevector(x, y, 0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5), z,
+                                    0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15);
+    to[1] = __builtin_shufflevector(__builtin_shufflevector(x, y, 21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26), z,
+                                    0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15);
+    to[2] = __builtin_shufflevector(__builtin_shufflevector(x, y, 0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0), z,
+                                    26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31);
+};
 for (int i = first; i < last; ++i) {
     const int row = rows[i], begin = done[row];
     if (begin == now && !with_gradient) continue;
     done[row] = now + with_gradient;
     const long long at = (long long)row * width;
-    float *m_row = mean + at, *s_row = square + at, *x_row = values + at, *g_row = gradient + (long long)i * width;
+    float *m_row = mean + at, *s_row = square + at, *x_row = values + at;
+    alignas(64) v16 product[VECTORS];
+    if (with_gradient) {
+        const v4 color = *(const v4*)(v_bands + (long long)COLOR * i);
+        const bool received = color.x != 0.0f || color.y != 0.0f || color.z != 0.0f;
+        outer_product(received ? load(bands + (long long)BANDS * i) : (v16)0.0f, color, product);
+    }
+    const float* g_row = (const float*)product;
     float padded[4][16];
     if (width < 16) {
         for (int j = 0; j < 16; ++j) {
@@ -64,6 +82,9 @@ for (int i = first; i < last; ++i) {
         s[v] = load(s_row + offset[v]);
         x[v] = load(x_row + offset[v]);
         g[v] = with_gradient ? load(g_row + offset[v]) : (v16)0.0f;
+        // What two stores wrote cannot be loaded before they are through.
+        if (width == 45 && v == 2 && with_gradient)
+            g[v] = __builtin_shufflevector(product[1], product[2], 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28);
         some |= (m[v] != 0.0f) | (s[v] != 0.0f) | (g[v] != 0.0f);
     }
     if (!bits(some)) continue;  // never trained: nothing changes

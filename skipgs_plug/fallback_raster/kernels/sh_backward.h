@@ -10,8 +10,9 @@ const bool empty = listed == 0;
 const auto clear_rows = [=](float* p, long long n) { empty ? clear_past_caches(p, n) : clear(p, n); };
 clear_rows(v_means + 3 * row_begin, 3 * rows);
 clear_rows(v_base + base_stride * row_begin, base_stride * rows);
-if (packed) clear(v_rest + (long long)rest_stride * block_start[block], rest_stride * listed);
-else if (v_rest != v_base) clear_rows(v_rest + rest_stride * row_begin, rest_stride * rows);
+const bool factors = outer && degree > 0;
+if (factors) clear(v_bands + (long long)COLOR * block_start[block], COLOR * listed);
+else if (!outer && v_rest != v_base) clear_rows(v_rest + rest_stride * row_begin, rest_stride * rows);
 const int terms = (degree + 1) * (degree + 1), begin = block_start[block];
 int received[BLOCK], place[BLOCK], count = 0;
 for (int i = begin; i < begin + listed; ++i) {
@@ -20,7 +21,7 @@ for (int i = begin; i < begin + listed; ++i) {
     bool any = !(shortcuts & CONTRIBUTED_ONLY);
     for (int k = 0; k < 3; ++k) any |= (colors[3 * g + k] > 0.0f) & (v_colors[3 * g + k] != 0.0f);
     received[count] = g;
-    place[count] = packed ? i : g;
+    place[count] = outer ? i : g;
     count += any;
 }
 for (int i = 0; i < count; i += 16) {
@@ -29,7 +30,7 @@ for (int i = 0; i < count; i += 16) {
     for (int l = 0; l < 16; ++l) row[l] = received[i + smaller(l, lanes - 1)];
     for (int l = 0; l < 16; ++l)
         fetch_bands(rest + rest_offset, received[smaller(i + 16 + l, count - 1)], rest_stride, 3 * (terms - 1));
-    v16 basis[16], v_sh[48], color[3], v[3], x, y, z, norm, shrink;
+    v16 basis[16], color[3], v[3], x, y, z, norm, shrink;
     gather3(colors, row, n, color);
     gather3(v_colors, row, n, v);
     for (int k = 0; k < 3; ++k) v[k] = color[k] > 0.0f ? v[k] : (v16)0.0f;
@@ -38,9 +39,18 @@ for (int i = 0; i < count; i += 16) {
     const v16 v_constant[3] = {basis[0] * v[0], basis[0] * v[1], basis[0] * v[2]};
     if (base_stride == 3) scatter3(v_base, row, v_constant[0], v_constant[1], v_constant[2], lanes);
     else put_bands(v_base, row, base_stride, 3, v_constant, lanes);
-    for (int band = 1; band < terms; ++band)
-        for (int k = 0; k < 3; ++k) v_sh[3 * band - 3 + k] = basis[band] * v[k];
-    put_bands(v_rest + rest_offset, place + i, rest_stride, 3 * (terms - 1), v_sh, lanes);
+    if (factors) {
+        v16 own[BANDS];
+        for (int band = 0; band < BANDS; ++band) own[band] = band + 1 < terms ? basis[band + 1] : (v16)0.0f;
+        transpose(own);
+        for (int l = 0; l < lanes; ++l) store(bands + (long long)BANDS * place[i + l], own[l]);
+        scatter4(v_bands, place + i, v[0], v[1], v[2], (v16)0.0f, lanes);
+    } else if (!outer) {
+        v16 v_sh[48];
+        for (int band = 1; band < terms; ++band)
+            for (int k = 0; k < 3; ++k) v_sh[3 * band - 3 + k] = basis[band] * v[k];
+        put_bands(v_rest + rest_offset, place + i, rest_stride, 3 * (terms - 1), v_sh, lanes);
+    }
     if (degree == 0) continue;
     v16 sh[48], along[16];
     take_bands(rest + rest_offset, row, rest_stride, 3 * (terms - 1), sh);
