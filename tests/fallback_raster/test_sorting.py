@@ -12,6 +12,8 @@ from skipgs_plug.fallback_raster.rows import all_rows
 DEPTHS = {
     "spread": lambda n, g: 1.0 + 9.0 * torch.rand(n, generator=g),
     "all equal": lambda n, g: torch.full((n,), 3.0),
+    "falling": lambda n, g: torch.linspace(10.0, 1.0, n),
+    "falling in clusters": lambda n, g: (3.0 + 4.0 * (torch.arange(n) // 13) - 1e-3 * (torch.arange(n) % 13)).flip(0),
     "two values": lambda n, g: torch.randint(1, 3, (n,), generator=g).float(),
     "one far away": lambda n, g: torch.cat([1.0 + 1e-4 * torch.rand(n - 1, generator=g), torch.tensor([1e9])]),
     "clusters in clusters": lambda n, g: 1.0 + 10.0 ** -torch.randint(0, 8, (n,), generator=g).float(),

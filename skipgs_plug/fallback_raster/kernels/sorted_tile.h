@@ -2,7 +2,7 @@
 //
 // Pairs are dealt into buckets of equal ranges of the depth's bits, and buckets are sorted when their turn comes. Equal
 // depths keep the order of the rows, which is that of the numbers in the lower half.
-static constexpr int LARGE = 8;  // pairs in a bucket above which it is dealt again
+static constexpr int LARGE = 16;  // pairs in a bucket above which it is dealt again
 struct SortedTile {
     long long *dealt, *other;  // the tile's pairs in buckets, and as much room again
     int *rows, *places;        // out: row and number of each pair
@@ -24,24 +24,40 @@ struct SortedTile {
     void sort(int wanted) {
         wanted = smaller(wanted, count);
         if (done >= wanted) return;
-        int end = done;
+        int end = done, longest = 0;
         for (int begin = done; end < wanted; begin = end) {
             end = start[next++];
+            longest = larger(longest, end - begin);
             if (end - begin > LARGE && shift > 0) refine(begin, end);
         }
-        // What is left to do is short: no pair moves farther than its bucket is long.
-        for (int i = done + 1; i < end; ++i) {
-            const long long pair = dealt[i];
-            int j = i;
-            for (; j > done && dealt[j - 1] > pair; --j) dealt[j] = dealt[j - 1];
-            dealt[j] = pair;
-        }
+        // A full bucket that was not dealt again holds one depth, in order.
+        settle(done, end, smaller(longest, LARGE));
         for (int i = done; i < end; ++i) places[i] = (int)dealt[i];
         for (int i = done; i < end; ++i) rows[i] = pair_row[places[i]];
         done = end;
     }
 
   private:
+    // Sorts where no pair is farther from its place than a bucket of `longest` pairs allows: neighbours trade places, each
+    // pair with the next and then with the one before (odd-even transposition, Habermann 1972). Which of them do nobody
+    // can foresee, so that comparing all costs less than a branch for each.
+    void settle(int begin, int end, int longest) {
+        typedef long long l8 __attribute__((ext_vector_type(8), aligned(8)));
+        for (int round = 0; round <= longest; ++round) {
+            int i = begin + (round & 1);
+            for (; i + 8 <= end; i += 8) {
+                const l8 a = *(const l8*)(dealt + i), b = __builtin_shufflevector(a, a, 1, 0, 3, 2, 5, 4, 7, 6);
+                const l8 low = __builtin_elementwise_min(a, b), high = __builtin_elementwise_max(a, b);
+                *(l8*)(dealt + i) = __builtin_shufflevector(low, high, 0, 9, 2, 11, 4, 13, 6, 15);
+            }
+            for (; i + 2 <= end; i += 2) {
+                const long long a = dealt[i], b = dealt[i + 1];
+                dealt[i] = a < b ? a : b;
+                dealt[i + 1] = a < b ? b : a;
+            }
+        }
+    }
+
     // Moves pairs into buckets of equal ranges; `bucket` [buckets + 1] gets the end of each, the result is the width of
     // the ranges in bits.
     static int deal(const long long* from, long long* to, int count, int* bucket, int buckets) {
