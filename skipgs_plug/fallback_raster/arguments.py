@@ -1,5 +1,6 @@
 """What `rasterization` refuses, in one sentence that names the argument."""
 
+import functools
 import math
 import numbers
 import operator
@@ -12,6 +13,8 @@ from torch import Tensor
 # Kernels count rows, channels of rows and pixels in 32 bits, and place pixel centres in float32.
 MAX_NUMBERS = 2**31 - 1
 MAX_SIDE = 2**23
+
+Shape = tuple[int, ...]
 
 
 def refuse_unsupported(**used: bool) -> None:
@@ -75,6 +78,11 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def as_kernels_read(*tensors: Tensor) -> list[Tensor]:
+    """Returns tensors as contiguous float32, those that are so already as they are."""
+    return [t if t.dtype is torch.float32 and t.is_contiguous() else t.to(torch.float32).contiguous() for t in tensors]
+
+
 def as_int(value: Any) -> Any:
     """Returns a whole number of any kind, such as NumPy's, as kernels take it, and all else as it is."""
     try:
@@ -121,35 +129,59 @@ def check_tensors(
             raise ValueError(f"{name} must be a floating point tensor, got {kind}.")
         if tensor.device.type != "cpu":
             raise ValueError(f"{name} is on {tensor.device}, but this rasterizer runs on the CPU: use {name}.cpu().")
-    if means.dim() != 2 or means.shape[1] != 3:
-        raise ValueError(f"means must have shape [N, 3] (no batch dimensions), got {list(means.shape)}.")
-    n = len(means)
-    if viewmats.dim() != 3:
-        raise ValueError(f"viewmats must have shape [C, 4, 4], got {list(viewmats.shape)}.")
-    n_cameras = len(viewmats)
+    if sh_degree is not None and (type(sh_degree) is not int or sh_degree not in (0, 1, 2, 3)):
+        raise ValueError(f"sh_degree must be 0 to 3 on the CPU, got {sh_degree!r}.")
+    if not (isinstance(width, int) and isinstance(height, int) and width > 0 and height > 0):
+        raise ValueError(f"width and height must be whole numbers of at least 1, got {width!r} and {height!r}.")
+    shapes = (None if t is None else t.shape for t in (means, quats, scales, opacities, colors, viewmats, Ks, sh_rest))
+    _check_shapes(*shapes, None if backgrounds is None else backgrounds.shape, sh_degree, width, height)
+    for name in ("viewmats", "Ks"):
+        if not all(map(math.isfinite, tensors[name].detach().flatten().tolist())):
+            raise ValueError(f"{name} holds NaN or infinity: a camera must be finite.")
+
+
+@functools.lru_cache(maxsize=64)  # those of the last images: looking again takes as long as a small kernel
+def _check_shapes(
+    means: Shape,
+    quats: Shape,
+    scales: Shape,
+    opacities: Shape,
+    colors: Shape,
+    viewmats: Shape,
+    Ks: Shape,
+    sh_rest: Shape | None,
+    backgrounds: Shape | None,
+    sh_degree: int | None,
+    width: int,
+    height: int,
+) -> None:
+    if len(means) != 2 or means[1] != 3:
+        raise ValueError(f"means must have shape [N, 3] (no batch dimensions), got {list(means)}.")
+    n = means[0]
+    if len(viewmats) != 3:
+        raise ValueError(f"viewmats must have shape [C, 4, 4], got {list(viewmats)}.")
+    n_cameras = viewmats[0]
     expected = {
-        "quats": [n, 4],
-        "scales": [n, 3],
-        "opacities": [n],
-        "viewmats": [n_cameras, 4, 4],
-        "Ks": [n_cameras, 3, 3],
+        "quats": (quats, [n, 4]),
+        "scales": (scales, [n, 3]),
+        "opacities": (opacities, [n]),
+        "viewmats": (viewmats, [n_cameras, 4, 4]),
+        "Ks": (Ks, [n_cameras, 3, 3]),
     }
-    for name, shape in expected.items():
-        if list(tensors[name].shape) != shape:
-            raise ValueError(f"{name} must have shape {shape}, got {list(tensors[name].shape)}.")
+    for name, (found, wanted) in expected.items():
+        if list(found) != wanted:
+            raise ValueError(f"{name} must have shape {wanted}, got {list(found)}.")
     if n_cameras == 0:
         raise ValueError("viewmats must hold at least one camera, got none.")
-    shape = list(colors.shape)
+    shape = list(colors)
     if sh_degree is None:
         if shape[:-1] not in ([n], [n_cameras, n]) or shape[-1] == 0:
             raise ValueError(f"colors must have shape [{n}, D] or [{n_cameras}, {n}, D], got {shape}.")
         channels = shape[-1]
     else:
-        if type(sh_degree) is not int or sh_degree not in (0, 1, 2, 3):
-            raise ValueError(f"sh_degree must be 0 to 3 on the CPU, got {sh_degree!r}.")
         terms = (sh_degree + 1) ** 2
         if sh_rest is not None:
-            rest = list(sh_rest.shape)
+            rest = list(sh_rest)
             if shape != [n, 1, 3] or len(rest) != 3 or rest[0] != n or rest[2] != 3:
                 raise ValueError(
                     f"colors as a pair must have shapes [{n}, 1, 3], [{n}, K - 1, 3], got {shape}, {rest}."
@@ -161,10 +193,8 @@ def check_tensors(
                 f"sh_degree={sh_degree}, got {shape}."
             )
         channels = 3
-    if backgrounds is not None and list(backgrounds.shape) != [n_cameras, channels]:
-        raise ValueError(f"backgrounds must have shape [{n_cameras}, {channels}], got {list(backgrounds.shape)}.")
-    if not (isinstance(width, int) and isinstance(height, int) and width > 0 and height > 0):
-        raise ValueError(f"width and height must be whole numbers of at least 1, got {width!r} and {height!r}.")
+    if backgrounds is not None and list(backgrounds) != [n_cameras, channels]:
+        raise ValueError(f"backgrounds must have shape [{n_cameras}, {channels}], got {list(backgrounds)}.")
     if max(width, height) > MAX_SIDE or width * height > MAX_NUMBERS:
         raise ValueError(
             f"An image may have at most {MAX_SIDE:,} pixels along a side and {MAX_NUMBERS:,} in all, "
@@ -173,6 +203,3 @@ def check_tensors(
     widest = max(4, channels if sh_degree is None else 3) + 1  # quaternions, or colours and depth
     if n * widest > MAX_NUMBERS:
         raise ValueError(f"{n:,} Gaussians with {widest} numbers each are more than {MAX_NUMBERS:,} numbers.")
-    for name in ("viewmats", "Ks"):
-        if not all(map(math.isfinite, tensors[name].detach().flatten().tolist())):
-            raise ValueError(f"{name} holds NaN or infinity: a camera must be finite.")

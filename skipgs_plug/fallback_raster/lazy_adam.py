@@ -4,6 +4,7 @@ import math
 from typing import Annotated, Any
 
 import torch
+from numpy import float32
 from torch import Tensor
 
 from .buffers import floats, zeros
@@ -53,6 +54,7 @@ class _Missed:
         self.param, self.betas, self.eps = param, betas, eps
         self.done = zeros(len(param), dtype=torch.int32)
         self.rates, self.roots, self.inverse_roots = floats(STEPS), floats(STEPS), floats(STEPS)
+        self._arrays = [tensor.numpy() for tensor in (self.rates, self.roots, self.inverse_roots)]
         self.now = 0
         self._least, self._most = math.inf, 0.0
 
@@ -63,9 +65,8 @@ class _Missed:
 
     def add(self, rate: float, root: float) -> None:
         """Note a step; it is complete when `now` is raised."""
-        self.rates[self.now] = rate
-        self.roots[self.now] = root
-        self.inverse_roots[self.now] = 1.0 / self.roots[self.now]
+        for array, value in zip(self._arrays, (rate, root, 1.0 / float32(root)), strict=True):
+            array[self.now] = value
         self._least = min(self._least, abs(rate) or math.inf)
         self._most = max(self._most, abs(rate))
 

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from .arguments import as_float, as_int, camera_centre, check_tensors, planes, refuse_unsupported
+from .arguments import as_float, as_int, as_kernels_read, camera_centre, check_tensors, planes, refuse_unsupported
 from .autograd import Blend, Pack, Project, SphericalHarmonics
 from .constants import MAX_CHANNELS, TILE, tiles
 from .rows import all_rows
@@ -142,11 +142,10 @@ def rasterization(
         )
 
     dtype, n_cameras, n = means.dtype, len(viewmats), len(means)
-    means, quats, scales, opacities, colors, viewmats, Ks = (
-        t.to(torch.float32).contiguous() for t in (means, quats, scales, opacities, colors, viewmats, Ks)
-    )
+    given = means, quats, scales, opacities, colors, viewmats, Ks
+    means, quats, scales, opacities, colors, viewmats, Ks = as_kernels_read(*given)
     if sh_rest is not None:
-        sh_rest = sh_rest.to(torch.float32).contiguous()
+        (sh_rest,) = as_kernels_read(sh_rest)
     antialiased = rasterize_mode == "antialiased"
     shared_colors = colors.dim() == (2 if sh_degree is None else 3)
 

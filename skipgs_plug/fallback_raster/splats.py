@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .arguments import camera_centre, check_tensors, planes
+from .arguments import as_kernels_read, camera_centre, check_tensors, planes
 from .autograd import check_shapes
 from .buffers import floats, ints, zeros
 from .constants import BANDS, COLOR, TILE, blocks, tiles
@@ -104,8 +104,7 @@ def rasterize_splats(
         None if background is None else background[None], width, height,
     )  # fmt: skip
     near_plane, far_plane = planes(near_plane, far_plane)
-    means, quats, log_scales, logits, sh0, shN = (t.to(torch.float32).contiguous() for t in tensors)
-    viewmat, K = viewmat.to(torch.float32).contiguous(), K.to(torch.float32).contiguous()
+    means, quats, log_scales, logits, sh0, shN, viewmat, K = as_kernels_read(*tensors, viewmat, K)
     size = (width, height)
     with torch.no_grad():
         projected = _project(means, quats, log_scales, logits, viewmat, K, size, near_plane, far_plane, antialiased)
