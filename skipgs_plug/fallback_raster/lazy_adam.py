@@ -139,6 +139,13 @@ class LazyAdam(Adam):
         elif len(rows):
             missed.advance(rows, None, self.state[param])
 
+    @torch.no_grad()
+    def receive(self, gradient: Factors) -> None:
+        """Add to the gradient of the parameter, which is an `OuterGradient` unless it has one already."""
+        (param,) = self.param_groups[0]["params"]
+        more = OuterGradient(param.shape, [gradient])
+        param.grad = more if param.grad is None else param.grad + more
+
     def state_dict(self) -> dict[str, Any]:
         """As torch's, of rows that are all up to date."""
         self.catch_up()

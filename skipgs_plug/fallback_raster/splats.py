@@ -5,7 +5,6 @@ come as logarithms and logits, whose activations and adjoints happen in the kern
 visible Gaussians only, and the gradients of the parameters are the only tensors of N rows that the backward fills.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,8 @@ from .arguments import as_kernels_read, camera_centre, check_tensors, planes
 from .autograd import check_shapes
 from .buffers import floats, ints, zeros
 from .constants import BANDS, COLOR, TILE, blocks, tiles
-from .outer_gradient import Factors, OuterGradient
+from .lazy_adam import LazyAdam
+from .outer_gradient import Factors
 from .project import project_backward, project_forward
 from .rendering import blend, blend_adjoint
 from .rows import take_rows, visible_rows
@@ -59,7 +59,7 @@ def rasterize_splats(
     background: Tensor | None = None,  # [3]
     antialiased: bool = False,
     absgrad: bool = False,
-    catch_up: Callable[[Tensor], None] | None = None,
+    lazy: LazyAdam | None = None,
     with_rows: bool = True,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Renders raw parameters of 3DGS into one camera, as `rasterization` renders their activations.
@@ -83,9 +83,8 @@ def rasterize_splats(
         background: Colour behind everything; black if None.
         antialiased: Scale opacities by the area lost to the blur of 0.3 square pixels.
         absgrad: Also add up |gradient| of the 2D means over pixels, in `info["means2d"].absgrad`.
-        catch_up: Called with the visible rows [M], int32, before their `shN` is read, which it may change in place.
-            With it the gradient of `shN` is an `OuterGradient` of these rows in that order; at degree 0 it has no
-            row, and nothing is called.
+        lazy: The optimizer of `shN`, where this is its parameter. Visible rows are caught up before they are read, and
+            the backward pass hands the gradient to it in factors, past autograd, which asks for all numbers.
         with_rows: Whether the dictionary has a row for each of M visible Gaussians, as densification and optimizers of
             visible rows want it; `absgrad` needs it.
 
@@ -109,8 +108,8 @@ def rasterize_splats(
     with torch.no_grad():
         projected = _project(means, quats, log_scales, logits, viewmat, K, size, near_plane, far_plane, antialiased)
     visible = projected.visible
-    if catch_up is not None and sh_degree > 0:
-        catch_up(visible)
+    if lazy is not None and sh_degree > 0:
+        lazy.catch_up(visible)
     tile_width, tile_height = tiles(width, height)
     info: dict[str, Any] = {
         "width": width,
@@ -136,7 +135,7 @@ def rasterize_splats(
         }
     image, transmittance = _Render.apply(
         means, quats, log_scales, logits, sh0, shN, centres, absolute, projected, viewmat, K, size, sh_degree,
-        antialiased, catch_up is not None,
+        antialiased, lazy,
     )  # fmt: skip
     if background is not None:
         image = image + transmittance.unsqueeze(-1) * background.to(torch.float32)
@@ -146,8 +145,7 @@ def rasterize_splats(
 class _Render(torch.autograd.Function):
     """Image [H, W, 3] of projected Gaussians and the transmittance [H, W] behind it.
 
-    `absolute` [M, 2] receives the sum over pixels of |v_centres| when it is not None. Where `outer`, the gradient of
-    `shN` is an `OuterGradient`.
+    `absolute` [M, 2] receives the sum over pixels of |v_centres| when it is not None, `lazy` the gradient of `shN`.
     """
 
     @staticmethod
@@ -167,7 +165,7 @@ class _Render(torch.autograd.Function):
         size: tuple[int, int],
         degree: int,
         antialiased: bool,
-        outer: bool,
+        lazy: LazyAdam | None,
     ) -> tuple[Tensor, Tensor]:
         p, n = projected, len(means)
         camera = camera_centre(viewmat).contiguous()
@@ -185,7 +183,7 @@ class _Render(torch.autograd.Function):
         ctx.projected, ctx.colors, ctx.absolute = projected, colors, absolute
         ctx.with_centres = centres is not None
         ctx.camera = camera, viewmat, K, size, antialiased
-        ctx.sh = layout, degree, outer
+        ctx.sh = layout, degree, lazy
         ctx.set_materialize_grads(False)  # the transmittance has a gradient where there is a background
         return image, transmittance
 
@@ -197,7 +195,7 @@ class _Render(torch.autograd.Function):
         means, quats, log_scales, logits, sh0, shN, transmittance = check_shapes(ctx.saved_tensors, **ctx.shapes)
         p, n = ctx.projected, len(means)
         camera, viewmat, K, size, antialiased = ctx.camera
-        layout, degree, outer = ctx.sh
+        layout, degree, lazy = ctx.sh
         absolute = None if ctx.absolute is None else zeros(n, 2)
         v_means2d, v_conics, v_activated, v_colors = blend_adjoint(
             ctx.blended, p.means2d, p.conics, p.opacities, ctx.colors, transmittance, v_image, v_transmittance, absolute
@@ -206,13 +204,13 @@ class _Render(torch.autograd.Function):
             ctx.absolute += take_rows(absolute, p.visible)
         gradients = [floats(*t.shape) for t in (means, quats, log_scales, logits, sh0)]
         v_means, v_quats, v_scales, v_logits, v_sh0 = gradients
-        rows = p.visible[: 0 if degree == 0 else None] if outer else p.visible[:0]
+        rows = p.visible if lazy is not None and degree > 0 else p.visible[:0]
         factors = Factors(rows, floats(len(rows), BANDS), floats(len(rows), COLOR))
-        v_shN = floats(0) if outer else floats(*shN.shape)
-        gradients.append(OuterGradient(shN.shape, [factors]) if outer else v_shN)
+        v_shN = floats(*shN.shape) if lazy is None else floats(0)
         sh_backward(
             means, camera, sh0, shN, p.visible, p.block_start, ctx.colors, v_colors, v_means, v_sh0, v_shN,
-            factors.bands, factors.color, zeros(blocks(n), 3), n, *layout, degree, int(outer), active_shortcuts(),
+            factors.bands, factors.color, zeros(blocks(n), 3), n, *layout, degree, int(lazy is not None),
+            active_shortcuts(),
         )  # fmt: skip
         project_backward(
             means, quats, log_scales, logits, viewmat, K, p.visible, p.block_start, v_means2d, floats(0), v_conics,
@@ -220,7 +218,10 @@ class _Render(torch.autograd.Function):
             n, *map(float, size), EPS2D, 0, int(antialiased), 0, 1, active_shortcuts(),
         )  # fmt: skip
         v_centres = take_rows(v_means2d, p.visible) if ctx.with_centres else None
-        return *gradients, v_centres, *[None] * 8
+        if lazy is None:
+            return *gradients, v_shN, v_centres, *[None] * 8
+        lazy.receive(factors)
+        return *gradients, None, v_centres, *[None] * 8
 
 
 def _project(

@@ -46,7 +46,7 @@ class Backend:
             antialiased: compensate opacities for the blur.
             with_rows: whether the dictionary has to hold rows of Gaussians.
             options: `width height sh_degree near_plane far_plane absgrad` of `rasterization`, and
-                `catch_up` of `rasterize_splats` on the CPU.
+                `lazy` of `rasterize_splats` on the CPU.
 
         Returns:
             Image [H, W, 3] and the dictionary of `rasterization`.

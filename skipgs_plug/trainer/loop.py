@@ -313,7 +313,7 @@ class Trainer:
     def _rasterize(
         self, view: View, degree: int, background: Tensor | None, with_rows: bool = False
     ) -> tuple[Tensor, dict[str, Any]]:
-        lazy = {} if self._lazy is None else {"catch_up": self._lazy.catch_up}
+        lazy = {} if self._lazy is None else {"lazy": self._lazy}
         return self.backend.render(
             self._splats,
             view.viewmat,

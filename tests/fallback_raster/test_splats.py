@@ -10,6 +10,7 @@ from raster_scenes import random_scene, relative_error
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import get_num_threads, rasterization, set_num_threads
+from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
 from skipgs_plug.fallback_raster.splats import rasterize_splats
 
 NAMES = ("means", "quats", "log_scales", "logits", "sh0", "shN")
@@ -183,34 +184,53 @@ def test_planes_may_be_whole_numbers_and_what_lies_behind_the_camera_is_never_dr
         assert torch.equal(activated(raw, camera, near_plane=near)[0], activated(raw, camera, near_plane=0.0)[0])
 
 
+class AskedFor(LazyAdam):
+    """Remembers the rows that it was asked for."""
+
+    def __init__(self, params: Any) -> None:
+        super().__init__(params)
+        self.asked: list[Tensor] = []
+
+    def catch_up(self, rows: Tensor | None = None) -> None:
+        assert rows is not None
+        self.asked.append(rows)
+
+
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("seen", [0.2, 0.9, 0.0])
 def test_gradients_of_the_higher_bands_may_be_factors_of_visible_rows(seen: float, degree: int) -> None:
     raw, camera = raw_scene(n=1500)
     behind = torch.rand(1500, generator=torch.Generator().manual_seed(4)) >= seen
     raw["means"][behind, 2] -= 100.0
-    asked: list[Tensor] = []
     dense = results(splatted, raw, camera, sh_degree=degree)
-    lazy = results(splatted, raw, camera, sh_degree=degree, catch_up=lambda rows: asked.append(rows))
-    higher = lazy.pop("shN")
-    assert torch.equal(higher.dense(), dense.pop("shN"))
+    optimizer = AskedFor([torch.nn.Parameter(raw["shN"].clone())])
+    lazy = results(splatted, raw, camera, sh_degree=degree, lazy=optimizer)
+    assert lazy.pop("shN") is None
+    (param,) = optimizer.param_groups[0]["params"]
+    assert torch.equal(param.grad.dense(), dense.pop("shN"))
     for name, value in dense.items():
         assert torch.equal(lazy[name], value), name
     visible = dense["gaussian_ids"]
     if degree == 0:
-        assert not asked and len(higher.factors.rows) == 0
+        assert not optimizer.asked and len(param.grad.factors.rows) == 0
     else:
-        assert torch.equal(asked[0].long(), visible) and len(asked) == 1
-        assert torch.equal(higher.factors.rows.long(), visible)
+        assert torch.equal(optimizer.asked[0].long(), visible) and len(optimizer.asked) == 1
+        assert torch.equal(param.grad.factors.rows.long(), visible)
+    once = param.grad.dense()
+    results(splatted, raw, camera, sh_degree=degree, lazy=optimizer)
+    assert torch.equal(param.grad, 2 * once)
 
 
 def test_higher_bands_that_are_brought_up_to_date_are_rendered() -> None:
     raw, camera = raw_scene()
     late = {**raw, "shN": raw["shN"].clone()}
 
-    def catch_up(rows: Tensor) -> None:
-        late["shN"][rows.long()] = raw["shN"][rows.long()]
+    class Late(LazyAdam):
+        def catch_up(self, rows: Tensor | None = None) -> None:
+            assert rows is not None
+            late["shN"][rows.long()] = raw["shN"][rows.long()]
 
     late["shN"].zero_()
-    assert torch.equal(splatted(late, camera, catch_up=catch_up)[0], splatted(raw, camera)[0])
+    lazy = Late([torch.nn.Parameter(late["shN"])])
+    assert torch.equal(splatted(late, camera, lazy=lazy)[0], splatted(raw, camera)[0])
     assert bool(late["shN"].any())
