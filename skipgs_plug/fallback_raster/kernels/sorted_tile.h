@@ -2,7 +2,12 @@
 //
 // Pairs are dealt into buckets of equal ranges of the depth's bits, and buckets are sorted when their turn comes. Equal
 // depths keep the order of the rows, which is that of the numbers in the lower half.
-static constexpr int LARGE = 16;  // pairs in a bucket above which it is dealt again
+// Pairs in a bucket above which it is dealt again.
+#ifdef __AVX2__
+static constexpr int LARGE = 16;
+#else
+static constexpr int LARGE = 8;  // registers hold two pairs, so that rounds take longer
+#endif
 struct SortedTile {
     long long *dealt, *other;  // the tile's pairs in buckets, and as much room again
     int *rows, *places;        // out: row and number of each pair
