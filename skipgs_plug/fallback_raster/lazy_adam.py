@@ -143,8 +143,11 @@ class LazyAdam(Adam):
     def receive(self, gradient: Factors) -> None:
         """Add to the gradient of the parameter, which is an `OuterGradient` unless it has one already."""
         (param,) = self.param_groups[0]["params"]
-        more = OuterGradient(param.shape, [gradient])
-        param.grad = more if param.grad is None else param.grad + more
+        before, more = param.grad, OuterGradient(param.shape, [gradient])
+        if before is None:
+            param.grad = more
+        else:
+            param.grad = (before.dense() if isinstance(before, OuterGradient) else before) + more.dense()
 
     def state_dict(self) -> dict[str, Any]:
         """As torch's, of rows that are all up to date."""

@@ -2,6 +2,7 @@
 //
 // Pairs are dealt into buckets of equal ranges of the depth's bits, and buckets are sorted when their turn comes. Equal
 // depths keep the order of the rows, which is that of the numbers in the lower half.
+
 // Pairs in a bucket above which it is dealt again.
 #ifdef __AVX2__
 static constexpr int LARGE = 16;
