@@ -11,7 +11,7 @@ from .buffers import floats, zeros
 from .constants import BANDS
 from .launch import FloatArray, IntArray, worker
 from .optimizer import Adam, corrected, moments
-from .outer_gradient import Factors, OuterGradient
+from .outer_gradient import Factors, OuterGradient, plain
 from .source import read_kernel
 
 ROW = 3 * BANDS  # numbers of a row that the kernel holds, at most
@@ -143,11 +143,8 @@ class LazyAdam(Adam):
     def receive(self, gradient: Factors) -> None:
         """Add to the gradient of the parameter, which is an `OuterGradient` unless it has one already."""
         (param,) = self.param_groups[0]["params"]
-        before, more = param.grad, OuterGradient(param.shape, [gradient])
-        if before is None:
-            param.grad = more
-        else:
-            param.grad = (before.dense() if isinstance(before, OuterGradient) else before) + more.dense()
+        more = OuterGradient(param.shape, [gradient])
+        param.grad = more if param.grad is None else plain(param.grad) + plain(more)
 
     def state_dict(self) -> dict[str, Any]:
         """As torch's, of rows that are all up to date."""
@@ -174,8 +171,7 @@ class LazyAdam(Adam):
             return
         factors = param.grad.factors if isinstance(param.grad, OuterGradient) else None
         if factors is None:
-            if isinstance(param.grad, OuterGradient):
-                param.grad = param.grad.dense()
+            param.grad = plain(param.grad)
             self.catch_up()
             super()._step(group)
             return

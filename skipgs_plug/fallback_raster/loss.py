@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from .arguments import as_kernels_read
 from .buffers import floats
 from .constants import BAND, CHUNK, LOSS_CHANNELS, WINDOW
 from .launch import ByteArray, FloatArray, Worker, worker
@@ -114,8 +115,11 @@ def l1_ssim_loss(
             asked for.
     """
     in_bytes = target.dtype is torch.uint8
-    for name, tensor, kinds in (("image", image, "float"), ("target", target, "float or uint8")):
-        if not (tensor.is_floating_point() or (tensor is target and in_bytes)) or tensor.device.type != "cpu":
+    for name, tensor, kinds, fits in (
+        ("image", image, "float", image.is_floating_point()),
+        ("target", target, "float or uint8", target.is_floating_point() or in_bytes),
+    ):
+        if not fits or tensor.device.type != "cpu":
             raise ValueError(f"{name} must be a {kinds} tensor on the CPU, got {tensor.dtype} on {tensor.device}.")
     if image.shape != target.shape or image.dim() < 3 or image.numel() == 0:
         raise ValueError(
@@ -139,6 +143,6 @@ def l1_ssim_loss(
         )
     if target.requires_grad:
         raise ValueError("l1_ssim_loss is differentiable in image only: pass target.detach().")
-    target = (target if in_bytes else target.to(torch.float32)).contiguous()
-    value = _L1Ssim.apply(image.to(torch.float32).contiguous(), target, ssim_lambda, padding == "valid")
-    return value.to(image.dtype)
+    (rendered,) = as_kernels_read(image)
+    (photograph,) = [target.contiguous()] if in_bytes else as_kernels_read(target)
+    return _L1Ssim.apply(rendered, photograph, ssim_lambda, padding == "valid").to(image.dtype)

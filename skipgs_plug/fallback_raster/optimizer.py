@@ -81,7 +81,7 @@ class Adam(torch.optim.Adam):
             return
         lists: tuple[list[Tensor], ...] = ([], [], [], [], [], [])
         has_complex = self._init_group({**group, "params": left}, *lists)
-        adam(
+        _torchs_adam(
             *lists,
             has_complex=has_complex,
             beta1=group["betas"][0],

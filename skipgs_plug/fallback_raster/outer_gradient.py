@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .buffers import zeros
+
 
 class Factors(NamedTuple):
     """Rows of a gradient [N, K, 3] that are not zero, and what they are products of.
@@ -49,7 +51,7 @@ class OuterGradient(Tensor):
         rows, bands, color = content
         product = bands[:, : self.shape[1], None] * color[:, None, :3]
         product = torch.where((color[:, :3] != 0).any(1)[:, None, None], product, 0.0)
-        return torch.zeros(self.shape, device="cpu").index_copy_(0, rows.long(), product)
+        return zeros(*self.shape).index_copy_(0, rows.long(), product)
 
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
@@ -61,9 +63,10 @@ class OuterGradient(Tensor):
         changed = args[0] if func._schema.is_mutable and isinstance(args[0], cls) else None
         if changed is not None:
             changed._content[0] = changed.dense()
-
-        def plain(value: Any) -> Any:
-            return value.dense() if isinstance(value, cls) else value
-
         result = func(*torch.utils._pytree.tree_map(plain, args), **torch.utils._pytree.tree_map(plain, kwargs or {}))
         return result if changed is None else changed
+
+
+def plain(value: Any) -> Any:
+    """What is dense of an `OuterGradient`, and all else as it is."""
+    return value.dense() if isinstance(value, OuterGradient) else value

@@ -272,7 +272,7 @@ class Trainer:
         }
 
     def _measure(self, wanted: Sequence[metrics.Metric], view: View) -> dict[str, float]:
-        image, target = leave_out(self.render(view), self._target(view) / 255.0, view.mask)
+        image, target = leave_out(self.render(view), self._target(view).float() / 255.0, view.mask)
         return metrics.measure(wanted, image, target, view.mask)
 
     def export_ply(self, path: str | Path) -> None:

@@ -15,7 +15,7 @@ C2 = 0.03**2
 def l1_ssim_loss(image: Tensor, target: Tensor, ssim_lambda: float = 0.2) -> Tensor:
     """Return the 3DGS loss of images [..., H, W, C] in [0, 1], the target also uint8; SSIM is zero-padded ("same")."""
     if target.dtype is torch.uint8:
-        target = target / 255.0
+        target = target.float() / 255.0
     l1 = (image - target).abs().mean()
     return (1.0 - ssim_lambda) * l1 + ssim_lambda * (1.0 - ssim(image, target))
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from skipgs_plug.fallback_raster import get_num_threads, l1_ssim_loss, set_num_threads
 
 TOLERANCE = 1e-5
+BYTES = torch.ones(8, 8, 3, dtype=torch.uint8)
 
 
 def plain_loss(image: Tensor, target: Tensor, ssim_lambda: float, padding: str) -> Tensor:
@@ -213,6 +214,7 @@ def test_nan_stays_visible() -> None:
         (torch.rand(0, 8, 3), torch.rand(0, 8, 3), "same", "shape"),
         (torch.rand(3, 8, 40), torch.rand(3, 8, 40), "same", "channels"),
         (torch.ones(8, 8, 3, dtype=torch.uint8), torch.rand(8, 8, 3), "same", "image must be a float"),
+        (BYTES, BYTES, "same", "image must be a float"),
         (torch.rand(8, 8, 3), torch.ones(8, 8, 3, dtype=torch.int32), "same", "target must be a float or uint8"),
         (torch.rand(8, 8, 3, device="meta"), torch.rand(8, 8, 3), "same", "CPU"),
         (torch.rand(10, 11, 3), torch.rand(10, 11, 3), "valid", "11x10"),

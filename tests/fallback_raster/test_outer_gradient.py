@@ -54,6 +54,16 @@ def test_products_of_the_rows_and_zeros_elsewhere() -> None:
     assert gradient.shape == SHAPE and gradient.dtype is torch.float32 and gradient.is_contiguous()
 
 
+def test_whatever_the_default_type_of_the_process() -> None:
+    gradient = some()
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = gradient.dense()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert found.dtype is torch.float32
+
+
 @pytest.mark.parametrize(
     "operation",
     [

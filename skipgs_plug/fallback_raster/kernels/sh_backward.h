@@ -42,8 +42,7 @@ for (int i = 0; i < count; i += 16) {
     if (factors) {
         v16 own[BANDS];
         for (int band = 0; band < BANDS; ++band) own[band] = band + 1 < terms ? basis[band + 1] : (v16)0.0f;
-        transpose(own);
-        for (int l = 0; l < lanes; ++l) store(bands + (long long)BANDS * place[i + l], own[l]);
+        put_bands(bands, place + i, BANDS, BANDS, own, lanes);
         scatter4(v_bands, place + i, v[0], v[1], v[2], (v16)0.0f, lanes);
     } else if (!outer) {
         v16 v_sh[48];
