@@ -76,25 +76,26 @@ class Worker:
         TypeError: Arguments are missing, too many, or not of the declared kind.
     """
 
-    def __init__(self, name: str, kinds: dict[str, type], shapes: dict[str, str], code: str):
+    def __init__(self, name: str, kinds: dict[str, type], shapes: dict[str, str], code: str, alone: bool):
         self._name = name
         self._kinds = kinds
         self._sizes = Sizes(name, shapes)
         self._code = code
+        self._alone = alone  # on this thread
         self._kernel: Kernel | None = None
         self._checks = [(parameter, kind, _KINDS[kind].dtype) for parameter, kind in kinds.items()]
 
     def __call__(self, *arguments: Tensor | int | float) -> None:
         values = self._values(arguments)
         if guard.level() == guard.OFF:
-            self._run(values, arguments)
+            self._run(values)
             return
         named = dict(zip(self._kinds, arguments, strict=True))
         self._sizes.check(named)
         if guard.level() == guard.SIZES:
-            self._run(values, arguments)
+            self._run(values)
         else:
-            guard.run_between_zones(self._name, named, lambda inside: self._run(self._values(inside), inside))
+            guard.run_between_zones(self._name, named, lambda inside: self._run(self._values(inside)))
 
     def _values(self, arguments: tuple[Any, ...]) -> list[int | float]:
         """Addresses of tensors, and numbers, in the order of the parameters."""
@@ -130,22 +131,20 @@ class Worker:
         layout = "contiguous" if argument.is_contiguous() else f"strides {argument.stride()}"
         return f"{self._name}: {parameter} must be a {wanted}, got {argument.dtype} on {argument.device}, {layout}."
 
-    def _run(self, values: list[int | float], arguments: tuple[Any, ...]) -> None:
+    def _run(self, values: list[int | float]) -> None:
         with LOCK:
             if self._kernel is None:
                 self._kernel = self._load()
-            kernel, threads = self._kernel, get_num_threads()
+            kernel, threads = self._kernel, 1 if self._alone else get_num_threads()
             sections = _SECTIONS * threads if threads > 1 else 1
             counters = (ctypes.c_int32 * (_LINE // 4 * (sections + 2)))()
             counters[_LINE // 4] = sections
             # Every call fills a block of parameters of its own, which the threads share.
             block = kernel.block(ctypes.addressof(counters) + _LINE, *values)
-
-            # What a thread needs lives as long as its work: an exception may end this call before they do.
-            def work(owned: Any = (counters, arguments)) -> None:
+            if self._alone:
                 kernel.run(kernel.bounds, ctypes.byref(block))
-
-            on_all_threads(work)
+            else:
+                on_all_threads(kernel, block)
 
     def _load(self) -> Kernel:
         parameters = {"counters_address": "wp.uint64"}
@@ -206,6 +205,6 @@ for (int turn_ = 0; turn_ < sections_; ++turn_) {{
             if get_origin(kind) is Annotated:
                 kind, shapes[parameter.name] = get_args(kind)
             kinds[parameter.name] = kind
-        return Worker(name or stub.__name__, kinds, shapes, loop)
+        return Worker(name or stub.__name__, kinds, shapes, loop, alone=items == "1")
 
     return build

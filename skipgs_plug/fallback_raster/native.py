@@ -25,6 +25,7 @@ class Kernel(NamedTuple):
     run: Callable[..., None]
     bounds: Any
     block: type[ctypes.Structure]  # its parameters, in their order
+    addresses: tuple[int, int]  # of the function and of the bounds
     command: Any  # of Warp; the code stays loaded as long as it lives
 
 
@@ -63,7 +64,9 @@ def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:
     bounds, *values = command.params
     fields = [(parameter, type(value)) for parameter, value in zip(parameters, values, strict=True)]
     block = type(f"{name}_parameters", (ctypes.Structure,), {"_fields_": fields})
-    return Kernel(command.hooks.forward, ctypes.byref(bounds), block, command)
+    run = command.hooks.forward
+    addresses = ctypes.cast(run, ctypes.c_void_p).value or 0, ctypes.addressof(bounds)
+    return Kernel(run, ctypes.byref(bounds), block, addresses, command)
 
 
 @functools.cache

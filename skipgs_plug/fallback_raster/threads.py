@@ -1,30 +1,24 @@
-"""The threads that kernels run on, beside the one that calls.
+"""How many threads kernels run on, and whose turn it is.
 
-One launch takes place at a time, under `LOCK`. Between kernels threads wait in Python; while they run one they hold no
-interpreter lock.
-
-KeyboardInterrupt and what signal handlers raise may come between any two steps of the main thread. Only locks and
-queues that are written in C are used here: such an exception leaves a `threading.Condition`, and with it an Event, a
-Future or the start of a Thread, in a state in which it raises something else or waits for ever.
+One launch takes place at a time, under `LOCK`. KeyboardInterrupt and what signal handlers raise may come between any
+two steps of the main thread, but not while a kernel runs, which is one call of native code on all threads.
 """
 
-import _thread
 import atexit
+import ctypes
 import os
 import threading
-import time
 import warnings
-from collections.abc import Callable
-from queue import Empty, SimpleQueue
 
 import torch
 
 from .cores import usable_cores
+from .crew import Crew
+from .native import Kernel
 
 LOCK = threading.RLock()
 _num_threads = usable_cores()
-_crew: "_Crew | None" = None
-_busy = False  # threads of the crew may still be at work
+_crew: Crew | None = None
 _forked = False  # this process inherited torch's OpenMP without its threads, and has not been told so
 
 
@@ -50,83 +44,27 @@ def set_num_threads(n: int) -> None:
         _dismiss()
 
 
-def on_all_threads(work: Callable[[], None]) -> None:
-    """Runs `work` on every thread and returns when all are done, also when an exception arrives meanwhile.
-
-    Another exception may come while the threads are awaited. So they count as busy until all are known to be done, and
-    the next call waits for that. The caller holds `LOCK`.
-    """
-    global _crew, _busy
+def on_all_threads(kernel: Kernel, block: ctypes.Structure) -> None:
+    """Runs a kernel on every thread and returns when all are done. The caller holds `LOCK`."""
+    global _crew
     if _forked:
         _warn_after_fork()
     if _num_threads == 1:
-        work()
+        kernel.run(kernel.bounds, ctypes.byref(block))
         return
-    if _busy:
-        _dismiss()
     if _crew is None:
-        _crew = _Crew(_num_threads - 1)
-    _busy = True
-    _crew.run(work)
-    _busy = False
-
-
-class _Crew:
-    """Threads that wait for work."""
-
-    def __init__(self, count: int) -> None:
-        self._count = count
-        self._work: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        self._done: SimpleQueue[BaseException | None] = SimpleQueue()
-        self._alive = list(range(count))
-        for number in range(count):
-            _thread.start_new_thread(self._serve, (number,))
-
-    def run(self, work: Callable[[], None]) -> None:
-        """Do it on all of them and here."""
-        given, failure = 0, None
-        try:
-            for _ in range(self._count):
-                self._work.put(work)
-                given += 1
-            work()
-        finally:
-            for _ in range(given):
-                try:
-                    self._work.get_nowait()  # a thread that has not begun by now would find no item left
-                except Empty:
-                    failure = self._done.get() or failure
-        if failure is not None:
-            raise failure
-
-    def dismiss(self) -> None:
-        """Wait until all are done and gone; may be called again when an exception ended it."""
-        for _ in range(self._count):
-            self._work.put(None)
-        while self._alive:
-            time.sleep(0.0005)
-
-    def _serve(self, number: int) -> None:
-        try:
-            while (work := self._work.get()) is not None:
-                failure = None
-                try:
-                    work()
-                except BaseException as error:
-                    failure = error
-                del work  # it holds tensors
-                self._done.put(failure)
-        finally:
-            self._alive.remove(number)
+        _crew = Crew(_num_threads - 1)
+    _crew.run(kernel, block)
 
 
 @atexit.register
 def _dismiss() -> None:
     """No thread runs a kernel when this returns."""
-    global _crew, _busy
-    if _crew is not None:
-        _crew.dismiss()
-    _crew, _busy = None, False
+    global _crew
+    with LOCK:
+        if _crew is not None:
+            _crew.dismiss()
+        _crew = None
 
 
 def _warn_after_fork() -> None:
@@ -142,8 +80,8 @@ def _warn_after_fork() -> None:
 
 def _after_fork_in_child() -> None:
     """Threads do not survive a fork: a child starts its own."""
-    global _crew, _busy, _forked
-    _crew, _busy = None, False
+    global _crew, _forked
+    _crew = None
     _forked = torch.get_num_threads() > 1
     LOCK.release()
 

@@ -6,7 +6,6 @@ import errno
 import os
 import subprocess
 import sys
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import pytest
 import torch
 from raster_scenes import leaves, random_scene
 
-from skipgs_plug.fallback_raster import binning, get_num_threads, l1_ssim_loss, rasterization, set_num_threads, threads
+from skipgs_plug.fallback_raster import binning, l1_ssim_loss, rasterization
 from skipgs_plug.fallback_raster.adam import adam_rows
 from skipgs_plug.fallback_raster.cache import load_or_rebuild, say_unwritable
 from skipgs_plug.files import WriteError
@@ -35,64 +34,6 @@ def run(*command: str, timeout: float = 120, **environment: str) -> str:
     )
     assert found.returncode == 0, f"exit {found.returncode}\n{found.stdout[-3000:]}\n{found.stderr[-3000:]}"
     return found.stdout + found.stderr
-
-
-@pytest.fixture
-def two_threads() -> Any:
-    before = get_num_threads()
-    set_num_threads(2)
-    yield
-    set_num_threads(before)
-
-
-def test_an_exception_waits_for_the_other_threads(two_threads: None) -> None:
-    started, release, done = threading.Event(), threading.Event(), []
-
-    def work() -> None:
-        if threading.current_thread() is threading.main_thread():
-            assert started.wait(10)
-            threading.Timer(0.2, release.set).start()
-            raise KeyboardInterrupt
-        started.set()
-        assert release.wait(10)
-        done.append(True)
-
-    with pytest.raises(KeyboardInterrupt):
-        threads.on_all_threads(work)
-    assert done
-    threads.on_all_threads(lambda: done.append(True))  # the pool still works
-    assert len(done) >= 2
-
-
-def test_threads_that_a_second_exception_left_at_work_are_awaited_before_the_next_kernel(
-    two_threads: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    started, release, done = threading.Event(), threading.Event(), []
-
-    class Interrupted:
-        """A queue whose reader is interrupted."""
-
-        def put(self, item: object) -> None:
-            done.append("first")
-
-        def get(self) -> None:
-            raise KeyboardInterrupt
-
-    def work() -> None:
-        if threading.current_thread() is threading.main_thread():
-            assert started.wait(10)
-            raise KeyboardInterrupt
-        started.set()
-        assert release.wait(10)
-
-    threads.on_all_threads(lambda: None)
-    monkeypatch.setattr(threads._crew, "_done", Interrupted())
-    with pytest.raises(KeyboardInterrupt):
-        threads.on_all_threads(work)
-    assert not done
-    threading.Timer(0.2, release.set).start()
-    threads.on_all_threads(lambda: done.append("second"))
-    assert done[0] == "first" and "second" in done
 
 
 INTERRUPTED = """

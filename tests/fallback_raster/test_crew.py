@@ -1,0 +1,96 @@
+"""Helpers run a kernel along with its caller, which comes back when the last of them is done."""
+
+from __future__ import annotations
+
+import ctypes
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from skipgs_plug.fallback_raster.crew import Crew
+from skipgs_plug.fallback_raster.native import Kernel
+
+PATIENCE = 2e-4  # seconds after which threads sleep, about
+
+
+class Block(ctypes.Structure):
+    _fields_ = (("number", ctypes.c_int32),)
+
+
+def kernel(work: Callable[[int], None]) -> Kernel:
+    """One that calls Python, with the number in its block."""
+
+    def body(bounds: int, block: int) -> None:
+        assert bounds == 7
+        work(Block.from_address(block).number)
+
+    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(body)
+    address = ctypes.cast(function, ctypes.c_void_p).value
+    assert address is not None
+    return Kernel(function, None, Block, (address, 7), function)
+
+
+@pytest.fixture(params=[1, 3])
+def crew(request: pytest.FixtureRequest) -> Iterator[Crew]:
+    crew = Crew(request.param)
+    yield crew
+    crew.dismiss()
+
+
+def test_all_that_began_are_done_when_a_launch_returns(crew: Crew) -> None:
+    lengths = random.Random(0)
+    begun: list[tuple[int, int]] = []
+    ended: list[tuple[int, int]] = []
+
+    def work(number: int) -> None:
+        me = number, threading.get_ident()
+        begun.append(me)
+        time.sleep(lengths.choice([0, 0, PATIENCE / 10, PATIENCE, 4 * PATIENCE]))
+        ended.append(me)
+
+    working = kernel(work)
+    for number in range(400):
+        crew.run(working, Block(number))
+        assert sorted(begun) == sorted(ended)
+        mine = [thread for launch, thread in ended if launch == number]
+        assert threading.get_ident() in mine
+        assert len(set(mine)) == len(mine) <= 1 + crew._count
+        if number % 3 == 0:  # let helpers fall asleep, or not
+            time.sleep(lengths.choice([PATIENCE / 10, 3 * PATIENCE]))
+    assert len({thread for _, thread in ended}) == 1 + crew._count
+
+
+def test_helpers_that_sleep_are_woken(crew: Crew) -> None:
+    together = threading.Barrier(1 + crew._count)
+    meeting = kernel(lambda _: together.wait(10) and None)
+    for _ in range(3):
+        time.sleep(20 * PATIENCE)
+        crew.run(meeting, Block(0))
+    assert not together.broken
+
+
+def test_a_caller_waits_for_helpers_that_take_long(crew: Crew) -> None:
+    caller, ended = threading.get_ident(), []
+    started = threading.Event()
+
+    def work(_: int) -> None:
+        if threading.get_ident() == caller:
+            assert started.wait(10)
+        else:
+            started.set()
+            time.sleep(0.05)
+            ended.append(True)
+
+    crew.run(kernel(work), Block(0))
+    assert ended
+
+
+def test_who_is_dismissed_is_gone_and_may_be_dismissed_again() -> None:
+    crew = Crew(4)
+    crew.run(kernel(lambda _: None), Block(0))
+    crew.dismiss()
+    assert not crew._alive and not crew._locks
+    crew.dismiss()
