@@ -101,10 +101,9 @@ class Project(torch.autograd.Function):
             floats(0) if v is None else v.contiguous() for v in (v_depths, v_compensations)
         )  # fmt: skip
         project_backward(
-            means, quats, scales, floats(0), viewmat, K, visible, block_start, v_means2d, v_depths, v_conics,
-            v_compensations, floats(0), v_means, v_quats, v_scales, floats(0), v_poses,
-            n, float(width), float(height), eps2d,
-            int(v_depths.numel() > 0), int(v_compensations.numel() > 0), int(with_pose), 0, active_shortcuts(),
+            means, quats, scales, viewmat, K, visible, block_start, v_means2d, v_depths, v_conics, v_compensations,
+            v_means, v_quats, v_scales, v_poses, n, float(width), float(height), eps2d,
+            int(v_depths.numel() > 0), int(v_compensations.numel() > 0), int(with_pose), active_shortcuts(),
         )  # fmt: skip
         v_viewmat = None
         if with_pose:
@@ -152,7 +151,7 @@ class SphericalHarmonics(torch.autograd.Function):
         v_cameras = zeros(blocks(len(means)), 3)
         sh_backward(
             means, camera, base, rest, visible, block_start, colors, v_colors.contiguous(), v_means, v_base, v_rest,
-            floats(0), floats(0), v_cameras, len(means), *ctx.layout, ctx.degree, 0, active_shortcuts(),
+            v_cameras, len(means), *ctx.layout, ctx.degree, active_shortcuts(),
         )  # fmt: skip
         v_camera = v_cameras.sum(0) if ctx.needs_input_grad[1] else None
         return v_means, v_camera, v_base, None if ctx.joined else v_rest, None, None, None

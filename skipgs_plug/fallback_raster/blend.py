@@ -133,7 +133,7 @@ def number_pairs(
 ) -> None: ...
 
 
-@worker(read_kernel("reduce_pairs.h"), items="(rows + BLOCK - 1) / BLOCK", grain="1")
+@worker(read_kernel("reduce_pairs.h"), items="(rows + BLOCK - 1) / BLOCK", grain="1", constants={"DENSE": 1})
 def reduce_pairs(
     visible: Annotated[IntArray, "M"],
     block_start: Annotated[IntArray, "blocks(rows) + 1"],  # where each block of rows begins in `visible`
@@ -145,7 +145,7 @@ def reduce_pairs(
     v_pairs: Annotated[FloatArray, "Q, PAIR"],
     conics: Annotated[FloatArray, "rows, 3"],
     opacities: Annotated[FloatArray, "rows"],
-    # Out, all rows where `dense`, else visible ones; added to from the second pass over the channels on, as the next.
+    # Out, zeros where not visible; added to from the second pass over the channels on, as the next.
     v_means2d: Annotated[FloatArray, "rows, 2"],
     v_conics: Annotated[FloatArray, "rows, 3"],
     v_opacities: Annotated[FloatArray, "rows"],
@@ -156,6 +156,5 @@ def reduce_pairs(
     channel: int,
     channels: int,
     absgrad: int,
-    dense: int,
     parts: int,
 ) -> None: ...

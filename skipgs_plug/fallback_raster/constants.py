@@ -22,9 +22,11 @@ BOX = 5
 # makes it a cache line.
 PAIR = 16
 
-# Numbers of a row of an `OuterGradient`: bands, of which SH of degree 3 have 15 beside the constant one, and channels.
-BANDS = 16
-COLOR = 4
+# Bands of SH of degree 3 beside the constant one.
+BANDS = 15
+
+# Numbers of a row of either factor of an `OuterGradient`: of a direction or a colour, and one that nobody reads.
+FACTOR = 4
 
 # Most ranges of depth into which a tile deals its pairs before it sorts one after the other.
 BUCKETS = 4096

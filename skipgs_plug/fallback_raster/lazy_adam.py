@@ -14,17 +14,16 @@ from .optimizer import Adam, corrected, moments
 from .outer_gradient import Factors, OuterGradient, plain
 from .source import read_kernel
 
-ROW = 3 * BANDS  # numbers of a row that the kernel holds, at most
 STEPS = 1024  # that a row may miss, for which rates are kept
 CHUNK = 32  # steps of a row between two looks at how small its numbers have become
 
 
-@worker(read_kernel("catch_up.h"), items="n", grain=256, constants={"ROW": ROW, "CHUNK": CHUNK})
+@worker(read_kernel("catch_up.h"), items="n", grain=256, constants={"CHUNK": CHUNK})
 def _catch_up(
     rows: Annotated[IntArray, "n"],  # none of them twice
     done: Annotated[IntArray, "R"],  # steps that each row has, updated, as `values`, `mean` and `square`
-    bands: Annotated[FloatArray, "n if with_gradient else 0, BANDS"],  # of the gradient, as the next
-    v_bands: Annotated[FloatArray, "n if with_gradient else 0, COLOR"],
+    directions: Annotated[FloatArray, "n if with_gradient else 0, FACTOR"],  # of the gradient, as the next
+    colors: Annotated[FloatArray, "n if with_gradient else 0, FACTOR"],
     values: Annotated[FloatArray, "R, width"],
     mean: Annotated[FloatArray, "R, width"],  # as `adam_step` has it, as all that follow
     square: Annotated[FloatArray, "R, width"],
@@ -35,6 +34,7 @@ def _catch_up(
     width: int,
     now: int,  # steps that rows get before that with a gradient
     with_gradient: int,
+    degree: int,
     take1: float,
     keep2: float,
     take2: float,
@@ -72,14 +72,14 @@ class _Missed:
 
     def advance(self, rows: Tensor, gradient: Factors | None, state: dict[str, Tensor]) -> None:
         """Bring rows [n] to `now`, and on by the step that was noted last where there is a gradient of them."""
-        factors = (floats(0), floats(0)) if gradient is None else (gradient.bands, gradient.color)
+        *factors, degree = (floats(0), floats(0), 0) if gradient is None else gradient[1:]
         beta1, beta2 = self.betas
         smallest = self._least * beta1 ** (CHUNK + 1)
         longest = self._most if beta1**2 <= beta2 else math.inf
         _catch_up(
             rows, self.done, *factors, self.param.detach(), state["exp_avg"], state["exp_avg_sq"],
             self.rates, self.roots, self.inverse_roots, len(rows), self.param[0].numel(), self.now,
-            int(gradient is not None), 1 - beta1, beta2, 1 - beta2, self.eps, beta2**-0.5, longest,
+            int(gradient is not None), degree, 1 - beta1, beta2, 1 - beta2, self.eps, beta2**-0.5, longest,
             2.0**-100 / smallest if smallest else math.inf, 2.0**60 / self._most if self._most else math.inf,
             max(2.0**-74, (2.0**13 * self.eps) ** 2) / beta2 ** (CHUNK + 1),
         )  # fmt: skip

@@ -1,7 +1,7 @@
 """The gradient of the higher bands as it comes about: of each row an outer product, which nobody has to write down.
 
-The colour of a Gaussian is linear in its coefficients, so their gradient is the basis in the direction of the camera
-times the gradient of the colour: 15 and 3 numbers instead of 45.
+The colour of a Gaussian is linear in its coefficients, so their gradient is the basis in the direction from the camera
+times the gradient of the colour: 3 and 3 numbers instead of 45.
 """
 
 from typing import Any, NamedTuple
@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .buffers import zeros
+from .buffers import floats, zeros
+from .constants import BANDS
+from .sh import sh_bands
 
 
 class Factors(NamedTuple):
@@ -17,13 +19,16 @@ class Factors(NamedTuple):
 
     Attributes:
         rows: [M] int32, none of them twice.
-        bands: [M, BANDS] float32, of which the first K count; undefined where a row of `color` is zero.
-        color: [M, COLOR] float32, of which the first three count.
+        directions: [M, FACTOR] float32, of which the first three count, of length 1; undefined where a row of `colors`
+            is zero.
+        colors: [M, FACTOR] float32, of which the first three count.
+        degree: of the SH that have a gradient; that of higher bands is zero.
     """
 
     rows: Tensor
-    bands: Tensor
-    color: Tensor
+    directions: Tensor
+    colors: Tensor
+    degree: int
 
 
 class OuterGradient(Tensor):
@@ -48,9 +53,11 @@ class OuterGradient(Tensor):
         (content,) = self._content
         if isinstance(content, Tensor):
             return content
-        rows, bands, color = content
-        product = bands[:, : self.shape[1], None] * color[:, None, :3]
-        product = torch.where((color[:, :3] != 0).any(1)[:, None, None], product, 0.0)
+        rows, directions, colors, degree = content
+        bands = floats(len(rows), BANDS)
+        sh_bands(directions, bands, len(rows), degree)
+        product = bands[:, : self.shape[1], None] * colors[:, None, :3]
+        product = torch.where((colors[:, :3] != 0).any(1)[:, None, None], product, 0.0)
         return zeros(*self.shape).index_copy_(0, rows.long(), product)
 
     @classmethod

@@ -56,7 +56,6 @@ def project_backward(
     means: Annotated[FloatArray, "n, 3"],
     quats: Annotated[FloatArray, "n, 4"],
     scales: Annotated[FloatArray, "n, 3"],
-    opacities: Annotated[FloatArray, "n if raw else 0"],
     viewmat: Annotated[FloatArray, "4, 4"],
     K: Annotated[FloatArray, "3, 3"],
     visible: Annotated[IntArray, "M"],  # rows with a radius
@@ -64,12 +63,10 @@ def project_backward(
     v_means2d: Annotated[FloatArray, "n, 2"],
     v_depths: Annotated[FloatArray, "n if with_depth else 0"],
     v_conics: Annotated[FloatArray, "n, 3"],
-    v_compensations: Annotated[FloatArray, "n if antialiased and not raw else 0"],
-    v_activated: Annotated[FloatArray, "n if raw else 0"],
-    v_means: Annotated[FloatArray, "n, 3"],  # out, added to where `raw`
+    v_compensations: Annotated[FloatArray, "n if antialiased else 0"],
+    v_means: Annotated[FloatArray, "n, 3"],  # out
     v_quats: Annotated[FloatArray, "n, 4"],  # out
     v_scales: Annotated[FloatArray, "n, 3"],  # out
-    v_opacities: Annotated[FloatArray, "n if raw else 0"],  # out
     v_poses: Annotated[FloatArray, "blocks(n) if with_pose else 0, 3, 4"],  # out, partial sums
     n: int,
     width: float,
@@ -78,6 +75,5 @@ def project_backward(
     with_depth: int,
     antialiased: int,
     with_pose: int,
-    raw: int,
     shortcuts: int,
 ) -> None: ...

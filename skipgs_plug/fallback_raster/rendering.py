@@ -1,6 +1,8 @@
 """The blend of one image from its projected Gaussians, and the adjoint, any number of channels."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -57,13 +59,16 @@ class Blended:
         near: The lists that were blended first, all there are if they were deep enough.
         last: Those behind them, with the pairs of both; else `near`.
         pixel_stop: [H, W] int32, place in the list behind the last Gaussian blended.
-        dense: Whether rows that are not visible get gradients, zeros.
     """
 
     near: Pass
     last: Pass
     pixel_stop: Tensor
-    dense: bool
+
+    @property
+    def parts(self) -> int:
+        """Of the lists: 1 or 2."""
+        return 1 if self.last is self.near else 2
 
 
 def blend(
@@ -97,7 +102,7 @@ def blend(
         rest = bin_the_rest(bins, ranges, still_open, block_start, *rows)
         if rest is not None:
             last = _blend_lists(*rest, colors, pixels, size, len(bins.tile_list), True, False).after(near)
-    return image, transmittance, Blended(near, last, pixel_stop, dense)
+    return image, transmittance, Blended(near, last, pixel_stop)
 
 
 def _blend_lists(
@@ -131,6 +136,73 @@ def _blend_lists(
     return Pass(bins, block_start, tile_stop, tile_blended, pair_blocks)
 
 
+class PairSums(NamedTuple):
+    """Sums of the pairs that were blended, as kernels read them that add up those of a row.
+
+    Attributes:
+        visible: [M] int32, rows.
+        block_start: [blocks + 1] int32, where each block of rows begins among them.
+        pair_start: [M + 1] int32, number of the first pair of each.
+        far_visible: [F] int32, as the next two of the second part of the lists, if there is one.
+        far_block_start: [blocks + 1] int32.
+        far_pair_start: [F + 1] int32.
+        pair_slot: [P] int32, 1 + the slot of each pair, 0 if it was not blended.
+        v_pairs: [Q, PAIR], the slots.
+    """
+
+    visible: Tensor
+    block_start: Tensor
+    pair_start: Tensor
+    far_visible: Tensor
+    far_block_start: Tensor
+    far_pair_start: Tensor
+    pair_slot: Tensor
+    v_pairs: Tensor
+
+
+def pair_sums(
+    blended: Blended,
+    colors: Tensor,  # [R, D], as the next one of the forward pass
+    transmittance: Tensor,  # [H, W]
+    v_image: Tensor | None,  # [H, W, D], None for zeros, as the next
+    v_transmittance: Tensor | None,  # [H, W]
+    with_absolute: bool,
+) -> Iterator[tuple[int, int, PairSums]]:
+    """First channel, number of channels and sums of each pass of the adjoint; sums live until the next one."""
+    near, last = blended.near, blended.last
+    bins, lists, parts = near.bins, last.bins, blended.parts
+    (height, width), channels = transmittance.shape, colors.shape[1]
+    size = (width, height, *tiles(width, height))
+    v_image = zeros(height, width, channels) if v_image is None else v_image.contiguous()
+    v_transmittance = floats(0, width) if v_transmittance is None else v_transmittance.contiguous()
+    pairs = len(lists.tile_list)
+    # Behind the surface most pairs are not blended: they have no sums.
+    per_tile = near.tile_blended if parts == 1 else torch.cat([near.tile_blended, last.tile_blended])
+    slot_start, pair_slot = zeros(len(per_tile) + 1, dtype=torch.int32), zeros(pairs, dtype=torch.int32)
+    torch.cumsum(per_tile, 0, out=slot_start[1:])
+    number_pairs(
+        bins.tile_start, near.tile_stop, lists.tile_start, last.tile_stop, lists.tile_place, last.pair_blocks,
+        slot_start, pair_slot, pairs, len(near.tile_stop), parts,
+    )  # fmt: skip
+    v_pairs = scratch("v_pairs", int(slot_start[-1]), PAIR)
+    sums = PairSums(
+        bins.visible, near.block_start, bins.pair_start, lists.visible, last.block_start, lists.pair_start,
+        pair_slot, v_pairs,
+    )  # fmt: skip
+    for channel in range(0, channels, MAX_CHANNELS):
+        some = min(MAX_CHANNELS, channels - channel)
+        if channels > MAX_CHANNELS:
+            pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
+        backward_worker(some, with_absolute)(
+            bins.records, bins.tile_start, near.tile_stop, lists.tile_start, last.tile_stop, lists.tile_list,
+            last.pair_blocks, slot_start, transmittance, blended.pixel_stop, v_image, v_transmittance,
+            v_pairs, *size, channels, channel, some, int(len(v_transmittance) > 0), parts, active_shortcuts(),
+        )  # fmt: skip
+        yield channel, some, sums
+        # The gradient of the transmittance belongs to the first pass alone.
+        v_transmittance = floats(0, width)
+
+
 def blend_adjoint(
     blended: Blended,
     means2d: Tensor,  # [R, 2], as the next ones the inputs of the blend
@@ -143,39 +215,12 @@ def blend_adjoint(
     absolute: Tensor | None,  # [R, 2]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Gradients of means2d, conics, opacities and colors; `absolute` receives the sum over pixels of |v_means2d|."""
-    near, last = blended.near, blended.last
-    bins, lists, parts = near.bins, last.bins, 1 if last is near else 2
-    (height, width), channels = transmittance.shape, colors.shape[1]
-    size = (width, height, *tiles(width, height))
-    v_image = zeros(height, width, channels) if v_image is None else v_image.contiguous()
-    v_transmittance = floats(0, width) if v_transmittance is None else v_transmittance.contiguous()
     v_means2d, v_conics, v_opacities, v_colors = (floats(*t.shape) for t in (means2d, conics, opacities, colors))
     with_absolute = absolute is not None
     absolute = floats(0) if absolute is None else absolute
-    pairs = len(lists.tile_list)
-    # Behind the surface most pairs are not blended: they have no sums.
-    per_tile = near.tile_blended if parts == 1 else torch.cat([near.tile_blended, last.tile_blended])
-    slot_start, pair_slot = zeros(len(per_tile) + 1, dtype=torch.int32), zeros(pairs, dtype=torch.int32)
-    torch.cumsum(per_tile, 0, out=slot_start[1:])
-    number_pairs(
-        bins.tile_start, near.tile_stop, lists.tile_start, last.tile_stop, lists.tile_place, last.pair_blocks,
-        slot_start, pair_slot, pairs, len(near.tile_stop), parts,
-    )  # fmt: skip
-    v_pairs = scratch("v_pairs", int(slot_start[-1]), PAIR)
-    for channel in range(0, channels, MAX_CHANNELS):
-        some = min(MAX_CHANNELS, channels - channel)
-        if channels > MAX_CHANNELS:
-            pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
-        backward_worker(some, with_absolute)(
-            bins.records, bins.tile_start, near.tile_stop, lists.tile_start, last.tile_stop, lists.tile_list,
-            last.pair_blocks, slot_start, transmittance, blended.pixel_stop, v_image, v_transmittance,
-            v_pairs, *size, channels, channel, some, int(len(v_transmittance) > 0), parts, active_shortcuts(),
-        )  # fmt: skip
+    for channel, some, sums in pair_sums(blended, colors, transmittance, v_image, v_transmittance, with_absolute):
         reduce_pairs(
-            bins.visible, near.block_start, bins.pair_start, lists.visible, last.block_start, lists.pair_start,
-            pair_slot, v_pairs, conics, opacities, v_means2d, v_conics, v_opacities, absolute,
-            v_colors, len(means2d), channels, channel, some, int(with_absolute), int(blended.dense), parts,
+            *sums, conics, opacities, v_means2d, v_conics, v_opacities, absolute, v_colors,
+            *colors.shape, channel, some, int(with_absolute), blended.parts,
         )  # fmt: skip
-        # The gradient of the transmittance belongs to the first pass alone.
-        v_transmittance = floats(0, width)
     return v_means2d, v_conics, v_opacities, v_colors

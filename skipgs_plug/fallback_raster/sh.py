@@ -41,17 +41,21 @@ def sh_backward(
     v_colors: Annotated[FloatArray, "n, 3"],
     v_means: Annotated[FloatArray, "n, 3"],  # out
     v_base: Annotated[FloatArray, "n, base_stride"],  # out
-    v_rest: Annotated[FloatArray, "0 if outer else n, rest_stride"],  # out; v_base where rest and base are one array
-    bands: Annotated[
-        FloatArray, "M if outer and degree else 0, BANDS"
-    ],  # out, in place of v_rest; of rows with a gradient
-    v_bands: Annotated[FloatArray, "M if outer and degree else 0, COLOR"],  # out, what they are multiplied with
+    v_rest: Annotated[FloatArray, "n, rest_stride"],  # out; v_base where rest and base are one array
     v_cameras: Annotated[FloatArray, "blocks(n), 3"],  # out, partial sums
     n: int,
     base_stride: int,
     rest_stride: int,
     rest_offset: int,
     degree: int,
-    outer: int,  # whether the gradient of the higher bands is wanted in factors
     shortcuts: int,
+) -> None: ...
+
+
+@worker(read_kernel("sh_bands.h"), items="n", grain="BLOCK")
+def sh_bands(
+    directions: Annotated[FloatArray, "n, FACTOR"],
+    bands: Annotated[FloatArray, "n, BANDS"],  # out, beside the constant one
+    n: int,
+    degree: int,
 ) -> None: ...

@@ -15,14 +15,15 @@ from torch.autograd.function import once_differentiable
 from .arguments import as_kernels_read, camera_centre, check_tensors, planes
 from .autograd import check_shapes
 from .buffers import floats, ints, zeros
-from .constants import BANDS, COLOR, TILE, blocks, tiles
+from .constants import FACTOR, TILE, blocks, tiles
 from .lazy_adam import LazyAdam
 from .outer_gradient import Factors
-from .project import project_backward, project_forward
-from .rendering import blend, blend_adjoint
+from .project import project_forward
+from .rendering import blend, pair_sums
 from .rows import take_rows, visible_rows
-from .sh import sh_backward, sh_forward
+from .sh import sh_forward
 from .shortcuts import active_shortcuts
+from .splat_backward import splat_backward
 
 EPS2D = 0.3  # added to the 2D covariance's diagonal, square pixels
 
@@ -196,32 +197,24 @@ class _Render(torch.autograd.Function):
         p, n = ctx.projected, len(means)
         camera, viewmat, K, size, antialiased = ctx.camera
         layout, degree, lazy = ctx.sh
-        absolute = None if ctx.absolute is None else zeros(n, 2)
-        v_means2d, v_conics, v_activated, v_colors = blend_adjoint(
-            ctx.blended, p.means2d, p.conics, p.opacities, ctx.colors, transmittance, v_image, v_transmittance, absolute
-        )
-        if absolute is not None:
-            ctx.absolute += take_rows(absolute, p.visible)
         gradients = [floats(*t.shape) for t in (means, quats, log_scales, logits, sh0)]
-        v_means, v_quats, v_scales, v_logits, v_sh0 = gradients
         rows = p.visible if lazy is not None and degree > 0 else p.visible[:0]
-        factors = Factors(rows, floats(len(rows), BANDS), floats(len(rows), COLOR))
+        factors = Factors(rows, floats(len(rows), FACTOR), floats(len(rows), FACTOR), degree)
         v_shN = floats(*shN.shape) if lazy is None else floats(0)
-        sh_backward(
-            means, camera, sh0, shN, p.visible, p.block_start, ctx.colors, v_colors, v_means, v_sh0, v_shN,
-            factors.bands, factors.color, zeros(blocks(n), 3), n, *layout, degree, int(lazy is not None),
-            active_shortcuts(),
+        with_absolute = ctx.absolute is not None
+        absolute = ctx.absolute if with_absolute else floats(0)
+        v_centres = floats(len(p.visible) if ctx.with_centres else 0, 2)
+        # Three channels are one pass.
+        ((_, _, sums),) = pair_sums(ctx.blended, ctx.colors, transmittance, v_image, v_transmittance, with_absolute)
+        splat_backward(
+            *sums, means, quats, log_scales, logits, sh0, shN, viewmat, K, camera, ctx.colors, p.conics, p.opacities,
+            *gradients, v_shN, factors.directions, factors.colors, v_centres, absolute,
+            n, *map(float, size), EPS2D, layout[1], degree, int(lazy is not None), int(antialiased),
+            int(ctx.with_centres), int(with_absolute), ctx.blended.parts, active_shortcuts(),
         )  # fmt: skip
-        project_backward(
-            means, quats, log_scales, logits, viewmat, K, p.visible, p.block_start, v_means2d, floats(0), v_conics,
-            floats(0), v_activated, v_means, v_quats, v_scales, v_logits, floats(0),
-            n, *map(float, size), EPS2D, 0, int(antialiased), 0, 1, active_shortcuts(),
-        )  # fmt: skip
-        v_centres = take_rows(v_means2d, p.visible) if ctx.with_centres else None
-        if lazy is None:
-            return *gradients, v_shN, v_centres, *[None] * 8
-        lazy.receive(factors)
-        return *gradients, None, v_centres, *[None] * 8
+        if lazy is not None:
+            lazy.receive(factors)
+        return *gradients, v_shN if lazy is None else None, v_centres if ctx.with_centres else None, *[None] * 8
 
 
 def _project(

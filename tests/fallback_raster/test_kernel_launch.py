@@ -23,6 +23,7 @@ from skipgs_plug.fallback_raster import (
     rasterization,
     rows,
     sh,
+    splat_backward,
 )
 from skipgs_plug.fallback_raster.compat import statistics
 from skipgs_plug.fallback_raster.compat.inria import GaussianRasterizationSettings
@@ -34,7 +35,10 @@ from skipgs_plug.fallback_raster.splats import rasterize_splats
 
 WORKERS = {
     found._name: found
-    for module in (adam, binning, blend, gradient_norms, lazy_adam, loss, near_first, project, rows, sh, statistics)
+    for module in (
+        *(adam, binning, blend, gradient_norms, lazy_adam, loss, near_first),
+        *(project, rows, sh, splat_backward, statistics),
+    )
     for value in vars(module).values()
     for found in (value.values() if isinstance(value, dict) else [value])
     if isinstance(found, Worker)
@@ -48,7 +52,7 @@ def test_every_kernel_file_is_used_and_tested() -> None:
     texts += [found._code for found in WORKERS.values()]
     unused = [path.name for path in KERNELS.glob("*.h") if not any(f'kernels/{path.name}"' in text for text in texts)]
     assert not unused
-    assert len(WORKERS) == 31
+    assert len(WORKERS) == 33
 
 
 @pytest.mark.parametrize("name", WORKERS)
@@ -101,16 +105,19 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker, list[A
         rasterization(**deep)
         raw = [deep[name] for name in ("means", "quats", "scales", "opacities")]
         sh = [deep["colors"][:, None], torch.zeros(6000, 0, 3)]
-        rasterize_splats(*raw, *sh, deep["viewmats"][0], deep["Ks"][0], deep["width"], deep["height"], 0)
+        seen = deep["viewmats"][0], deep["Ks"][0], deep["width"], deep["height"], 0
+        for own in (raw, [t.clone().requires_grad_() for t in raw]):
+            splats_image, _, _ = rasterize_splats(*own, *sh, *seen, absgrad=True)
+        splats_image.sum().backward()
         for dtype in (torch.float32, torch.uint8):
             l1_ssim_loss(image, torch.zeros_like(image, dtype=dtype)).backward(retain_graph=True)
         param = torch.nn.Parameter(torch.ones(5, 3))
         param.grad = torch.ones(5, 3)
         adam.adam_rows(torch.ones(5) > 0, param, torch.zeros(5, 3), torch.zeros(5, 3), 0.1, (0.9, 0.999), 1e-15)
         bands = torch.nn.Parameter(torch.ones(5, 15, 3))
-        bands.grad = OuterGradient(
-            bands.shape, [Factors(torch.tensor([1, 3], dtype=torch.int32), torch.ones(2, 16), torch.ones(2, 4))]
-        )
+        factors = Factors(torch.tensor([1, 3], dtype=torch.int32), torch.ones(2, 4), torch.ones(2, 4), 3)
+        bands.grad = OuterGradient(bands.shape, [factors])
+        bands.grad.dense()
         lazy_adam.LazyAdam([bands]).step()
         sums = torch.zeros(5), torch.zeros(5)
         gradient_norms.sum_norms(torch.tensor([1, 3], dtype=torch.int32), torch.ones(2, 2), (1.0, 1.0), *sums)
@@ -124,7 +131,7 @@ def test_a_tensor_of_another_size_is_an_error(monkeypatch: pytest.MonkeyPatch) -
     assert {found._name for found, _ in calls} == set(WORKERS)
     # Sizes that nothing else in a call tells, or only up to a whole vector.
     free = {("project_backward", "visible"), ("sh_forward", "visible"), ("sh_backward", "visible")}
-    free.add(("reduce_pairs", "pair_slot"))
+    free |= {("reduce_pairs", "pair_slot"), ("splat_backward", "pair_slot")}
     for found, arguments in calls:
         for place, (parameter, kind) in enumerate(found._kinds.items()):
             if kind not in DTYPES or not arguments[place].numel() or (found._name, parameter) in free:

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from skipgs_plug.core.refinement.rates import ScaledRates
 from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
-from skipgs_plug.fallback_raster.constants import BANDS, COLOR
+from skipgs_plug.fallback_raster.constants import FACTOR
 from skipgs_plug.fallback_raster.lazy_adam import STEPS, LazyAdam
 from skipgs_plug.fallback_raster.optimizer import Adam
 from skipgs_plug.fallback_raster.outer_gradient import Factors, OuterGradient
 
 EPS = 1e-15
-SHAPES = [(60, 15, 3), (60, 8, 3), (60, 3, 3), (60, 1, 3), (1, 16, 3), (60, 6, 3)]
+SHAPES = [(60, 15, 3), (60, 8, 3), (60, 3, 3), (60, 1, 3), (1, 15, 3), (60, 6, 3)]
 
 
 @pytest.fixture
@@ -40,14 +40,16 @@ def parameter(shape: tuple[int, ...], generator: torch.Generator) -> torch.nn.Pa
 def gradient(shape: tuple[int, ...], share: float, generator: torch.Generator) -> OuterGradient:
     """For a share of the rows, of all sizes from row to row, zero in some numbers and in some rows."""
     rows = torch.nonzero(torch.rand(shape[0], generator=generator) < share)[:, 0].to(torch.int32)
-    bands = torch.randn(len(rows), BANDS, generator=generator)
-    bands[torch.rand(bands.shape, generator=generator) < 0.05] = 0.0
-    color = torch.randn(len(rows), COLOR, generator=generator)
-    color *= 10.0 ** torch.randint(-14, 4, (len(rows), 1), generator=generator)
+    directions = torch.randn(len(rows), FACTOR, generator=generator)
+    directions[torch.rand(directions.shape, generator=generator) < 0.2] = 0.0
+    directions /= directions[:, :3].norm(dim=1, keepdim=True)
+    colors = torch.randn(len(rows), FACTOR, generator=generator)
+    colors *= 10.0 ** torch.randint(-14, 4, (len(rows), 1), generator=generator)
     nothing = torch.rand(len(rows), generator=generator) < 0.2
-    color[nothing, :3] = 0.0
-    bands[nothing] = torch.nan  # undefined
-    return OuterGradient(torch.Size(shape), [Factors(rows, bands, color)])
+    colors[nothing | directions.isnan().any(1), :3] = 0.0
+    directions[nothing] = torch.nan  # undefined
+    degree = int(torch.randint(1, 4, (), generator=generator))
+    return OuterGradient(torch.Size(shape), [Factors(rows, directions, colors, degree)])
 
 
 def assert_equal(lazy: LazyAdam, dense: Adam) -> None:

@@ -10,20 +10,22 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.fallback_raster.adam import adam_step
-from skipgs_plug.fallback_raster.constants import BANDS, COLOR
+from skipgs_plug.fallback_raster.constants import FACTOR
 from skipgs_plug.fallback_raster.optimizer import Adam
 from skipgs_plug.fallback_raster.outer_gradient import Factors, OuterGradient
+from skipgs_plug.fallback_raster.torch_reference_projection import spherical_harmonics
 
 SHAPE = torch.Size((7, 15, 3))
 
 
-def some(seed: int = 0) -> OuterGradient:
+def some(seed: int = 0, degree: int = 3) -> OuterGradient:
     generator = torch.Generator().manual_seed(seed)
     rows = torch.tensor([1, 2, 5], dtype=torch.int32)
-    bands, color = torch.randn(3, BANDS, generator=generator), torch.randn(3, COLOR, generator=generator)
-    color[1, :3] = 0.0
-    bands[1] = torch.nan
-    return OuterGradient(SHAPE, [Factors(rows, bands, color)])
+    directions, colors = torch.randn(2, 3, FACTOR, generator=generator)
+    directions[:, :3] /= directions[:, :3].norm(dim=1, keepdim=True)
+    colors[1, :3] = 0.0
+    directions[1] = torch.nan
+    return OuterGradient(SHAPE, [Factors(rows, directions, colors, degree)])
 
 
 class Given(torch.autograd.Function):
@@ -43,14 +45,18 @@ def parameter() -> torch.nn.Parameter:
     return torch.nn.Parameter(torch.randn(SHAPE, generator=torch.Generator().manual_seed(9)))
 
 
-def test_products_of_the_rows_and_zeros_elsewhere() -> None:
-    gradient = some()
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_products_of_the_rows_and_zeros_elsewhere(degree: int) -> None:
+    gradient = some(degree=degree)
     assert gradient.factors is not None
-    expected = torch.zeros(SHAPE)
-    for row, bands, color in zip(*gradient.factors, strict=True):
-        if color[:3].any():
-            expected[row] = torch.outer(bands[:15], color[:3])
-    assert torch.equal(gradient.dense(), expected) and expected.any()
+    rows, directions, colors, _ = gradient.factors
+    coefficients = torch.zeros(len(rows), 16, 3, dtype=torch.float64, requires_grad=True)
+    shown = spherical_harmonics(degree, directions[:, :3].double(), coefficients)
+    expected = torch.zeros(SHAPE, dtype=torch.float64)
+    (product,) = torch.autograd.grad(shown, coefficients, colors[:, :3].double())
+    expected[rows.long()] = torch.where((colors[:, :3] != 0).any(1)[:, None, None], product[:, 1:], 0.0)
+    torch.testing.assert_close(gradient.dense(), expected.float(), rtol=1e-6, atol=1e-6)
+    assert not gradient.dense()[:, (degree + 1) ** 2 - 1 :].any() and expected.any()
     assert gradient.shape == SHAPE and gradient.dtype is torch.float32 and gradient.is_contiguous()
 
 

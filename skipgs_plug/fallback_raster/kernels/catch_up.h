@@ -4,6 +4,7 @@
 // Where nothing comes near underflow, multiply-adds give the same correctly rounded results (Markstein, IBM J. Res. Dev.
 // 34, 1990) in 15.
 #include "adam_step.h"
+#include "harmonics.h"
 #if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
 constexpr bool fused = true;
 #else
@@ -36,8 +37,8 @@ const auto distance = [&](v16 m, v16 s, v16 half, int step) INLINE -> v16 {
     const v16 quotient = moved * inverse;
     return fma(fma(-below, quotient, moved), inverse, quotient);
 };
-constexpr int VECTORS = ROW / 16;
-static_assert(ROW == 3 * BANDS && BANDS == 16 && COLOR == 4, "an outer product fills a row");
+constexpr int VECTORS = 3;
+static_assert(VECTORS * 16 == 3 * (BANDS + 1) && FACTOR == 4, "an outer product fills a row");
 // Bands times three channels, channel by channel.
 const auto outer_product = [](v16 bands, v4 color, v16* to) INLINE {
     const v16 x = bands * color.x, y = bands * color.y, z = bands * color.z;
@@ -48,7 +49,18 @@ const auto outer_product = [](v16 bands, v4 color, v16* to) INLINE {
     to[2] = __builtin_shufflevector(__builtin_shufflevector(x, y, 0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0), z,
                                     26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31);
 };
+alignas(64) float bands[16][16];  // of the next rows, beside the constant one
 for (int i = first; i < last; ++i) {
+    if (with_gradient && (i - first) % 16 == 0) {
+        int next[16];
+        for (int l = 0; l < 16; ++l) next[l] = smaller(i + l, last - 1);
+        v16 direction[4], basis[17];
+        gather4(directions, next, direction);
+        for (int band = 1; band < 17; ++band) basis[band] = (v16)0.0f;
+        harmonics(direction[0], direction[1], direction[2], degree, basis);
+        transpose(basis + 1);
+        for (int l = 0; l < 16; ++l) store(bands[l], basis[1 + l]);
+    }
     const int row = rows[i], begin = done[row];
     if (begin == now && !with_gradient) continue;
     done[row] = now + with_gradient;
@@ -56,9 +68,9 @@ for (int i = first; i < last; ++i) {
     float *m_row = mean + at, *s_row = square + at, *x_row = values + at;
     alignas(64) v16 product[VECTORS];
     if (with_gradient) {
-        const v4 color = *(const v4*)(v_bands + (long long)COLOR * i);
+        const v4 color = *(const v4*)(colors + (long long)FACTOR * i);
         const bool received = color.x != 0.0f || color.y != 0.0f || color.z != 0.0f;
-        outer_product(received ? load(bands + (long long)BANDS * i) : (v16)0.0f, color, product);
+        outer_product(received ? load(bands[(i - first) % 16]) : (v16)0.0f, color, product);
     }
     const float* g_row = (const float*)product;
     float padded[4][16];

@@ -1,7 +1,8 @@
-// Adds up the pairs of each row of a block in a fixed order and turns their moments into gradients.
+// Adds up the pairs of each row of a block in a fixed order and turns their moments into gradients, of all rows where
+// DENSE, else of visible ones.
 const int row_begin = BLOCK * first, rows_here = smaller(BLOCK, rows - row_begin);
 const bool more = channel > 0;
-if (!more && dense) {
+if (!more && DENSE) {
     // Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
     clear(v_means2d + 2ll * row_begin, 2 * rows_here);
     clear(v_conics + 3ll * row_begin, 3 * rows_here);
@@ -34,7 +35,7 @@ for (int i = block_start[first]; i < end; ++i) {
         ++j;
     }
     if (!received) {
-        if (dense || more) continue;
+        if (DENSE || more) continue;
         clear(v_means2d + 2ll * g, 2);
         clear(v_conics + 3ll * g, 3);
         clear(v_opacities + g, 1);

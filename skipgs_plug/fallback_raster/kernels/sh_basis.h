@@ -1,7 +1,8 @@
-// Real spherical harmonics up to degree 3 with the signs of 3DGS (Kerbl et al. 2023), of 16 rows, in the unit directions
-// x, y, z from the camera to the Gaussians; norm * shrink is what the distances were multiplied with.
-static constexpr auto harmonics = [](const float* means, const int* row, int n, const float* camera, int degree,
-                                     v16* basis, v16& x, v16& y, v16& z, v16& norm, v16& shrink) INLINE {
+#include "harmonics.h"
+// Unit directions x, y, z from the camera to the Gaussians of 16 rows; norm * shrink is what the distances were multiplied
+// with.
+static constexpr auto directions = [](const float* means, const int* row, int n, const float* camera, v16& x, v16& y,
+                                      v16& z, v16& norm, v16& shrink) INLINE {
     v16 mean[3];
     gather3(means, row, n, mean);
     const v16 dx = mean[0] - camera[0], dy = mean[1] - camera[1], dz = mean[2] - camera[2];
@@ -17,29 +18,6 @@ static constexpr auto harmonics = [](const float* means, const int* row, int n, 
     }
     norm = 1.0f / vsqrt(vmax(square, (v16)1e-30f));
     x *= norm, y *= norm, z *= norm;
-    const v16 xx = x * x, yy = y * y, zz = z * z;
-    basis[0] = (v16)0.28209479177387814f;
-    if (degree > 0) {
-        basis[1] = -0.4886025119029199f * y;
-        basis[2] = 0.4886025119029199f * z;
-        basis[3] = -0.4886025119029199f * x;
-    }
-    if (degree > 1) {
-        basis[4] = 1.0925484305920792f * x * y;
-        basis[5] = -1.0925484305920792f * y * z;
-        basis[6] = 0.31539156525252005f * (2.0f * zz - xx - yy);
-        basis[7] = -1.0925484305920792f * x * z;
-        basis[8] = 0.5462742152960396f * (xx - yy);
-    }
-    if (degree > 2) {
-        basis[9] = -0.5900435899266435f * y * (3.0f * xx - yy);
-        basis[10] = 2.890611442640554f * x * y * z;
-        basis[11] = -0.4570457994644658f * y * (4.0f * zz - xx - yy);
-        basis[12] = 0.3731763325901154f * z * (2.0f * zz - 3.0f * xx - 3.0f * yy);
-        basis[13] = -0.4570457994644658f * x * (4.0f * zz - xx - yy);
-        basis[14] = 1.445305721320277f * z * (xx - yy);
-        basis[15] = -0.5900435899266435f * x * (xx - 3.0f * yy);
-    }
 };
 // Fetches `count` numbers of row g ahead of their use.
 static constexpr auto fetch_bands = [](const float* p, int g, int stride, int count) INLINE {
