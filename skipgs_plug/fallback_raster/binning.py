@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from .buffers import floats, ints, longs, zeros
-from .constants import BOX, MAX_CHANNELS, RECORD, tiles
+from .constants import BOX, MAX_CHANNELS, PLACE, RECORD, SPARE_COUNTS, tiles
 from .launch import FloatArray, IntArray, LongArray, worker
 from .shortcuts import active_shortcuts
 from .source import read_kernel
@@ -51,8 +51,9 @@ def pack_and_count(
     records: Annotated[FloatArray, "R, RECORD"],  # out, only rows with pairs are written
     listed: Annotated[IntArray, "n"],  # out, places in `visible` that have pairs, from where their slice begins
     listed_count: Annotated[IntArray, "slices"],  # out
-    boxes: Annotated[IntArray, "n, BOX"],  # out, of those
-    counts: Annotated[IntArray, "slices, tiles_x, tiles_y"],  # out
+    places: Annotated[IntArray, "n, PLACE"],  # out, of those, as the next
+    boxes: Annotated[IntArray, "n, BOX"],  # out, only of larger ones
+    counts: Annotated[IntArray, "slices, tiles_x * tiles_y + SPARE_COUNTS"],  # out
     totals: Annotated[LongArray, "slices + 1"],  # out, pairs of each slice
     tiles_per_gauss: Annotated[IntArray, "R if dense else 0"],  # out, zeros before
     n: int,
@@ -72,7 +73,9 @@ def pack_and_count(
 
 @worker(read_kernel("scan_pairs.h"), items="1", grain="1")
 def scan_pairs(
-    counts: Annotated[IntArray, "slices, tiles"],  # in: counts; out: where each slice starts in each tile's list
+    counts: Annotated[
+        IntArray, "slices, tiles + SPARE_COUNTS"
+    ],  # in: counts; out: where each slice starts in each tile's list
     totals: Annotated[LongArray, "slices + 1"],  # in: pairs of each slice; out: running sum
     tile_start: Annotated[IntArray, "tiles + 1"],  # out
     slices: int,
@@ -87,9 +90,10 @@ def fill_pairs(
     records: Annotated[FloatArray, "R, RECORD"],
     listed: Annotated[IntArray, "n"],
     listed_count: Annotated[IntArray, "slices"],
+    places: Annotated[IntArray, "n, PLACE"],
     boxes: Annotated[IntArray, "n, BOX"],
     ranges: Annotated[IntArray, "tiles_x * tiles_y if limited else 0, 2"],
-    counts: Annotated[IntArray, "slices, tiles_x, tiles_y"],  # next free place
+    counts: Annotated[IntArray, "slices, tiles_x * tiles_y + SPARE_COUNTS"],  # next free place
     totals: Annotated[LongArray, "slices + 1"],
     pair_start: Annotated[IntArray, "n + 1"],  # out
     pair_row: Annotated[IntArray, "P"],  # out
@@ -184,12 +188,12 @@ def bin_gaussians(
     ranges = ints(0) if ranges is None else ranges
     records = floats(rows, RECORD) if records is None else records
     listed, listed_count = ints(n), ints(slices)
-    boxes, counts = ints(n, BOX), ints(slices, tiles_x * tiles_y)
+    places, boxes, counts = ints(n, PLACE), ints(n, BOX), ints(slices, tiles_x * tiles_y + SPARE_COUNTS)
     tile_start, pair_start = ints(tiles_x * tiles_y + 1), ints(n + 1)
     tiles_per_gauss, totals = zeros(rows if dense else 0, dtype=torch.int32), longs(slices + 1)
     pack_and_count(
-        visible, means2d, depths, conics, opacities, sigmas, colors, ranges, records, listed, listed_count, boxes,
-        counts, totals, tiles_per_gauss,
+        visible, means2d, depths, conics, opacities, sigmas, colors, ranges, records, listed, listed_count, places,
+        boxes, counts, totals, tiles_per_gauss,
         n, rows, channels, min(channels, MAX_CHANNELS), slices, float(width), float(height), tiles_x, tiles_y,
         int(dense), int(limited), active_shortcuts(),
     )  # fmt: skip
@@ -203,8 +207,8 @@ def bin_gaussians(
         )
     pair_row, unsorted = ints(pairs), longs(pairs)
     fill_pairs(
-        visible, depths, records, listed, listed_count, boxes, ranges, counts, totals, pair_start, pair_row, unsorted,
-        n, slices, float(width), tiles_x, tiles_y, int(limited), active_shortcuts(),
+        visible, depths, records, listed, listed_count, places, boxes, ranges, counts, totals, pair_start, pair_row,
+        unsorted, n, slices, float(width), tiles_x, tiles_y, int(limited), active_shortcuts(),
     )  # fmt: skip
     lists = ints(pairs), ints(pairs)
     return Bins(visible, records, tile_start, *lists, pair_start, pair_row, unsorted, tiles_per_gauss)

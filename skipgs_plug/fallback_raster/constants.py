@@ -14,9 +14,15 @@ BLOCK = 512
 # column; p^2 + w^2 at ALPHA_MIN; 1 / r[2]. Together a cache line.
 RECORD = 16
 
-# Numbers of the box of tiles around a Gaussian: its first and last column, its first and last row, and which of its
-# tiles the Gaussian meets, as bits, where they are at most 2 x 2; -1 where they are more.
-BOX = 5
+# Numbers of the place of a Gaussian among the tiles: the first tile of the box around it, and which of its tiles it
+# meets, as bits, where they are at most 2 x 2; -1 where they are more.
+PLACE = 2
+
+# Numbers of the box of tiles around a larger one: its first and last column, its first and last row.
+BOX = 4
+
+# Counters of a slice that belong to no tile, so that tiles can be counted two at a time.
+SPARE_COUNTS = 2
 
 # Sums of a (tile, Gaussian) pair in the adjoint: the six moments; up to four channels of colour; |v_x|, |v_y|; the rest
 # makes it a cache line.

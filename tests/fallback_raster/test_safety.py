@@ -16,6 +16,7 @@ from raster_scenes import leaves, random_scene
 from skipgs_plug.fallback_raster import binning, l1_ssim_loss, rasterization
 from skipgs_plug.fallback_raster.adam import adam_rows
 from skipgs_plug.fallback_raster.cache import load_or_rebuild, say_unwritable
+from skipgs_plug.fallback_raster.constants import SPARE_COUNTS
 from skipgs_plug.files import WriteError
 
 HERE = Path(__file__).parent
@@ -135,7 +136,7 @@ def test_defaults_of_the_process_change_nothing(default: Any) -> None:
 
 
 def test_pairs_are_counted_beyond_32_bits() -> None:
-    counts = torch.full((2, 4), 2**30, dtype=torch.int32)
+    counts = torch.full((2, 4 + SPARE_COUNTS), 2**30, dtype=torch.int32)
     totals = torch.tensor([2**32, 2**32, 0])
     binning.scan_pairs(counts, totals, torch.zeros(5, dtype=torch.int32), 2, 4)
     assert totals.tolist() == [0, 2**32, 2**33]

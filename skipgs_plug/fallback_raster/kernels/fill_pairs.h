@@ -3,24 +3,25 @@
 #include "ellipse.h"
 #include "tile_ranges.h"
 for (int s = first; s < last; ++s) {
-    int* next = counts + (long long)s * tiles_x * tiles_y;
+    int* next = counts + (long long)s * (tiles_x * tiles_y + SPARE_COUNTS);
     int pair = (int)totals[s];
     const int begin = (int)((long long)s * n / slices), end = (int)((long long)(s + 1) * n / slices);
     int i = begin;
     for (int k = begin; k < begin + listed_count[s]; ++k) {
         while (i <= listed[k]) pair_start[i++] = pair;
-        const int* box = boxes + (long long)BOX * k;
+        const int meets = places[(long long)PLACE * k + 1];
         const int g = visible[listed[k]], depth = ((const int*)depths)[g];
         const long long key = (long long)depth << 32;
-        if (box[4] >= 0) {
-            int* corner = next + box[2] * tiles_x + box[0];
-            for (int rest = box[4]; rest; rest &= rest - 1) {
+        if (meets >= 0) {
+            int* corner = next + places[(long long)PLACE * k];
+            for (int rest = meets; rest; rest &= rest - 1) {
                 const int j = __builtin_ctz(rest);
                 pair_row[pair] = g;
                 unsorted[corner[(j >> 1) * tiles_x + (j & 1)]++] = key | (unsigned)pair++;
             }
             continue;
         }
+        const int* box = boxes + (long long)BOX * k;
         const Ellipse ellipse(records + (long long)RECORD * g, box, width, shortcuts & EXACT_TILES);
         for (int ty = ellipse.first_row; ty <= ellipse.last_row; ++ty) {
             int left, right;

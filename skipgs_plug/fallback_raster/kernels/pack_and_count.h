@@ -1,13 +1,21 @@
-// Records of the visible rows, the boxes of tiles around them, and the number of pairs of each tile, by slice of the rows.
+// Records of the visible rows, their places among the tiles, and the number of pairs of each tile, by slice of the rows.
 // Where `limited`, only pairs whose depths lie in the range of their tile count, and only rows that have some get a record.
 #include "ellipse.h"
 #include "tile_ranges.h"
 const int tiles = tiles_x * tiles_y;
+const auto interleave = [](i16 a, i16 b, int* to) INLINE {
+    *(i16*)to = __builtin_shufflevector(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+    *(i16*)(to + 16) = __builtin_shufflevector(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+};
+const auto add_two = [](int* to, const int* numbers) INLINE {
+    typedef int two __attribute__((ext_vector_type(2), aligned(4)));
+    *(two*)to += *(const two*)numbers;
+};
 int least = limited ? NO_DEPTH : -NO_DEPTH, most = limited ? -NO_DEPTH : NO_DEPTH;
 for (int t = 0; limited && t < tiles; ++t) least = smaller(least, ranges[2 * t]), most = larger(most, ranges[2 * t + 1]);
 for (int s = first; s < last; ++s) {
-    int* count = counts + (long long)s * tiles;
-    for (int t = 0; t < tiles; ++t) count[t] = 0;
+    int* count = counts + (long long)s * (tiles + SPARE_COUNTS);
+    for (int t = 0; t < tiles + SPARE_COUNTS; ++t) count[t] = 0;
     long long of_slice = 0;
     int found = 0;
     const int begin = (int)((long long)s * n / slices), end = (int)((long long)(s + 1) * n / slices);
@@ -45,7 +53,7 @@ for (int s = first; s < last; ++s) {
         alignas(64) int box[BOX][16];
         const i16 first_column = left >> 4, last_column = right >> 4, first_row = top >> 4, last_row = bottom >> 4;
         *(i16*)box[0] = first_column, *(i16*)box[1] = last_column, *(i16*)box[2] = first_row;
-        *(i16*)box[3] = empty ? (i16)-1 : last_row;
+        *(i16*)box[3] = last_row;
         // Which of the four tiles of a box of at most 2 x 2 the ellipse meets, or a hair more: a convex function is least
         // at the point nearest to the centre or on an edge that faces it.
         i16 meets = (i16)0;
@@ -62,46 +70,63 @@ for (int s = first; s < last; ++s) {
         }
         const i16 small = (last_column - first_column <= 1) & (last_row - first_row <= 1);
         meets = empty ? (i16)0 : (small ? meets : (i16)-1);
-        *(i16*)box[4] = meets;
+        const i16 corner = first_row * tiles_x + first_column;
 
         // All tiles of a large ellipse are found with its record, to count them where `dense`.
         const i16 wanted = (meets != 0) & (near | ((meets < 0) & (dense ? -1 : 0)));
-        if (dense) {
-            const i16 met = (meets & 1) + (meets >> 1 & 1) + (meets >> 2 & 1) + (meets >> 3 & 1);
-            scatter((float*)tiles_per_gauss, row, (v16)met, lanes);
-        }
-        if (any(wanted)) {
+        const i16 met = (meets & 1) + (meets >> 1 & 1) + (meets >> 2 & 1) + (meets >> 3 & 1);
+        if (dense) scatter((float*)tiles_per_gauss, row, (v16)met, lanes);
+        const unsigned chosen = bits(wanted) & ((1u << lanes) - 1);
+        if (!chosen) continue;
+        {
             v16 value[RECORD] = {mx, my, along, along * slope, across, log2_opacity, half_h, half_w, {}, {}, {}, {},
                                  -slope, -steepness, reach, 1.0f / along};
             if (stride == 3 && channels == 3) gather3(colors, row, rows, value + 8);
             else
                 for (int k = 0; k < channels; ++k) value[8 + k] = gather(colors, row, stride, k);
             transpose(value);
-            for (unsigned rest = bits(wanted) & ((1u << lanes) - 1); rest; rest &= rest - 1) {
+            for (unsigned rest = chosen; rest; rest &= rest - 1) {
                 const int l = __builtin_ctz(rest);
                 store(records + (long long)RECORD * row[l], value[l]);
             }
         }
-        alignas(64) int key[16];
+        // By lane: first tile and tiles met; pairs in the upper two tiles, and in the lower two, wherever these are.
+        alignas(64) int place[16][PLACE], upper[16][2], lower[16][2], below[16], key[16];
+        interleave(corner, meets, place[0]);
+        interleave(meets & 1, meets >> 1 & 1, upper[0]);
+        interleave(meets >> 2 & 1, meets >> 3 & 1, lower[0]);
+        *(i16*)below = last_row > first_row ? corner + tiles_x : (i16)tiles;
         *(i16*)key = depth;
-        for (unsigned rest = bits(wanted) & ((1u << lanes) - 1); rest; rest &= rest - 1) {
-            const int l = __builtin_ctz(rest);
-            int* own = boxes + (long long)BOX * (begin + found);
-            for (int j = 0; j < BOX; ++j) own[j] = box[j][l];
-            int pairs = 0;
-            if (own[4] >= 0) {
-                const int corner = own[2] * tiles_x + own[0];
-                for (int todo = limited ? own[4] : 0; todo; todo &= todo - 1) {
+        if (chosen == 0xffff && !limited && !any(meets < 0)) {
+            int* own = places + (long long)PLACE * (begin + found);
+            for (int l = 0; l < 16; ++l) {
+                *(v2*)(own + PLACE * l) = *(const v2*)place[l];
+                listed[begin + found + l] = i + l;
+                // Two counters at a time: a branch for each would often be taken the wrong way.
+                add_two(count + place[l][0], upper[l]);
+                add_two(count + below[l], lower[l]);
+            }
+            of_slice += __builtin_reduce_add(met);
+            found += 16;
+            continue;
+        }
+        for (unsigned rest = chosen; rest; rest &= rest - 1) {
+            const int l = __builtin_ctz(rest), corner = place[l][0];
+            int own_meets = place[l][1], pairs = 0;
+            if (own_meets >= 0) {
+                for (int todo = limited ? own_meets : 0; todo; todo &= todo - 1) {
                     const int j = __builtin_ctz(todo);
-                    if (!in_range(ranges, corner + (j >> 1) * tiles_x + (j & 1), key[l])) own[4] &= ~(1 << j);
+                    if (!in_range(ranges, corner + (j >> 1) * tiles_x + (j & 1), key[l])) own_meets &= ~(1 << j);
                 }
-                for (int todo = own[4]; todo; todo &= todo - 1) {
+                for (int todo = own_meets; todo; todo &= todo - 1) {
                     const int j = __builtin_ctz(todo);
                     ++count[corner + (j >> 1) * tiles_x + (j & 1)];
                 }
-                pairs = __builtin_popcount(own[4]);
+                pairs = __builtin_popcount(own_meets);
             } else {
                 int met = 0;
+                int* own = boxes + (long long)BOX * (begin + found);
+                for (int j = 0; j < BOX; ++j) own[j] = box[j][l];
                 const Ellipse ellipse(records + (long long)RECORD * row[l], own, width, shortcuts & EXACT_TILES);
                 for (int ty = ellipse.first_row; ty <= ellipse.last_row; ++ty) {
                     int left, right;
@@ -113,6 +138,8 @@ for (int s = first; s < last; ++s) {
                 if (dense) tiles_per_gauss[row[l]] = met;
             }
             of_slice += pairs;
+            places[(long long)PLACE * (begin + found)] = corner;
+            places[(long long)PLACE * (begin + found) + 1] = own_meets;
             listed[begin + found] = i + l;
             found += pairs > 0;
         }
