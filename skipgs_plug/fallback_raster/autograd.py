@@ -69,7 +69,7 @@ class Project(torch.autograd.Function):
         project_forward(
             means, quats, scales, opacities, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
             floats(0), seen, block_count, n, float(width), float(height), near_plane, far_plane, eps2d, radius_clip,
-            int(antialiased), 0, 1, active_shortcuts(),
+            int(antialiased), 0, 1, 1, active_shortcuts(),
         )  # fmt: skip
         visible, block_start = visible_rows(seen, block_count)
         ctx.save_for_backward(means, quats, scales, viewmat, K, visible, block_start)

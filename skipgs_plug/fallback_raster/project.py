@@ -23,7 +23,7 @@ def project_forward(
     conics: Annotated[FloatArray, "n, 3"],  # out, upper triangle of the inverse 2D covariance
     sigmas: Annotated[FloatArray, "n, 2"],  # out, standard deviations along x and y in pixels
     compensations: Annotated[FloatArray, "n if antialiased else 0"],  # out
-    radii: Annotated[IntArray, "n, 2"],  # out, zero where the Gaussian is not visible
+    radii: Annotated[IntArray, "n if with_radii else 0, 2"],  # out, zero where the Gaussian is not visible
     activated: Annotated[FloatArray, "n if raw else 0"],  # out, opacities, compensated where antialiased
     seen: Annotated[IntArray, "n"],  # out, the rows with a radius, from where their block begins
     block_count: Annotated[IntArray, "blocks(n)"],  # out, their number in each block
@@ -37,6 +37,7 @@ def project_forward(
     antialiased: int,
     raw: int,
     dense: int,  # whether to write rows that are not visible
+    with_radii: int,
     shortcuts: int,
 ) -> None: ...
 

@@ -107,7 +107,9 @@ def rasterize_splats(
     means, quats, log_scales, logits, sh0, shN, viewmat, K = as_kernels_read(*tensors, viewmat, K)
     size = (width, height)
     with torch.no_grad():
-        projected = _project(means, quats, log_scales, logits, viewmat, K, size, near_plane, far_plane, antialiased)
+        projected = _project(
+            means, quats, log_scales, logits, viewmat, K, size, near_plane, far_plane, antialiased, with_rows
+        )
     visible = projected.visible
     if lazy is not None and sh_degree > 0:
         lazy.catch_up(visible)
@@ -228,15 +230,16 @@ def _project(
     near_plane: float,
     far_plane: float,
     antialiased: bool,
+    with_radii: bool,
 ) -> _Projected:
     n = len(means)
     means2d, depths, conics, sigmas, opacities = floats(n, 2), floats(n), floats(n, 3), floats(n, 2), floats(n)
-    compensations, radii = floats(n if antialiased else 0), ints(n, 2)
+    compensations, radii = floats(n if antialiased else 0), ints(n if with_radii else 0, 2)
     seen, block_count = ints(n), ints(blocks(n))
     project_forward(
         means, quats, log_scales, logits, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
         opacities, seen, block_count, n, *map(float, size), near_plane, far_plane, EPS2D, 0.0, int(antialiased),
-        1, 0, active_shortcuts(),
+        1, 0, int(with_radii), active_shortcuts(),
     )  # fmt: skip
     lists = visible_rows(seen, block_count)
     return _Projected(means2d, depths, conics, sigmas, compensations, radii, opacities, *lists)

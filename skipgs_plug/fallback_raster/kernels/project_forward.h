@@ -21,7 +21,7 @@ for (int base = row_begin; base < row_end; base += 16) {
     if (shortcuts & SPHERES) outside |= beyond(K, width, height, eps2d, x, y, iz, longest);
     if (!any(~outside)) {
         if (dense) {
-            clear((float*)radii + 2ll * base, 2 * lanes);
+            if (with_radii) clear((float*)radii + 2ll * base, 2 * lanes);
             clear(means2d + 2ll * base, 2 * lanes);
             clear(depths + base, lanes);
             clear(conics + 3ll * base, 3 * lanes);
@@ -57,9 +57,11 @@ for (int base = row_begin; base < row_end; base += 16) {
     for (unsigned rest = bits(visible) & ((1u << lanes) - 1); rest; rest &= rest - 1)
         seen[found++] = base + __builtin_ctz(rest);
     if (!dense && !any(visible)) continue;
-    const i16 rx = __builtin_convertvector(visible ? radius_x : none, i16);
-    const i16 ry = __builtin_convertvector(visible ? radius_y : none, i16);
-    scatter2((float*)radii, row, (v16)rx, (v16)ry, lanes);
+    if (with_radii) {
+        const i16 rx = __builtin_convertvector(visible ? radius_x : none, i16);
+        const i16 ry = __builtin_convertvector(visible ? radius_y : none, i16);
+        scatter2((float*)radii, row, (v16)rx, (v16)ry, lanes);
+    }
     scatter2(means2d, row, visible ? u : none, visible ? v : none, lanes);
     store_some(depths + base, visible ? z : none, lanes);
     scatter3(conics, row, visible ? conic_a : none, visible ? conic_b : none, visible ? conic_c : none, lanes);
