@@ -35,7 +35,7 @@ BANDS = 15
 FACTOR = 4
 
 # Most ranges of depth into which a tile deals its pairs before it sorts one after the other.
-BUCKETS = 4096
+BUCKETS = 8192
 
 # Channels that one pass blends; wider colours take several passes.
 MAX_CHANNELS = 4

@@ -85,7 +85,7 @@ class _L1Ssim(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, v_loss: Tensor) -> Any:  # type: ignore[override]
         (gradient,) = ctx.saved_tensors
-        return gradient if v_loss == 1 else v_loss * gradient, None, None, None
+        return gradient if v_loss.item() == 1.0 else v_loss * gradient, None, None, None
 
 
 def l1_ssim_loss(
