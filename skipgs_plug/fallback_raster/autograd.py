@@ -40,8 +40,8 @@ def check_shapes(tensors: tuple[Tensor, ...], **shapes: torch.Size) -> tuple[Ten
 class Project(torch.autograd.Function):
     """Gaussians of one camera on its image plane.
 
-    Gives means2d [N, 2], depths [N], conics [N, 3], compensations [N] (empty unless antialiased), and without a
-    gradient radii [N, 2], sigmas [N, 2] (standard deviations in pixels), the visible rows [M] and where
+    Gives means2d [1, N, 2], depths [1, N], conics [1, N, 3], compensations [1, N] (empty unless antialiased), and
+    without a gradient radii [1, N, 2], sigmas [1, N, 2] (standard deviations in pixels), the visible rows [M] and where
     each block of rows begins among them [ceil(N / BLOCK) + 1].
     """
 
@@ -63,8 +63,8 @@ class Project(torch.autograd.Function):
         antialiased: bool,
     ) -> tuple[Tensor, ...]:
         n = len(means)
-        means2d, sigmas, depths, conics = floats(n, 2), floats(n, 2), floats(n), floats(n, 3)
-        compensations, radii = floats(n if antialiased else 0), ints(n, 2)
+        means2d, sigmas, depths, conics = floats(1, n, 2), floats(1, n, 2), floats(1, n), floats(1, n, 3)
+        compensations, radii = floats(1, n if antialiased else 0), ints(1, n, 2)
         seen, block_count = ints(n), ints(blocks(n))
         project_forward(
             means, quats, scales, opacities, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
@@ -174,9 +174,11 @@ class Pack(torch.autograd.Function):
 
 
 class Blend(torch.autograd.Function):
-    """Image [H, W, D] of one camera, the transmittance [H, W] behind it, and tiles_per_gauss [R].
+    """Image [1, H, W, D] of one camera, the transmittance [1, H, W, 1] behind it, and tiles_per_gauss [R].
 
-    `absolute` [R, 2] receives the sum over pixels of |v_means2d| (AbsGS) when it is not None.
+    Tensors of rows may have a dimension of one camera in front: views of them, whose gradients are views too, would
+    take as long as a small kernel. `absolute` [R, 2] receives the sum over pixels of |v_means2d| (AbsGS) when it is
+    not None.
     """
 
     @staticmethod
@@ -194,8 +196,20 @@ class Blend(torch.autograd.Function):
         height: int,
         absolute: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        image, transmittance, ctx.blended = blend(
-            means2d, conics, opacities, colors, depths, sigmas, visible, block_start, width, height
+        image, transmittance = floats(1, height, width, colors.shape[1]), floats(1, height, width, 1)
+        ctx.blended = blend(
+            means2d,
+            conics,
+            opacities,
+            colors,
+            depths,
+            sigmas,
+            visible,
+            block_start,
+            width,
+            height,
+            image,
+            transmittance,
         )
         ctx.save_for_backward(means2d, conics, opacities, colors, transmittance)
         ctx.shapes = {

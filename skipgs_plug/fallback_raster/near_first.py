@@ -123,7 +123,7 @@ def bin_the_rest(
     open_before = torch.zeros(tiles_y + 1, tiles_x + 1, dtype=torch.int32, device="cpu")
     open_before[1:, 1:] = is_open.view(tiles_y, tiles_x).cumsum(0).cumsum(1)
     count = len(block_start) - 1
-    seen, block_count = ints(len(means2d)), ints(count)
+    seen, block_count = ints(len(colors)), ints(count)
     _list_open(
         near.visible, block_start, means2d, depths, opacities, sigmas, open_before, seen, block_count,
         len(near.visible), count, int(behind[:, 0].min()), tiles_x, tiles_y,

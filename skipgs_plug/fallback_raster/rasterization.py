@@ -157,7 +157,7 @@ def rasterization(
         for viewmat, K in zip(viewmats, Ks, strict=True)
     ]  # fmt: skip
     *stacked, visible, block_starts = map(list, zip(*projected, strict=True))
-    means2d, depths, conics, compensations, radii, sigmas = (_stack(parts) for parts in stacked)
+    means2d, depths, conics, compensations, radii, sigmas = (_join(parts) for parts in stacked)
     # The adjoint of `expand` adds up, of one camera too.
     opacities = opacities[None] if n_cameras == 1 else opacities.expand(n_cameras, n)
     if antialiased:
@@ -185,7 +185,7 @@ def rasterization(
 
         features = pack(features) if features else []
         means2d, depths, conics, opacities, radii, sigmas = (
-            _join(pack(_unstack(t, None))) for t in (means2d, depths, conics, opacities, radii, sigmas)
+            _join(pack(t.unbind())) for t in (means2d, depths, conics, opacities, radii, sigmas)
         )
         visible, block_starts = map(list, zip(*map(all_rows, counts), strict=True))
     absolute = None
@@ -193,8 +193,8 @@ def rasterization(
         absolute = torch.zeros_like(means2d)
         means2d.absgrad = absolute  # type: ignore[attr-defined]
 
-    absolutes = None if absolute is None else _unstack(absolute, counts)
-    projections = zip(*(_unstack(t, counts) for t in (means2d, conics, opacities, depths, sigmas)), strict=True)
+    absolutes = None if absolute is None else _split(absolute, counts)
+    projections = zip(*(_split(t, counts) for t in (means2d, conics, opacities, depths, sigmas)), strict=True)
     rendered = [
         _render_camera(
             projection,
@@ -222,18 +222,18 @@ def rasterization(
         "opacities": opacities,
         "tile_width": tile_width,
         "tile_height": tile_height,
-        "tiles_per_gauss": _join(list(tiles_per_gauss)) if packed else _stack(tiles_per_gauss),
+        "tiles_per_gauss": _join(tiles_per_gauss) if packed else torch.stack(tiles_per_gauss),
         "width": width,
         "height": height,
         "tile_size": TILE,
         "n_batches": 1,
         "n_cameras": n_cameras,
     }
-    return _stack(images).to(dtype), _stack(alphas).to(dtype), info
+    return _join(images).to(dtype), _join(alphas).to(dtype), info
 
 
 def _render_camera(
-    projection: tuple[Tensor, ...],  # means2d [R, 2], conics [R, 3], opacities [R], depths [R], sigmas [R, 2]
+    projection: tuple[Tensor, ...],  # means2d, conics, opacities, depths and sigmas of R rows
     visible: Tensor,  # [M]
     block_start: Tensor,  # [ceil(R / BLOCK) + 1]
     features: Tensor | None,  # [R, D], None where only depth is wanted
@@ -243,39 +243,35 @@ def _render_camera(
     height: int,
     render_mode: RenderMode,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Image [H, W, X], alpha [H, W, 1] and tiles_per_gauss [R] of projected Gaussians."""
+    """Image [1, H, W, X], alpha [1, H, W, 1] and tiles_per_gauss [R] of projected Gaussians."""
     means2d, conics, opacities, depths, sigmas = projection
     with_depth = render_mode != "RGB"
     channels = [] if features is None else [features]
     if with_depth:
-        channels.append(depths.unsqueeze(1))
+        channels.append(depths.reshape(-1, 1))
     image, transmittance, tiles_per_gauss = Blend.apply(
         means2d, conics, opacities, torch.cat(channels, 1) if len(channels) > 1 else channels[0],
         depths, sigmas, visible, block_start, width, height, absolute,
     )  # fmt: skip
-    alpha = (1.0 - transmittance).unsqueeze(-1)
+    alpha = 1.0 - transmittance
     if background is not None and features is not None:
         behind = background.to(torch.float32)
         if with_depth:
             behind = torch.cat([behind, behind.new_zeros(1)])
-        image = image + transmittance.unsqueeze(-1) * behind
+        image = image + transmittance * behind
     if render_mode.endswith("ED"):
         expected = image[..., -1:] / alpha.clamp(min=1e-10)
         image = expected if features is None else torch.cat([image[..., :-1], expected], -1)
     return image, alpha, tiles_per_gauss
 
 
-# One camera is the rule in training: views, whose gradients are views too, spare copies of everything.
-def _stack(tensors: Any) -> Tensor:
-    return tensors[0].unsqueeze(0) if len(tensors) == 1 else torch.stack(list(tensors))
+# One camera is the rule in training: it needs neither copies nor views, whose gradients are views too.
+def _join(tensors: Sequence[Tensor]) -> Tensor:
+    return tensors[0] if len(tensors) == 1 else torch.cat(list(tensors))
 
 
-def _join(tensors: list[Tensor]) -> Tensor:
-    return tensors[0] if len(tensors) == 1 else torch.cat(tensors)
-
-
-def _unstack(tensor: Tensor, counts: list[int] | None) -> Sequence[Tensor]:
-    """One tensor per camera, of rows that are stacked, or packed with `counts` per camera."""
-    if counts is not None:
-        return [tensor] if len(counts) == 1 else tensor.split(counts)
-    return [tensor.squeeze(0)] if len(tensor) == 1 else tensor.unbind()
+def _split(tensor: Tensor, counts: list[int] | None) -> Sequence[Tensor]:
+    """One tensor per camera, of rows [C, N, ...], whose first dimension stays, or packed with `counts` per camera."""
+    if len(tensor if counts is None else counts) == 1:
+        return [tensor]
+    return tensor.split(1 if counts is None else counts)

@@ -82,16 +82,18 @@ def blend(
     block_start: Tensor,  # [blocks + 1]
     width: int,
     height: int,
+    image: Tensor,  # H W D numbers, filled here as the next
+    transmittance: Tensor,  # H W numbers, behind the image
     dense: bool = True,
-) -> tuple[Tensor, Tensor, Blended]:
-    """Image [H, W, D] and the transmittance [H, W] behind it."""
+) -> Blended:
+    """Blends an image. Tensors of rows may have a dimension of one camera in front."""
     channels, size = colors.shape[1], (width, height, *tiles(width, height))
     ranges = None
     if channels <= MAX_CHANNELS:
         ranges = near_ranges(visible, means2d, depths, conics, opacities, width, height)
     rows = means2d, depths, conics, opacities, sigmas, colors, width, height
     bins = bin_gaussians(visible, *rows, dense, ranges)
-    image, transmittance, pixel_stop = floats(height, width, channels), floats(height, width), ints(height, width)
+    pixel_stop = ints(height, width)
     limited = ranges is not None
     product_left, still_open = floats(height if limited else 0, width), ints(size[2] * size[3] if limited else 0)
     pixels = image, transmittance, pixel_stop, product_left, still_open
@@ -102,7 +104,7 @@ def blend(
         rest = bin_the_rest(bins, ranges, still_open, block_start, *rows)
         if rest is not None:
             last = _blend_lists(*rest, colors, pixels, size, len(bins.tile_list), True, False).after(near)
-    return image, transmittance, Blended(near, last, pixel_stop)
+    return Blended(near, last, pixel_stop)
 
 
 def _blend_lists(
@@ -163,15 +165,15 @@ class PairSums(NamedTuple):
 def pair_sums(
     blended: Blended,
     colors: Tensor,  # [R, D], as the next one of the forward pass
-    transmittance: Tensor,  # [H, W]
-    v_image: Tensor | None,  # [H, W, D], None for zeros, as the next
-    v_transmittance: Tensor | None,  # [H, W]
+    transmittance: Tensor,  # H W numbers
+    v_image: Tensor | None,  # H W D numbers, None for zeros, as the next
+    v_transmittance: Tensor | None,  # H W numbers
     with_absolute: bool,
 ) -> Iterator[tuple[int, int, PairSums]]:
     """First channel, number of channels and sums of each pass of the adjoint; sums live until the next one."""
     near, last = blended.near, blended.last
     bins, lists, parts = near.bins, last.bins, blended.parts
-    (height, width), channels = transmittance.shape, colors.shape[1]
+    (height, width), channels = blended.pixel_stop.shape, colors.shape[1]
     size = (width, height, *tiles(width, height))
     v_image = zeros(height, width, channels) if v_image is None else v_image.contiguous()
     v_transmittance = floats(0, width) if v_transmittance is None else v_transmittance.contiguous()
@@ -209,9 +211,9 @@ def blend_adjoint(
     conics: Tensor,  # [R, 3]
     opacities: Tensor,  # [R]
     colors: Tensor,  # [R, D]
-    transmittance: Tensor,  # [H, W]
-    v_image: Tensor | None,  # [H, W, D], None for zeros, as the next
-    v_transmittance: Tensor | None,  # [H, W]
+    transmittance: Tensor,  # H W numbers
+    v_image: Tensor | None,  # H W D numbers, None for zeros, as the next
+    v_transmittance: Tensor | None,  # H W numbers
     absolute: Tensor | None,  # [R, 2]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Gradients of means2d, conics, opacities and colors; `absolute` receives the sum over pixels of |v_means2d|."""
