@@ -222,7 +222,7 @@ def rasterization(
         "opacities": opacities,
         "tile_width": tile_width,
         "tile_height": tile_height,
-        "tiles_per_gauss": _join(tiles_per_gauss) if packed else torch.stack(tiles_per_gauss),
+        "tiles_per_gauss": _join(tiles_per_gauss if packed else [t.unsqueeze(0) for t in tiles_per_gauss]),
         "width": width,
         "height": height,
         "tile_size": TILE,
