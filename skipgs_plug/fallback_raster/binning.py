@@ -73,9 +73,8 @@ def pack_and_count(
 
 @worker(read_kernel("scan_pairs.h"), items="1", grain="1")
 def scan_pairs(
-    counts: Annotated[
-        IntArray, "slices, tiles + SPARE_COUNTS"
-    ],  # in: counts; out: where each slice starts in each tile's list
+    # In: counts; out: where each slice starts in each tile's list.
+    counts: Annotated[IntArray, "slices, tiles + SPARE_COUNTS"],
     totals: Annotated[LongArray, "slices + 1"],  # in: pairs of each slice; out: running sum
     tile_start: Annotated[IntArray, "tiles + 1"],  # out
     slices: int,

@@ -68,13 +68,11 @@ class Crew:
         return lock
 
     def _launch(self, *addresses: int) -> None:
-        block = self._launcher.block(self._address, *addresses, self._count, _PATIENCE)
-        self._launcher.run(self._launcher.bounds, ctypes.byref(block))
+        self._launcher(self._launcher.block(self._address, *addresses, self._count, _PATIENCE))
 
     def _serve(self, number: int) -> None:
         try:
-            block = self._server.block(self._address, number, _PATIENCE)
-            self._server.run(self._server.bounds, ctypes.byref(block))
+            self._server(self._server.block(self._address, number, _PATIENCE))
         finally:
             self._alive.remove(number)
 

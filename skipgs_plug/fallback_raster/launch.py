@@ -23,7 +23,7 @@ from . import guard
 from .guard import Sizes
 from .native import Kernel, load_kernel
 from .source import PRELUDE, SHARED, declare
-from .threads import LOCK, get_num_threads, on_all_threads
+from .threads import LOCK, get_num_threads, on_threads
 
 # Sections of the items for each thread. Neighbouring items write to the same cache lines: threads that took items in
 # turns would pass these lines to and fro.
@@ -141,10 +141,7 @@ class Worker:
             counters[_LINE // 4] = sections
             # Every call fills a block of parameters of its own, which the threads share.
             block = kernel.block(ctypes.addressof(counters) + _LINE, *values)
-            if self._alone:
-                kernel.run(kernel.bounds, ctypes.byref(block))
-            else:
-                on_all_threads(kernel, block)
+            on_threads(threads, kernel, block)
 
     def _load(self) -> Kernel:
         parameters = {"counters_address": "wp.uint64"}

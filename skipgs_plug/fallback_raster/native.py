@@ -20,13 +20,17 @@ from .cache import load_or_rebuild, say_unwritable
 
 
 class Kernel(NamedTuple):
-    """A loaded kernel: `run(bounds, ctypes.byref(block(*values)))`, on this thread, without the interpreter lock."""
+    """A loaded kernel: `kernel(kernel.block(*values))` runs it on this thread, without the interpreter lock."""
 
     run: Callable[..., None]
     bounds: Any
     block: type[ctypes.Structure]  # its parameters, in their order
     addresses: tuple[int, int]  # of the function and of the bounds
     command: Any  # of Warp; the code stays loaded as long as it lives
+
+    def __call__(self, block: ctypes.Structure) -> None:
+        """Run it with the parameters in `block`."""
+        self.run(self.bounds, ctypes.byref(block))
 
 
 def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:

@@ -185,7 +185,9 @@ def rasterization(
 
         features = pack(features) if features else []
         means2d, depths, conics, opacities, radii, sigmas = (
-            _join(pack(t.unbind())) for t in (means2d, depths, conics, opacities, radii, sigmas)
+            # The adjoint of `unbind` copies.
+            _join(pack([t.squeeze(0)] if n_cameras == 1 else t.unbind()))
+            for t in (means2d, depths, conics, opacities, radii, sigmas)
         )
         visible, block_starts = map(list, zip(*map(all_rows, counts), strict=True))
     absolute = None

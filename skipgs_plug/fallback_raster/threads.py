@@ -44,13 +44,13 @@ def set_num_threads(n: int) -> None:
         _dismiss()
 
 
-def on_all_threads(kernel: Kernel, block: ctypes.Structure) -> None:
-    """Runs a kernel on every thread and returns when all are done. The caller holds `LOCK`."""
+def on_threads(count: int, kernel: Kernel, block: ctypes.Structure) -> None:
+    """Runs a kernel on one thread, this one, or on all, and returns when it is done. The caller holds `LOCK`."""
     global _crew
     if _forked:
         _warn_after_fork()
-    if _num_threads == 1:
-        kernel.run(kernel.bounds, ctypes.byref(block))
+    if count == 1:
+        kernel(block)
         return
     if _crew is None:
         _crew = Crew(_num_threads - 1)
