@@ -9,6 +9,7 @@ import _thread
 import ctypes
 import time
 
+from .cores import usable_cores
 from .native import Kernel, load_kernel
 from .source import read_kernel
 
@@ -36,6 +37,8 @@ class Crew:
 
     def __init__(self, count: int) -> None:
         self._count = count
+        # With more threads than cores, one that looks keeps another from its work.
+        self._patience = _PATIENCE if count < usable_cores() else 0
         self._server = _load("crew_serve", ["crew_address"], ["number", "patience"])
         launch = ["crew_address", "function_address", "bounds_address", "block_address"]
         self._launcher = _load("crew_run", launch, ["helpers", "patience"])
@@ -68,11 +71,11 @@ class Crew:
         return lock
 
     def _launch(self, *addresses: int) -> None:
-        self._launcher(self._launcher.block(self._address, *addresses, self._count, _PATIENCE))
+        self._launcher(self._launcher.block(self._address, *addresses, self._count, self._patience))
 
     def _serve(self, number: int) -> None:
         try:
-            self._server(self._server.block(self._address, number, _PATIENCE))
+            self._server(self._server.block(self._address, number, self._patience))
         finally:
             self._alive.remove(number)
 
