@@ -196,11 +196,9 @@ class Blend(torch.autograd.Function):
         height: int,
         absolute: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        image, transmittance = floats(1, height, width, colors.shape[1]), floats(1, height, width, 1)
-        ctx.blended = blend(
-            means2d, conics, opacities, colors, depths, sigmas, visible, block_start, width, height,
-            image, transmittance,
-        )  # fmt: skip
+        image, transmittance, ctx.blended = blend(
+            means2d, conics, opacities, colors, depths, sigmas, visible, block_start, width, height
+        )
         ctx.save_for_backward(means2d, conics, opacities, colors, transmittance)
         ctx.shapes = {
             "means2d": means2d.shape,

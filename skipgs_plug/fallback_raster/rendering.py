@@ -82,17 +82,21 @@ def blend(
     block_start: Tensor,  # [blocks + 1]
     width: int,
     height: int,
-    image: Tensor,  # H W D numbers, filled here as the next
-    transmittance: Tensor,  # H W numbers, behind the image
     dense: bool = True,
-) -> Blended:
-    """Blends an image. Tensors of rows may have a dimension of one camera in front."""
+) -> tuple[Tensor, Tensor, Blended]:
+    """Image and the transmittance behind it.
+
+    Where `dense`, they are [1, H, W, D] and [1, H, W, 1], tiles are counted for all rows, and tensors of rows may have
+    a dimension of one camera in front; else they are [H, W, D] and [H, W].
+    """
     channels, size = colors.shape[1], (width, height, *tiles(width, height))
     ranges = None
     if channels <= MAX_CHANNELS:
         ranges = near_ranges(visible, means2d, depths, conics, opacities, width, height)
     rows = means2d, depths, conics, opacities, sigmas, colors, width, height
     bins = bin_gaussians(visible, *rows, dense, ranges)
+    camera, channel = ((1,), (1,)) if dense else ((), ())
+    image, transmittance = floats(*camera, height, width, channels), floats(*camera, height, width, *channel)
     pixel_stop = ints(height, width)
     limited = ranges is not None
     product_left, still_open = floats(height if limited else 0, width), ints(size[2] * size[3] if limited else 0)
@@ -104,7 +108,7 @@ def blend(
         rest = bin_the_rest(bins, ranges, still_open, block_start, *rows)
         if rest is not None:
             last = _blend_lists(*rest, colors, pixels, size, len(bins.tile_list), True, False).after(near)
-    return Blended(near, last, pixel_stop)
+    return image, transmittance, Blended(near, last, pixel_stop)
 
 
 def _blend_lists(

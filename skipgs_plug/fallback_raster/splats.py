@@ -175,11 +175,9 @@ class _Render(torch.autograd.Function):
         colors = floats(n, 3)
         layout = (3, 3 * shN.shape[1], 0)
         sh_forward(means, camera, sh0, shN, p.visible, p.block_start, colors, n, *layout, degree, 0)
-        image, transmittance = floats(size[1], size[0], 3), floats(size[1], size[0])
-        ctx.blended = blend(
-            p.means2d, p.conics, p.opacities, colors, p.depths, p.sigmas, p.visible, p.block_start, *size,
-            image, transmittance, dense=False,
-        )  # fmt: skip
+        image, transmittance, ctx.blended = blend(
+            p.means2d, p.conics, p.opacities, colors, p.depths, p.sigmas, p.visible, p.block_start, *size, dense=False
+        )
         ctx.save_for_backward(means, quats, log_scales, logits, sh0, shN, transmittance)
         ctx.shapes = {
             name: tensor.shape
