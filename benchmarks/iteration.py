@@ -24,9 +24,10 @@ FILE = RESULTS / "iteration.json"
 PHASES = ("forward", "loss", "backward", "optimizer")
 WARM_UP = 6  # the SH degree has reached its maximum and every buffer its size
 
-# Milliseconds of OpenSplat 15b7e80 on the CPU (two-core AVX-512 server, idle) for one iteration at SH degree 0, the
-# fastest CPU trainer found.
-PEER = {1_000: 427, 3_000: 522, 10_000: 680, 30_000: 1072, 100_000: 1903}
+# Milliseconds of OpenSplat bd0400d, the fastest CPU trainer found, for one iteration at SH degree 0 on two cores of an
+# AMD EPYC (Zen 4); medians of 24 iterations, three rounds. How it was built and timed stands in docs/rasterizer.md.
+PEER = {1_000: 210, 3_000: 258, 10_000: 391, 30_000: 656, 100_000: 1186}
+PEER_THREADS, PEER_SH_DEGREE = 2, 0
 LARGE = (1_000_000, 3_000_000)  # of which no peer was timed
 
 
@@ -76,17 +77,18 @@ def plot(rows: list[dict[str, Any]]) -> None:
 
     most = max(row["threads"] for row in rows)
     rows = [row for row in rows if row["threads"] == most]
-    figure, axis = plt.subplots(figsize=(9, 5), layout="constrained")
-    labels = [f"{row['gaussians']:,}\nSH {row['sh_degree']}" for row in rows]
+    figure, axis = plt.subplots(figsize=(11, 5), layout="constrained")
+    labels = [f"{row['gaussians'] // 1000:,}k\nSH {row['sh_degree']}" for row in rows]
     bottom = [0.0] * len(rows)
     for phase in PHASES:
         values = [row["phases_ms"][phase] for row in rows]
         axis.bar(labels, values, 0.6, bottom=bottom, label=phase)
         bottom = [b + v for b, v in zip(bottom, values, strict=True)]
-    axis.plot(labels, [row["peer_ms"] or math.nan for row in rows], "k_", markersize=24, label="OpenSplat CPU (SH 0)")
+    peers = [row["peer_ms"] or math.nan for row in rows]
+    axis.plot(labels, peers, "k_", markersize=24, label="OpenSplat bd0400d (CPU)")
     axis.set(yscale="log", ylabel=f"ms per iteration, {most} threads", xlabel="Gaussians", ylim=(1, None))
     axis.grid(axis="y", alpha=0.3)
-    axis.legend()
+    figure.legend(loc="outside upper center", ncols=len(PHASES) + 1)
     figure.savefig(FILE.with_suffix(".png"), dpi=120)
 
 
@@ -113,12 +115,13 @@ def main(scene: Path = SCENES / "fern", quick: bool = False, iterations: int = 1
                 with threads(count):
                     row: dict[str, Any] = {"gaussians": n, "sh_degree": sh_degree, "threads": count}
                     row |= measure(resampled(fern, n), sh_degree, iterations)
-                row["peer_ms"] = PEER.get(n)
+                comparable = (count, sh_degree) == (PEER_THREADS, PEER_SH_DEGREE)
+                peer = row["peer_ms"] = PEER.get(n) if comparable else None
                 rows.append(row)
                 print(
                     f"{n:9,} {sh_degree:2} {count:7} {row['ms']:7.1f}  "
                     + " ".join(f"{row['phases_ms'][p]:9.2f}" for p in PHASES)
-                    + (f" {PEER[n]:6} {PEER[n] / row['ms']:5.1f}x" if n in PEER else ""),
+                    + (f" {peer:6} {peer / row['ms']:5.1f}x" if peer else ""),
                     flush=True,
                 )
             if only is not None:
