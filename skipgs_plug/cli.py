@@ -44,10 +44,13 @@ OURS = ("SkipGSError", "InputError", "WriteError")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
+    Standard streams that are closed lead nowhere, also when it has returned.
+
     Returns:
         0 done; 2 bad input, one sentence on stderr; 130 interrupted, 143 terminated, 141 nobody reads the output.
         `--debug` shows the traceback.
     """
+    replace_closed_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
     own = arguments[: arguments.index("--")] if "--" in arguments else arguments
     debug = "--debug" in own
@@ -71,6 +74,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exc()
             return BAD_INPUT if sentence else 1
         return fail(sentence)
+
+
+def replace_closed_streams() -> None:
+    """Let standard streams that were closed (`>&-`, some schedulers) lead nowhere.
+
+    Else the next file that is opened gets the number of one of them, and what a library prints ends up in that file.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - as long as the process lives
 
 
 def run(arguments: list[str]) -> int:

@@ -157,6 +157,34 @@ def test_nobody_reads_the_output() -> None:
     assert tried.returncode == 141 and tried.stderr == b""
 
 
+CLOSED = """
+import os, sys
+from skipgs_plug.cli import main
+main(["--version"])
+numbers = [stream.fileno() for stream in (sys.stdin, sys.stdout, sys.stderr)]
+print("lost"), print("lost", file=sys.stderr)
+os.write(1, b"lost"), os.write(2, b"lost")  # as native code does
+with open(sys.argv[1], "w") as file:
+    file.write(f"{numbers} {file.fileno() > 2}")
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="closes streams by a POSIX shell")
+@pytest.mark.parametrize("closed", ["<&- >&- 2>&-", ">&-", "2>&-"])
+def test_closed_standard_streams_get_no_file(closed: str, tmp_path: Path) -> None:
+    command = shlex.join([sys.executable, "-c", CLOSED, str(tmp_path / "written")])
+    tried = subprocess.run(f"exec {command} {closed}", shell=True, check=False, timeout=60, stdin=subprocess.DEVNULL)
+    assert tried.returncode == 0 and (tmp_path / "written").read_text() == "[0, 1, 2] True"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="closes streams by a POSIX shell")
+def test_kernels_run_where_standard_streams_are_closed() -> None:
+    code = "import torch; from skipgs_plug.fallback_raster import l1_ssim_loss; i = torch.rand(20, 20, 3); "
+    command = shlex.join([sys.executable, "-c", code + "assert l1_ssim_loss(i, i) < 1e-6"])
+    tried = subprocess.run(f"exec {command} <&- >&- 2>&-", shell=True, check=False, timeout=120)
+    assert tried.returncode == 0
+
+
 def test_a_file_that_cannot_be_written_says_how_much_it_needs(tmp_path: Path) -> None:
     import resource
 

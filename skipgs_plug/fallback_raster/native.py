@@ -92,8 +92,14 @@ def _quiet_stderr() -> Iterator[None]:
 
     Warp's library warns there that it found no CUDA driver, which a rasterizer for machines without one expects.
     """
-    sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        kept = os.dup(2)
+    except OSError:  # closed, as of programs without a window on Windows: nothing to drop
+        yield
+        return
+    if sys.stderr is not None:
+        sys.stderr.flush()
+    nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:
         yield
