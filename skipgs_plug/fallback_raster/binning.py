@@ -26,12 +26,15 @@ MAX_PAIRS = 2**31 - 1
 SLICES = 4
 
 
-@worker(read_kernel("pack_colors.h"), items="n", grain="BLOCK")
-def pack_colors(
+@worker(read_kernel("pack_colors.h"), items="slices", grain="1")
+def _pack_colors(
     visible: Annotated[IntArray, "n"],
+    listed: Annotated[IntArray, "n"],
+    listed_count: Annotated[IntArray, "slices"],
     colors: Annotated[FloatArray, "R, stride"],
-    records: Annotated[FloatArray, "R, RECORD"],  # the channels are replaced
+    records: Annotated[FloatArray, "n, RECORD"],  # the channels are replaced
     n: int,
+    slices: int,
     stride: int,
     channel: int,
     channels: int,
@@ -48,10 +51,10 @@ def pack_and_count(
     sigmas: Annotated[FloatArray, "R, 2"],
     colors: Annotated[FloatArray, "R, stride"],
     ranges: Annotated[IntArray, "tiles_x * tiles_y if limited else 0, 2"],
-    records: Annotated[FloatArray, "R, RECORD"],  # out, only rows with pairs are written
-    listed: Annotated[IntArray, "n"],  # out, places in `visible` that have pairs, from where their slice begins
+    records: Annotated[FloatArray, "n, RECORD"],  # out, of rows that have pairs, from where their slice begins
+    listed: Annotated[IntArray, "n"],  # out, places in `visible` of those
     listed_count: Annotated[IntArray, "slices"],  # out
-    places: Annotated[IntArray, "n, PLACE"],  # out, of those, as the next
+    places: Annotated[IntArray, "n, PLACE"],  # out, as the next
     boxes: Annotated[IntArray, "n, BOX"],  # out, only of larger ones
     counts: Annotated[IntArray, "slices, tiles_x * tiles_y + SPARE_COUNTS"],  # out
     totals: Annotated[LongArray, "slices + 1"],  # out, pairs of each slice
@@ -85,8 +88,8 @@ def scan_pairs(
 @worker(read_kernel("fill_pairs.h"), items="slices", grain="1")
 def fill_pairs(
     visible: Annotated[IntArray, "n"],
-    depths: Annotated[FloatArray, "R"],
-    records: Annotated[FloatArray, "R, RECORD"],
+    depths: Annotated[FloatArray, "rows"],
+    records: Annotated[FloatArray, "n, RECORD"],
     listed: Annotated[IntArray, "n"],
     listed_count: Annotated[IntArray, "slices"],
     places: Annotated[IntArray, "n, PLACE"],
@@ -95,9 +98,10 @@ def fill_pairs(
     counts: Annotated[IntArray, "slices, tiles_x * tiles_y + SPARE_COUNTS"],  # next free place
     totals: Annotated[LongArray, "slices + 1"],
     pair_start: Annotated[IntArray, "n + 1"],  # out
-    pair_row: Annotated[IntArray, "P"],  # out
+    pair_record: Annotated[IntArray, "P"],  # out
     unsorted: Annotated[LongArray, "P"],  # out, depth and number of each pair
     n: int,
+    rows: int,
     slices: int,
     width: float,
     tiles_x: int,
@@ -110,7 +114,7 @@ def fill_pairs(
 @worker(read_kernel("sort_tiles.h"), items="tiles", grain="2")
 def sort_tiles(
     tile_start: Annotated[IntArray, "tiles + 1"],
-    pair_row: Annotated[IntArray, "P"],
+    pair_record: Annotated[IntArray, "P"],
     unsorted: Annotated[LongArray, "P"],
     buffer: Annotated[LongArray, "P"],  # scratch
     tile_list: Annotated[IntArray, "P"],  # out
@@ -125,23 +129,27 @@ class Bins:
 
     Attributes:
         visible: [M] int32, rows of the visible Gaussians.
-        records: [R, RECORD] float32, what the blend reads of each of them that has pairs.
+        listed: [M] int32, place in `visible` of each record.
+        listed_count: [slices] int32, records of each slice of `visible`, which lie where the slice begins.
+        records: [M, RECORD] float32, what the blend reads of each of them that has pairs.
         tile_start: [tiles + 1] int32, begin of each tile's part of the lists, row-major.
-        tile_list: [P] int32, rows, front to back in every tile as far as it is sorted.
+        tile_list: [P] int32, records, front to back in every tile as far as it is sorted.
         tile_place: [P] int32, number of the pair; pairs are numbered by row and tile.
         pair_start: [M + 1] int32, number of each visible Gaussian's first pair.
-        pair_row: [P] int32, row of each pair.
+        pair_record: [P] int32, record of each pair.
         unsorted: [P] int64, depth and number of the pairs of each tile.
         tiles_per_gauss: [R] int32, number of tiles of every row.
     """
 
     visible: Tensor
+    listed: Tensor
+    listed_count: Tensor
     records: Tensor
     tile_start: Tensor
     tile_list: Tensor
     tile_place: Tensor
     pair_start: Tensor
-    pair_row: Tensor
+    pair_record: Tensor
     unsorted: Tensor
     tiles_per_gauss: Tensor
 
@@ -149,8 +157,15 @@ class Bins:
         """Sorts the lists of all tiles to their ends."""
         buffer = longs(len(self.unsorted))
         sort_tiles(
-            self.tile_start, self.pair_row, self.unsorted, buffer, self.tile_list, self.tile_place,
+            self.tile_start, self.pair_record, self.unsorted, buffer, self.tile_list, self.tile_place,
             len(self.tile_start) - 1,
+        )  # fmt: skip
+
+    def pack_colors(self, colors: Tensor, first: int, count: int) -> None:
+        """Puts `count` channels of `colors` [R, D], from `first` on, into the records."""
+        _pack_colors(
+            self.visible, self.listed, self.listed_count, colors, self.records,
+            len(self.visible), len(self.listed_count), colors.shape[1], first, count,
         )  # fmt: skip
 
 
@@ -166,14 +181,12 @@ def bin_gaussians(
     height: int,
     dense: bool = True,
     ranges: Tensor | None = None,  # [tiles, 2] int32
-    records: Tensor | None = None,  # [R, RECORD]
     before: int = 0,
 ) -> Bins:
     """Lists the visible Gaussians of one image per tile, not yet sorted by depth, with their first channels.
 
-    With `ranges`, only at depths, as bits of float32, that lie between the two numbers of the tile; `records` may be
-    given where they hold the records of other lists, which hold `before` pairs. `tiles_per_gauss` is empty unless
-    `dense`, and counts all tiles.
+    With `ranges`, only at depths, as bits of float32, that lie between the two numbers of the tile; other lists hold
+    `before` pairs. `tiles_per_gauss` is empty unless `dense`, and counts all tiles.
 
     Raises:
         ValueError: There are more (tile, Gaussian) pairs than can be listed.
@@ -185,8 +198,7 @@ def bin_gaussians(
     slices = 1 if n < 1024 or get_num_threads() == 1 else SLICES * get_num_threads()
     limited = ranges is not None
     ranges = ints(0) if ranges is None else ranges
-    records = floats(rows, RECORD) if records is None else records
-    listed, listed_count = ints(n), ints(slices)
+    records, listed, listed_count = floats(n, RECORD), ints(n), ints(slices)
     places, boxes, counts = ints(n, PLACE), ints(n, BOX), ints(slices, tiles_x * tiles_y + SPARE_COUNTS)
     tile_start, pair_start = ints(tiles_x * tiles_y + 1), ints(n + 1)
     tiles_per_gauss, totals = zeros(rows if dense else 0, dtype=torch.int32), longs(slices + 1)
@@ -204,10 +216,12 @@ def bin_gaussians(
             f"{n:,} visible Gaussians cover {covered:,} tiles of an image of {width}x{height} pixels in all, at most "
             f"{MAX_PAIRS:,} can be listed: render a smaller image, or fewer or smaller Gaussians."
         )
-    pair_row, unsorted = ints(pairs), longs(pairs)
+    pair_record, unsorted = ints(pairs), longs(pairs)
     fill_pairs(
-        visible, depths, records, listed, listed_count, places, boxes, ranges, counts, totals, pair_start, pair_row,
-        unsorted, n, slices, float(width), tiles_x, tiles_y, int(limited), active_shortcuts(),
+        visible, depths, records, listed, listed_count, places, boxes, ranges, counts, totals, pair_start, pair_record,
+        unsorted, n, rows, slices, float(width), tiles_x, tiles_y, int(limited), active_shortcuts(),
     )  # fmt: skip
     lists = ints(pairs), ints(pairs)
-    return Bins(visible, records, tile_start, *lists, pair_start, pair_row, unsorted, tiles_per_gauss)
+    return Bins(
+        visible, listed, listed_count, records, tile_start, *lists, pair_start, pair_record, unsorted, tiles_per_gauss
+    )

@@ -30,9 +30,9 @@ def _forward(channels: int) -> Worker:
         constants={"D": channels},
     )
     def blend_forward(
-        records: Annotated[FloatArray, "R, RECORD"],
+        records: Annotated[FloatArray, "M, RECORD"],
         tile_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],
-        pair_row: Annotated[IntArray, "P"],
+        pair_record: Annotated[IntArray, "P"],
         unsorted: Annotated[LongArray, "P"],
         buffer: Annotated[LongArray, "0 if sorted else P"],  # scratch
         tile_list: Annotated[IntArray, "P"],  # sorted, or sorted here as far as necessary; as the next
@@ -71,10 +71,11 @@ def _backward(channels: int, absgrad: bool) -> Worker:
         constants={"D": channels, "ABSGRAD": int(absgrad)},
     )
     def blend_backward(
-        records: Annotated[FloatArray, "R, RECORD"],
+        records: Annotated[FloatArray, "M, RECORD"],
         tile_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],
         tile_stop: Annotated[IntArray, "tiles_x, tiles_y"],
-        far_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],  # of the second part of each list, if there is one
+        far_records: Annotated[FloatArray, "F, RECORD"],  # of the second part of the lists, as the next two
+        far_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],
         far_stop: Annotated[IntArray, "tiles_x, tiles_y"],
         tile_list: Annotated[IntArray, "P"],
         pair_blocks: Annotated[IntArray, "P"],

@@ -132,7 +132,7 @@ def bin_the_rest(
     if len(rows) == 0:
         return None
     rest = bin_gaussians(
-        rows, means2d, depths, conics, opacities, sigmas, colors, width, height, False, behind, near.records,
+        rows, means2d, depths, conics, opacities, sigmas, colors, width, height, False, behind,
         len(near.tile_list),
     )  # fmt: skip
     return rest, starts

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .binning import Bins, bin_gaussians, pack_colors
+from .binning import Bins, bin_gaussians
 from .blend import backward_worker, forward_worker, number_pairs, reduce_pairs
 from .buffers import floats, ints, longs, scratch, zeros
 from .constants import MAX_CHANNELS, PAIR, tiles
@@ -38,12 +38,14 @@ class Pass:
         first, own, pairs = near.bins, self.bins, len(near.bins.tile_list)
         bins = Bins(
             own.visible,
+            own.listed,
+            own.listed_count,
             own.records,
             own.tile_start + pairs,
             torch.cat([first.tile_list, own.tile_list]),
             torch.cat([first.tile_place, own.tile_place + pairs]),
             own.pair_start + pairs,
-            own.pair_row,
+            own.pair_record,
             own.unsorted,
             own.tiles_per_gauss,
         )
@@ -131,14 +133,14 @@ def _blend_lists(
     for channel in range(0, channels, MAX_CHANNELS):
         some = min(MAX_CHANNELS, channels - channel)
         if channel > 0:
-            pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
+            bins.pack_colors(colors, channel, some)
         forward_worker(some)(
-            bins.records, bins.tile_start, bins.pair_row, bins.unsorted, buffer, bins.tile_list, bins.tile_place,
+            bins.records, bins.tile_start, bins.pair_record, bins.unsorted, buffer, bins.tile_list, bins.tile_place,
             image, transmittance, pixel_stop, tile_stop, tile_blended, pair_blocks, product_left, still_open,
             *size, channels, channel, some, int(not in_one), before, int(continued), int(unfinished),
             active_shortcuts(),
         )  # fmt: skip
-    bins.unsorted, bins.pair_row = longs(0), ints(0)  # no longer needed
+    bins.unsorted, bins.pair_record = longs(0), ints(0)  # no longer needed
     return Pass(bins, block_start, tile_stop, tile_blended, pair_blocks)
 
 
@@ -198,10 +200,10 @@ def pair_sums(
     for channel in range(0, channels, MAX_CHANNELS):
         some = min(MAX_CHANNELS, channels - channel)
         if channels > MAX_CHANNELS:
-            pack_colors(bins.visible, colors, bins.records, len(bins.visible), channels, channel, some)
+            bins.pack_colors(colors, channel, some)
         backward_worker(some, with_absolute)(
-            bins.records, bins.tile_start, near.tile_stop, lists.tile_start, last.tile_stop, lists.tile_list,
-            last.pair_blocks, slot_start, transmittance, blended.pixel_stop, v_image, v_transmittance,
+            bins.records, bins.tile_start, near.tile_stop, lists.records, lists.tile_start, last.tile_stop,
+            lists.tile_list, last.pair_blocks, slot_start, transmittance, blended.pixel_stop, v_image, v_transmittance,
             v_pairs, *size, channels, channel, some, int(len(v_transmittance) > 0), parts, active_shortcuts(),
         )  # fmt: skip
         yield channel, some, sums

@@ -46,9 +46,10 @@ class Statistics(NamedTuple):
 
 @worker(read_kernel("blend_statistics.h"), items="tiles_x * tiles_y", grain="2", constants={"SUMS": SUMS})
 def blend_statistics(
-    records: Annotated[FloatArray, "R, RECORD"],
+    records: Annotated[FloatArray, "M, RECORD"],
     tile_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],
     tile_list: Annotated[IntArray, "P"],
+    tile_rows: Annotated[IntArray, "P"],
     values: Annotated[FloatArray, "height, width"],
     pair_sums: Annotated[FloatArray, "P, 8"],  # out
     contributions: Annotated[IntArray, "height, width"],  # out
@@ -77,14 +78,15 @@ def gather(f: Footprint, values: Tensor | None = None) -> Statistics:
         visible, means2d, depths, conics, opacities, sigmas, zeros(len(f), 1), f.width, f.height
     )  # fmt: skip
     bins.sort()
+    rows = visible[bins.listed[bins.tile_list]]
     tiles_x, tiles_y = tiles(f.width, f.height)
     size = (f.height, f.width)
     picture = zeros(*size) if values is None else values.detach().to(torch.float32).reshape(size).contiguous()
     pair_sums, contributions, strongest = floats(len(bins.tile_list), SUMS), ints(*size), ints(*size)
     blend_statistics(
-        bins.records, bins.tile_start, bins.tile_list, picture, pair_sums, contributions, strongest,
+        bins.records, bins.tile_start, bins.tile_list, rows, picture, pair_sums, contributions, strongest,
         f.width, f.height, tiles_x, tiles_y,
     )  # fmt: skip
-    total = zeros(len(f), SUMS).index_add_(0, bins.tile_list, pair_sums)
+    total = zeros(len(f), SUMS).index_add_(0, rows, pair_sums)
     count, weight, light, value, weighted, distance = (column.contiguous() for column in total[:, :6].unbind(dim=1))
     return Statistics(count.to(torch.int32), weight, light, value, weighted, distance, contributions, strongest)

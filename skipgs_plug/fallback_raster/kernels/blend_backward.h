@@ -31,11 +31,12 @@ for (int t = first; t < last; ++t) {
     // The part of the list that was blended last comes first.
     for (int part = parts - 1; part >= 0; --part) {
         const int begin = part ? far_start[t] : tile.begin, tile_end = part ? far_stop[t] : tile_stop[t];
+        const float* own = part ? far_records : records;
         int slot = slot_start[part * tiles_x * tiles_y + t + 1];
         for (int k = tile_end - 1; k >= begin; --k) {
-            __builtin_prefetch(records + (long long)RECORD * tile_list[larger(k - 8, begin)]);
+            __builtin_prefetch(own + (long long)RECORD * tile_list[larger(k - 8, begin)]);
             if (!pair_blocks[k]) continue;
-            const float* r = records + (long long)RECORD * tile_list[k];
+            const float* r = own + (long long)RECORD * tile_list[k];
             vblock m[8], abs_x = (vblock)0.0f, abs_y = (vblock)0.0f, v_color[D];
             for (int j = 0; j < 8; ++j) m[j] = (vblock)0.0f;
             for (int c = 0; c < D; ++c) v_color[c] = (vblock)0.0f;

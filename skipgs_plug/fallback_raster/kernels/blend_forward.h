@@ -24,7 +24,7 @@ for (int t = first; t < last; ++t) {
         continue;
     }
     const int begin = tile.begin, end = tile.end;
-    SortedTile list(begin, sorted ? begin : end, unsorted, buffer, tile_list, tile_place, pair_row);
+    SortedTile list(begin, sorted ? begin : end, unsorted, buffer, tile_list, tile_place, pair_record);
 
     alignas(64) vblock P[BLOCKS], T[BLOCKS], C[BLOCKS][D];
     alignas(64) iblock stop[BLOCKS];

@@ -21,12 +21,11 @@ for (int t = first; t < last; ++t) {
     }
 
     for (int k = tile.begin; k < tile.end; ++k) {
-        const int g = tile_list[k];
         vblock sums[SUMS];
         for (int s = 0; s < SUMS; ++s) sums[s] = (vblock)0.0f;
         for (unsigned todo = open; todo; todo &= todo - 1) {
             const int b = __builtin_ctz(todo);
-            const Falloff seen(tile, b, records + (long long)RECORD * g);
+            const Falloff seen(tile, b, records + (long long)RECORD * tile_list[k]);
             const vblock light = T[b];
             const iblock taken = (seen.log2_alpha >= LOG2_ALPHA_MIN) & (light > 0.0f);
             if (!any(taken)) continue;
@@ -44,7 +43,7 @@ for (int t = first; t < last; ++t) {
             count[b] += hit & 1;
             const iblock leads = hit & (weight > most[b]);
             most[b] = leads ? weight : most[b];
-            who[b] = leads ? (iblock)g : who[b];
+            who[b] = leads ? (iblock)tile_rows[k] : who[b];
             if (any(finished) && !any(T[b] > 0.0f)) open &= ~(1u << b);
         }
         *(v8*)(pair_sums + (long long)SUMS * k) = sum8(sums);

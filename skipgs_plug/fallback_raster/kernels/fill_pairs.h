@@ -10,25 +10,25 @@ for (int s = first; s < last; ++s) {
     for (int k = begin; k < begin + listed_count[s]; ++k) {
         while (i <= listed[k]) pair_start[i++] = pair;
         const int meets = places[(long long)PLACE * k + 1];
-        const int g = visible[listed[k]], depth = ((const int*)depths)[g];
+        const int depth = ((const int*)depths)[visible[listed[k]]];
         const long long key = (long long)depth << 32;
         if (meets >= 0) {
             int* corner = next + places[(long long)PLACE * k];
             for (int rest = meets; rest; rest &= rest - 1) {
                 const int j = __builtin_ctz(rest);
-                pair_row[pair] = g;
+                pair_record[pair] = k;
                 unsorted[corner[(j >> 1) * tiles_x + (j & 1)]++] = key | (unsigned)pair++;
             }
             continue;
         }
         const int* box = boxes + (long long)BOX * k;
-        const Ellipse ellipse(records + (long long)RECORD * g, box, width, shortcuts & EXACT_TILES);
+        const Ellipse ellipse(records + (long long)RECORD * k, box, width, shortcuts & EXACT_TILES);
         for (int ty = ellipse.first_row; ty <= ellipse.last_row; ++ty) {
             int left, right;
             ellipse.columns(ty, left, right);
             for (int tile = ty * tiles_x + left; tile <= ty * tiles_x + right; ++tile) {
                 if (limited && !in_range(ranges, tile, depth)) continue;
-                pair_row[pair] = g;
+                pair_record[pair] = k;
                 unsorted[next[tile]++] = key | (unsigned)pair++;
             }
         }

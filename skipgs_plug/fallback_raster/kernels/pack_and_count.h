@@ -1,5 +1,5 @@
-// Records of the visible rows, their places among the tiles, and the number of pairs of each tile, by slice of the rows.
-// Where `limited`, only pairs whose depths lie in the range of their tile count, and only rows that have some get a record.
+// Records of the visible rows that have pairs, one after the other, their places among the tiles, and the number of pairs
+// of each tile, by slice of the rows. Where `limited`, only pairs whose depths lie in the range of their tile count.
 #include "ellipse.h"
 #include "tile_ranges.h"
 const int tiles = tiles_x * tiles_y;
@@ -78,18 +78,12 @@ for (int s = first; s < last; ++s) {
         if (dense) scatter((float*)tiles_per_gauss, row, (v16)met, lanes);
         const unsigned chosen = bits(wanted) & ((1u << lanes) - 1);
         if (!chosen) continue;
-        {
-            v16 value[RECORD] = {mx, my, along, along * slope, across, log2_opacity, half_h, half_w, {}, {}, {}, {},
-                                 -slope, -steepness, reach, 1.0f / along};
-            if (stride == 3 && channels == 3) gather3(colors, row, rows, value + 8);
-            else
-                for (int k = 0; k < channels; ++k) value[8 + k] = gather(colors, row, stride, k);
-            transpose(value);
-            for (unsigned rest = chosen; rest; rest &= rest - 1) {
-                const int l = __builtin_ctz(rest);
-                store(records + (long long)RECORD * row[l], value[l]);
-            }
-        }
+        v16 record[RECORD] = {mx, my, along, along * slope, across, log2_opacity, half_h, half_w, {}, {}, {}, {},
+                              -slope, -steepness, reach, 1.0f / along};
+        if (stride == 3 && channels == 3) gather3(colors, row, rows, record + 8);
+        else
+            for (int k = 0; k < channels; ++k) record[8 + k] = gather(colors, row, stride, k);
+        transpose(record);
         // By lane: first tile and tiles met; pairs in the upper two tiles, and in the lower two, wherever these are.
         alignas(64) int place[16][PLACE], upper[16][2], lower[16][2], below[16], key[16];
         interleave(corner, meets, place[0]);
@@ -101,6 +95,7 @@ for (int s = first; s < last; ++s) {
             int* own = places + (long long)PLACE * (begin + found);
             for (int l = 0; l < 16; ++l) {
                 *(v2*)(own + PLACE * l) = *(const v2*)place[l];
+                store(records + (long long)RECORD * (begin + found + l), record[l]);
                 listed[begin + found + l] = i + l;
                 // Two counters at a time: a branch for each would often be taken the wrong way.
                 add_two(count + place[l][0], upper[l]);
@@ -113,6 +108,8 @@ for (int s = first; s < last; ++s) {
         for (unsigned rest = chosen; rest; rest &= rest - 1) {
             const int l = __builtin_ctz(rest), corner = place[l][0];
             int own_meets = place[l][1], pairs = 0;
+            float* own_record = records + (long long)RECORD * (begin + found);  // the next one's where this has no pairs
+            store(own_record, record[l]);
             if (own_meets >= 0) {
                 for (int todo = limited ? own_meets : 0; todo; todo &= todo - 1) {
                     const int j = __builtin_ctz(todo);
@@ -127,7 +124,7 @@ for (int s = first; s < last; ++s) {
                 int met = 0;
                 int* own = boxes + (long long)BOX * (begin + found);
                 for (int j = 0; j < BOX; ++j) own[j] = box[j][l];
-                const Ellipse ellipse(records + (long long)RECORD * row[l], own, width, shortcuts & EXACT_TILES);
+                const Ellipse ellipse(own_record, own, width, shortcuts & EXACT_TILES);
                 for (int ty = ellipse.first_row; ty <= ellipse.last_row; ++ty) {
                     int left, right;
                     ellipse.columns(ty, left, right);

@@ -1,4 +1,7 @@
 // Puts further channels of colour into the records.
-for (int i = first; i < last; ++i)
-    for (int k = 0; k < channels; ++k)
-        records[(long long)RECORD * visible[i] + 8 + k] = colors[(long long)visible[i] * stride + channel + k];
+for (int s = first; s < last; ++s) {
+    const int begin = (int)((long long)s * n / slices);
+    for (int k = begin; k < begin + listed_count[s]; ++k)
+        for (int c = 0; c < channels; ++c)
+            records[(long long)RECORD * k + 8 + c] = colors[(long long)visible[listed[k]] * stride + channel + c];
+}

@@ -11,15 +11,15 @@ static constexpr int LARGE = 8;  // registers hold two pairs, so that rounds tak
 #endif
 struct SortedTile {
     long long *dealt, *other;  // the tile's pairs in buckets, and as much room again
-    int *rows, *places;        // out: row and number of each pair
-    const int* pair_row;
+    int *records, *places;     // out: record and number of each pair
+    const int* pair_record;
     int count, done, next, shift;  // pairs, those that are sorted, the next bucket, and bits of depth in one
     int start[BUCKETS + 1];
 
     SortedTile(int begin, int end, long long* unsorted, long long* buffer, int* tile_list, int* tile_place,
-               const int* pair_row)
-        : dealt(buffer + begin), other(unsorted + begin), rows(tile_list + begin), places(tile_place + begin),
-          pair_row(pair_row), count(end - begin), done(0), next(0) {
+               const int* pair_record)
+        : dealt(buffer + begin), other(unsorted + begin), records(tile_list + begin), places(tile_place + begin),
+          pair_record(pair_record), count(end - begin), done(0), next(0) {
         // Twice as many buckets as pairs: most of them hold one or none.
         int buckets = 64;
         while (buckets < 2 * count && buckets < BUCKETS) buckets *= 2;
@@ -39,7 +39,7 @@ struct SortedTile {
         // A full bucket that was not dealt again holds one depth, in order.
         settle(done, end, smaller(longest, LARGE));
         for (int i = done; i < end; ++i) places[i] = (int)dealt[i];
-        for (int i = done; i < end; ++i) rows[i] = pair_row[places[i]];
+        for (int i = done; i < end; ++i) records[i] = pair_record[places[i]];
         done = end;
     }
 
