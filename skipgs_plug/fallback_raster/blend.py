@@ -78,13 +78,15 @@ def _backward(channels: int, absgrad: bool) -> Worker:
         far_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],
         far_stop: Annotated[IntArray, "tiles_x, tiles_y"],
         tile_list: Annotated[IntArray, "P"],
+        tile_place: Annotated[IntArray, "P"],
         pair_blocks: Annotated[IntArray, "P"],
         slot_start: Annotated[IntArray, "parts * tiles_x * tiles_y + 1"],
         transmittance: Annotated[FloatArray, "height, width"],
         pixel_stop: Annotated[IntArray, "height, width"],
         v_image: Annotated[FloatArray, "height, width, stride"],
         v_transmittance: Annotated[FloatArray, "height if with_transmittance else 0, width"],  # of the final one
-        v_pairs: Annotated[FloatArray, "Q, PAIR"],  # out
+        pair_slot: Annotated[IntArray, "P"],  # out, zeros before; 1 + the slot of each pair, 0 if it was not blended
+        v_pairs: Annotated[FloatArray, "Q, PAIR"],  # out, the slots
         width: int,
         height: int,
         tiles_x: int,
@@ -114,24 +116,6 @@ def forward_worker(channels: int) -> Worker:
 def backward_worker(channels: int, absgrad: bool) -> Worker:
     """The backward kernel that fits `channels` (1 to MAX_CHANNELS) best."""
     return _BACKWARD[min(width for width in _WIDTHS if width >= channels), absgrad]
-
-
-# Pairs are numbered by row, and neighbours in a list are rows from anywhere: where there are few pairs, several threads
-# would pass their cache lines to and fro.
-@worker(read_kernel("number_pairs.h"), items="parts * tiles", grain="pairs < 262144 ? parts * tiles : 8")
-def number_pairs(
-    tile_start: Annotated[IntArray, "tiles + 1"],
-    tile_stop: Annotated[IntArray, "tiles"],
-    far_start: Annotated[IntArray, "tiles + 1"],  # of the second part of each list, if there is one
-    far_stop: Annotated[IntArray, "tiles"],
-    tile_place: Annotated[IntArray, "pairs"],
-    pair_blocks: Annotated[IntArray, "pairs"],
-    slot_start: Annotated[IntArray, "parts * tiles + 1"],  # blended pairs of the tiles before each
-    pair_slot: Annotated[IntArray, "pairs"],  # out, zeros before; 1 + the slot of each pair, 0 if it was not blended
-    pairs: int,
-    tiles: int,
-    parts: int,
-) -> None: ...
 
 
 @worker(read_kernel("reduce_pairs.h"), items="(rows + BLOCK - 1) / BLOCK", grain="1", constants={"DENSE": 1})

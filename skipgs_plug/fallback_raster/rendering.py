@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .binning import Bins, bin_gaussians
-from .blend import backward_worker, forward_worker, number_pairs, reduce_pairs
+from .blend import backward_worker, forward_worker, reduce_pairs
 from .buffers import floats, ints, longs, scratch, zeros
 from .constants import MAX_CHANNELS, PAIR, tiles
 from .near_first import bin_the_rest, near_ranges
@@ -183,15 +183,10 @@ def pair_sums(
     size = (width, height, *tiles(width, height))
     v_image = zeros(height, width, channels) if v_image is None else v_image.contiguous()
     v_transmittance = floats(0, width) if v_transmittance is None else v_transmittance.contiguous()
-    pairs = len(lists.tile_list)
     # Behind the surface most pairs are not blended: they have no sums.
     per_tile = near.tile_blended if parts == 1 else torch.cat([near.tile_blended, last.tile_blended])
-    slot_start, pair_slot = zeros(len(per_tile) + 1, dtype=torch.int32), zeros(pairs, dtype=torch.int32)
+    slot_start, pair_slot = zeros(len(per_tile) + 1, dtype=torch.int32), zeros(len(lists.tile_list), dtype=torch.int32)
     torch.cumsum(per_tile, 0, out=slot_start[1:])
-    number_pairs(
-        bins.tile_start, near.tile_stop, lists.tile_start, last.tile_stop, lists.tile_place, last.pair_blocks,
-        slot_start, pair_slot, pairs, len(near.tile_stop), parts,
-    )  # fmt: skip
     v_pairs = scratch("v_pairs", int(slot_start[-1]), PAIR)
     sums = PairSums(
         bins.visible, near.block_start, bins.pair_start, lists.visible, last.block_start, lists.pair_start,
@@ -203,8 +198,9 @@ def pair_sums(
             bins.pack_colors(colors, channel, some)
         backward_worker(some, with_absolute)(
             bins.records, bins.tile_start, near.tile_stop, lists.records, lists.tile_start, last.tile_stop,
-            lists.tile_list, last.pair_blocks, slot_start, transmittance, blended.pixel_stop, v_image, v_transmittance,
-            v_pairs, *size, channels, channel, some, int(len(v_transmittance) > 0), parts, active_shortcuts(),
+            lists.tile_list, lists.tile_place, last.pair_blocks, slot_start, transmittance, blended.pixel_stop,
+            v_image, v_transmittance, pair_slot, v_pairs,
+            *size, channels, channel, some, int(len(v_transmittance) > 0), parts, active_shortcuts(),
         )  # fmt: skip
         yield channel, some, sums
         # The gradient of the transmittance belongs to the first pass alone.

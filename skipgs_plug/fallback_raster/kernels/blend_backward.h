@@ -76,7 +76,8 @@ for (int t = first; t < last; ++t) {
                 seen = then;
                 b = following;
             }
-            float* out = v_pairs + (long long)PAIR * --slot;
+            pair_slot[tile_place[k]] = slot--;
+            float* out = v_pairs + (long long)PAIR * slot;
             for (int c = 0; c < D && c < 2; ++c) m[6 + c] = v_color[c];
             *(v8*)out = sum8(m);
             for (int c = 2; c < 4; ++c) out[6 + c] = c < D ? sum(v_color[c < D ? c : 0]) : 0.0f;
