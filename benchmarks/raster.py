@@ -435,12 +435,12 @@ def plot(results: dict[str, Any]) -> None:
         labels = [f"{r['kind']} {r['gaussians']:,} {r['size']}" for r in rows if r["threads"] == counts[0]]
         peers = [row["peer_ms"] for row in rows if row["threads"] == 1]
         bars = {"OpenSplat, 1 thread": peers}
-        bars |= {f"{c} threads": [r["ms"] for r in rows if r["threads"] == c] for c in counts}
+        bars |= {f"ours, {c} thread{'s' * (c > 1)}": [r["ms"] for r in rows if r["threads"] == c] for c in counts}
         for shift, (label, values) in enumerate(bars.items()):
             scenes.barh([i + 0.27 * (shift - 1) for i in range(len(labels))], values, 0.25, label=label)
         scenes.set(xscale="log", xlabel="forward + backward (ms)", yticks=range(len(labels)), yticklabels=labels)
         scenes.invert_yaxis()
-        scenes.legend()
+        scenes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(bars), fontsize="small")
     for name in ("gaussians", "pixels", "sh_terms"):
         if name in results:
             rows, exponent = results[name]["rows"]["points"], results[name]["rows"]["exponents"]["time"]["fitted"]
