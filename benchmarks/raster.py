@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
+import math
 import statistics
 import subprocess
 import sys
@@ -262,6 +263,12 @@ def measure_point(point: str, repeats: int) -> None:
     print(json.dumps({**result, "peak_mib": (peak - before) / 2**20}))
 
 
+def standard_error(values: list[float]) -> float:
+    """Of the median, if but for outliers the values are normally distributed."""
+    first, _, third = statistics.quantiles(values, n=4)
+    return 1.253 * (third - first) / 1.349 / math.sqrt(len(values))
+
+
 def part_order(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
     """What the order of the rows costs where a camera sees part of a scene, by either entrance, SH degree 3."""
     size = "324x210" if quick else "162x105"
@@ -311,7 +318,7 @@ def part_shortcuts(quick: bool, repeats: int, only: str | None) -> list[dict[str
     left = slice(0, scene["width"] // 2)  # half of the image has no gradient
     names: list[tuple[str, ...]] = [(name,) for name in SHORTCUTS] + [tuple(SHORTCUTS)]
     rows = []
-    print(f"{'left out':>18} {'ms':>7} {'ms with':>7} {'saves':>6} {'image':>8} {'gradient':>8}")
+    print(f"{'left out':>18} {'ms':>7} {'ms with':>7} {'saves':>14} {'image':>8} {'gradient':>8}")
     for left_out in names:
         # A pass leaves caches and free memory to the next, so either goes first in every other round.
         seconds: dict[bool, list[float]] = {True: [], False: []}
@@ -329,12 +336,14 @@ def part_shortcuts(quick: bool, repeats: int, only: str | None) -> list[dict[str
             "ms": median_ms(seconds[True]),
             "ms_without": median_ms(seconds[False]),
             "saved": 1 - statistics.median(ratios),  # of neighbours in time, between which the machine changes little
+            "saved_error": standard_error(ratios),
             "image_difference": (fast["image"] - slow["image"]).abs().max().item(),
             "gradient_difference": max(relative_difference(fast[p].grad, slow[p].grad) for p in PARAMETERS),
         }
         rows.append(row)
         print(
-            f"{row['shortcut']:>18} {row['ms_without']:7.1f} {row['ms']:7.1f} {row['saved']:6.1%} "
+            f"{row['shortcut']:>18} {row['ms_without']:7.1f} {row['ms']:7.1f} "
+            f"{row['saved']:6.1%} +- {row['saved_error']:.1%} "
             f"{row['image_difference']:8.1e} {row['gradient_difference']:8.1e}",
             flush=True,
         )
@@ -460,8 +469,9 @@ def plot(results: dict[str, Any]) -> None:
         rows = results["shortcuts"]["rows"]
         # Each row was measured in turn with its own baseline, so only the share is comparable.
         saved = [100 * row["saved"] for row in rows]
-        shortcuts.barh([row["shortcut"] for row in rows], saved)
-        shortcuts.set(xlabel="time saved by the shortcut (%)")
+        errors = [100 * row["saved_error"] for row in rows]
+        shortcuts.barh([row["shortcut"] for row in rows], saved, xerr=errors, ecolor="gray")
+        shortcuts.set(xlabel="time saved by the shortcut (%), and its standard error")
     figure.savefig(FILE.with_suffix(".png"), dpi=120)
 
 
