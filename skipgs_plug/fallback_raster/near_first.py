@@ -132,7 +132,6 @@ def bin_the_rest(
     if len(rows) == 0:
         return None
     rest = bin_gaussians(
-        rows, means2d, depths, conics, opacities, sigmas, colors, width, height, False, behind,
-        len(near.tile_list),
-    )  # fmt: skip
+        rows, means2d, depths, conics, opacities, sigmas, colors, width, height, False, behind, len(near.tile_list)
+    )
     return rest, starts

@@ -1,7 +1,7 @@
 """The blend of one image from its projected Gaussians, and the adjoint, any number of channels."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -36,18 +36,12 @@ class Pass:
     def after(self, near: "Pass") -> "Pass":
         """This one as the second part of one list of pairs whose first part is `near`."""
         first, own, pairs = near.bins, self.bins, len(near.bins.tile_list)
-        bins = Bins(
-            own.visible,
-            own.listed,
-            own.listed_count,
-            own.records,
-            own.tile_start + pairs,
-            torch.cat([first.tile_list, own.tile_list]),
-            torch.cat([first.tile_place, own.tile_place + pairs]),
-            own.pair_start + pairs,
-            own.pair_record,
-            own.unsorted,
-            own.tiles_per_gauss,
+        bins = replace(
+            own,
+            tile_start=own.tile_start + pairs,
+            tile_list=torch.cat([first.tile_list, own.tile_list]),
+            tile_place=torch.cat([first.tile_place, own.tile_place + pairs]),
+            pair_start=own.pair_start + pairs,
         )
         pair_blocks = torch.cat([near.pair_blocks, self.pair_blocks])
         return Pass(bins, self.block_start, self.tile_stop + pairs, self.tile_blended, pair_blocks)
