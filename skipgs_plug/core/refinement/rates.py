@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
@@ -108,7 +108,7 @@ class ScaledRates:
         self._rows = self._rows_now = 0  # Gaussians in the iteration before and in this one; 0 where not known
         self._thread = threading.get_ident()
         self._depth: dict[int, int] = {}  # a step can call the step of its base class
-        self._before: dict[int, list[tuple[dict[str, Any], dict[str, Any]]]] = {}
+        self._under_way: dict[int, _Step] = {}
         self._handles: list[RemovableHandle] = []
         self._removed = False
 
@@ -141,9 +141,9 @@ class ScaledRates:
     def rest(self) -> None:
         """Touch nothing until the next `scale`."""
         self._factor = None
-        for saved in self._before.values():  # a step that raised had no end
-            _restore(saved)
-        self._before.clear()
+        for step in self._under_way.values():  # one that raised had no end
+            step.end()
+        self._under_way.clear()
         self._depth.clear()
 
     def remove(self) -> None:
@@ -168,12 +168,13 @@ class ScaledRates:
         if self._depth[key] > 1:
             return
         # An optimizer can be wrapped in another one, which has the same groups.
-        scaled = {id(group) for saved in self._before.values() for group, _ in saved}
+        scaled = {id(group) for step in self._under_way.values() for group, _ in step.before}
         groups = [group for group in optimizer.param_groups if id(group) not in scaled]
         self.shown.see(groups, names[0])
         # Without names a camera's position has the shape of a Gaussian's, but there are fewer.
         self._rows_now = max([self._rows_now, *map(len, positions(groups, names[0]))])
-        self._before[key] = [(group, {name: group[name] for name in SETTINGS if name in group}) for group in groups]
+        before = [(group, {name: group[name] for name in SETTINGS if name in group}) for group in groups]
+        self._under_way[key] = _Step(before, optimizer.register_state_dict_pre_hook(self._as_before))
         for group in groups:
             longer = self._of_gaussians(group, names[0])
             if "lr" in group:
@@ -199,9 +200,24 @@ class ScaledRates:
         self._depth[key] -= 1
         if self._depth[key] == 0:
             del self._depth[key]
-            _restore(self._before.pop(key))
+            self._under_way.pop(key).end()
+
+    def _as_before(self, _: torch.optim.Optimizer) -> None:
+        """A checkpoint is written although a step raised: it holds the trainer's rates, too."""
+        for step in self._under_way.values():
+            step.put_back()
 
 
-def _restore(saved: list[tuple[dict[str, Any], dict[str, Any]]]) -> None:
-    for group, settings in saved:
-        group.update(settings)
+class _Step(NamedTuple):
+    """A step under way."""
+
+    before: list[tuple[dict[str, Any], dict[str, Any]]]  # groups, and what the trainer has set there
+    hook: RemovableHandle
+
+    def put_back(self) -> None:
+        for group, settings in self.before:
+            group.update(settings)
+
+    def end(self) -> None:
+        self.hook.remove()
+        self.put_back()

@@ -226,6 +226,31 @@ def test_a_step_that_raises_gives_its_rate_back_in_the_next_iteration(rates):
     assert optimizer.param_groups[0]["lr"] == 0.1
 
 
+def test_a_checkpoint_after_a_step_that_raised_holds_the_trainers_rates(rates):
+    class Broken(torch.optim.Adam):
+        def step(self):
+            raise KeyboardInterrupt
+
+    class Wrapper(torch.optim.Optimizer):
+        def __init__(self, inner):
+            super().__init__(inner.param_groups, {})
+            self.inner, self.param_groups = inner, inner.param_groups
+
+        def step(self):
+            self.inner.step()
+
+    broken = Broken([parameter()], lr=0.1)
+    before = broken.state_dict()
+    for optimizer in (broken, Wrapper(broken)):
+        rates.scale(5.0)
+        with pytest.raises(KeyboardInterrupt):
+            optimizer.step()
+        assert broken.param_groups[0]["lr"] == 0.5
+        assert broken.state_dict() == before
+        rates.rest()
+        assert not broken._optimizer_state_dict_pre_hooks
+
+
 def test_a_wrapped_optimizer_with_the_same_groups_is_scaled_once(rates):
     class Wrapper(torch.optim.Optimizer):
         def __init__(self, base):
