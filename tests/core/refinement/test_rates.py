@@ -15,6 +15,17 @@ def parameter(value=1.0):
     return one
 
 
+class Wrapper(torch.optim.Optimizer):
+    """An optimizer around another one, with the same groups."""
+
+    def __init__(self, base):
+        super().__init__(base.param_groups, {})
+        self.base, self.param_groups = base, base.param_groups
+
+    def step(self):
+        self.base.step()
+
+
 @pytest.fixture
 def rates():
     scaled = ScaledRates()
@@ -231,14 +242,6 @@ def test_a_checkpoint_after_a_step_that_raised_holds_the_trainers_rates(rates):
         def step(self):
             raise KeyboardInterrupt
 
-    class Wrapper(torch.optim.Optimizer):
-        def __init__(self, inner):
-            super().__init__(inner.param_groups, {})
-            self.inner, self.param_groups = inner, inner.param_groups
-
-        def step(self):
-            self.inner.step()
-
     broken = Broken([parameter()], lr=0.1)
     before = broken.state_dict()
     for optimizer in (broken, Wrapper(broken)):
@@ -252,14 +255,6 @@ def test_a_checkpoint_after_a_step_that_raised_holds_the_trainers_rates(rates):
 
 
 def test_a_wrapped_optimizer_with_the_same_groups_is_scaled_once(rates):
-    class Wrapper(torch.optim.Optimizer):
-        def __init__(self, base):
-            super().__init__(base.param_groups, {})
-            self.base, self.param_groups = base, base.param_groups
-
-        def step(self):
-            self.base.step()
-
     value = parameter()
     base = torch.optim.SGD([value], lr=0.1)
     rates.scale(3.0)
