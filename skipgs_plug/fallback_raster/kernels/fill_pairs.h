@@ -1,11 +1,12 @@
 // Lists the pairs of each tile, as yet in the order of the rows: depth in the upper half, number of the pair in the lower.
 // Pairs are numbered by row and tile. Depths are positive, so their bits sort like integers.
 #include "ellipse.h"
+#include "slice_begin.h"
 #include "tile_ranges.h"
 for (int s = first; s < last; ++s) {
     int* next = counts + (long long)s * (tiles_x * tiles_y + SPARE_COUNTS);
     int pair = (int)totals[s];
-    const int begin = (int)((long long)s * n / slices), end = (int)((long long)(s + 1) * n / slices);
+    const int begin = slice_begin(s, n, slices), end = slice_begin(s + 1, n, slices);
     int i = begin;
     for (int k = begin; k < begin + listed_count[s]; ++k) {
         while (i <= listed[k]) pair_start[i++] = pair;

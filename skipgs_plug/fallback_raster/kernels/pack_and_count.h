@@ -1,6 +1,7 @@
 // Records of the visible rows that have pairs, one after the other, their places among the tiles, and the number of pairs
 // of each tile, by slice of the rows. Where `limited`, only pairs whose depths lie in the range of their tile count.
 #include "ellipse.h"
+#include "slice_begin.h"
 #include "tile_ranges.h"
 const int tiles = tiles_x * tiles_y;
 const auto interleave = [](i16 a, i16 b, int* to) INLINE {
@@ -18,7 +19,7 @@ for (int s = first; s < last; ++s) {
     for (int t = 0; t < tiles + SPARE_COUNTS; ++t) count[t] = 0;
     long long of_slice = 0;
     int found = 0;
-    const int begin = (int)((long long)s * n / slices), end = (int)((long long)(s + 1) * n / slices);
+    const int begin = slice_begin(s, n, slices), end = slice_begin(s + 1, n, slices);
     for (int i = begin; i < end; i += 16) {
         const int lanes = smaller(16, end - i);
         int row[16];
