@@ -7,6 +7,8 @@ static constexpr int GROUP = 64;        // Gaussians at a time, one bit each
 static constexpr int SIDE_BY_SIDE = 4;  // of these in the chains of one block
 typedef unsigned char bytes __attribute__((ext_vector_type(32)));
 typedef bool b32 __attribute__((ext_vector_type(32)));
+typedef unsigned some_masks __attribute__((ext_vector_type(TESTED)));
+typedef unsigned char some_bytes __attribute__((ext_vector_type(TESTED)));
 // Bit l of the result's word k is bit k of byte l.
 static constexpr auto turn = [](const unsigned char* from, unsigned* words) INLINE {
     bytes a = *(const bytes*)from;
@@ -67,7 +69,7 @@ for (int t = first; t < last; ++t) {
         chunk[GROUP * RECORD + 5] = -100.0f;
         for (int j = 0; j < count; j += TESTED) {
             const float* r[TESTED];
-            unsigned blocks[TESTED];
+            alignas(some_masks) unsigned blocks[TESTED];
             for (int g = 0; g < TESTED; ++g) {
                 const int k = base + j + g;
                 r[g] = records + (long long)RECORD * tile_list[smaller(k, listed - 1)];
@@ -76,15 +78,16 @@ for (int t = first; t < last; ++t) {
                 blocks[g] = ~0u;
             }
             if (shortcuts & BLOCK_BOUNDS) reached_blocks(r, tile.x0, tile.y0, blocks);
-            for (int g = 0; g < TESTED && j + g < count; ++g)
-                for (int i = 0; i < BLOCKS / 8; ++i) reached[i][j + g] = (unsigned char)(blocks[g] >> 8 * i);
+            for (int i = 0; i < BLOCKS / 8; ++i)
+                *(some_bytes*)(reached[i] + j) = __builtin_convertvector(*(const some_masks*)blocks >> 8 * i, some_bytes);
         }
         unsigned long long live[BLOCKS];  // by block, the Gaussians of the group that reach it
+        const unsigned long long here = ~0ull >> (GROUP - count);
         for (int i = 0; i < BLOCKS / 8; ++i) {
             unsigned low[8], high[8];
             turn(reached[i], low);
             turn(reached[i] + 32, high);
-            for (int b = 0; b < 8; ++b) live[8 * i + b] = low[b] | (unsigned long long)high[b] << 32;
+            for (int b = 0; b < 8; ++b) live[8 * i + b] = (low[b] | (unsigned long long)high[b] << 32) & here;
         }
         const unsigned visited = open;
         for (unsigned todo = open; todo; todo &= todo - 1) {

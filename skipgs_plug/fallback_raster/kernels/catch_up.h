@@ -41,13 +41,7 @@ constexpr int VECTORS = 3;
 static_assert(VECTORS * 16 == 3 * (BANDS + 1) && FACTOR == 4, "an outer product fills a row");
 // Bands times three channels, channel by channel.
 const auto outer_product = [](v16 bands, v4 color, v16* to) INLINE {
-    const v16 x = bands * color.x, y = bands * color.y, z = bands * color.z;
-    to[0] = __builtin_shufflevector(__builtin_shufflevector(x, y, 0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5), z,
-                                    0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15);
-    to[1] = __builtin_shufflevector(__builtin_shufflevector(x, y, 21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26), z,
-                                    0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15);
-    to[2] = __builtin_shufflevector(__builtin_shufflevector(x, y, 0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0), z,
-                                    26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31);
+    interleave3(bands * color.x, bands * color.y, bands * color.z, (float*)to);
 };
 alignas(64) float bands[16][16];  // of the next rows, beside the constant one
 for (int i = first; i < last; ++i) {

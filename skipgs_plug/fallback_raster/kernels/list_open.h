@@ -6,7 +6,7 @@ const int end = block_start[first + 1];
 for (int i = block_start[first]; i < end; i += 16) {
     const int lanes = smaller(16, end - i);
     int row[16];
-    for (int l = 0; l < 16; ++l) row[l] = visible[i + smaller(l, lanes - 1)];
+    take_rows(visible + i, lanes, row);
     const i16 deep = (i16)gather(depths, row, 1, 0) >= least;
     if (!any(deep)) continue;
     v16 centre[2], sigma[2];

@@ -2,6 +2,7 @@
 int m = 0;
 for (int b = 0; b < blocks; ++b) {
     block_start[b] = m;
-    for (int i = 0; i < block_count[b]; ++i) visible[m++] = seen[(long long)BLOCK * b + i];
+    __builtin_memcpy(visible + m, seen + (long long)BLOCK * b, sizeof(int) * block_count[b]);
+    m += block_count[b];
 }
 block_start[blocks] = m;

@@ -4,10 +4,6 @@
 #include "slice_begin.h"
 #include "tile_ranges.h"
 const int tiles = tiles_x * tiles_y;
-const auto interleave = [](i16 a, i16 b, int* to) INLINE {
-    *(i16*)to = __builtin_shufflevector(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
-    *(i16*)(to + 16) = __builtin_shufflevector(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
-};
 const auto add_two = [](int* to, const int* numbers) INLINE {
     typedef int two __attribute__((ext_vector_type(2), aligned(4)));
     *(two*)to += *(const two*)numbers;
@@ -23,7 +19,7 @@ for (int s = first; s < last; ++s) {
     for (int i = begin; i < end; i += 16) {
         const int lanes = smaller(16, end - i);
         int row[16];
-        for (int l = 0; l < 16; ++l) row[l] = visible[i + smaller(l, lanes - 1)];
+        take_rows(visible + i, lanes, row);
         const i16 depth = (i16)gather(depths, row, 1, 0);
         const i16 near = (depth >= least) & (depth < most);
         if (!dense && !any(near)) continue;
@@ -87,9 +83,9 @@ for (int s = first; s < last; ++s) {
         transpose(record);
         // By lane: first tile and tiles met; pairs in the upper two tiles, and in the lower two, wherever these are.
         alignas(64) int place[16][PLACE], upper[16][2], lower[16][2], below[16], key[16];
-        interleave(corner, meets, place[0]);
-        interleave(meets & 1, meets >> 1 & 1, upper[0]);
-        interleave(meets >> 2 & 1, meets >> 3 & 1, lower[0]);
+        interleave2((v16)corner, (v16)meets, (float*)place[0]);
+        interleave2((v16)(meets & 1), (v16)(meets >> 1 & 1), (float*)upper[0]);
+        interleave2((v16)(meets >> 2 & 1), (v16)(meets >> 3 & 1), (float*)lower[0]);
         *(i16*)below = last_row > first_row ? corner + tiles_x : (i16)tiles;
         *(i16*)key = depth;
         if (chosen == 0xffff && !limited && !any(meets < 0)) {

@@ -13,21 +13,24 @@ if (RAW) clear_rows(v_opacities + row_begin, rows);
 // Few of the rows that are visible received a gradient where most lie behind others; the zeros of the rest are in place.
 alignas(64) int received[BLOCK];
 int count = 0;
-for (int i = block_start[block]; i < block_start[block + 1]; ++i) {
-    const int g = visible[i];
-    const auto word = [](const float* p) INLINE -> unsigned { return 2 * *(const unsigned*)p; };  // 0 for either zero
-    unsigned any = word(v_means2d + 2 * g) | word(v_means2d + 2 * g + 1);
-    for (int j = 0; j < 3; ++j) any |= word(v_conics + 3 * g + j);
-    if (with_depth) any |= word(v_depths + g);
-    if (RAW) any |= word(v_activated + g);
-    else if (antialiased) any |= word(v_compensations + g);
-    received[count] = g;
-    count += any || !(shortcuts & CONTRIBUTED_ONLY);
+for (int i = block_start[block]; i < block_start[block + 1]; i += 16) {
+    const int lanes = smaller(16, block_start[block + 1] - i);
+    int row[16];
+    take_rows(visible + i, lanes, row);
+    v16 center[2], conic[3], single[2] = {};
+    gather2(v_means2d, row, center);
+    gather3(v_conics, row, n, conic);
+    if (with_depth) single[0] = gather(v_depths, row, 1, 0);
+    if (RAW) single[1] = gather(v_activated, row, 1, 0);
+    else if (antialiased) single[1] = gather(v_compensations, row, 1, 0);
+    i16 some = (single[0] != 0.0f) | (single[1] != 0.0f) | (center[0] != 0.0f) | (center[1] != 0.0f);
+    for (int j = 0; j < 3; ++j) some |= conic[j] != 0.0f;
+    append_rows(received, count, row, (shortcuts & CONTRIBUTED_ONLY ? bits(some) : ~0u) & ((1u << lanes) - 1));
 }
 for (int base = 0; base < count; base += 16) {
     const int lanes = smaller(16, count - base);
     int row[16];
-    for (int l = 0; l < 16; ++l) row[l] = received[base + (l < lanes ? l : lanes - 1)];
+    take_rows(received + base, lanes, row);
     v16 v_center[2], v_conic[3], v_depth = (v16)0.0f, v_comp = (v16)0.0f;
     gather2(v_means2d, row, v_center);
     gather3(v_conics, row, n, v_conic);

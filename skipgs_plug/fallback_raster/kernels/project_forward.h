@@ -54,8 +54,7 @@ for (int base = row_begin; base < row_end; base += 16) {
     visible &= (u + radius_x > 0.0f) & (u - radius_x < width) & (v + radius_y > 0.0f) & (v - radius_y < height);
 
     const v16 none = (v16)0.0f;
-    for (unsigned rest = bits(visible) & ((1u << lanes) - 1); rest; rest &= rest - 1)
-        seen[found++] = base + __builtin_ctz(rest);
+    append_rows(seen, found, row, bits(visible) & ((1u << lanes) - 1));
     if (!dense && !any(visible)) continue;
     if (with_radii) {
         const i16 rx = __builtin_convertvector(visible ? radius_x : none, i16);

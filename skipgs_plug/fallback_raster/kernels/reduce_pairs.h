@@ -1,5 +1,6 @@
 // Adds up the pairs of each row of a block in a fixed order and turns their moments into gradients, of all rows where
 // DENSE, else of visible ones.
+#include "copy_row.h"
 const int row_begin = BLOCK * first, rows_here = smaller(BLOCK, rows - row_begin);
 const bool more = channel > 0;
 if (!more && DENSE) {
@@ -51,7 +52,7 @@ for (int i = block_start[first]; i < end; ++i) {
     for (int j = 0; j < 2; ++j) v_means2d[2 * g + j] = v_center[j] + (more ? v_means2d[2 * g + j] : 0.0f);
     for (int j = 0; j < 3; ++j) v_conics[3 * g + j] = v_conic[j] + (more ? v_conics[3 * g + j] : 0.0f);
     v_opacities[g] = v_opacity + (more ? v_opacities[g] : 0.0f);
-    for (int j = 0; j < channels; ++j) v_colors[(long long)g * stride + channel + j] = total[6 + j];
+    copy_row(v_colors + (long long)g * stride + channel, total + 6, channels);
     if (absgrad)
         for (int j = 0; j < 2; ++j) v_absolute[2 * g + j] += LN_4 * total[10 + j];
 }

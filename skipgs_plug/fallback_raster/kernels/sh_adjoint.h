@@ -28,7 +28,7 @@ for (int i = begin; i < begin + listed; ++i) {
 for (int i = 0; i < count; i += 16) {
     const int lanes = smaller(16, count - i);
     int row[16];
-    for (int l = 0; l < 16; ++l) row[l] = received[i + smaller(l, lanes - 1)];
+    take_rows(received + i, lanes, row);
     for (int l = 0; l < 16; ++l)
         fetch_bands(rest + rest_offset, received[smaller(i + 16 + l, count - 1)], rest_stride, 3 * (terms - 1));
     v16 color[3], v[3], x, y, z, norm, shrink;

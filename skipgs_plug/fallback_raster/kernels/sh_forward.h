@@ -6,7 +6,7 @@ if (dense) clear(colors + 3ll * BLOCK * block, 3 * smaller(BLOCK, n - BLOCK * bl
 for (int i = block_start[block]; i < end; i += 16) {
     const int lanes = smaller(16, end - i);
     int row[16];
-    for (int l = 0; l < 16; ++l) row[l] = visible[i + smaller(l, lanes - 1)];
+    take_rows(visible + i, lanes, row);
     for (int l = 0; l < 16; ++l)
         fetch_bands(rest + rest_offset, visible[smaller(i + 16 + l, all - 1)], rest_stride, 3 * (terms - 1));
     v16 basis[16], sh[48], constant[3], c[3], x, y, z, norm, shrink;

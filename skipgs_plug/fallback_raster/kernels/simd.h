@@ -99,8 +99,38 @@ static constexpr auto clear_past_caches = [](float* p, long long n) {
     for (; i + 16 <= n; i += 16) __builtin_nontemporal_store((whole)0.0f, (whole*)(p + i));
     for (; i < n; ++i) p[i] = 0.0f;
 };
+// Columns of 16 rows of two or three numbers as these lie in memory.
+static constexpr auto interleave2 = [](v16 x, v16 y, float* to) INLINE {
+    store(to, __builtin_shufflevector(x, y, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23));
+    store(to + 16, __builtin_shufflevector(x, y, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31));
+};
+static constexpr auto interleave3 = [](v16 x, v16 y, v16 z, float* to) INLINE {
+    const v16 a = __builtin_shufflevector(x, y, 0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5);
+    const v16 b = __builtin_shufflevector(x, y, 21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26);
+    const v16 c = __builtin_shufflevector(x, y, 0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0);
+    store(to, __builtin_shufflevector(a, z, 0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15));
+    store(to + 16, __builtin_shufflevector(b, z, 0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15));
+    store(to + 32, __builtin_shufflevector(c, z, 26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31));
+};
+// Whether 16 rows, which ascend, lie one after the other, so that vectors move them as they lie. Where there are fewer, the
+// last one is repeated.
+static constexpr auto in_a_row = [](const int* row) INLINE -> bool { return row[15] - row[0] == 15 && row[14] < row[15]; };
+// 16 rows of a list of which `lanes` are left, the last one repeated; and those of the lanes that `mask` has a bit of, put
+// behind the `count` rows of a list.
+static constexpr auto take_rows = [](const int* list, int lanes, int* row) INLINE {
+    for (int l = 0; l < 16; ++l) row[l] = list[smaller(l, lanes - 1)];
+};
+static constexpr auto append_rows = [](int* list, int& count, const int* row, unsigned mask) INLINE {
+    if (mask == 0xffff) {
+        *(i16*)(list + count) = *(const i16*)row;
+        count += 16;
+        return;
+    }
+    for (; mask; mask &= mask - 1) list[count++] = row[__builtin_ctz(mask)];
+};
 // 16 rows of an array of structures, column `c`; `row` names the row of each lane.
-static constexpr auto gather = [](const float* p, const int* row, int width, int c) -> v16 {
+static constexpr auto gather = [](const float* p, const int* row, int width, int c) INLINE -> v16 {
+    if (width == 1 && in_a_row(row)) return load(p + row[0]);
     v16 a;
     for (int l = 0; l < 16; ++l) a[l] = p[row[l] * width + c];
     return a;
@@ -111,7 +141,8 @@ static constexpr auto scatter = [](float* p, const int* row, v16 a, int lanes) {
     for (int l = 0; l < lanes; ++l) p[row[l]] = all[l];
 };
 // The columns of 16 rows of three or four numbers, and the other way round; `row` ascends. Rows move as a whole, four to a
-// vector, and 4 x 4 numbers are transposed inside each quarter: a third of the instructions of number by number.
+// vector, and 4 x 4 numbers are transposed inside each quarter: a third of the instructions of number by number. Where
+// rows lie one after the other it is a quarter of these.
 typedef float v4 __attribute__((ext_vector_type(4), aligned(4)));
 typedef float v2 __attribute__((ext_vector_type(2), aligned(4)));
 static constexpr auto quarters = [](const v16* a, v16* b) INLINE {
@@ -140,9 +171,26 @@ static constexpr auto fours = [](const float* p, const int* row, int width, v16*
     }
     quarters(a, columns);
 };
-static constexpr auto gather4 = [](const float* p, const int* row, v16* columns) INLINE { fours(p, row, 4, columns); };
+static constexpr auto gather4 = [](const float* p, const int* row, v16* columns) INLINE {
+    if (!in_a_row(row)) return fours(p, row, 4, columns);
+    v16 rows[4], a[4];
+    for (int i = 0; i < 4; ++i) rows[i] = load(p + 4 * row[0] + 16 * i);
+    quarters(rows, a);  // lane 4 q + i has row 4 i + q
+    for (int c = 0; c < 4; ++c)
+        columns[c] = __builtin_shufflevector(a[c], a[c], 0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+};
 // Of `n` rows in all: a fourth number is read along with a row, which is that of the next one.
 static constexpr auto gather3 = [](const float* p, const int* row, int n, v16* columns) INLINE {
+    if (in_a_row(row)) {
+        const v16 a = load(p + 3 * row[0]), b = load(p + 3 * row[0] + 16), c = load(p + 3 * row[0] + 32);
+        const v16 x = __builtin_shufflevector(a, b, 0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 0, 0, 0, 0, 0);
+        const v16 y = __builtin_shufflevector(a, b, 1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, 0, 0, 0, 0, 0);
+        const v16 z = __builtin_shufflevector(a, b, 2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 0, 0, 0, 0, 0, 0);
+        columns[0] = __builtin_shufflevector(x, c, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29);
+        columns[1] = __builtin_shufflevector(y, c, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30);
+        columns[2] = __builtin_shufflevector(z, c, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31);
+        return;
+    }
     if (row[15] + 1 < n) {
         v16 all[4];
         fours(p, row, 3, all);
@@ -153,14 +201,17 @@ static constexpr auto gather3 = [](const float* p, const int* row, int n, v16* c
 };
 static constexpr auto gather2 = [](const float* p, const int* row, v16* columns) INLINE {
     v16 half[2];
-    for (int i = 0; i < 2; ++i) {
-        v4 r[4];
-        for (int k = 0; k < 4; ++k) {
-            const v2 a = *(const v2*)(p + 2 * row[8 * i + 2 * k]), b = *(const v2*)(p + 2 * row[8 * i + 2 * k + 1]);
-            r[k] = __builtin_shufflevector(a, b, 0, 1, 2, 3);
+    if (in_a_row(row)) {
+        half[0] = load(p + 2 * row[0]), half[1] = load(p + 2 * row[0] + 16);
+    } else
+        for (int i = 0; i < 2; ++i) {
+            v4 r[4];
+            for (int k = 0; k < 4; ++k) {
+                const v2 a = *(const v2*)(p + 2 * row[8 * i + 2 * k]), b = *(const v2*)(p + 2 * row[8 * i + 2 * k + 1]);
+                r[k] = __builtin_shufflevector(a, b, 0, 1, 2, 3);
+            }
+            half[i] = join(r);
         }
-        half[i] = join(r);
-    }
     columns[0] = __builtin_shufflevector(half[0], half[1], 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
     columns[1] = __builtin_shufflevector(half[0], half[1], 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
 };
@@ -177,10 +228,12 @@ static constexpr auto scatter_rows = [](float* p, const int* row, int width, con
     }
 };
 static constexpr auto scatter2 = [](float* p, const int* row, v16 x, v16 y, int lanes) INLINE {
+    if (in_a_row(row)) return interleave2(x, y, p + 2 * row[0]);
     const v16 columns[4] = {x, y, x, y};
     scatter_rows(p, row, 2, columns, lanes);
 };
 static constexpr auto scatter3 = [](float* p, const int* row, v16 x, v16 y, v16 z, int lanes) INLINE {
+    if (in_a_row(row)) return interleave3(x, y, z, p + 3 * row[0]);
     const v16 columns[4] = {x, y, z, z};
     scatter_rows(p, row, 3, columns, lanes);
 };

@@ -14,7 +14,7 @@ struct SortedTile {
     int *records, *places;     // out: record and number of each pair
     const int* pair_record;
     int count, done, next, shift;  // pairs, those that are sorted, the next bucket, and bits of depth in one
-    int start[BUCKETS + 1];
+    int bound[BUCKETS + 2];        // where each bucket begins, and the last one ends
 
     SortedTile(int begin, int end, long long* unsorted, long long* buffer, int* tile_list, int* tile_place,
                const int* pair_record)
@@ -23,19 +23,24 @@ struct SortedTile {
         // Twice as many buckets as pairs: most of them hold one or none.
         int buckets = 64;
         while (buckets < 2 * count && buckets < BUCKETS) buckets *= 2;
-        shift = deal(other, dealt, count, start, buckets);
+        bound[0] = 0;
+        shift = deal(other, dealt, count, bound + 1, buckets);
     }
 
     // Sorts at least the first `wanted` pairs, or all.
     void sort(int wanted) {
         wanted = smaller(wanted, count);
         if (done >= wanted) return;
-        int end = done, longest = 0;
-        for (int begin = done; end < wanted; begin = end) {
-            end = start[next++];
-            longest = larger(longest, end - begin);
-            if (end - begin > LARGE && shift > 0) refine(begin, end);
+        int longest = 0;
+        while (bound[next] < wanted) {  // 16 buckets at a time, which their number is a multiple of
+            const int most = __builtin_reduce_max(*(const i16*)(bound + next + 1) - *(const i16*)(bound + next));
+            if (most > LARGE && shift > 0)
+                for (int b = next; b < next + 16; ++b)
+                    if (bound[b + 1] - bound[b] > LARGE) refine(bound[b], bound[b + 1]);
+            longest = larger(longest, most);
+            next += 16;
         }
+        const int end = bound[next];
         // A full bucket that was not dealt again holds one depth, in order.
         settle(done, end, smaller(longest, LARGE));
         for (int i = done; i < end; ++i) places[i] = (int)dealt[i];
@@ -76,11 +81,17 @@ struct SortedTile {
         for (int b = 0; b <= buckets; ++b) bucket[b] = 0;
         for (int i = 0; i < count; ++i) ++bucket[((int)(from[i] >> 32) - least) >> shift];
         int sum = 0;
-        for (int b = 0; b <= buckets; ++b) {
-            const int pairs = bucket[b];
-            bucket[b] = sum;
-            sum += pairs;
+        for (int b = 0; b < buckets; b += 16) {
+            const i16 pairs = *(const i16*)(bucket + b);
+            i16 up_to = pairs;
+            up_to += __builtin_shufflevector(up_to, (i16)0, 16, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14);
+            up_to += __builtin_shufflevector(up_to, (i16)0, 16, 16, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13);
+            up_to += __builtin_shufflevector(up_to, (i16)0, 16, 16, 16, 16, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11);
+            up_to += __builtin_shufflevector(up_to, (i16)0, 16, 16, 16, 16, 16, 16, 16, 16, 0, 1, 2, 3, 4, 5, 6, 7);
+            *(i16*)(bucket + b) = up_to - pairs + sum;
+            sum += up_to[15];
         }
+        bucket[buckets] = sum;
         for (int i = 0; i < count; ++i) to[bucket[((int)(from[i] >> 32) - least) >> shift]++] = from[i];
         return shift;
     }
