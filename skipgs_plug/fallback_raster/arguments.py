@@ -34,7 +34,7 @@ def as_float(name: str, value: Any) -> float:
     Raises:
         ValueError: It is none, or NaN.
     """
-    if not isinstance(value, numbers.Real) or math.isnan(value):
+    if type(value) is not float and not isinstance(value, numbers.Real) or math.isnan(value):
         raise ValueError(f"{name} must be a number, got {value!r}.")
     return float(value)
 
@@ -127,7 +127,7 @@ def check_tensors(
         if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
             kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
             raise ValueError(f"{name} must be a floating point tensor, got {kind}.")
-        if tensor.device.type != "cpu":
+        if not tensor.is_cpu:
             raise ValueError(f"{name} is on {tensor.device}, but this rasterizer runs on the CPU: use {name}.cpu().")
     if sh_degree is not None and (type(sh_degree) is not int or sh_degree not in (0, 1, 2, 3)):
         raise ValueError(f"sh_degree must be 0 to 3 on the CPU, got {sh_degree!r}.")
@@ -135,8 +135,8 @@ def check_tensors(
         raise ValueError(f"width and height must be whole numbers of at least 1, got {width!r} and {height!r}.")
     shapes = (None if t is None else t.shape for t in (means, quats, scales, opacities, colors, viewmats, Ks, sh_rest))
     _check_shapes(*shapes, None if backgrounds is None else backgrounds.shape, sh_degree, width, height)
-    for name in ("viewmats", "Ks"):
-        if not all(map(math.isfinite, tensors[name].detach().flatten().tolist())):
+    for name, cameras in (("viewmats", viewmats), ("Ks", Ks)):
+        if not all(math.isfinite(number) for camera in cameras.tolist() for row in camera for number in row):
             raise ValueError(f"{name} holds NaN or infinity: a camera must be finite.")
 
 

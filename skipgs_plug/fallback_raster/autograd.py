@@ -52,8 +52,8 @@ class Project(torch.autograd.Function):
         quats: Tensor,  # [N, 4]
         scales: Tensor,  # [N, 3]
         opacities: Tensor,  # [N], only decides what is visible
-        viewmat: Tensor,  # [4, 4]
-        K: Tensor,  # [3, 3]
+        viewmat: Tensor,  # [1, 4, 4]
+        K: Tensor,  # [1, 3, 3]
         width: int,
         height: int,
         near_plane: float,
@@ -107,8 +107,8 @@ class Project(torch.autograd.Function):
         )  # fmt: skip
         v_viewmat = None
         if with_pose:
-            v_viewmat = zeros(4, 4)
-            v_viewmat[:3] = v_poses.sum(0)
+            v_viewmat = zeros(1, 4, 4)
+            v_viewmat[0, :3] = v_poses.sum(0)
         return v_means, v_quats, v_scales, None, v_viewmat, *[None] * 8
 
 

@@ -154,7 +154,7 @@ def rasterization(
             means, quats, scales, opacities, viewmat, K, width, height, near_plane, far_plane, eps2d, radius_clip,
             antialiased,
         )
-        for viewmat, K in zip(viewmats, Ks, strict=True)
+        for viewmat, K in zip(_split(viewmats, None), _split(Ks, None), strict=True)
     ]  # fmt: skip
     *stacked, visible, block_starts = map(list, zip(*projected, strict=True))
     means2d, depths, conics, compensations, radii, sigmas = (_join(parts) for parts in stacked)
