@@ -91,7 +91,7 @@ POLICY = {
     "load_state_dict": "(self, state: 'dict[str, Any]') -> 'None'",
     "mean": "(self, view: 'Hashable') -> 'float | None'",
     "notify_event": "(self, step: 'int', n_views: 'int') -> 'None'",
-    "overrule_skip": "(self) -> 'None'",
+    "overrule": "(self, own: 'Decision', answer: 'Decision') -> 'None'",
     "state_dict": "(self) -> 'dict[str, Any]'",
 }
 

@@ -317,9 +317,9 @@ class Engine:
             distributed.abort()
             raise
         answer = distributed.agree(own)
-        if answer is decision.OTHER_RANK:
+        if answer is not own:
             assert self.policy is not None
-            self.policy.overrule_skip()
+            self.policy.overrule(own, answer)
         return answer
 
     def _own(self, view: str, loss: float, step: int) -> Decision:

@@ -17,6 +17,15 @@ from skipgs_plug.core.state import POLICY_VERSION, policy_state
 
 EPS = 1e-8  # keeps the deviation score defined for a mean of zero
 
+# What the floor counts; a pause counts neither for nor against it.
+_COUNTED = (
+    decision.WARM_UP,
+    decision.NEW_VIEW,
+    decision.ABOVE_MEAN,
+    decision.AT_OR_BELOW_MEAN,
+    decision.BUDGET,
+)
+
 
 class Policy(ABC):
     """What a gate asks of a policy, be it the rule or a control for a benchmark.
@@ -44,8 +53,8 @@ class Policy(ABC):
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
         """Decide on one view in one iteration, and record the answer."""
 
-    def overrule_skip(self) -> None:
-        """The skip just decided became a backward after all: another process needed it."""
+    def overrule(self, own: Decision, answer: Decision) -> None:
+        """What was decided and recorded last, `own`, does not happen: the processes agreed on `answer`."""
         return None
 
     @abstractmethod
@@ -164,10 +173,20 @@ class SkipPolicy(Policy):
             budget.calibrate()
         return answer
 
-    def overrule_skip(self) -> None:
-        """Record that the skip just decided became a backward after all (another process needed it)."""
-        self.budget.skips -= 1
-        self.budget.backwards += 1
+    def overrule(self, own: Decision, answer: Decision) -> None:
+        """Count what happens instead of what was decided last.
+
+        Another process needed the backward, or its loss was not finite: then the iteration counts for nothing, as one
+        with such a loss of its own.
+        """
+        if own not in _COUNTED:
+            return
+        if own.skip:
+            self.budget.skips -= 1
+        else:
+            self.budget.backwards -= 1
+        if answer is decision.OTHER_RANK:
+            self.budget.backwards += 1
 
     def notify_event(self, step: int, n_views: int) -> None:
         """Pause after a structural change in iteration `step`.

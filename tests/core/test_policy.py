@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skipgs_plug import SkipGate
+from skipgs_plug.core import decision
 from skipgs_plug.core.budget import MIN_SAMPLES
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.policy import SkipPolicy
@@ -200,12 +201,28 @@ def test_warm_up_counts_from_the_first_gated_iteration_seen() -> None:
     assert reasons == ["warm-up"] * 3 + ["deviation"] * 3
 
 
-def test_overruled_skip_counts_as_backward() -> None:
+@pytest.mark.parametrize(
+    ("loss", "answer", "counted"),
+    [
+        (0.5, decision.OTHER_RANK, (2, 0)),  # a skip became a backward
+        (0.5, decision.NON_FINITE, (1, 0)),  # another process's loss is not finite: nothing counts
+        (2.0, decision.NON_FINITE, (1, 0)),
+    ],
+)
+def test_what_the_processes_agreed_on_counts(loss: float, answer: decision.Decision, counted: tuple[int, int]) -> None:
     policy = SkipPolicy(start_iter=0, warmup=0)
     policy.decide("a", 1.0, 0)
-    assert policy.decide("a", 0.5, 1).skip
-    policy.overrule_skip()
-    assert (policy.budget.backwards, policy.budget.skips) == (2, 0)
+    own = policy.decide("a", loss, 1)
+    policy.overrule(own, answer)
+    assert (policy.budget.backwards, policy.budget.skips) == counted
+
+
+def test_what_was_not_counted_is_not_taken_back() -> None:
+    policy = SkipPolicy(start_iter=10, warmup=0)
+    policy.overrule(policy.decide("a", 1.0, 0), decision.NON_FINITE)
+    policy.notify_event(10, 1)
+    policy.overrule(policy.decide("a", 1.0, 11), decision.NON_FINITE)
+    assert (policy.budget.backwards, policy.budget.skips) == (0, 0)
 
 
 @pytest.mark.parametrize("view", [3, "3"])
