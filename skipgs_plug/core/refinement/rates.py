@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
@@ -174,7 +174,7 @@ class ScaledRates:
         # Without names a camera's position has the shape of a Gaussian's, but there are fewer.
         self._rows_now = max([self._rows_now, *map(len, positions(groups, names[0]))])
         before = [(group, {name: group[name] for name in SETTINGS if name in group}) for group in groups]
-        self._under_way[key] = _Step(before, optimizer.register_state_dict_pre_hook(self._as_before))
+        self._under_way[key] = _Step(before, self._put_back_first(optimizer), self._put_back_for_checkpoints(optimizer))
         for group in groups:
             longer = self._of_gaussians(group, names[0])
             if "lr" in group:
@@ -202,22 +202,47 @@ class ScaledRates:
             del self._depth[key]
             self._under_way.pop(key).end()
 
-    def _as_before(self, _: torch.optim.Optimizer) -> None:
-        """A checkpoint is written although a step raised: it holds the trainer's rates, too."""
-        for step in self._under_way.values():
-            step.put_back()
+    def _put_back_first(self, optimizer: torch.optim.Optimizer) -> RemovableHandle:
+        """Hooks of the trainer's own after the step, of a scheduler for example, find and set the trainer's rates."""
+
+        def put_back(*_: Any) -> None:
+            if self._depth.get(id(optimizer)) == 1:
+                self._under_way[id(optimizer)].put_back()
+
+        handle = optimizer.register_step_post_hook(put_back)
+        optimizer._optimizer_step_post_hooks.move_to_end(handle.id, last=False)  # type: ignore[attr-defined]
+        return handle
+
+    def _put_back_for_checkpoints(self, optimizer: torch.optim.Optimizer) -> RemovableHandle:
+        """One that is written after a step that raised holds the trainer's rates, too."""
+
+        def put_back(_: torch.optim.Optimizer) -> None:
+            for step in self._under_way.values():
+                step.put_back()
+
+        return optimizer.register_state_dict_pre_hook(put_back)
 
 
-class _Step(NamedTuple):
-    """A step under way."""
+class _Step:
+    """A step under way, whose groups have other settings than the trainer's.
 
-    before: list[tuple[dict[str, Any], dict[str, Any]]]  # groups, and what the trainer has set there
-    hook: RemovableHandle
+    Args:
+        before: Groups, and what the trainer has set there.
+        hooks: Of the optimizer, for as long as the step lasts.
+    """
+
+    def __init__(self, before: list[tuple[dict[str, Any], dict[str, Any]]], *hooks: RemovableHandle) -> None:
+        self.before = before
+        self._hooks = hooks
+        self._scaled = True
 
     def put_back(self) -> None:
-        for group, settings in self.before:
-            group.update(settings)
+        if self._scaled:
+            for group, settings in self.before:
+                group.update(settings)
+        self._scaled = False
 
     def end(self) -> None:
-        self.hook.remove()
+        for hook in self._hooks:
+            hook.remove()
         self.put_back()

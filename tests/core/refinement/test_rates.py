@@ -254,6 +254,24 @@ def test_a_checkpoint_after_a_step_that_raised_holds_the_trainers_rates(rates):
         assert not broken._optimizer_state_dict_pre_hooks
 
 
+def test_a_scheduler_in_a_hook_of_the_optimizer_sets_the_trainers_rate(rates):
+    optimizer = torch.optim.SGD([parameter()], lr=0.1)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.5)
+    found = []
+
+    def advance(*_):
+        found.append(optimizer.param_groups[0]["lr"])
+        schedule.step()
+
+    optimizer.register_step_post_hook(advance)
+    for _ in range(2):
+        rates.scale(4.0)
+        optimizer.step()
+    assert found == [0.1, 0.05]
+    assert optimizer.param_groups[0]["lr"] == 0.025
+    assert len(optimizer._optimizer_step_post_hooks) == 1
+
+
 def test_a_wrapped_optimizer_with_the_same_groups_is_scaled_once(rates):
     value = parameter()
     base = torch.optim.SGD([value], lr=0.1)
