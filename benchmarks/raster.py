@@ -56,21 +56,21 @@ from skipgs_plug.trainer.scalars import peak_memory
 FILE = RESULTS / "raster.json"
 Part = Literal["scenes", "threads", "gaussians", "pixels", "sh_terms", "order", "shortcuts", "loss"]
 
-# Milliseconds of OpenSplat bd0400d's CPU rasterizer on one and on two cores of an AMD EPYC (Zen 4) for these scenes,
+# Milliseconds of OpenSplat bd0400d's CPU rasterizer on one and on two cores of an AMD EPYC (Zen 5) for these scenes,
 # projection, forward, mean-L1 and backward; medians of 18 passes, three rounds. How it was built: docs/rasterizer.md.
 PEER = {
-    ("random", 1_000, "128x128"): (29, 29),
-    ("random", 1_000, "256x256"): (109, 73),
-    ("random", 1_000, "504x378"): (337, 208),
-    ("random", 10_000, "128x128"): (65, 51),
-    ("random", 10_000, "256x256"): (218, 135),
-    ("random", 10_000, "504x378"): (680, 376),
-    ("random", 50_000, "128x128"): (134, 84),
-    ("random", 50_000, "256x256"): (320, 197),
-    ("random", 50_000, "504x378"): (804, 449),
-    ("garden", 138_766, "162x105"): (268, 181),
-    ("garden", 138_766, "324x210"): (435, 266),
-    ("garden", 138_766, "648x420"): (1071, 659),
+    ("random", 1_000, "128x128"): (24, 21),
+    ("random", 1_000, "256x256"): (94, 60),
+    ("random", 1_000, "504x378"): (294, 168),
+    ("random", 10_000, "128x128"): (51, 38),
+    ("random", 10_000, "256x256"): (181, 112),
+    ("random", 10_000, "504x378"): (558, 292),
+    ("random", 50_000, "128x128"): (102, 68),
+    ("random", 50_000, "256x256"): (256, 161),
+    ("random", 50_000, "504x378"): (656, 362),
+    ("garden", 138_766, "162x105"): (199, 135),
+    ("garden", 138_766, "324x210"): (320, 211),
+    ("garden", 138_766, "648x420"): (841, 508),
 }
 GARDEN_DOWNSCALE = {"162x105": 4, "324x210": 2, "648x420": 1}
 
