@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
@@ -85,8 +86,9 @@ class ScaledRates:
 
     Where a group has `betas`, as Adam's have, the second is at most `SQUARES_KEPT` for the length of the step.
 
-    PyTorch's own hooks around `step` are used, so fused, sparse and selective optimizers are reached alike, the
-    trainer's schedule is never disturbed, and a checkpoint holds the trainer's rates.
+    PyTorch's own hooks are used, around `step` of every optimizer and, from its first larger step until `remove`, on
+    the optimizer itself: so fused, sparse and selective optimizers are reached alike, the trainer's schedule is never
+    disturbed, and a checkpoint holds the trainer's rates.
 
     Only what has a row for each Gaussian takes larger steps, as soon as an optimizer has shown how many there are by
     their positions. Exposures, camera poses and networks, which a trainer steps beside them, must not run after a model
@@ -110,6 +112,7 @@ class ScaledRates:
         self._depth: dict[int, int] = {}  # a step can call the step of its base class
         self._under_way: dict[int, _Step] = {}
         self._handles: list[RemovableHandle] = []
+        self._watched: WeakKeyDictionary[torch.optim.Optimizer, list[RemovableHandle]] = WeakKeyDictionary()
         self._removed = False
 
     def scale(self, factor: float) -> None:
@@ -142,7 +145,7 @@ class ScaledRates:
         """Touch nothing until the next `scale`."""
         self._factor = None
         for step in self._under_way.values():  # one that raised had no end
-            step.end()
+            step.put_back()
         self._under_way.clear()
         self._depth.clear()
 
@@ -150,8 +153,9 @@ class ScaledRates:
         """Take the hooks back, for good."""
         self.rest()
         self._removed = True
-        while self._handles:
-            self._handles.pop().remove()
+        for handles in (self._handles, *self._watched.values()):
+            while handles:
+                handles.pop().remove()
         if self in _hooked:
             _hooked.remove(self)
 
@@ -174,7 +178,9 @@ class ScaledRates:
         # Without names a camera's position has the shape of a Gaussian's, but there are fewer.
         self._rows_now = max([self._rows_now, *map(len, positions(groups, names[0]))])
         before = [(group, {name: group[name] for name in SETTINGS if name in group}) for group in groups]
-        self._under_way[key] = _Step(before, self._put_back_first(optimizer), self._put_back_for_checkpoints(optimizer))
+        self._under_way[key] = _Step(before)
+        if optimizer not in self._watched:
+            self._watched[optimizer] = self._watch(optimizer)
         for group in groups:
             longer = self._of_gaussians(group, names[0])
             if "lr" in group:
@@ -200,27 +206,23 @@ class ScaledRates:
         self._depth[key] -= 1
         if self._depth[key] == 0:
             del self._depth[key]
-            self._under_way.pop(key).end()
+            self._under_way.pop(key).put_back()
 
-    def _put_back_first(self, optimizer: torch.optim.Optimizer) -> RemovableHandle:
-        """Hooks of the trainer's own after the step, of a scheduler for example, find and set the trainer's rates."""
+    def _watch(self, optimizer: torch.optim.Optimizer) -> list[RemovableHandle]:
+        """Put the trainer's settings back before anybody else looks at them."""
+        ends = optimizer.register_step_post_hook(self._put_back_first)
+        # The trainer's own hooks after a step, of a scheduler for example, find and set its rates.
+        optimizer._optimizer_step_post_hooks.move_to_end(ends.id, last=False)  # type: ignore[attr-defined]
+        # A checkpoint is written although a step raised: it holds the trainer's rates, too.
+        return [ends, optimizer.register_state_dict_pre_hook(self._put_back_all)]
 
-        def put_back(*_: Any) -> None:
-            if self._depth.get(id(optimizer)) == 1:
-                self._under_way[id(optimizer)].put_back()
+    def _put_back_first(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        if self._depth.get(id(optimizer)) == 1:
+            self._under_way[id(optimizer)].put_back()
 
-        handle = optimizer.register_step_post_hook(put_back)
-        optimizer._optimizer_step_post_hooks.move_to_end(handle.id, last=False)  # type: ignore[attr-defined]
-        return handle
-
-    def _put_back_for_checkpoints(self, optimizer: torch.optim.Optimizer) -> RemovableHandle:
-        """One that is written after a step that raised holds the trainer's rates, too."""
-
-        def put_back(_: torch.optim.Optimizer) -> None:
-            for step in self._under_way.values():
-                step.put_back()
-
-        return optimizer.register_state_dict_pre_hook(put_back)
+    def _put_back_all(self, _: torch.optim.Optimizer) -> None:
+        for step in self._under_way.values():
+            step.put_back()
 
 
 class _Step:
@@ -228,21 +230,15 @@ class _Step:
 
     Args:
         before: Groups, and what the trainer has set there.
-        hooks: Of the optimizer, for as long as the step lasts.
     """
 
-    def __init__(self, before: list[tuple[dict[str, Any], dict[str, Any]]], *hooks: RemovableHandle) -> None:
+    def __init__(self, before: list[tuple[dict[str, Any], dict[str, Any]]]) -> None:
         self.before = before
-        self._hooks = hooks
         self._scaled = True
 
     def put_back(self) -> None:
+        """Once: what the trainer sets afterwards stays."""
         if self._scaled:
             for group, settings in self.before:
                 group.update(settings)
         self._scaled = False
-
-    def end(self) -> None:
-        for hook in self._hooks:
-            hook.remove()
-        self.put_back()

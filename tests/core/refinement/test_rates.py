@@ -251,7 +251,8 @@ def test_a_checkpoint_after_a_step_that_raised_holds_the_trainers_rates(rates):
         assert broken.param_groups[0]["lr"] == 0.5
         assert broken.state_dict() == before
         rates.rest()
-        assert not broken._optimizer_state_dict_pre_hooks
+    rates.remove()
+    assert not broken._optimizer_state_dict_pre_hooks
 
 
 def test_a_scheduler_in_a_hook_of_the_optimizer_sets_the_trainers_rate(rates):
@@ -269,6 +270,7 @@ def test_a_scheduler_in_a_hook_of_the_optimizer_sets_the_trainers_rate(rates):
         optimizer.step()
     assert found == [0.1, 0.05]
     assert optimizer.param_groups[0]["lr"] == 0.025
+    rates.remove()
     assert len(optimizer._optimizer_step_post_hooks) == 1
 
 
