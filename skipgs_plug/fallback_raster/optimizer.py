@@ -49,17 +49,21 @@ class Adam(torch.optim.Adam):
         Returns:
             What `closure` returns.
         """
-        return self._hooked_step(closure) if self._somebody_looks_on() else self._plain_step(closure)
+        if torch.autograd._profiler_enabled():
+            return self._profiled_step(closure)
+        given: tuple[Any, Any] = (self,) if closure is None else (self, closure), {}
+        for hook in (*_torchs_base._global_optimizer_pre_hooks.values(), *self._optimizer_step_pre_hooks.values()):
+            given = hook(self, *given) or given
+        args, kwargs = given
+        loss = self._plain_step(*args[1:], **kwargs)
+        for hook in (*self._optimizer_step_post_hooks.values(), *_torchs_base._global_optimizer_post_hooks.values()):
+            hook(self, args, kwargs)
+        return loss
 
     # Torch wraps a step that does not say so, for its hooks and its profiler, which takes as long as a small step.
     step.hooked = True  # type: ignore[attr-defined]
 
-    def _somebody_looks_on(self) -> bool:
-        own = self._optimizer_step_pre_hooks or self._optimizer_step_post_hooks
-        everyone = _torchs_base._global_optimizer_pre_hooks or _torchs_base._global_optimizer_post_hooks
-        return bool(own or everyone or torch.autograd._profiler_enabled())
-
-    def _plain_step(self, closure: Any) -> Any:
+    def _plain_step(self, closure: Any = None) -> Any:
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -69,7 +73,7 @@ class Adam(torch.optim.Adam):
                 self._step(group)
         return loss
 
-    _hooked_step = torch.optim.Optimizer.profile_hook_step(_plain_step)
+    _profiled_step = torch.optim.Optimizer.profile_hook_step(_plain_step)
 
     def _step(self, group: dict[str, Any]) -> None:
         grad_scale, found_inf = getattr(self, "grad_scale", None), getattr(self, "found_inf", None)

@@ -236,6 +236,24 @@ def test_hooks_of_all_optimizers_and_the_profiler_see_every_step_once() -> None:
     assert [event.count for event in profile.key_averages() if event.key == "Optimizer.step#Adam.step"] == [3]
 
 
+def test_hooks_are_called_and_may_change_arguments_as_torchs() -> None:
+    def watched(make: type[torch.optim.Adam]) -> list[Any]:
+        param = parameter((6,))
+        param.grad = torch.ones(6)
+        optimizer, seen = make([param], lr=0.1), []
+
+        def other(_: Any, args: Any, kwargs: Any) -> Any:
+            seen.append((len(args), sorted(kwargs)))
+            return (*args[:1], lambda: 7.0), kwargs
+
+        optimizer.register_step_pre_hook(other)
+        optimizer.register_step_post_hook(lambda _, args, kwargs: seen.append((len(args), sorted(kwargs))))
+        seen += [optimizer.step(), optimizer.step(lambda: 5.0)]
+        return seen
+
+    assert watched(Adam) == watched(torch.optim.Adam) == [(1, []), (2, []), (2, []), (2, []), 7.0, 7.0]
+
+
 def test_a_closure_is_called_with_gradients_on() -> None:
     param = parameter((6,))
     optimizer = Adam([param])
