@@ -51,6 +51,7 @@ class Adam(torch.optim.Adam):
         """
         if torch.autograd._profiler_enabled():
             return self._profiled_step(closure)
+        # Hooks as torch's wrapper calls them, without the note for a profiler that it makes in any case.
         given: tuple[Any, Any] = (self,) if closure is None else (self, closure), {}
         for hook in (*_torchs_base._global_optimizer_pre_hooks.values(), *self._optimizer_step_pre_hooks.values()):
             given = hook(self, *given) or given

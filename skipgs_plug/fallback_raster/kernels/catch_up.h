@@ -39,10 +39,6 @@ const auto distance = [&](v16 m, v16 s, v16 half, int step) INLINE -> v16 {
 };
 constexpr int VECTORS = 3;
 static_assert(VECTORS * 16 == 3 * (BANDS + 1) && FACTOR == 4, "an outer product fills a row");
-// Bands times three channels, channel by channel.
-const auto outer_product = [](v16 bands, v4 color, v16* to) INLINE {
-    interleave3(bands * color.x, bands * color.y, bands * color.z, (float*)to);
-};
 alignas(64) float bands[16][16];  // of the next rows, beside the constant one
 for (int i = first; i < last; ++i) {
     if (with_gradient && (i - first) % 16 == 0) {
@@ -64,7 +60,8 @@ for (int i = first; i < last; ++i) {
     if (with_gradient) {
         const v4 color = *(const v4*)(colors + (long long)FACTOR * i);
         const bool received = color.x != 0.0f || color.y != 0.0f || color.z != 0.0f;
-        outer_product(received ? load(bands[(i - first) % 16]) : (v16)0.0f, color, product);
+        const v16 basis = received ? load(bands[(i - first) % 16]) : (v16)0.0f;
+        interleave3(basis * color.x, basis * color.y, basis * color.z, (float*)product);  // channel by channel
     }
     const float* g_row = (const float*)product;
     float padded[4][16];
