@@ -15,7 +15,7 @@ BLOCK = 512
 RECORD = 16
 
 # Numbers of the place of a Gaussian among the tiles: the first tile of the box around it, and which of its tiles it
-# meets, as bits, where they are at most 2 x 2; -1 where they are more.
+# meets, as bits, where they are few (`kernels/box_tiles.h`); -1 where they are more.
 PLACE = 2
 
 # Numbers of the box of tiles around a larger one: its first and last column, its first and last row.

@@ -1,5 +1,6 @@
 // Lists the pairs of each tile, as yet in the order of the rows: depth in the upper half, number of the pair in the lower.
 // Pairs are numbered by row and tile. Depths are positive, so their bits sort like integers.
+#include "box_tiles.h"
 #include "ellipse.h"
 #include "slice_begin.h"
 #include "tile_ranges.h"
@@ -16,9 +17,8 @@ for (int s = first; s < last; ++s) {
         if (meets >= 0) {
             int* corner = next + places[(long long)PLACE * k];
             for (int rest = meets; rest; rest &= rest - 1) {
-                const int j = __builtin_ctz(rest);
                 pair_record[pair] = k;
-                unsorted[corner[(j >> 1) * tiles_x + (j & 1)]++] = key | (unsigned)pair++;
+                unsorted[corner[offset[__builtin_ctz(rest)]]++] = key | (unsigned)pair++;
             }
             continue;
         }

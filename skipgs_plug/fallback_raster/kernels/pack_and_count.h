@@ -1,5 +1,6 @@
 // Records of the visible rows that have pairs, one after the other, their places among the tiles, and the number of pairs
 // of each tile, by slice of the rows. Where `limited`, only pairs whose depths lie in the range of their tile count.
+#include "box_tiles.h"
 #include "ellipse.h"
 #include "slice_begin.h"
 #include "tile_ranges.h"
@@ -51,27 +52,39 @@ for (int s = first; s < last; ++s) {
         const i16 first_column = left >> 4, last_column = right >> 4, first_row = top >> 4, last_row = bottom >> 4;
         *(i16*)box[0] = first_column, *(i16*)box[1] = last_column, *(i16*)box[2] = first_row;
         *(i16*)box[3] = last_row;
-        // Which of the four tiles of a box of at most 2 x 2 the ellipse meets, or a hair more: a convex function is least
-        // at the point nearest to the centre or on an edge that faces it.
-        i16 meets = (i16)0;
-        for (int j = 0; j < 4; ++j) {
-            const v16 x0 = 16.0f * __builtin_convertvector(first_column + j % 2, v16) + 0.5f - mx, x1 = x0 + 15.0f;
-            const v16 y0 = 16.0f * __builtin_convertvector(first_row + j / 2, v16) + 0.5f - my, y1 = y0 + 15.0f;
-            const v16 near_x = vmax(x0, vmin(x1, (v16)0.0f)), near_y = vmax(y0, vmin(y1, (v16)0.0f));
-            const v16 at_y = vmax(y0, vmin(y1, -steepness * near_x)), at_x = vmax(x0, vmin(x1, -slope * near_y));
-            const v16 p = along * (near_x + slope * at_y), w = across * at_y;
-            const v16 q = along * (at_x + slope * near_y), u = across * near_y;
-            const i16 meets_it = (vmin(p * p + w * w, q * q + u * u) <= reach + 0.01f) | !(shortcuts & EXACT_TILES);
-            const i16 in_box = (first_column + j % 2 <= last_column) & (first_row + j / 2 <= last_row);
-            meets |= meets_it & in_box & (1 << j);
+        // Which tiles of a small box the ellipse meets, or a hair more: those between the leftmost and the rightmost point of
+        // its part in each row of tiles, which is convex.
+        const i16 columns = last_column - first_column, lines = last_row - first_row;
+        const i16 small = (columns < BOX_COLUMNS) & (lines < BOX_ROWS);
+        const v16 extreme = -steepness * half_w, inverse_h = 1.0f / half_h;
+        const v16 chord = vsqrt(vmax(reach, (v16)0.0f)) / along;
+        i16 meets = (i16)0, met = (i16)0;
+        const int deepest = __builtin_reduce_max(small ? lines : (i16)0);
+        for (int r = 0; r <= deepest; ++r) {
+            i16 left = (i16)0, right = columns;
+            if (shortcuts & EXACT_TILES) {
+                const v16 y = 16.0f * __builtin_convertvector(first_row + r, v16) + 0.5f - my;
+                const v16 low = vmax(y, -half_h), high = vmin(y + 15.0f, half_h);
+                const auto edge = [&](v16 outermost, v16 chord) INLINE -> v16 {
+                    const v16 dy = vmin(vmax(outermost, low), high), t = dy * inverse_h;
+                    return mx - dy * slope + chord * vsqrt(vmax(1.0f - t * t, (v16)0.0f));
+                };
+                const v16 x0 = __builtin_elementwise_ceil(edge(-extreme, -chord) - 0.51f);
+                const v16 x1 = __builtin_elementwise_floor(edge(extreme, chord) - 0.49f);
+                left = vmax((clamped(x0, 0.0f, width) >> 4) - first_column, left);
+                right = vmin((clamped(x1, -1.0f, width - 1.0f) >> 4) - first_column, right);
+            }
+            right = vmin(right, (i16)(BOX_COLUMNS - 1));
+            const i16 hit = small & (r <= lines) & (left <= right);
+            meets |= hit & ((((i16)2 << right) - ((i16)1 << vmin(left, right))) << BOX_COLUMNS * r);
+            met += hit & (right - left + 1);
         }
-        const i16 small = (last_column - first_column <= 1) & (last_row - first_row <= 1);
         meets = empty ? (i16)0 : (small ? meets : (i16)-1);
+        met = meets > 0 ? met : (i16)0;
         const i16 corner = first_row * tiles_x + first_column;
 
         // All tiles of a large ellipse are found with its record, to count them where `dense`.
         const i16 wanted = (meets != 0) & (near | ((meets < 0) & (dense ? -1 : 0)));
-        const i16 met = (meets & 1) + (meets >> 1 & 1) + (meets >> 2 & 1) + (meets >> 3 & 1);
         if (dense) scatter((float*)tiles_per_gauss, row, (v16)met, lanes);
         const unsigned chosen = bits(wanted) & ((1u << lanes) - 1);
         if (!chosen) continue;
@@ -85,10 +98,11 @@ for (int s = first; s < last; ++s) {
         alignas(64) int place[16][PLACE], upper[16][2], lower[16][2], below[16], key[16];
         interleave2((v16)corner, (v16)meets, (float*)place[0]);
         interleave2((v16)(meets & 1), (v16)(meets >> 1 & 1), (float*)upper[0]);
-        interleave2((v16)(meets >> 2 & 1), (v16)(meets >> 3 & 1), (float*)lower[0]);
+        interleave2((v16)(meets >> BOX_COLUMNS & 1), (v16)(meets >> (BOX_COLUMNS + 1) & 1), (float*)lower[0]);
         *(i16*)below = last_row > first_row ? corner + tiles_x : (i16)tiles;
         *(i16*)key = depth;
-        if (chosen == 0xffff && !limited && !any(meets < 0)) {
+        const unsigned tiny = bits((meets & ~TWO_BY_TWO) == 0);  // a tile of each or two, in both directions
+        if (chosen == 0xffff && tiny == 0xffff && !limited) {
             int* own = places + (long long)PLACE * (begin + found);
             for (int l = 0; l < 16; ++l) {
                 *(v2*)(own + PLACE * l) = *(const v2*)place[l];
@@ -107,15 +121,16 @@ for (int s = first; s < last; ++s) {
             int own_meets = place[l][1], pairs = 0;
             float* own_record = records + (long long)RECORD * (begin + found);  // the next one's where this has no pairs
             store(own_record, record[l]);
-            if (own_meets >= 0) {
+            if (!limited && (tiny >> l & 1)) {
+                add_two(count + corner, upper[l]);
+                add_two(count + below[l], lower[l]);
+                pairs = __builtin_popcount(own_meets);
+            } else if (own_meets >= 0) {
                 for (int todo = limited ? own_meets : 0; todo; todo &= todo - 1) {
                     const int j = __builtin_ctz(todo);
-                    if (!in_range(ranges, corner + (j >> 1) * tiles_x + (j & 1), key[l])) own_meets &= ~(1 << j);
+                    if (!in_range(ranges, corner + offset[j], key[l])) own_meets &= ~(1 << j);
                 }
-                for (int todo = own_meets; todo; todo &= todo - 1) {
-                    const int j = __builtin_ctz(todo);
-                    ++count[corner + (j >> 1) * tiles_x + (j & 1)];
-                }
+                for (int todo = own_meets; todo; todo &= todo - 1) ++count[corner + offset[__builtin_ctz(todo)]];
                 pairs = __builtin_popcount(own_meets);
             } else {
                 int met = 0;
