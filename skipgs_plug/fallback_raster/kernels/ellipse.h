@@ -1,48 +1,50 @@
-// The tiles that the ellipse at alpha = ALPHA_MIN of one Gaussian crosses.
+// The tiles that ellipses at alpha = ALPHA_MIN cross, or a hair more.
 //
 // Two kernels ask, one to count and one to write where that count made room: they must find the same tiles to the last
 // bit. No multiplication and addition are fused here, because Clang may fuse them differently in two places.
-struct Ellipse {
-    float mx, my, half_h;          // centre and half height of its box, pixels
-    float slope, extreme;          // dx / dy of the line of its outermost points in a row; dy of the outermost of all
-    float inverse_h, chord;
-    float width;
-    int box_left, box_right;  // columns of tiles that its box crosses
-    int first_row, last_row;  // rows of tiles
-    bool whole;               // take every tile of the box
+struct Ellipses {
+    v16 mx, my, half_h;  // centres and half heights of their boxes, pixels
+    v16 slope, extreme;  // dx / dy of the line of the outermost points in a row; dy of the outermost of all
+    v16 inverse_h, chord;
 
-    // `r` is its record, see `constants.RECORD`, and `box` the tiles of its box: left, right, first and last row. Not
-    // `exact`, it crosses every tile of its box.
-    Ellipse(const float* r, const int* box, float width, bool exact)
-        : width(width), box_left(box[0]), box_right(box[1]), first_row(box[2]), last_row(box[3]) {
-#pragma clang fp contract(off)
-        // Small ones need no more than their bounding box.
-        whole = box_left == box_right || first_row >= last_row || !exact;
-        if (whole) return;
-        mx = r[0], my = r[1], half_h = r[6], slope = r[12], extreme = r[13] * r[7];
-        inverse_h = 1.0f / half_h;
-        chord = sqrtf(fmaxf(r[14], 0.0f)) / r[2];
-    }
+    // The last six as in a record, see `constants.RECORD`.
+    Ellipses(v16 mx, v16 my, v16 along, v16 half_h, v16 half_w, v16 slope, v16 steepness, v16 reach)
+        : mx(mx), my(my), half_h(half_h), slope(slope), extreme(steepness * half_w), inverse_h(1.0f / half_h),
+          chord(vsqrt(vmax(reach, (v16)0.0f)) / along) {}
 
-    // x of its edge on one side (-1 left, 1 right), `dy` below its centre:
+    // x of the edges on one side (-1 left, 1 right), `dy` below the centres:
     // x(dy) = mx + dy slope +- chord sqrt(1 - (dy / half_h)^2), farthest out at dy = -+extreme.
-    float edge(float dy, float side) const {
+    v16 edge(v16 dy, float side) const {
 #pragma clang fp contract(off)
-        const float t = dy * inverse_h;
-        return mx + dy * slope + side * chord * sqrtf(fmaxf(1.0f - t * t, 0.0f));
+        const v16 t = dy * inverse_h;
+        return mx + dy * slope + side * chord * vsqrt(vmax(1.0f - t * t, (v16)0.0f));
     }
 
-    // Tiles [left, right] of tile row `ty`.
-    void columns(int ty, int& left, int& right) const {
+    // Columns [left, right] of tiles in which the part in row `ty` of tiles lies, which is convex.
+    void columns(i16 ty, float width, i16& left, i16& right) const {
 #pragma clang fp contract(off)
-        left = box_left;
-        right = box_right;
-        if (whole) return;
-        const float low = fmaxf(TILE * (float)ty + 0.5f - my, -half_h);
-        const float high = fminf(TILE * (float)ty + (TILE - 0.5f) - my, half_h);
-        const float x0 = edge(fminf(fmaxf(-extreme, low), high), -1.0f) - 0.51f;
-        const float x1 = edge(fminf(fmaxf(extreme, low), high), 1.0f) - 0.49f;
-        left = larger(left, (int)fminf(fmaxf(ceilf(x0), 0.0f), width) / TILE);
-        right = smaller(right, x1 < 0.0f ? -1 : (int)floorf(fminf(x1, width - 1.0f)) / TILE);
+        const v16 top = 16.0f * __builtin_convertvector(ty, v16) + 0.5f - my;
+        const v16 low = vmax(top, -half_h), high = vmin(top + 15.0f, half_h);
+        const v16 x0 = edge(vmin(vmax(-extreme, low), high), -1.0f) - 0.51f;
+        const v16 x1 = edge(vmin(vmax(extreme, low), high), 1.0f) - 0.49f;
+        static_assert(TILE == 16, "pixels to tiles");
+        left = __builtin_convertvector(vmin(vmax(__builtin_elementwise_ceil(x0), (v16)0.0f), (v16)width), i16) >> 4;
+        right = __builtin_convertvector(vmax(__builtin_elementwise_floor(vmin(x1, (v16)(width - 1.0f))), (v16)-1.0f), i16) >> 4;
+    }
+};
+
+// Tells `take` the tiles of `box` (first and last column, first and last row) that the ellipse of record `r` crosses, row by
+// row, or all of them.
+static constexpr auto each_tile = [](const float* r, const int* box, float width, int tiles_x, bool all, auto take) INLINE {
+    const Ellipses ellipse(r[0], r[1], r[2], r[6], r[7], r[12], r[13], r[14]);
+    const i16 following = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+    for (int row = box[2]; row <= box[3]; row += 16) {
+        i16 left, right;
+        ellipse.columns(row + following, width, left, right);
+        alignas(64) int from[16], to[16];
+        *(i16*)from = all ? (i16)box[0] : vmax(left, (i16)box[0]);
+        *(i16*)to = all ? (i16)box[1] : vmin(right, (i16)box[1]);
+        for (int l = 0; l < 16 && row + l <= box[3]; ++l)
+            for (int column = from[l]; column <= to[l]; ++column) take((row + l) * tiles_x + column);
     }
 };

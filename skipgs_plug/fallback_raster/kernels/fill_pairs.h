@@ -8,6 +8,16 @@ for (int s = first; s < last; ++s) {
     int* next = counts + (long long)s * (tiles_x * tiles_y + SPARE_COUNTS);
     int pair = (int)totals[s];
     const int begin = slice_begin(s, n, slices), end = slice_begin(s + 1, n, slices);
+    // Not inlined: few are large, and the loop of the others has registers enough without it.
+    const auto list_larger = [=](int k, int* next, long long key, int pair) __attribute__((noinline)) -> int {
+        const bool all = !(shortcuts & EXACT_TILES);
+        each_tile(records + (long long)RECORD * k, boxes + (long long)BOX * k, width, tiles_x, all, [&](int tile) INLINE {
+            if (limited && !in_range(ranges, tile, (int)(key >> 32))) return;
+            pair_record[pair] = k;
+            unsorted[next[tile]++] = key | (unsigned)pair++;
+        });
+        return pair;
+    };
     int i = begin;
     for (int k = begin; k < begin + listed_count[s]; ++k) {
         while (i <= listed[k]) pair_start[i++] = pair;
@@ -22,17 +32,7 @@ for (int s = first; s < last; ++s) {
             }
             continue;
         }
-        const int* box = boxes + (long long)BOX * k;
-        const Ellipse ellipse(records + (long long)RECORD * k, box, width, shortcuts & EXACT_TILES);
-        for (int ty = ellipse.first_row; ty <= ellipse.last_row; ++ty) {
-            int left, right;
-            ellipse.columns(ty, left, right);
-            for (int tile = ty * tiles_x + left; tile <= ty * tiles_x + right; ++tile) {
-                if (limited && !in_range(ranges, tile, depth)) continue;
-                pair_record[pair] = k;
-                unsorted[next[tile]++] = key | (unsigned)pair++;
-            }
-        }
+        pair = list_larger(k, next, key, pair);
     }
     while (i < end) pair_start[i++] = pair;
     if (s == slices - 1) pair_start[n] = pair;

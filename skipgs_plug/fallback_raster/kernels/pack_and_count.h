@@ -52,29 +52,17 @@ for (int s = first; s < last; ++s) {
         const i16 first_column = left >> 4, last_column = right >> 4, first_row = top >> 4, last_row = bottom >> 4;
         *(i16*)box[0] = first_column, *(i16*)box[1] = last_column, *(i16*)box[2] = first_row;
         *(i16*)box[3] = last_row;
-        // Which tiles of a small box the ellipse meets, or a hair more: those between the leftmost and the rightmost point of
-        // its part in each row of tiles, which is convex.
+        // Which tiles of a small box the ellipse meets.
         const i16 columns = last_column - first_column, lines = last_row - first_row;
         const i16 small = (columns < BOX_COLUMNS) & (lines < BOX_ROWS);
-        const v16 extreme = -steepness * half_w, inverse_h = 1.0f / half_h;
-        const v16 chord = vsqrt(vmax(reach, (v16)0.0f)) / along;
+        const Ellipses ellipses(mx, my, along, half_h, half_w, -slope, -steepness, reach);
         i16 meets = (i16)0, met = (i16)0;
         const int deepest = __builtin_reduce_max(small ? lines : (i16)0);
         for (int r = 0; r <= deepest; ++r) {
-            i16 left = (i16)0, right = columns;
-            if (shortcuts & EXACT_TILES) {
-                const v16 y = 16.0f * __builtin_convertvector(first_row + r, v16) + 0.5f - my;
-                const v16 low = vmax(y, -half_h), high = vmin(y + 15.0f, half_h);
-                const auto edge = [&](v16 outermost, v16 chord) INLINE -> v16 {
-                    const v16 dy = vmin(vmax(outermost, low), high), t = dy * inverse_h;
-                    return mx - dy * slope + chord * vsqrt(vmax(1.0f - t * t, (v16)0.0f));
-                };
-                const v16 x0 = __builtin_elementwise_ceil(edge(-extreme, -chord) - 0.51f);
-                const v16 x1 = __builtin_elementwise_floor(edge(extreme, chord) - 0.49f);
-                left = vmax((clamped(x0, 0.0f, width) >> 4) - first_column, left);
-                right = vmin((clamped(x1, -1.0f, width - 1.0f) >> 4) - first_column, right);
-            }
-            right = vmin(right, (i16)(BOX_COLUMNS - 1));
+            i16 left = first_column, right = last_column;
+            if (shortcuts & EXACT_TILES) ellipses.columns(first_row + r, width, left, right);
+            left = vmax(left - first_column, (i16)0);
+            right = vmin(right - first_column, vmin(columns, (i16)(BOX_COLUMNS - 1)));
             const i16 hit = small & (r <= lines) & (left <= right);
             meets |= hit & ((((i16)2 << right) - ((i16)1 << vmin(left, right))) << BOX_COLUMNS * r);
             met += hit & (right - left + 1);
@@ -136,14 +124,10 @@ for (int s = first; s < last; ++s) {
                 int met = 0;
                 int* own = boxes + (long long)BOX * (begin + found);
                 for (int j = 0; j < BOX; ++j) own[j] = box[j][l];
-                const Ellipse ellipse(own_record, own, width, shortcuts & EXACT_TILES);
-                for (int ty = ellipse.first_row; ty <= ellipse.last_row; ++ty) {
-                    int left, right;
-                    ellipse.columns(ty, left, right);
-                    if (right >= left) met += right - left + 1;
-                    for (int tile = ty * tiles_x + left; tile <= ty * tiles_x + right; ++tile)
-                        if (!limited || in_range(ranges, tile, key[l])) ++count[tile], ++pairs;
-                }
+                each_tile(own_record, own, width, tiles_x, !(shortcuts & EXACT_TILES), [&](int tile) INLINE {
+                    ++met;
+                    if (!limited || in_range(ranges, tile, key[l])) ++count[tile], ++pairs;
+                });
                 if (dense) tiles_per_gauss[row[l]] = met;
             }
             of_slice += pairs;
