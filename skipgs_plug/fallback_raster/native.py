@@ -8,6 +8,7 @@ import functools
 import importlib
 import linecache
 import os
+import struct
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ class Kernel(NamedTuple):
 
     run: Callable[..., None]
     bounds: Any
-    block: type[ctypes.Structure]  # its parameters, in their order
+    block: Callable[..., ctypes.Structure]  # of its parameters, in their order
     addresses: tuple[int, int]  # of the function and of the bounds
     command: Any  # of Warp; the code stays loaded as long as it lives
 
@@ -66,11 +67,27 @@ def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:
 
     command = load_or_rebuild(folder, load, kernel.module.unload)
     bounds, *values = command.params
-    fields = [(parameter, type(value)) for parameter, value in zip(parameters, values, strict=True)]
-    block = type(f"{name}_parameters", (ctypes.Structure,), {"_fields_": fields})
+    block = _block(f"{name}_parameters", dict(zip(parameters, map(type, values), strict=True)))
     run = command.hooks.forward
     addresses = ctypes.cast(run, ctypes.c_void_p).value or 0, ctypes.addressof(bounds)
     return Kernel(run, ctypes.byref(bounds), block, addresses, command)
+
+
+def _block(name: str, kinds: dict[str, Any]) -> Callable[..., ctypes.Structure]:
+    """Makes structures of these fields, of the simple types of ctypes, from their values."""
+    structure = type(name, (ctypes.Structure,), {"_fields_": list(kinds.items())})
+    # ctypes looks for the names of fields one by one, far from the caches.
+    layout = struct.Struct("".join(kind._type_ for kind in kinds.values()))
+
+    def fill(*values: int | float) -> ctypes.Structure:
+        block = structure()
+        try:
+            layout.pack_into(block, 0, *values)
+        except OverflowError:  # beyond float32, which is infinite to ctypes
+            return structure(*values)
+        return block
+
+    return fill
 
 
 @functools.cache
