@@ -9,10 +9,9 @@ alpha = 1/255 really crosses it (exact bounds per row of tiles, `kernels/ellipse
 from dataclasses import dataclass
 from typing import Annotated
 
-import torch
 from torch import Tensor
 
-from .buffers import floats, ints, longs, zeros
+from .buffers import floats, ints, longs
 from .constants import BOX, MAX_CHANNELS, PLACE, RECORD, SPARE_COUNTS, tiles
 from .launch import FloatArray, IntArray, LongArray, worker
 from .shortcuts import active_shortcuts
@@ -58,7 +57,7 @@ def pack_and_count(
     boxes: Annotated[IntArray, "n, BOX"],  # out, only of larger ones
     counts: Annotated[IntArray, "slices, tiles_x * tiles_y + SPARE_COUNTS"],  # out
     totals: Annotated[LongArray, "slices + 1"],  # out, pairs of each slice
-    tiles_per_gauss: Annotated[IntArray, "R if dense else 0"],  # out, zeros before
+    tiles_per_gauss: Annotated[IntArray, "R if dense else 0"],  # out
     n: int,
     rows: int,
     stride: int,
@@ -99,6 +98,7 @@ def fill_pairs(
     totals: Annotated[LongArray, "slices + 1"],
     pair_start: Annotated[IntArray, "n + 1"],  # out
     pair_record: Annotated[IntArray, "P"],  # out
+    pair_slot: Annotated[IntArray, "P"],  # out, zeros
     unsorted: Annotated[LongArray, "P"],  # out, depth and number of each pair
     n: int,
     rows: int,
@@ -137,6 +137,7 @@ class Bins:
         tile_place: [P] int32, number of the pair; pairs are numbered by row and tile.
         pair_start: [M + 1] int32, number of each visible Gaussian's first pair.
         pair_record: [P] int32, record of each pair.
+        pair_slot: [P] int32, zeros, for the adjoint.
         unsorted: [P] int64, depth and number of the pairs of each tile.
         tiles_per_gauss: [R] int32, number of tiles of every row.
     """
@@ -150,6 +151,7 @@ class Bins:
     tile_place: Tensor
     pair_start: Tensor
     pair_record: Tensor
+    pair_slot: Tensor
     unsorted: Tensor
     tiles_per_gauss: Tensor
 
@@ -201,7 +203,7 @@ def bin_gaussians(
     records, listed, listed_count = floats(n, RECORD), ints(n), ints(slices)
     places, boxes, counts = ints(n, PLACE), ints(n, BOX), ints(slices, tiles_x * tiles_y + SPARE_COUNTS)
     tile_start, pair_start = ints(tiles_x * tiles_y + 1), ints(n + 1)
-    tiles_per_gauss, totals = zeros(rows if dense else 0, dtype=torch.int32), longs(slices + 1)
+    tiles_per_gauss, totals = ints(rows if dense else 0), longs(slices + 1)
     pack_and_count(
         visible, means2d, depths, conics, opacities, sigmas, colors, ranges, records, listed, listed_count, places,
         boxes, counts, totals, tiles_per_gauss,
@@ -209,19 +211,20 @@ def bin_gaussians(
         int(dense), int(limited), active_shortcuts(),
     )  # fmt: skip
     scan_pairs(counts, totals, tile_start, slices, tiles_x * tiles_y)
-    pairs = int(totals[-1])
+    pairs = totals.tolist()[-1]
     covered = before + pairs
     if covered > MAX_PAIRS:
         raise ValueError(
             f"{n:,} visible Gaussians cover {covered:,} tiles of an image of {width}x{height} pixels in all, at most "
             f"{MAX_PAIRS:,} can be listed: render a smaller image, or fewer or smaller Gaussians."
         )
-    pair_record, unsorted = ints(pairs), longs(pairs)
+    pair_record, pair_slot, unsorted = ints(pairs), ints(pairs), longs(pairs)
     fill_pairs(
         visible, depths, records, listed, listed_count, places, boxes, ranges, counts, totals, pair_start, pair_record,
-        unsorted, n, rows, slices, float(width), tiles_x, tiles_y, int(limited), active_shortcuts(),
+        pair_slot, unsorted, n, rows, slices, float(width), tiles_x, tiles_y, int(limited), active_shortcuts(),
     )  # fmt: skip
     lists = ints(pairs), ints(pairs)
     return Bins(
-        visible, listed, listed_count, records, tile_start, *lists, pair_start, pair_record, unsorted, tiles_per_gauss
-    )
+        visible, listed, listed_count, records, tile_start, *lists, pair_start, pair_record, pair_slot, unsorted,
+        tiles_per_gauss,
+    )  # fmt: skip

@@ -80,7 +80,7 @@ def _backward(channels: int, absgrad: bool) -> Worker:
         tile_list: Annotated[IntArray, "P"],
         tile_place: Annotated[IntArray, "P"],
         pair_blocks: Annotated[IntArray, "P"],
-        slot_start: Annotated[IntArray, "parts * tiles_x * tiles_y + 1"],
+        slot_end: Annotated[IntArray, "parts * tiles_x * tiles_y"],  # of each tile, in the order of the lists
         transmittance: Annotated[FloatArray, "height, width"],
         pixel_stop: Annotated[IntArray, "height, width"],
         v_image: Annotated[FloatArray, "height, width, stride"],

@@ -42,6 +42,7 @@ class Pass:
             tile_list=torch.cat([first.tile_list, own.tile_list]),
             tile_place=torch.cat([first.tile_place, own.tile_place + pairs]),
             pair_start=own.pair_start + pairs,
+            pair_slot=torch.cat([first.pair_slot, own.pair_slot]),
         )
         pair_blocks = torch.cat([near.pair_blocks, self.pair_blocks])
         return Pass(bins, self.block_start, self.tile_stop + pairs, self.tile_blended, pair_blocks)
@@ -179,12 +180,11 @@ def pair_sums(
     v_transmittance = floats(0, width) if v_transmittance is None else v_transmittance.contiguous()
     # Behind the surface most pairs are not blended: they have no sums.
     per_tile = near.tile_blended if parts == 1 else torch.cat([near.tile_blended, last.tile_blended])
-    slot_start, pair_slot = zeros(len(per_tile) + 1, dtype=torch.int32), zeros(len(lists.tile_list), dtype=torch.int32)
-    torch.cumsum(per_tile, 0, out=slot_start[1:])
-    v_pairs = scratch("v_pairs", int(slot_start[-1]), PAIR)
+    slot_end = per_tile.cumsum(0, dtype=torch.int32)
+    v_pairs = scratch("v_pairs", int(slot_end[-1]), PAIR)
     sums = PairSums(
         bins.visible, near.block_start, bins.pair_start, lists.visible, last.block_start, lists.pair_start,
-        pair_slot, v_pairs,
+        lists.pair_slot, v_pairs,
     )  # fmt: skip
     for channel in range(0, channels, MAX_CHANNELS):
         some = min(MAX_CHANNELS, channels - channel)
@@ -192,8 +192,8 @@ def pair_sums(
             bins.pack_colors(colors, channel, some)
         backward_worker(some, with_absolute)(
             bins.records, bins.tile_start, near.tile_stop, lists.records, lists.tile_start, last.tile_stop,
-            lists.tile_list, lists.tile_place, last.pair_blocks, slot_start, transmittance, blended.pixel_stop,
-            v_image, v_transmittance, pair_slot, v_pairs,
+            lists.tile_list, lists.tile_place, last.pair_blocks, slot_end, transmittance, blended.pixel_stop,
+            v_image, v_transmittance, lists.pair_slot, v_pairs,
             *size, channels, channel, some, int(len(v_transmittance) > 0), parts, active_shortcuts(),
         )  # fmt: skip
         yield channel, some, sums

@@ -32,7 +32,7 @@ for (int t = first; t < last; ++t) {
     for (int part = parts - 1; part >= 0; --part) {
         const int begin = part ? far_start[t] : tile.begin, tile_end = part ? far_stop[t] : tile_stop[t];
         const float* own = part ? far_records : records;
-        int slot = slot_start[part * tiles_x * tiles_y + t + 1];
+        int slot = slot_end[part * tiles_x * tiles_y + t];
         for (int k = tile_end - 1; k >= begin; --k) {
             __builtin_prefetch(own + (long long)RECORD * tile_list[larger(k - 8, begin)]);
             if (!pair_blocks[k]) continue;

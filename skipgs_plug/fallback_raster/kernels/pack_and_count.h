@@ -17,6 +17,10 @@ for (int s = first; s < last; ++s) {
     long long of_slice = 0;
     int found = 0;
     const int begin = slice_begin(s, n, slices), end = slice_begin(s + 1, n, slices);
+    if (dense) {
+        const int row_begin = s > 0 ? visible[begin] : 0, row_end = s < slices - 1 ? visible[end] : rows;
+        clear((float*)tiles_per_gauss + row_begin, row_end - row_begin);
+    }
     for (int i = begin; i < end; i += 16) {
         const int lanes = smaller(16, end - i);
         int row[16];
