@@ -174,7 +174,7 @@ class Pack(torch.autograd.Function):
 
 
 class Blend(torch.autograd.Function):
-    """Image [1, H, W, D] of one camera, the transmittance [1, H, W, 1] behind it, and tiles_per_gauss [R].
+    """Image [1, H, W, D] and alpha [1, H, W, 1] of one camera, and tiles_per_gauss [R].
 
     Tensors of rows may have a dimension of one camera in front: views of them, whose gradients are views too, would
     take as long as a small kernel. `absolute` [R, 2] receives the sum over pixels of |v_means2d| (AbsGS) when it is
@@ -196,7 +196,7 @@ class Blend(torch.autograd.Function):
         height: int,
         absolute: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        image, transmittance, ctx.blended = blend(
+        image, transmittance, alpha, ctx.blended = blend(
             means2d, conics, opacities, colors, depths, sigmas, visible, block_start, width, height
         )
         ctx.save_for_backward(means2d, conics, opacities, colors, transmittance)
@@ -205,20 +205,20 @@ class Blend(torch.autograd.Function):
             "conics": conics.shape,
             "opacities": opacities.shape,
             "colors": colors.shape,
-            "alphas": transmittance.shape,
         }
         ctx.absolute = absolute
         tiles_per_gauss = ctx.blended.near.bins.tiles_per_gauss
         ctx.mark_non_differentiable(tiles_per_gauss)
         ctx.set_materialize_grads(False)  # no zeros for tiles_per_gauss, which has a number for each row
-        return image, transmittance, tiles_per_gauss
+        return image, alpha, tiles_per_gauss
 
     @staticmethod
     @once_differentiable
     def backward(  # type: ignore[override]
-        ctx: Any, v_image: Tensor | None, v_transmittance: Tensor | None, _: Any
+        ctx: Any, v_image: Tensor | None, v_alpha: Tensor | None, _: Any
     ) -> Any:
         means2d, conics, opacities, colors, transmittance = check_shapes(ctx.saved_tensors, **ctx.shapes)
+        v_transmittance = None if v_alpha is None else -v_alpha
         gradients = blend_adjoint(
             ctx.blended, means2d, conics, opacities, colors, transmittance, v_image, v_transmittance, ctx.absolute
         )

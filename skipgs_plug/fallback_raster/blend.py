@@ -39,6 +39,7 @@ def _forward(channels: int) -> Worker:
         tile_place: Annotated[IntArray, "P"],
         image: Annotated[FloatArray, "height, width, stride"],  # out
         transmittance: Annotated[FloatArray, "height, width"],  # out, behind the last Gaussian blended
+        alpha: Annotated[FloatArray, "height if with_alpha else 0, width"],  # out, 1 - transmittance
         pixel_stop: Annotated[IntArray, "height, width"],  # out, place in tile_list behind the last Gaussian blended
         tile_stop: Annotated[IntArray, "tiles_x, tiles_y"],  # out, their maximum
         tile_blended: Annotated[IntArray, "tiles_x, tiles_y"],  # out, pairs that were blended
@@ -56,6 +57,7 @@ def _forward(channels: int) -> Worker:
         before: int,  # pairs of the lists in front of these, where an earlier pass ended
         continued: int,  # whether there was one
         unfinished: int,  # whether there may be a later one
+        with_alpha: int,
         shortcuts: int,
     ) -> None: ...
 

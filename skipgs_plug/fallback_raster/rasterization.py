@@ -251,16 +251,15 @@ def _render_camera(
     channels = [] if features is None else [features]
     if with_depth:
         channels.append(depths.reshape(-1, 1))
-    image, transmittance, tiles_per_gauss = Blend.apply(
+    image, alpha, tiles_per_gauss = Blend.apply(
         means2d, conics, opacities, torch.cat(channels, 1) if len(channels) > 1 else channels[0],
         depths, sigmas, visible, block_start, width, height, absolute,
     )  # fmt: skip
-    alpha = 1.0 - transmittance
     if background is not None and features is not None:
         behind = background.to(torch.float32)
         if with_depth:
             behind = torch.cat([behind, behind.new_zeros(1)])
-        image = image + transmittance * behind
+        image = image + (1.0 - alpha) * behind
     if render_mode.endswith("ED"):
         expected = image[..., -1:] / alpha.clamp(min=1e-10)
         image = expected if features is None else torch.cat([image[..., :-1], expected], -1)

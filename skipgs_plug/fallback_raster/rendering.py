@@ -80,11 +80,11 @@ def blend(
     width: int,
     height: int,
     dense: bool = True,
-) -> tuple[Tensor, Tensor, Blended]:
-    """Image and the transmittance behind it.
+) -> tuple[Tensor, Tensor, Tensor, Blended]:
+    """Image, the transmittance behind it [H, W], and alpha.
 
-    Where `dense`, they are [1, H, W, D] and [1, H, W, 1], tiles are counted for all rows, and tensors of rows may have
-    a dimension of one camera in front; else they are [H, W, D] and [H, W].
+    Where `dense`, image and alpha are [1, H, W, D] and [1, H, W, 1], tiles are counted for all rows, and tensors of rows
+    may have a dimension of one camera in front; else the image is [H, W, D], and alpha is left out.
     """
     channels, size = colors.shape[1], (width, height, *tiles(width, height))
     ranges = None
@@ -92,12 +92,12 @@ def blend(
         ranges = near_ranges(visible, means2d, depths, conics, opacities, width, height)
     rows = means2d, depths, conics, opacities, sigmas, colors, width, height
     bins = bin_gaussians(visible, *rows, dense, ranges)
-    camera, channel = ((1,), (1,)) if dense else ((), ())
-    image, transmittance = floats(*camera, height, width, channels), floats(*camera, height, width, *channel)
-    pixel_stop = ints(height, width)
+    image = floats(1, height, width, channels) if dense else floats(height, width, channels)
+    alpha = floats(1, height, width, 1) if dense else floats(0)
+    transmittance, pixel_stop = floats(height, width), ints(height, width)
     limited = ranges is not None
     product_left, still_open = floats(height if limited else 0, width), ints(size[2] * size[3] if limited else 0)
-    pixels = image, transmittance, pixel_stop, product_left, still_open
+    pixels = image, transmittance, alpha, pixel_stop, product_left, still_open
 
     near = _blend_lists(bins, block_start, colors, pixels, size, 0, False, limited)
     last = near
@@ -105,7 +105,7 @@ def blend(
         rest = bin_the_rest(bins, ranges, still_open, block_start, *rows)
         if rest is not None:
             last = _blend_lists(*rest, colors, pixels, size, len(bins.tile_list), True, False).after(near)
-    return image, transmittance, Blended(near, last, pixel_stop)
+    return image, transmittance, alpha, Blended(near, last, pixel_stop)
 
 
 def _blend_lists(
@@ -119,7 +119,7 @@ def _blend_lists(
     unfinished: bool,  # whether others may follow
 ) -> Pass:
     channels, pairs = colors.shape[1], len(bins.tile_list)
-    image, transmittance, pixel_stop, product_left, still_open = pixels
+    image, transmittance, alpha, pixel_stop, product_left, still_open = pixels
     tile_stop, tile_blended, pair_blocks = ints(size[2] * size[3]), ints(size[2] * size[3]), ints(pairs)
     in_one = channels <= MAX_CHANNELS
     if not in_one:
@@ -131,9 +131,9 @@ def _blend_lists(
             bins.pack_colors(colors, channel, some)
         forward_worker(some)(
             bins.records, bins.tile_start, bins.pair_record, bins.unsorted, buffer, bins.tile_list, bins.tile_place,
-            image, transmittance, pixel_stop, tile_stop, tile_blended, pair_blocks, product_left, still_open,
+            image, transmittance, alpha, pixel_stop, tile_stop, tile_blended, pair_blocks, product_left, still_open,
             *size, channels, channel, some, int(not in_one), before, int(continued), int(unfinished),
-            active_shortcuts(),
+            int(len(alpha) > 0), active_shortcuts(),
         )  # fmt: skip
     bins.unsorted, bins.pair_record = longs(0), ints(0)  # no longer needed
     return Pass(bins, block_start, tile_stop, tile_blended, pair_blocks)

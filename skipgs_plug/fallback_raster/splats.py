@@ -175,7 +175,7 @@ class _Render(torch.autograd.Function):
         colors = floats(n, 3)
         layout = (3, 3 * shN.shape[1], 0)
         sh_forward(means, camera, sh0, shN, p.visible, p.block_start, colors, n, *layout, degree, 0)
-        image, transmittance, ctx.blended = blend(
+        image, transmittance, _, ctx.blended = blend(
             p.means2d, p.conics, p.opacities, colors, p.depths, p.sigmas, p.visible, p.block_start, *size, dense=False
         )
         ctx.save_for_backward(means, quats, log_scales, logits, sh0, shN, transmittance)

@@ -154,9 +154,11 @@ for (int t = first; t < last; ++t) {
     }
     if (unfinished) still_open[t] = open != 0;
     int tile_end = begin;
+    alignas(64) vblock covered[BLOCKS];
     for (int b = 0; b < BLOCKS; ++b) {
         tile_end = larger(tile_end, __builtin_reduce_max(stop[b]));
         stop[b] += before;
+        covered[b] = 1.0f - T[b];
     }
     tile_stop[t] = tile_end;
     tile_blended[t] = blended_here;
@@ -164,6 +166,7 @@ for (int t = first; t < last; ++t) {
         const Quad quad(tile, q, width);
         write_blocks(image + channel, quad, stride, channels, C[0], D);
         write_blocks(transmittance, quad, 1, 1, T, 1);
+        if (with_alpha) write_blocks(alpha, quad, 1, 1, covered, 1);
         write_blocks((float*)pixel_stop, quad, 1, 1, (const vblock*)stop, 1);
         if (unfinished) write_blocks(product_left, quad, 1, 1, P, 1);
     }
