@@ -28,8 +28,12 @@ struct Ellipses {
         const v16 x0 = edge(vmin(vmax(-extreme, low), high), -1.0f) - 0.51f;
         const v16 x1 = edge(vmin(vmax(extreme, low), high), 1.0f) - 0.49f;
         static_assert(TILE == 16, "pixels to tiles");
-        left = __builtin_convertvector(vmin(vmax(__builtin_elementwise_ceil(x0), (v16)0.0f), (v16)width), i16) >> 4;
-        right = __builtin_convertvector(vmax(__builtin_elementwise_floor(vmin(x1, (v16)(width - 1.0f))), (v16)-1.0f), i16) >> 4;
+        // What lies beside the image is beyond the last column, of which the image may hold a part only.
+        const auto column = [](v16 x, float low, float high) INLINE -> i16 {
+            return __builtin_convertvector(vmin(vmax(x, (v16)low), (v16)high), i16) >> 4;
+        };
+        left = column(__builtin_elementwise_ceil(x0), 0.0f, width + 15.0f);
+        right = column(__builtin_elementwise_floor(x1), -1.0f, width - 1.0f);
     }
 };
 
