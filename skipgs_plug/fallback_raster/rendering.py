@@ -83,8 +83,8 @@ def blend(
 ) -> tuple[Tensor, Tensor, Tensor, Blended]:
     """Image, the transmittance behind it [H, W], and alpha.
 
-    Where `dense`, image and alpha are [1, H, W, D] and [1, H, W, 1], tiles are counted for all rows, and tensors of rows
-    may have a dimension of one camera in front; else the image is [H, W, D], and alpha is left out.
+    Where `dense`, image and alpha are [1, H, W, D] and [1, H, W, 1], tiles are counted for all rows, and tensors of
+    rows may have a dimension of one camera in front; else the image is [H, W, D], and alpha is left out.
     """
     channels, size = colors.shape[1], (width, height, *tiles(width, height))
     ranges = None
