@@ -10,7 +10,7 @@ from torch import Tensor
 from .buffers import floats, zeros
 from .constants import BANDS
 from .launch import FloatArray, IntArray, worker
-from .optimizer import Adam, corrected, moments
+from .optimizer import Adam, moments, next_step
 from .outer_gradient import Factors, OuterGradient, plain
 from .source import read_kernel
 
@@ -183,8 +183,7 @@ class LazyAdam(Adam):
         if missed is None:
             missed = self._missed = _Missed(param, betas, eps)
         missed.require(param)
-        state["step"] += 1
-        missed.add(*corrected(float(group["lr"]), state["step"], betas))
+        missed.add(*next_step(state["step"], float(group["lr"]), betas))
         if len(factors.rows):
             missed.advance(factors.rows, factors, state)
         missed.now += 1

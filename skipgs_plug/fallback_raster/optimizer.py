@@ -99,7 +99,7 @@ class Adam(torch.optim.Adam):
     def _advance_param(self, param: Tensor, *numbers: Any) -> bool:
         if param.grad is None:
             return True
-        if not _fits(param, param):
+        if not self.state.get(param) and not _fits(param, param):  # torch's own step makes the state
             return False
         state = moments(self, param)
         return _advance(param, param.grad, state["exp_avg"], state["exp_avg_sq"], state["step"], *numbers)
@@ -114,10 +114,11 @@ def moments(optimizer: torch.optim.Optimizer, param: Tensor) -> dict[str, Tensor
     return state
 
 
-def corrected(lr: float, step: Tensor, betas: tuple[float, float]) -> tuple[float, float]:
-    """`rate` and `root` of `adam_step` in step number `step`, from 1 on: with the bias corrections of both means."""
-    first, second = (1 - beta ** step.item() for beta in betas)
-    return lr / first, second**0.5
+def next_step(step: Tensor, lr: float, betas: tuple[float, float]) -> tuple[float, float]:
+    """Counts a step; gives `rate` and `root` of `adam_step` for it, with the bias corrections of both means."""
+    count = step.item() + 1
+    step.fill_(count)  # half the time of an addition
+    return lr / (1 - betas[0] ** count), (1 - betas[1] ** count) ** 0.5
 
 
 def adam(
@@ -172,7 +173,10 @@ def instead_of_torchs_adam() -> Iterator[None]:
 
 def _plain(options: dict[str, Any], *betas: Any) -> bool:
     """Whether the options are those that `adam` knows, and the decays numbers."""
-    return not any(options.get(name) for name in _TORCHS) and not any(isinstance(beta, Tensor) for beta in betas)
+    for name in _TORCHS:
+        if options.get(name):
+            return False
+    return not any(isinstance(beta, Tensor) for beta in betas)
 
 
 def _advance(
@@ -180,10 +184,10 @@ def _advance(
     eps: float,
 ) -> bool:  # fmt: skip
     """Steps a parameter, if the kernel can read all that belongs to it; `step` is the number of steps so far."""
-    if step.device.type != "cpu" or not all(_fits(tensor, param) for tensor in (param, grad, mean, square)):
+    # One after the other, without a generator: for small parameters these questions are most of a step.
+    if not (step.is_cpu and _fits(param, param) and _fits(grad, param) and _fits(mean, param) and _fits(square, param)):
         return False
-    step += 1
-    adam_step(None, param, grad, mean, square, *corrected(lr, step, betas), betas, eps)
+    adam_step(None, param, grad, mean, square, *next_step(step, lr, betas), betas, eps)
     return True
 
 
