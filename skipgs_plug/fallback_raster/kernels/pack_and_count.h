@@ -68,7 +68,8 @@ for (int s = first; s < last; ++s) {
             left = vmax(left - first_column, (i16)0);
             right = vmin(right - first_column, vmin(columns, (i16)(BOX_COLUMNS - 1)));
             const i16 hit = small & (r <= lines) & (left <= right);
-            meets |= hit & ((((i16)2 << right) - ((i16)1 << vmin(left, right))) << BOX_COLUMNS * r);
+            left = hit ? left : (i16)0, right = hit ? right : (i16)0;  // no number is shifted by less than 0
+            meets |= hit & ((((i16)2 << right) - ((i16)1 << left)) << BOX_COLUMNS * r);
             met += hit & (right - left + 1);
         }
         meets = empty ? (i16)0 : (small ? meets : (i16)-1);
