@@ -55,6 +55,18 @@ def test_every_kernel_file_is_used_and_tested() -> None:
     assert len(WORKERS) == 32
 
 
+@worker("out[0] = small; out[1] = large; numbers[0] = 2 * number; numbers[1] = most;", items="1", grain="1")
+def _echo(out: FloatArray, numbers: IntArray, small: float, number: int, large: float, most: int) -> None: ...
+
+
+@pytest.mark.parametrize("large", [1e39, -1e39, float("inf"), 3e38, 1e-50])
+def test_numbers_arrive_as_they_are_and_beyond_float32_as_infinity(large: float) -> None:
+    out, numbers = torch.zeros(2), torch.zeros(2, dtype=torch.int32)
+    _echo(out, numbers, 0.1, -7, large, 2**31 - 1)
+    assert torch.equal(out, torch.tensor([0.1, large], dtype=torch.float64).to(torch.float32))
+    assert numbers.tolist() == [-14, 2**31 - 1]
+
+
 @pytest.mark.parametrize("name", WORKERS)
 def test_misuse_is_an_error_that_names_kernel_and_argument(name: str) -> None:
     found = WORKERS[name]
