@@ -29,11 +29,8 @@ struct Ellipses {
         const v16 x1 = edge(vmin(vmax(extreme, low), high), 1.0f) - 0.49f;
         static_assert(TILE == 16, "pixels to tiles");
         // What lies beside the image is beyond the last column, of which the image may hold a part only.
-        const auto column = [](v16 x, float low, float high) INLINE -> i16 {
-            return __builtin_convertvector(vmin(vmax(x, (v16)low), (v16)high), i16) >> 4;
-        };
-        left = column(__builtin_elementwise_ceil(x0), 0.0f, width + 15.0f);
-        right = column(__builtin_elementwise_floor(x1), -1.0f, width - 1.0f);
+        left = clamped(__builtin_elementwise_ceil(x0), 0.0f, width + 15.0f) >> 4;
+        right = clamped(__builtin_elementwise_floor(x1), -1.0f, width - 1.0f) >> 4;
     }
 };
 
@@ -41,10 +38,9 @@ struct Ellipses {
 // row, or all of them.
 static constexpr auto each_tile = [](const float* r, const int* box, float width, int tiles_x, bool all, auto take) INLINE {
     const Ellipses ellipse(r[0], r[1], r[2], r[6], r[7], r[12], r[13], r[14]);
-    const i16 following = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
     for (int row = box[2]; row <= box[3]; row += 16) {
         i16 left, right;
-        ellipse.columns(row + following, width, left, right);
+        ellipse.columns(row + __builtin_convertvector(lane, i16), width, left, right);
         alignas(64) int from[16], to[16];
         *(i16*)from = all ? (i16)box[0] : vmax(left, (i16)box[0]);
         *(i16*)to = all ? (i16)box[1] : vmin(right, (i16)box[1]);

@@ -16,7 +16,7 @@ for (int i = block_start[first]; i < end; i += 16) {
     const v16 reach = log2(vmax(gather(opacities, row, 1, 0), (v16)1e-20f)) - LOG2_ALPHA_MIN;
     const v16 half = 1.001f * vsqrt(vmax(2.0f * reach / LOG2_E, (v16)0.0f)) + 1e-3f;
     const auto tile = [](v16 x, int most) INLINE -> i16 {
-        return __builtin_convertvector(vmin(vmax(x * (1.0f / TILE), (v16)0.0f), (v16)(float)most), i16);
+        return clamped(x * (1.0f / TILE), 0.0f, (float)most);
     };
     const v16 reach_x = half * sigma[0] + 1.0f, reach_y = half * sigma[1] + 1.0f;
     const i16 left = tile(centre[0] - reach_x, tiles_x - 1), right = tile(centre[0] + reach_x, tiles_x - 1) + 1;

@@ -42,10 +42,7 @@ for (int s = first; s < last; ++s) {
         const v16 half_w = half * sigma[0], half_h = half * sigma[1];
         const v16 slope = b / a, steepness = b / c;
 
-        // Pixels whose centres the box holds. Clamped before they become integers: what lies far outside is beyond them.
-        auto clamped = [](v16 x, float low, float high) -> i16 {
-            return __builtin_convertvector(vmin(vmax(x, (v16)low), (v16)high), i16);
-        };
+        // Pixels whose centres the box holds.
         const i16 left = clamped(__builtin_elementwise_ceil(mx - half_w - 0.5f), 0.0f, width);
         const i16 right = clamped(__builtin_elementwise_floor(mx + half_w - 0.5f), -1.0f, width - 1.0f);
         const i16 top = clamped(__builtin_elementwise_ceil(my - half_h - 0.5f), 0.0f, height);

@@ -36,6 +36,10 @@ static constexpr auto bits = [](i16 mask) -> unsigned {
 static constexpr auto vmin = [](auto a, decltype(a) b) { return a < b ? a : b; };
 static constexpr auto vmax = [](auto a, decltype(a) b) { return a > b ? a : b; };
 static constexpr auto vabs = [](auto a) { return __builtin_elementwise_abs(a); };
+// Clamped before they become integers: what lies far outside is beyond them.
+static constexpr auto clamped = [](v16 x, float low, float high) INLINE -> i16 {
+    return __builtin_convertvector(vmin(vmax(x, (v16)low), (v16)high), i16);
+};
 static constexpr auto vsqrt = [](auto a) { return __builtin_elementwise_sqrt(a); };
 // Pairwise, so that the order of additions (and the result to the bit) is fixed.
 static constexpr auto sum = [](auto a) -> float {
