@@ -98,7 +98,6 @@ def fill_pairs(
     totals: Annotated[LongArray, "slices + 1"],
     pair_start: Annotated[IntArray, "n + 1"],  # out
     pair_record: Annotated[IntArray, "P"],  # out
-    pair_slot: Annotated[IntArray, "P"],  # out, zeros
     unsorted: Annotated[LongArray, "P"],  # out, depth and number of each pair
     n: int,
     rows: int,
@@ -137,7 +136,6 @@ class Bins:
         tile_place: [P] int32, number of the pair; pairs are numbered by row and tile.
         pair_start: [M + 1] int32, number of each visible Gaussian's first pair.
         pair_record: [P] int32, record of each pair.
-        pair_slot: [P] int32, zeros, for the adjoint.
         unsorted: [P] int64, depth and number of the pairs of each tile.
         tiles_per_gauss: [R] int32, number of tiles of every row.
     """
@@ -151,7 +149,6 @@ class Bins:
     tile_place: Tensor
     pair_start: Tensor
     pair_record: Tensor
-    pair_slot: Tensor
     unsorted: Tensor
     tiles_per_gauss: Tensor
 
@@ -218,13 +215,12 @@ def bin_gaussians(
             f"{n:,} visible Gaussians cover {covered:,} tiles of an image of {width}x{height} pixels in all, at most "
             f"{MAX_PAIRS:,} can be listed: render a smaller image, or fewer or smaller Gaussians."
         )
-    pair_record, pair_slot, unsorted = ints(pairs), ints(pairs), longs(pairs)
+    pair_record, unsorted = ints(pairs), longs(pairs)
     fill_pairs(
         visible, depths, records, listed, listed_count, places, boxes, ranges, counts, totals, pair_start, pair_record,
-        pair_slot, unsorted, n, rows, slices, float(width), tiles_x, tiles_y, int(limited), active_shortcuts(),
+        unsorted, n, rows, slices, float(width), tiles_x, tiles_y, int(limited), active_shortcuts(),
     )  # fmt: skip
     lists = ints(pairs), ints(pairs)
     return Bins(
-        visible, listed, listed_count, records, tile_start, *lists, pair_start, pair_record, pair_slot, unsorted,
-        tiles_per_gauss,
-    )  # fmt: skip
+        visible, listed, listed_count, records, tile_start, *lists, pair_start, pair_record, unsorted, tiles_per_gauss
+    )

@@ -42,7 +42,6 @@ class Pass:
             tile_list=torch.cat([first.tile_list, own.tile_list]),
             tile_place=torch.cat([first.tile_place, own.tile_place + pairs]),
             pair_start=own.pair_start + pairs,
-            pair_slot=torch.cat([first.pair_slot, own.pair_slot]),
         )
         pair_blocks = torch.cat([near.pair_blocks, self.pair_blocks])
         return Pass(bins, self.block_start, self.tile_stop + pairs, self.tile_blended, pair_blocks)
@@ -181,10 +180,11 @@ def pair_sums(
     # Behind the surface most pairs are not blended: they have no sums.
     per_tile = near.tile_blended if parts == 1 else torch.cat([near.tile_blended, last.tile_blended])
     slot_end = per_tile.cumsum(0, dtype=torch.int32)
+    pair_slot = zeros(len(lists.tile_list), dtype=torch.int32)
     v_pairs = scratch("v_pairs", int(slot_end[-1]), PAIR)
     sums = PairSums(
         bins.visible, near.block_start, bins.pair_start, lists.visible, last.block_start, lists.pair_start,
-        lists.pair_slot, v_pairs,
+        pair_slot, v_pairs,
     )  # fmt: skip
     for channel in range(0, channels, MAX_CHANNELS):
         some = min(MAX_CHANNELS, channels - channel)
@@ -193,7 +193,7 @@ def pair_sums(
         backward_worker(some, with_absolute)(
             bins.records, bins.tile_start, near.tile_stop, lists.records, lists.tile_start, last.tile_stop,
             lists.tile_list, lists.tile_place, last.pair_blocks, slot_end, transmittance, blended.pixel_stop,
-            v_image, v_transmittance, lists.pair_slot, v_pairs,
+            v_image, v_transmittance, pair_slot, v_pairs,
             *size, channels, channel, some, int(len(v_transmittance) > 0), parts, active_shortcuts(),
         )  # fmt: skip
         yield channel, some, sums

@@ -13,7 +13,7 @@ for (int s = first; s < last; ++s) {
         const bool all = !(shortcuts & EXACT_TILES);
         each_tile(records + (long long)RECORD * k, boxes + (long long)BOX * k, width, tiles_x, all, [&](int tile) INLINE {
             if (limited && !in_range(ranges, tile, (int)(key >> 32))) return;
-            pair_record[pair] = k, pair_slot[pair] = 0;
+            pair_record[pair] = k;
             unsorted[next[tile]++] = key | (unsigned)pair++;
         });
         return pair;
@@ -27,7 +27,7 @@ for (int s = first; s < last; ++s) {
         if (meets >= 0) {
             int* corner = next + places[(long long)PLACE * k];
             for (int rest = meets; rest; rest &= rest - 1) {
-                pair_record[pair] = k, pair_slot[pair] = 0;
+                pair_record[pair] = k;
                 unsorted[corner[offset[__builtin_ctz(rest)]]++] = key | (unsigned)pair++;
             }
             continue;
