@@ -104,7 +104,7 @@ def test_without_the_test_of_ellipses_whole_boxes_are_listed() -> None:
 
 
 def test_slices_of_threads_list_the_same() -> None:
-    n, (width, height) = 2000, SIZE
+    n, (width, height) = 3600, SIZE  # 1,200 are visible: fewer than 1,024 are one slice
     before, lists = get_num_threads(), []
     centres, depths, conics, opacities, sigmas = ellipses(n, 10)
     visible = torch.arange(0, n, 3, dtype=torch.int32)
