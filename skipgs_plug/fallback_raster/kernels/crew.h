@@ -3,7 +3,7 @@
 #if defined(__x86_64__) || defined(__i386__)
 #define PAUSE() __builtin_ia32_pause()
 #elif defined(__aarch64__)
-#define PAUSE() asm volatile("yield")
+#define PAUSE() __builtin_arm_yield()  // the compiler inside Warp has no assembler for this processor
 #else
 #define PAUSE()
 #endif
