@@ -17,9 +17,9 @@ from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Adapter, Hooks
-from skipgs_plug.core.optimizers import listed
+from skipgs_plug.core.optimizers import listed, step_pending
+from skipgs_plug.core.pace.loop_range import LoopRange
 from skipgs_plug.core.policy import Policy
-from skipgs_plug.core.refinement.loop_range import Every, LoopRange
 from skipgs_plug.core.report import build_report, counters, summarise
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.views import view_key
@@ -43,11 +43,12 @@ class SkipGate:
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)
 
-    With `refine_share` whole iterations are left out after densification, and all learning rates are larger for
-    it and shrink (see `skipgs_plug.core.refinement`); a loop of your own is then written as
+    With `share` whole iterations are left out, densification included, and larger, shrinking steps make up for those
+    of refinement (see `skipgs_plug.core.pace`); `refine_share` leaves densification as it is. A loop of your own is
+    then written as
 
-        gate = SkipGate(start_iter=15_000, refine_share=0.4)
-        for step in gate.iterations(range(1, 30_001)):
+        gate = SkipGate(start_iter=15_000, share="auto")
+        for step in gate.iterations(range(1, 30_001), views=names, events=range(600, 15_000, 100)):
 
     Learning-rate and SH schedules, logging and checkpoints count iterations, not updates: let them run on
     skipped iterations too. From `start_iter` on the loss is read on the host before the backward, one
@@ -100,7 +101,12 @@ class SkipGate:
     # Verbs for a loop of your own.
 
     def iterations(
-        self, numbers: range, *, always: Iterable[int] | None = None, views: Iterable[Any] | None = None
+        self,
+        numbers: range,
+        *,
+        always: Iterable[int] | None = None,
+        views: Iterable[Any] | None = None,
+        events: Iterable[int] | None = None,
     ) -> LoopRange:
         """Return the iterations of your loop that run: `for step in gate.iterations(range(30_000))`.
 
@@ -113,7 +119,8 @@ class SkipGate:
         Args:
             numbers: All iterations of the run, or all that are left, one by one.
             always: Iterations that must run, instead of those read from the loop; what an adapter knows comes on top.
-            views: Keys of all training views; `refine_share="auto"` must know them.
+            views: Keys of all training views; `share="auto"` and `refine_share="auto"` must know them.
+            events: Iterations in which your loop densifies, such as `range(600, 15_000, 100)`; `share` thins them out.
 
         Raises:
             SkipGSError: The numbers do not go up by one, or go on after those of an earlier call, or a condition of the
@@ -123,18 +130,12 @@ class SkipGate:
             raise SkipGSError("iterations() takes a range that goes up by one, such as range(30_000).")
         if isinstance(views, str):
             raise SkipGSError(f"views= takes a list of all names of training views, not the one name {views!r}.")
-        engine = self._engine
-        engine.compensate(numbers)
-        if engine.refinement is None:
-            return LoopRange(numbers, Every(engine.rates.rest))
         source = None
         if always is None:
             frame = sys._getframe(1)
             source = (frame.f_code, {**frame.f_globals, **frame.f_locals})
-        engine.refinement.choose(always or ())
-        if views is not None:
-            engine.refinement.know_views(list(dict.fromkeys(view_key(view) for view in views)))
-        return engine.refinement.follow(LoopRange(numbers, engine.refinement, source))
+        keys = None if views is None else list(dict.fromkeys(view_key(view) for view in views))
+        return self._engine.pace.follow(numbers, source, always or (), keys, events)
 
     def backward(self, loss: Any, view: Any, step: int, *, signal: Any = None) -> bool:
         """Run `loss.backward()` unless this view can do without; True when gradients were computed.
@@ -156,9 +157,9 @@ class SkipGate:
         self._require_manual("backward")
         engine, now, step = self._engine, self._iteration, int(step)
         self._check_losses(loss, view)
-        if engine.refinement is not None and engine.refinement.lacks_loop and step >= engine.start:
+        if engine.pace.lacks_loop and engine.pace.needs_loop(step):
             raise SkipGSError(
-                "refine_share leaves out iterations of a loop that it is given: write the loop as "
+                "share and refine_share leave out iterations of a loop that they are given: write the loop as "
                 "for step in gate.iterations(range(...))."
             )
         if step != now.step:
@@ -180,9 +181,8 @@ class SkipGate:
         earlier one. Zero the gradients only when True is returned, and with `set_to_none=True`.
 
         Args:
-            optimizer: One optimizer, or a list or dict of all that step together. With
-                `step_mode="adaptive_norm"` give all in one call.
-            *args: Passed on. For sparse optimizers see `visible`.
+            optimizer: One optimizer, or a list or dict of all that step together.
+            *args: Passed on, such as the mask of visible Gaussians for a sparse optimizer.
 
         Raises:
             GateOrderError: No `backward` came first in this iteration, or the optimizer was stepped in it.
@@ -193,7 +193,7 @@ class SkipGate:
             if id(one) in self._iteration.stepped:
                 raise GateOrderError("step() was called twice for one optimizer in this iteration.")
         self._iteration.stepped.update(id(one) for one in optimizers)
-        return self._engine.steps.step(optimizers, args)
+        return step_pending(optimizers, args, always=not self._engine.config.enabled)
 
     def update(self) -> None:
         """End the iteration. Optional: a new step number ends it too.
@@ -203,17 +203,6 @@ class SkipGate:
         """
         self._require_backward_before("update")
         self._iteration.ended = True
-
-    def visible(self, mask: Tensor) -> Tensor:
-        """Return the mask that a sparse optimizer must step with: `gate.step(opt, gate.visible(mask), N)`.
-
-        With accumulated gradients it is the union over all backwards since the last step, else the mask.
-
-        Args:
-            mask: Gaussians visible in this iteration, bool  # [N]
-        """
-        steps = self._engine.steps
-        return steps.accumulator.see(mask) if steps.accumulating and self._iteration.ran else mask
 
     def notify_event(self, kind: str, step: int | None = None) -> None:
         """Tell of a structural change: real backwards follow for a while, and means are left alone.
@@ -283,7 +272,7 @@ class SkipGate:
         own = None if self.adapter is None else self.adapter.timing()
         clock = self._engine.clock
         t_total, t_post = (clock.t_total, clock.t_post) if own is None else own
-        return counters(self._engine.stats, self._floor, t_total, t_post, self._engine.refinement)
+        return counters(self._engine.stats, self._floor, t_total, t_post, self._engine.pace.report())
 
     def report(self) -> dict[str, Any]:
         """The content of skipgs.json: settings, counters, seconds, per-view table."""
@@ -314,7 +303,7 @@ class SkipGate:
 
         Returns:
             `version` (2), `policy` (see `SkipPolicy.state_dict`), `stats` (counts, per-view rows),
-            `accumulator` (norms of single gradients), `non_finite_in_a_row`, `clock` (seconds), `step` (last
+            `non_finite_in_a_row`, `clock` (seconds), `step` (last
             iteration, None before the first). Empty while an adapter does not know yet when to begin.
         """
         return self._engine.state_dict()

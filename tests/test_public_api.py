@@ -27,7 +27,8 @@ NAMES = {
 GATE = {
     "iterations": (
         "(self, numbers: 'range', *, always: 'Iterable[int] | None' = None, "
-        "views: 'Iterable[Any] | None' = None) -> 'LoopRange'"
+        "views: 'Iterable[Any] | None' = None, "
+        "events: 'Iterable[int] | None' = None) -> 'LoopRange'"
     ),
     "backward": "(self, loss: 'Any', view: 'Any', step: 'int', *, signal: 'Any' = None) -> 'bool'",
     "detach": "(self) -> 'None'",
@@ -42,7 +43,6 @@ GATE = {
     "update": "(self) -> 'None'",
     "verify": "(self) -> 'None'",
     "view_table": "(self) -> 'list[dict[str, Any]]'",
-    "visible": "(self, mask: 'Tensor') -> 'Tensor'",
 }
 GATE_PROPERTIES = {"script_globals", "adapter", "config", "patched", "policy", "skipped", "trace", "trained"}
 
@@ -67,11 +67,11 @@ HOOKS = {
     "iteration": "(self, step: 'int') -> 'None'",
     "loop": (
         "(self, names: 'dict[str, Any]', *functions: 'str', always: 'Always | None' = None, "
-        "pure: 'Iterable[str]' = ()) -> 'None'"
+        "pure: 'Iterable[str]' = (), densification: 'Densification | None' = None) -> 'None'"
     ),
     "number": "(self, counted: 'int') -> 'int'",
     "on_detach": "(self, label: 'str', undo: 'Callable[[], None]') -> 'None'",
-    "own_loop": "(self, owner: 'Any', name: 'str') -> 'None'",
+    "own_loop": "(self, owner: 'Any', name: 'str', always: 'Always | None' = None) -> 'None'",
     "optimizer_names": "(self, named: 'Named') -> 'None'",
     "ready": "(self, facts: 'TrainerFacts') -> 'None'",
     "restore": "(self) -> 'None'",
@@ -84,7 +84,8 @@ HOOKS = {
 FACTS = (
     "(start_iter: 'int | None', *, view_names: 'Iterable[str] | None' = None, max_steps: 'int | None' = None, "
     "world_size: 'int | None' = None, gradients_read_until: 'int | None' = None, "
-    "accumulates: 'bool' = False, defaults: 'Mapping[str, Any]' = <factory>) -> None"
+    "accumulates: 'bool' = False, densification: 'Densification | None' = None, "
+    "defaults: 'Mapping[str, Any]' = <factory>) -> None"
 )
 POLICY = {
     "decide": "(self, view: 'Hashable', loss: 'float', step: 'int') -> 'Decision'",
@@ -104,9 +105,11 @@ DEFAULTS = {
     "enabled": True,
     "on_nonfinite": "skip",
     "pause_iters": None,
-    "step_mode": "off",
-    "step_trigger": "snr",
+    "share": None,
+    "grow_share": None,
     "refine_share": None,
+    "max_gaussians": None,
+    "always": None,
     "tolerance": 0.05,
     "compensate": None,
     "rate_peak": None,
@@ -189,7 +192,7 @@ def test_state_keys() -> None:
     gate = SkipGate(start_iter=0)
     gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
     state = gate.state_dict()
-    gate = {"version", "policy", "stats", "accumulator", "non_finite_in_a_row", "clock", "step", "refinement", "shown"}
+    gate = {"version", "policy", "stats", "non_finite_in_a_row", "clock", "step", "pace", "shown"}
     assert set(state) == gate
     assert set(state["policy"]) == {"version", "means", "budget", "warmup_end", "pause_until", "events"}
     assert set(state["stats"]) == {"iterations", "backwards", "skips", "reasons", "events", "views"}

@@ -90,7 +90,7 @@ class AbstractAdapter(ABC):
         return False
 
     def optimizers(self) -> Iterable[torch.optim.Optimizer]:
-        """Optimizers that may wait for accumulated gradients; none where the trainer has its own schedule."""
+        """Optimizers whose learning rates may be scaled, where the trainer knows them; see `Hooks.own_loop`."""
         return ()
 
     def timing(self) -> tuple[float, float] | None:

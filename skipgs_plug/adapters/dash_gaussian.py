@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.core.facts import Densification
 
 
 class DashGaussian(InriaFamily):
@@ -17,6 +18,7 @@ class DashGaussian(InriaFamily):
     gated = "From `densify_until_iter` on, where resolution and number of Gaussians are constant."
     left_alone = "Both optimizers, sparse Adam too. Its `train.py` is Inria's, and so is the adapter for it."
     mark = "TrainingScheduler"
+    densification = Densification(marks=("densification_interval",), needs="nothing")
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter)

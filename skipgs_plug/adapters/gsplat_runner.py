@@ -9,7 +9,12 @@ from typing import Any
 import torch
 
 from skipgs_plug.adapters.base import GATES_CHILDREN, AbstractAdapter, refuse_other_processes
-from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
+from skipgs_plug.adapters.gsplat_strategy import (
+    gradients_read_until,
+    leave_out_noise,
+    opacity_resets,
+    strategy_events,
+)
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
 from skipgs_plug.core.errors import AdapterMismatchError
@@ -91,7 +96,9 @@ class GsplatRunner(AbstractAdapter):
         hooks.before(*((runner, "rasterize_splats") if stage is None else (stage, "render")), remember)
         hooks.before(type(strategy), "step_pre_backward", forwarded)
         hooks.gate_tensor_backward("train")
-        hooks.loop(function_names(type(runner).train), "train")
+        hooks.loop(
+            function_names(type(runner).train), "train", always=lambda numbers: opacity_resets(strategy, numbers)
+        )
         catch_up_schedulers(hooks, "train")
         self._relocations = leave_out_noise(hooks, strategy, type(strategy))
         self.output_folder = runner.cfg.result_dir
@@ -102,6 +109,7 @@ class GsplatRunner(AbstractAdapter):
                 max_steps=runner.cfg.max_steps - 1,
                 world_size=runner.world_size,
                 gradients_read_until=gradients_read_until(strategy),
+                densification=strategy_events(strategy),
             )
         )
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
+from skipgs_plug.core.facts import Densification
 from skipgs_plug.core.hooks import Hooks
 
 
@@ -15,6 +17,30 @@ def is_mcmc(strategy: Any) -> bool:
 def gradients_read_until(strategy: Any) -> int | None:
     """First iteration whose gradients the strategy does not read; None when it reads none at all."""
     return None if strategy is None or is_mcmc(strategy) else int(strategy.refine_stop_iter)
+
+
+def strategy_events(strategy: Any) -> Densification | None:
+    """Return the densification events of a strategy; None without a strategy.
+
+    MCMC adds a constant share of Gaussians per event, so all of its events are kept.
+    """
+    if strategy is None:
+        return None
+    first, every = getattr(strategy, "refine_start_iter", 0), strategy.refine_every
+    mcmc = is_mcmc(strategy)
+    reset, pause = getattr(strategy, "reset_every", every), getattr(strategy, "pause_refine_after_reset", 0)
+
+    def acts(n: int) -> bool:
+        return n > first and n % every == 0 and (mcmc or n % reset >= pause)
+
+    return Densification(numbers=lambda numbers: filter(acts, numbers), needs="nothing" if mcmc else "visits")
+
+
+def opacity_resets(strategy: Any, numbers: range) -> Iterable[int]:
+    """Return the iterations in which a strategy resets opacities, which must all run."""
+    every = getattr(strategy, "reset_every", 0)
+    stop = getattr(strategy, "refine_stop_iter", 0)
+    return (n for n in numbers if every and n > 0 and n % every == 0 and n < stop)
 
 
 def leave_out_noise(hooks: Hooks, strategy: Any, owner: Any) -> range:

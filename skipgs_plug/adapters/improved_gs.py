@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.core.facts import Densification
 
 ACCUMULATES_FROM = 15_000  # the loop has this number in it
 
@@ -25,6 +26,7 @@ class ImprovedGS(InriaFamily):
         "skipped iterations too."
     )
     mark = "compute_edge_score"
+    densification = Densification(marks=("densification_interval",), needs="nothing")
     structural = (*InriaFamily.structural, "only_prune")
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:

@@ -26,7 +26,7 @@ from skipgs_plug.adapters.loop_code import LOOP, LoopCode
 from skipgs_plug.adapters.stillness import Stillness
 from skipgs_plug.adapters.strangers import refuse_strangers
 from skipgs_plug.core.errors import AdapterMismatchError
-from skipgs_plug.core.facts import TrainerFacts
+from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.views import view_key
 
@@ -39,12 +39,15 @@ class InriaFamily(AbstractAdapter):
         renders: names of the functions that render a training view; at least one must exist.
         structural: methods of `GaussianModel` that make losses jump.
         scenes: names that the loop's variable for its Scene can have.
+        densification: how its densification events are told; None if growth must run whole.
     """
 
     mark: ClassVar[str] = ""
     renders: ClassVar[tuple[str, ...]] = ("render",)
     structural: ClassVar[tuple[str, ...]] = ("prune_points", "reset_opacity", "training_setup")
     scenes: ClassVar[tuple[str, ...]] = ("scene",)
+    # Statistics are means over visits, so events with enough visits behind them may be fewer.
+    densification: ClassVar[Densification | None] = Densification(marks=("densification_interval",))
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
@@ -169,7 +172,7 @@ class InriaFamily(AbstractAdapter):
             hooks.wrap(names, name, rendered)
         hooks.events(model, *(name for name in self.structural if hasattr(model, name)))
         hooks.gate_tensor_backward(LOOP)
-        hooks.loop(script, LOOP, always=self.always_run)
+        hooks.loop(script, LOOP, always=self.always_run, densification=self.densification)
 
     def always_run(self, numbers: range) -> Iterable[int]:
         """Those of these iterations on whose number something hangs that the loop itself does not say."""

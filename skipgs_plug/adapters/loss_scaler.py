@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
-from skipgs_plug.core.accumulate import has_pending_gradient
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.optimizers import has_pending_gradient
 
 
 def guard_scaler(hooks: Hooks, scaler: torch.amp.GradScaler) -> None:

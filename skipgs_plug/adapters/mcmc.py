@@ -11,6 +11,7 @@ import torch
 
 from skipgs_plug.adapters.inria import InriaFamily
 from skipgs_plug.adapters.loop_code import LOOP
+from skipgs_plug.core.facts import Densification
 from skipgs_plug.core.hooks import Hooks
 
 NOISE = "build_scaling_rotation"  # the loop calls it for nothing but its noise
@@ -36,6 +37,7 @@ class MCMC(InriaFamily):
         "numbers are drawn as ever."
     )
     mark = NOISE
+    densification = Densification(marks=("densification_interval",), needs="nothing")
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)

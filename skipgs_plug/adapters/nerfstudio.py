@@ -9,7 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
-from skipgs_plug.adapters.gsplat_strategy import gradients_read_until, leave_out_noise
+from skipgs_plug.adapters.gsplat_strategy import (
+    gradients_read_until,
+    leave_out_noise,
+    opacity_resets,
+    strategy_events,
+)
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.loss_scaler import guard_scaler
 from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
@@ -92,6 +97,7 @@ class Nerfstudio(AbstractAdapter):
                 max_steps=trainer.config.max_num_iterations - 1,
                 world_size=trainer.world_size,
                 gradients_read_until=gradients_read_until(strategy),
+                densification=strategy_events(strategy),
             )
         )
 
@@ -103,6 +109,7 @@ class Nerfstudio(AbstractAdapter):
         config = self.trainer.config
         every = (config.steps_per_eval_batch, config.steps_per_eval_image, config.steps_per_eval_all_images)
         gathered = [steps for steps in config.gradient_accumulation_steps.values() if steps > 1]
+        yield from opacity_resets(getattr(self.trainer.pipeline.model, "strategy", None), numbers)
         for n in numbers:
             evaluates = any(interval and n % interval == 0 for interval in every)
             if evaluates or any(n % steps in (0, steps - 1) for steps in gathered):

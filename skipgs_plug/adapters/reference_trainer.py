@@ -8,10 +8,11 @@ from typing import Any
 import torch
 
 from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.gsplat_strategy import opacity_resets, strategy_events
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.events import MIN_PAUSE_ITERS
-from skipgs_plug.core.facts import TrainerFacts
+from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.hooks import Hooks
 
 FULL_SCHEDULE = 30_000  # iterations that the default settings of gate and trainer are made for
@@ -40,7 +41,7 @@ class ReferenceTrainer(AbstractAdapter):
             hooks.backward(loss, lambda: original(loss, view, step), view)
 
         hooks.wrap(trainer, "backward", gated)
-        hooks.own_loop(trainer, "iterations")
+        hooks.own_loop(trainer, "iterations", always=lambda numbers: opacity_resets(trainer.strategy, numbers))
         n_views = len(trainer.view_names)
         scale = trainer.config.schedule / FULL_SCHEDULE
         hooks.ready(
@@ -48,6 +49,7 @@ class ReferenceTrainer(AbstractAdapter):
                 trainer.refine_stop_iter,
                 view_names=trainer.view_names,
                 max_steps=trainer.max_steps - 1,
+                densification=_densification(trainer),
                 defaults={
                     "warmup": max(2 * n_views, round(SkipConfig.warmup * scale)),
                     "pause_iters": max(n_views, round(MIN_PAUSE_ITERS * scale)),
@@ -62,3 +64,11 @@ class ReferenceTrainer(AbstractAdapter):
 
     def timing(self) -> tuple[float, float] | None:
         return self.trainer.t_total, self.trainer.t_post
+
+
+def _densification(trainer: Any) -> Densification | None:
+    """Events of the trainer's strategy; MCMC adds a constant share of Gaussians per event, so all are kept."""
+    mcmc = trainer.mcmc
+    if mcmc is None:
+        return strategy_events(trainer.strategy)
+    return Densification(numbers=lambda numbers: filter(mcmc.moves, numbers), needs="nothing")

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.core.facts import Densification
 
 
 class ScaffoldGS(InriaFamily):
@@ -17,6 +18,7 @@ class ScaffoldGS(InriaFamily):
     gated = "From `update_until` on, where anchors are neither grown nor pruned any more."
     left_alone = "Networks and anchors have one optimizer, which is left alone."
     mark = "prefilter_voxel"
+    densification = Densification(marks=("update_interval",), needs="iterations")
     structural = ("prune_anchor", "training_setup")
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 import torch
 
-from skipgs_plug.core.accumulate import has_pending_gradient
 from skipgs_plug.core.engine import Engine
+from skipgs_plug.core.optimizers import has_pending_gradient
 
 CHECKED_SKIPS = 5  # skipped iterations that are looked at, from the second on
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.core.facts import Densification
 
 
 class Taming(InriaFamily):
@@ -23,6 +24,7 @@ class Taming(InriaFamily):
         "no image and does not pause the gate."
     )
     mark = "get_count_array"
+    densification = Densification(marks=("densification_interval",), needs="nothing")
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter)

@@ -13,7 +13,7 @@ from typing import Any
 from skipgs_plug import SkipGate
 from skipgs_plug.bench.controls import PlannedSkipping, periodic_skipping, random_skipping
 from skipgs_plug.bench.record import RunRecord
-from skipgs_plug.core.refinement.rates import path_factor
+from skipgs_plug.core.pace.rates import path_factor
 from skipgs_plug.trainer import Trainer
 from skipgs_plug.trainer.errors import InputError
 
@@ -110,7 +110,6 @@ POLICIES = {
         PolicySpec(REFERENCE, "every backward runs"),
         PolicySpec("gate", "the paper's gate, default settings", gate_with()),
         PolicySpec("gate-no-floor", "the gate without a floor", gate_with(min_bwd_ratio=0.0)),
-        PolicySpec("gate-accumulate", "the gate, gradients accumulated", gate_with(step_mode="adaptive_norm")),
         PolicySpec(
             "random",
             "control: as many skips as the gate, drawn by chance",

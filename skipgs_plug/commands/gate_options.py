@@ -35,13 +35,17 @@ class GateOptions:
     """What a NaN or infinite loss does."""
     pause_iters: Annotated[int | None, shown("INT", "one round of the views, at least 500; scaled in train")] = None
     """Real backwards after a prune or reset."""
-    step_mode: Annotated[Literal["off", "adaptive_norm"] | None, shown("off|adaptive_norm", "off")] = None
-    """Accumulate gradients over several backwards before a step."""
-    step_trigger: Annotated[Literal["snr", "ref_k"] | None, shown("snr|ref_k", "snr")] = None
-    """When an accumulated step is taken."""
 
-    refine_share: Annotated[str | None, shown("SHARE|auto", "the paper's gate, which leaves out none")] = None
-    """Leave out whole iterations: the share of refinement that runs, such as 0.4, or auto."""
+    share: Annotated[str | None, shown("SHARE|auto", "the paper's gate, which leaves out none")] = None
+    """Leave out whole iterations in the whole run: the share that runs, such as 0.3, or auto."""
+    grow_share: Annotated[str | None, shown("SHARE|auto", "as --share")] = None
+    """The same until densification ends only, with fewer densification events."""
+    refine_share: Annotated[str | None, shown("SHARE|auto", "as --share")] = None
+    """The same after densification only, such as 0.4, or auto."""
+    max_gaussians: Annotated[int | None, shown("INT", "no bound")] = None
+    """With --share: densification events stop before one could go beyond this number of Gaussians."""
+    always: Annotated[tuple[int, ...] | None, shown("INT ...", "read from the loop's conditions")] = None
+    """Iterations that run in any case, instead of those that the loop's conditions on its number name."""
     tolerance: Annotated[float | None, shown("FLOAT", "0.05")] = None
     """Decibels that the rest of refinement may be worth when auto ends it."""
     compensate: Annotated[bool | None, shown("True|False", "with --refine-share only")] = None
@@ -55,15 +59,18 @@ class GateOptions:
         Raises:
             SkipGSError: One of them does nothing without another, which is missing.
         """
-        if self.refine_share is None:
+        shares = (self.share, self.grow_share, self.refine_share)
+        if all(share is None for share in shares):
             if self.tolerance is not None:
-                raise SkipGSError("--tolerance is for --refine-share auto; give that too, or leave it out.")
+                raise SkipGSError("--tolerance is for --share auto; give that too, or leave it out.")
+            if self.always is not None:
+                raise SkipGSError("--always is for --share or --refine-share; give one too, or leave it out.")
             if self.rate_peak is not None and not self.compensate:
                 raise SkipGSError(
-                    "--rate-peak is for --refine-share or --compensate True; give one too, or leave it out."
+                    "--rate-peak is for --share, --refine-share or --compensate True; give one too, or leave it out."
                 )
         settings = {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
-        for name in ("min_bwd_ratio", "refine_share"):
+        for name in ("min_bwd_ratio", "share", "grow_share", "refine_share"):
             if name in settings:
                 with contextlib.suppress(ValueError):
                     settings[name] = float(settings[name])

@@ -9,8 +9,6 @@ from typing import Any
 from skipgs_plug.core.errors import SkipGSError
 
 ON_NONFINITE = ("skip", "raise", "pass")
-STEP_MODES = ("off", "adaptive_norm")
-STEP_TRIGGERS = ("snr", "ref_k")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,12 +27,16 @@ class SkipConfig:
         on_nonfinite: What a NaN or infinite loss does: "skip" its backward, "raise" at once, or "pass" it
             through. It never enters a mean.
         pause_iters: Real backwards after a structural change; None for max(number of views, 500).
-        step_mode: "adaptive_norm" accumulates gradients until `step_trigger` fires before an optimizer
-            step is taken; "off" steps as the trainer does.
-        step_trigger: "snr" (accumulated energy is twice the noise floor) or "ref_k" (accumulated norm
-            reaches that of 16 single gradients).
+        share: Leave out whole iterations in the whole run, densification included: the share of them that runs, or
+            "auto" for what the scene needs. It stands for both `grow_share` and `refine_share`, where these are None.
+        grow_share: Leave out whole iterations until densification ends, and densification events with too little
+            behind them: the share of iterations that runs, or "auto".
         refine_share: Leave out whole iterations from `start_iter` on instead of single backwards: the share of
-            them that runs, or "auto" for what the scene needs. None for the paper's gate.
+            them that runs, or "auto" for what the scene needs. None for the paper's gate, unless `share` is given.
+        max_gaussians: With `share` or `grow_share`, densification events stop before one could take the number of
+            Gaussians beyond this. None for no bound.
+        always: With `share`, `grow_share` or `refine_share`, iterations that run in any case, instead of those that
+            the conditions of the loop name. None to read the conditions.
         tolerance: Decibels that the rest of refinement may be worth when "auto" ends it.
         compensate: Make up for what is left out with larger, shrinking steps. None: with `refine_share`, not
             with the paper's gate.
@@ -55,9 +57,11 @@ class SkipConfig:
     enabled: bool = True
     on_nonfinite: str = "skip"
     pause_iters: int | None = None
-    step_mode: str = "off"
-    step_trigger: str = "snr"
+    share: float | str | None = None
+    grow_share: float | str | None = None
     refine_share: float | str | None = None
+    max_gaussians: int | None = None
+    always: tuple[int, ...] | None = None
     tolerance: float = 0.05
     compensate: bool | None = None
     rate_peak: float | None = None
@@ -76,24 +80,45 @@ class SkipConfig:
         if ratio != "auto" and not (_is_number(ratio) and 0.0 <= float(ratio) <= 1.0):
             raise SkipGSError(f'min_bwd_ratio must be "auto" or in [0, 1], not {ratio!r}.')
         _check_choice("on_nonfinite", self.on_nonfinite, ON_NONFINITE)
-        _check_choice("step_mode", self.step_mode, STEP_MODES)
-        _check_choice("step_trigger", self.step_trigger, STEP_TRIGGERS)
-        share = self.refine_share
-        if share is not None and share != "auto" and not (_is_number(share) and 0.0 < float(share) <= 1.0):
-            raise SkipGSError(f'refine_share must be "auto" or in (0, 1], not {share!r}.')
+        for name in ("share", "grow_share", "refine_share"):
+            share = getattr(self, name)
+            if share is not None and share != "auto" and not (_is_number(share) and 0.0 < float(share) <= 1.0):
+                raise SkipGSError(f'{name} must be "auto" or in (0, 1], not {share!r}.')
+        if self.max_gaussians is not None:
+            _check_count("max_gaussians", self.max_gaussians, "Gaussians")
+            if self.growing is None and self.enabled:
+                raise SkipGSError("max_gaussians holds back densification events; give share or grow_share, too.")
+        if self.always is not None:
+            # A frozen dataclass takes any collection of whole numbers, and holds a tuple.
+            object.__setattr__(self, "always", tuple(sorted(int(number) for number in self.always)))
         if not (_is_number(self.tolerance) and self.tolerance >= 0.0):
             raise SkipGSError(f"tolerance must be a number of decibels >= 0, not {self.tolerance!r}.")
         if self.rate_peak is not None and not (_is_number(self.rate_peak) and self.rate_peak > 0.0):
             raise SkipGSError(f"rate_peak must be a factor above 0, not {self.rate_peak!r}.")
-        if share is not None and self.step_mode != "off":
-            raise SkipGSError("refine_share leaves out iterations whole; leave step_mode at 'off'.")
+
+    @property
+    def growing(self) -> float | str | None:
+        """Share of the iterations before the end of densification that runs, or "auto"; None for all, untouched."""
+        return self.share if self.grow_share is None else self.grow_share
+
+    @property
+    def refining(self) -> float | str | None:
+        """Share of the iterations after it, or "auto"; None for the paper's gate."""
+        if self.refine_share is not None or self.growing is None:
+            return self.refine_share
+        return 1.0 if self.share is None else self.share
+
+    @property
+    def leaves_out(self) -> bool:
+        """Whether whole iterations are left out."""
+        return self.enabled and self.refining is not None
 
     @property
     def compensates(self) -> bool:
         """Whether learning rates are scaled."""
         if not self.enabled:
             return False
-        return self.refine_share is not None if self.compensate is None else self.compensate
+        return self.refining is not None if self.compensate is None else self.compensate
 
     def as_dict(self) -> dict[str, Any]:
         """The settings as plain values, as written to skipgs.json."""
@@ -104,9 +129,9 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _check_count(name: str, value: Any) -> None:
+def _check_count(name: str, value: Any, unit: str = "iterations") -> None:
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise SkipGSError(f"{name} must be a whole number of iterations >= 0, not {value!r}.")
+        raise SkipGSError(f"{name} must be a whole number of {unit} >= 0, not {value!r}.")
 
 
 def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:

@@ -17,13 +17,11 @@ from skipgs_plug.core.errors import GateOrderError, SkipGSError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.iteration import Iteration
 from skipgs_plug.core.nonfinite import NonFiniteGuard
-from skipgs_plug.core.optimizers import OptimizerSteps
-from skipgs_plug.core.policy import Policy, SkipPolicy
-from skipgs_plug.core.refinement.compensation import Compensation
-from skipgs_plug.core.refinement.loop_range import require_planned
-from skipgs_plug.core.refinement.policy import RefinementPolicy
-from skipgs_plug.core.refinement.rates import ScaledRates
-from skipgs_plug.core.refinement.refinement import Refinement
+from skipgs_plug.core.pace.base import Pace
+from skipgs_plug.core.pace.compensated import Compensated
+from skipgs_plug.core.pace.phased import Phased
+from skipgs_plug.core.pace.rates import ScaledRates
+from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.scene_check import SceneCheck
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, require_state
 from skipgs_plug.core.stats import GateStats
@@ -49,10 +47,9 @@ class Engine:
         policy: None until `configure` was called.
         start: first iteration that may be skipped.
         iteration: what is known of the present iteration.
-        stats, clock, steps: counts, seconds, optimizer steps.
-        rates: scales learning rates, for one of the next two.
-        refinement: leaves out whole iterations; None without `refine_share`.
-        compensation: scales learning rates for skipped backwards; None unless asked for.
+        stats, clock: counts, seconds.
+        rates: scales learning rates, for the pace.
+        pace: says which iterations run, and scales learning rates.
         trace: rows of gated decisions; None when they are not recorded.
     """
 
@@ -70,12 +67,12 @@ class Engine:
         self.iteration = Iteration()
         self.stats = GateStats()
         self.clock = GateClock()
-        self.steps = OptimizerSteps(config, self.iteration)
         self.rates = ScaledRates()
-        self.refinement: Refinement | None = None
-        if config.enabled and config.refine_share is not None:
-            self.refinement = Refinement(config, self.rates, self._go_on_from_saved)
-        self.compensation: Compensation | None = None
+        self.pace: Pace
+        if config.leaves_out:
+            self.pace = Phased(config, self.rates, self._go_on_from_saved)
+        else:
+            self.pace = Compensated(config, self.rates) if config.compensates else Pace()
         self.trace: list[TraceRow] | None = [] if record_trace else None
         self._guard = NonFiniteGuard(config.on_nonfinite)
         self._must_run = must_run
@@ -115,40 +112,15 @@ class Engine:
             self._view_names = require_unique(facts.view_names)
         if config.enabled and facts.max_steps is not None and self.start > facts.max_steps:
             log.warning("The gate starts at %d, after the last iteration %d.", self.start, facts.max_steps)
-        if self.refinement is not None:
-            self.refinement.configure(self.start, facts.max_steps, self._view_names, facts.accumulates)
+        self.pace.configure(self.start, facts, self._view_names)
         if self.policy is None:
-            if self.refinement is None:
-                self.policy = SkipPolicy.from_config(config)
-            else:
-                self.policy = RefinementPolicy(config, self.refinement)
-        if facts.max_steps is not None:
-            self.compensate(range(facts.max_steps + 1))
+            self.policy = self.pace.policy(config)
         if self._pending_state is not None:
             self.load_state_dict(self._pending_state)
 
-    def compensate(self, numbers: range) -> None:
-        """Scale learning rates for the paper's gate, if that was asked for; `numbers` are the run's iterations.
-
-        Raises:
-            SkipGSError: They go on after the end that was given before, or processes would scale differently.
-        """
-        if not numbers or not self.config.compensates or self.refinement is not None:
-            return
-        if self.compensation is not None:
-            require_planned(numbers, self.compensation.last)
-            return
-        if self.config.min_bwd_ratio == "auto":
-            distributed.refuse_several(
-                "compensate=True scales learning rates by a floor that each process finds by itself",
-                "give min_bwd_ratio, such as 0.5",
-            )
-        self.compensation = Compensation(self.config, self.start, numbers[-1], self.rates)
-
     def release(self) -> None:
         """Let go of loops and optimizers; counts stay readable."""
-        if self.refinement is not None:
-            self.refinement.remove()
+        self.pace.remove()
         self.rates.remove()
 
     @property
@@ -186,13 +158,7 @@ class Engine:
                 f"Iterations went back from {before} to {step}: load the gate state that belongs to "
                 "the checkpoint, or attach a new gate."
             )
-        if self.config.compensates and self.refinement is None:
-            if self.compensation is None:
-                raise SkipGSError(
-                    "compensate=True must know the last iteration: write the loop as "
-                    "for step in gate.iterations(range(...))."
-                )
-            self.compensation.heartbeat(step, None if self.policy is None else self.policy.floor)
+        self.pace.begin(step, None if self.policy is None else self.policy.floor)
         self.iteration.begin(step)
         self.clock.open(post=step >= self.start)
 
@@ -233,7 +199,6 @@ class Engine:
         self.stats.events[kind] = self.stats.events.get(kind, 0) + 1
         self._scene_check.stop()
         self.policy.notify_event(step, self.n_views)
-        self.steps.accumulator.reset()
 
     def state_dict(self) -> dict[str, Any]:
         """As `SkipGate.state_dict`."""
@@ -244,11 +209,10 @@ class Engine:
             "version": GATE_VERSION,
             "policy": self.policy.state_dict(),
             "stats": self.stats.state_dict(),
-            "accumulator": self.steps.accumulator.state_dict(),
             "non_finite_in_a_row": self._guard.in_a_row,
             "clock": self.clock.state_dict(),
             "step": self.iteration.step,
-            "refinement": None if self.refinement is None else self.refinement.state_dict(),
+            "pace": self.pace.state_dict(),
             "shown": self.rates.shown.state_dict(),
         }
 
@@ -261,14 +225,12 @@ class Engine:
             self._load_pace(gate_state(state))
             return
         pending, self._pending_state = self._pending_state is not None, None
-        accumulator = self.steps.accumulator
         state = gate_state(state)
         if is_release_state(state):
             self._load_pace(state)
             self._refuse_other_scene(state["view_loss_ema"])
             self.policy.load_state_dict(state)
             self.stats.load_release_state(state)
-            accumulator.load_release_state(state)
             step = None
         else:
             self._refuse_other_scene(state["stats"]["views"])
@@ -276,11 +238,12 @@ class Engine:
                 self._load_pace(state)
             self.policy.load_state_dict(state["policy"])
             self.stats.load_state_dict(state["stats"])
-            accumulator.load_state_dict(state["accumulator"])
             self._guard.in_a_row = state["non_finite_in_a_row"]
             self.clock.load_state_dict(state["clock"])
             step = state["step"]
-        if self.refinement is None or not self.stats.events:  # where nothing pauses, means lag behind a change for long
+        if (
+            not self.pace.leaves_out or not self.stats.events
+        ):  # where nothing pauses, means lag behind a change for long
             self._scene_check.start()
         self.iteration.begin(step)
 
@@ -293,17 +256,17 @@ class Engine:
 
     def _load_pace(self, whole: dict[str, Any]) -> None:
         """Load which iterations run, and how long steps are; the authors' controller has neither."""
-        state = whole.get("refinement")
-        if (state is None) != (self.refinement is None):
-            saved = None if state is None else state["asked"]
+        state = whole.get("pace")
+        if (state is None) == self.pace.leaves_out:
+            saved = None if state is None else state["refining"]["asked"]
             raise SkipGSError(
-                f"The gate state was saved with refine_share={saved!r}, not {self.config.refine_share!r}; "
+                f"The gate state was saved with refine_share={saved!r}, not {self.config.refining!r}; "
                 "go on with its setting, or start the gate afresh."
             )
         if "shown" in whole:
             self.rates.shown.load_state_dict(whole["shown"])
-        if state is not None and self.refinement is not None:
-            self.refinement.load_state_dict(state)
+        if state is not None:
+            self.pace.load_state_dict(state)
 
     def _agreed(self, view: str, loss: float, step: int) -> Decision:
         if distributed.group_size() == 1:

@@ -3,9 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from typing import Any, Literal
+
+
+@dataclass(frozen=True)
+class Densification:
+    """How a trainer's densification events are told from other iterations, and what they need behind them.
+
+    Args:
+        marks: Names in a condition of the loop on its number that make it the condition of densification, such as
+            `densification_interval`.
+        numbers: Gives the iterations with an event, of a range of them, where a strategy object decides by itself.
+        needs: What must stand behind an event that is kept. "visits": enough visits of each Gaussian for a mean over
+            them, or as many iterations as in the trainer's own schedule; events with less behind them are left out.
+            "iterations": as many iterations as in the trainer's own schedule, for thresholds on counts of visits.
+            "nothing": every event is kept, for growth by a budget or by a constant share per event.
+    """
+
+    marks: tuple[str, ...] = ()
+    numbers: Callable[[range], Iterable[int]] | None = None
+    needs: Literal["visits", "iterations", "nothing"] = "visits"
 
 
 @dataclass(frozen=True)
@@ -22,6 +41,7 @@ class TrainerFacts:
             say, so that a gate which the user starts earlier is refused.
         accumulates: Optimizers step every so many iterations on what gathered in between, however many of
             these ran: nothing is to be made up for.
+        densification: Its events, for a growing phase with fewer iterations; None if growth must run whole.
         defaults: Settings that suit this trainer, used where the user gave none.
     """
 
@@ -32,4 +52,5 @@ class TrainerFacts:
     world_size: int | None = None
     gradients_read_until: int | None = None
     accumulates: bool = False
+    densification: Densification | None = None
     defaults: Mapping[str, Any] = dataclasses.field(default_factory=dict)

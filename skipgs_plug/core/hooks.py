@@ -11,11 +11,12 @@ import torch
 
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
-from skipgs_plug.core.facts import TrainerFacts
+from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.intercept import Around, Patches, intercept_tensor_backward
-from skipgs_plug.core.refinement.loop_range import LoopRange, replace_range
-from skipgs_plug.core.refinement.rates import Named
-from skipgs_plug.core.refinement.refinement import Always, nothing_always
+from skipgs_plug.core.pace.base import Always, nothing_always
+from skipgs_plug.core.pace.loop_range import LoopRange, replace_range
+from skipgs_plug.core.pace.phased import Phased
+from skipgs_plug.core.pace.rates import Named
 from skipgs_plug.core.views import view_key
 
 CHECKED_ITERATIONS = 10  # after these, exactly one training backward each must have been seen
@@ -86,13 +87,9 @@ class Hooks:
                 raise self._mismatch("the trainer iterates before it said when densification ends")
             if self._iterations == CHECKED_ITERATIONS:
                 self._require_one_backward_each()
-            if self._engine.refinement is not None:
-                self._engine.refinement.heartbeat(step)
             self._iterations += 1
             self._odd_iterations += 1  # until its backward is seen
             self._engine.open_iteration(step)
-            if self._engine.steps.accumulating:
-                self._engine.steps.attach(self.wrap, self._adapter.optimizers)
 
     def view(self, key: Any) -> None:
         """The present iteration renders this view for training; the last one before the backward counts.
@@ -173,6 +170,7 @@ class Hooks:
         *functions: str,
         always: Always | None = None,
         pure: Iterable[str] = (),
+        densification: Densification | None = None,
     ) -> None:
         """The training loop counts with `range` in one of these functions: iterations can be left out there.
 
@@ -184,15 +182,16 @@ class Hooks:
             always: Gives further iterations, of a range of them, that must run: what depends on their numbers
                 in functions that the loop calls.
             pure: Functions that only look at numbers, and may stand in the loop's conditions.
+            densification: How its densification events are told, where `ready` comes after the loop has begun.
         """
-        if self._engine.refinement is not None:
-            self._engine.refinement.describe(always or nothing_always, pure)
-            replace_range(self._patches, names, functions, self._engine.refinement)
+        pace = self._engine.pace
+        if isinstance(pace, Phased):
+            pace.describe(always or nothing_always, pure, densification)
+            replace_range(self._patches, names, functions, pace)
 
     def always(self, always: Always) -> None:
         """Iterations that must run, as for `loop`, where the loop is the user's own."""
-        if self._engine.refinement is not None:
-            self._engine.refinement.describe(always)
+        self._engine.pace.describe(always)
 
     def optimizer_names(self, named: Named) -> None:
         """`named` gives the trainer's optimizers by name, which tell parameters apart where groups have no names.
@@ -201,32 +200,31 @@ class Hooks:
         """
         self._engine.rates.only = named
 
-    def own_loop(self, owner: Any, name: str) -> None:
-        """`owner.name(...)` gives the range that the training loop counts with, and nothing hangs on its numbers.
+    def own_loop(self, owner: Any, name: str, always: Always | None = None) -> None:
+        """`owner.name(...)` gives the range that the training loop counts with; `always` gives those that must run.
 
         The learning rates of the adapter's `optimizers` are scaled, and of no others.
         """
         self._engine.rates.only = self._adapter.optimizers
-        if self._engine.refinement is None:
+        pace = self._engine.pace
+        if not pace.leaves_out:
             return
-        refinement = self._engine.refinement
+        pace.describe(always or nothing_always)
 
         def counted(original: Callable[..., range], *args: Any, **kwargs: Any) -> LoopRange:
-            return refinement.follow(LoopRange(original(*args, **kwargs), refinement))
+            return pace.follow(original(*args, **kwargs), None)
 
         self.wrap(owner, name, counted)
 
     def number(self, counted: int) -> int:
         """Number of the present iteration, for trainers whose iterations are only counted: `counted` if all ran."""
-        refinement = self._engine.refinement
-        number = None if refinement is None else refinement.number
+        number = self._engine.pace.number
         return counted if number is None else number
 
     @property
     def gap(self) -> int:
         """Iterations that were left out right before the present one."""
-        refinement = self._engine.refinement
-        return 0 if refinement is None else refinement.gap
+        return self._engine.pace.gap
 
     def catch_up(self, owner: Any, name: str, caller: str) -> None:
         """Call `owner.name` once more for every iteration that was left out before the present one.
@@ -237,7 +235,7 @@ class Hooks:
             owner, name: As for `wrap`.
             caller: Name of the function whose calls count.
         """
-        if self._engine.refinement is None:
+        if not self._engine.pace.leaves_out:
             return
 
         def repeated(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

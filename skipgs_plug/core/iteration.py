@@ -7,9 +7,6 @@ from typing import Any
 from skipgs_plug.core import decision
 from skipgs_plug.core.decision import Decision
 
-# Optimizers step at once in these iterations even when gradients are accumulated otherwise.
-STEP_AT_ONCE = frozenset({"inactive", "warm-up", "pause"})
-
 
 class Iteration:
     """What is known of the present iteration. `begin` is the one place where it is forgotten.
@@ -18,7 +15,6 @@ class Iteration:
         step: its number, None before the first.
         decision: the last answer in it.
         ran: a real backward ran in it.
-        due: whether optimizers step in it; None while nobody asked.
         view, signal: what a trainer's hooks named for the backward to come.
         backwards: training backwards that hooks saw in it.
         keys: views that `backward` was called on by hand.
@@ -26,7 +22,7 @@ class Iteration:
         ended: `update` was called by hand.
     """
 
-    __slots__ = ("backwards", "decision", "due", "ended", "keys", "ran", "signal", "step", "stepped", "view")
+    __slots__ = ("backwards", "decision", "ended", "keys", "ran", "signal", "step", "stepped", "view")
 
     def __init__(self) -> None:
         self.keys: set[str] = set()
@@ -38,7 +34,6 @@ class Iteration:
         self.step = step
         self.decision: Decision = decision.INACTIVE
         self.ran = False
-        self.due: bool | None = None
         self.view: Any = None
         self.signal: Any = None
         self.backwards = 0
@@ -50,8 +45,3 @@ class Iteration:
     def skipped(self) -> bool:
         """Whether it has a backward that was skipped, and none that ran."""
         return self.decision.skip and not self.ran
-
-    @property
-    def step_at_once(self) -> bool:
-        """Whether its gradients are stepped without accumulating."""
-        return self.decision.reason in STEP_AT_ONCE

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.refinement.refinement import Refinement
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.files import write_aside
 
@@ -18,6 +17,7 @@ NO_REFINEMENT: dict[str, Any] = {
     "iterations_skipped": 0,
     "always_run": {},
     "foresight": None,
+    "growing": None,
 }
 
 
@@ -28,7 +28,7 @@ class Reporting(Protocol):
 
 
 def counters(
-    stats: GateStats, floor: float | None, t_total: float, t_post: float, refinement: Refinement | None = None
+    stats: GateStats, floor: float | None, t_total: float, t_post: float, left_out: dict[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return what was counted and timed.
 
@@ -39,9 +39,9 @@ def counters(
         `events` (structural changes by kind); `t_total`, `t_post` (seconds of training, and of its part from
         start_iter on); `refine_share` (share of the iterations from start_iter on that run or may run, None when
         none is left out), `gaussians_shown` (share of the Gaussians that a view shows, None where it is not known),
-        `iterations_run`, `iterations_skipped`, `always_run`, `foresight` (see `Refinement.report`).
+        `iterations_run`, `iterations_skipped`, `always_run`, `foresight` (see
+        `Refining.report`), `growing` (see `Growing.report`; None if that phase runs whole).
     """
-    left_out = None if refinement is None else refinement.report()
     return {
         "iterations": stats.iterations,
         "gated_iterations": stats.gated,
@@ -84,7 +84,8 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
 def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
     run, skipped = counted["iterations_run"], counted["iterations_skipped"]
     share = 100 * run / (run + skipped) if run + skipped else 0.0
-    lines = [
+    lines = [] if counted["growing"] is None else [_summarise_growing(counted["growing"])]
+    lines += [
         f"SkipGS: {run:,} of {run + skipped:,} iterations run ({share:.1f} %) since iteration "
         f"{config.start_iter or 0:,}, {skipped:,} left out whole."
     ]
@@ -105,6 +106,18 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
     elif config.refine_share == "auto":
         lines.append("  refinement is too short, or views come up too seldom, to leave out iterations: all of them run")
     return "\n".join(lines)
+
+
+def _summarise_growing(growing: dict[str, Any]) -> str:
+    run, skipped = growing["iterations_run"], growing["iterations_skipped"]
+    share = 100 * run / (run + skipped) if run + skipped else 100.0
+    factor = growing["rate_factor"]
+    longer = "" if factor is None or factor == 1.0 else f", steps {factor:.1f} times as long"
+    return (
+        f"SkipGS: {run:,} of {run + skipped:,} iterations run ({share:.1f} %) until densification ends, with "
+        f"{growing['events_run']:,} of {growing['events_run'] + growing['events_skipped']:,} densification "
+        f"events{longer}."
+    )
 
 
 def write_report(gate: Reporting, path: str | Path) -> None:

@@ -52,13 +52,6 @@ class StatsState(TypedDict):
     views: dict[str, tuple[int, int, int, Real]]
 
 
-class AccumulatorState(TypedDict):
-    """As `StepAccumulator.state_dict`."""
-
-    norm_mean: Real | None
-    square_mean: Real | None
-
-
 class ClockState(TypedDict):
     """As `GateClock.state_dict`."""
 
@@ -66,8 +59,8 @@ class ClockState(TypedDict):
     t_post: float
 
 
-class ThinningState(TypedDict):
-    """As `Thinning.state_dict`."""
+class SamplingState(TypedDict):
+    """As `Sampling.state_dict`."""
 
     share: float
     run: int
@@ -75,8 +68,8 @@ class ThinningState(TypedDict):
     due: int
 
 
-class ForesightState(TypedDict):
-    """As `Foresight.state_dict`."""
+class EarlyStoppingState(TypedDict):
+    """As `EarlyStopping.state_dict`."""
 
     ends: list[float]
     cycle: int
@@ -87,16 +80,48 @@ class ForesightState(TypedDict):
     before: dict[str, float]
 
 
-class RefinementState(TypedDict):
-    """As `Refinement.state_dict`."""
+class RefiningState(TypedDict):
+    """As `Refining.state_dict`."""
 
     asked: float | str
     share: float | None
     first: int | None
-    next: int | None
-    thinning: ThinningState
+    sampling: SamplingState
+    watched: list[str]
     recovery: tuple[int, int]
-    foresight: ForesightState | None
+    stopping: EarlyStoppingState | None
+
+
+class EventsState(TypedDict):
+    """As `Events.state_dict`."""
+
+    kept: int
+    left_out: int
+    behind: int
+
+
+class GrowingState(TypedDict):
+    """As `Growing.state_dict`."""
+
+    asked: float | str
+    share: float | None
+    first: int | None
+    views: int
+    settled: bool
+    gaussians_shown: float | None
+    sampling: SamplingState
+    events: EventsState | None
+
+
+class PaceState(TypedDict):
+    """As `Phased.state_dict`."""
+
+    start: int
+    last: int | None
+    keeps_rates: bool
+    next: int | None
+    refining: RefiningState
+    growing: GrowingState | None
 
 
 class GateState(TypedDict):
@@ -105,12 +130,11 @@ class GateState(TypedDict):
     version: int
     policy: dict[str, Any]
     stats: StatsState
-    accumulator: AccumulatorState
     non_finite_in_a_row: int
     clock: ClockState
     step: int | None
-    refinement: RefinementState | None
-    shown: tuple[float, int]  # as `ShownShare.state_dict`
+    pace: PaceState | None
+    shown: tuple[float, int]  # as `Visibility.state_dict`
 
 
 class ReleaseStats(TypedDict):
@@ -129,12 +153,6 @@ class ReleaseState(TypedDict):
     calibrated: bool
     warmup_would_skip: int
     warmup_would_total: int
-
-
-class ReleaseGateState(ReleaseState):
-    """The same with what only a whole gate reads."""
-
-    single_scale_ema: Real | None
 
 
 def is_release_state(state: Mapping[str, Any]) -> bool:
@@ -177,13 +195,23 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
         SkipGSError: Another version, or an entry is missing or of another type.
     """
     require_state(state)
+    accumulator = state.get("accumulator") or {}
+    if accumulator.get("norm_mean") is not None:
+        raise SkipGSError(
+            'The gate state was saved with step_mode="adaptive_norm", which there is no more; start the gate afresh.'
+        )
     if is_release_state(state):
         _require_release_version(state)
-        _require(state, ReleaseGateState, "state")
+        _require(state, ReleaseState, "state")
     else:
         _require_version(state, GATE_VERSION)
-        # Of states from before iterations could be left out, and before steps hung on what a view shows.
-        state = {"refinement": None, "shown": [0.0, 0], **state}
+        if state.get("refinement") is not None:
+            raise SkipGSError(
+                "The gate state was saved by a version before 0.2.0, which left out iterations in another way; go on "
+                "with that version, or start the gate afresh."
+            )
+        # States from before iterations could be left out, and before steps depended on what a view shows.
+        state = {"pace": None, "shown": [0.0, 0], **state}
         _require(state, GateState, "state")
     return dict(state)
 

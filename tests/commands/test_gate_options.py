@@ -22,9 +22,11 @@ GIVEN = {
     "min_bwd_ratio": 0.25,
     "on_nonfinite": "raise",
     "pause_iters": 9,
-    "step_mode": "adaptive_norm",
-    "step_trigger": "ref_k",
+    "share": 0.5,
+    "grow_share": "auto",
     "refine_share": 0.25,
+    "max_gaussians": 1000,
+    "always": (70, 80),
     "tolerance": 0.1,
     "compensate": True,
     "rate_peak": 3.0,
@@ -41,7 +43,9 @@ def test_there_is_one_for_every_setting() -> None:
 
 @COMMANDS
 def test_what_is_given_reaches_the_gate(args, own) -> None:
-    options = [word for name, value in GIVEN.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    options = []
+    for name, value in GIVEN.items():
+        options += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else [value])]
     config = (tyro.conf.FlagCreatePairsOff,)
     assert tyro.cli(args, args=[*own, *options], config=config).gate_options.given() == GIVEN
     assert tyro.cli(args, args=own, config=config).gate_options.given() == {}
@@ -56,7 +60,7 @@ def test_what_is_no_share_is_refused_in_one_sentence(share, tmp_path, capsys) ->
 
 
 @pytest.mark.parametrize(
-    ("options", "other"), [(["--tolerance", "0.1"], "--refine-share auto"), (["--rate-peak", "5"], "--compensate True")]
+    ("options", "other"), [(["--tolerance", "0.1"], "--share auto"), (["--rate-peak", "5"], "--compensate True")]
 )
 @COMMANDS
 def test_what_does_nothing_without_another_is_refused(args, own, options, other) -> None:

@@ -27,8 +27,9 @@ from skipgs_plug.core.policy import SkipPolicy
         ("min_bwd_ratio", "half"),
         ("min_bwd_ratio", float("nan")),
         ("on_nonfinite", "ignore"),
-        ("step_mode", "on"),
-        ("step_trigger", "often"),
+        ("share", 0.0),
+        ("grow_share", 1.5),
+        ("max_gaussians", -1),
     ],
 )
 def test_bad_values_name_their_field(field: str, value) -> None:

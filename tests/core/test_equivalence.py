@@ -21,7 +21,6 @@ def equal(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
         {"enabled": False},
         {"start_iter": STEPS},
         {"start_iter": 50, "warmup": STEPS},
-        {"enabled": False, "start_iter": 50, "step_mode": "adaptive_norm"},
     ],
 )
 def test_a_gate_that_never_skips_changes_no_bit(tiny_loop, settings) -> None:

@@ -183,7 +183,7 @@ def test_step_passes_arguments_on() -> None:
     gate = SkipGate(start_iter=0)
     gate.backward(parameter.sum(), view="a", step=0)
     mask = torch.tensor([True, False])
-    assert gate.step(Sparse([parameter], lr=1.0), gate.visible(mask), 2)
+    assert gate.step(Sparse([parameter], lr=1.0), mask, 2)
     assert seen[0][0] is mask
     assert seen[0][1] == 2
 

@@ -31,6 +31,7 @@ KEYS = {
     "iterations_skipped",
     "always_run",
     "foresight",
+    "growing",
     "views",
 }
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from skipgs_plug.core.refinement.rates import ScaledRates
+from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
 from skipgs_plug.fallback_raster.constants import FACTOR
 from skipgs_plug.fallback_raster.lazy_adam import STEPS, LazyAdam

@@ -86,7 +86,7 @@ def test_held_out_views_and_the_model_stay_without(changing: Scene) -> None:
     assert torch.allclose(trainer.render(known), 0.5 * before, atol=1e-6)
 
 
-@pytest.mark.parametrize("settings", [{}, {"refine_share": 0.4}, {"step_mode": "adaptive_norm"}, None])
+@pytest.mark.parametrize("settings", [{}, {"refine_share": 0.4}, None])
 @pytest.mark.parametrize("stop", [13, 45])
 def test_resumed_equals_uninterrupted(tmp_path: Path, changing: Scene, stop: int, settings: dict | None) -> None:
     config = TrainConfig(max_steps=60, refine_every=4, sh_degree_interval=5000, exposure=True)

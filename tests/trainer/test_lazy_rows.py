@@ -144,7 +144,7 @@ def test_resumed_equals_uninterrupted(tmp_path: Path, narrow_scene: Scene, stop:
     assert_same(whole, second)
 
 
-@pytest.mark.parametrize("settings", [{}, {"step_mode": "adaptive_norm", "step_trigger": "ref_k"}])
+@pytest.mark.parametrize("settings", [{}, {"refine_share": 0.5}])
 def test_a_gate_leaves_steps_out_of_both(
     monkeypatch: pytest.MonkeyPatch, narrow_scene: Scene, settings: dict[str, Any]
 ) -> None:

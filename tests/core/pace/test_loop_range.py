@@ -3,7 +3,7 @@
 import pytest
 
 from skipgs_plug.core.intercept import Patches
-from skipgs_plug.core.refinement.loop_range import LoopRange, replace_range
+from skipgs_plug.core.pace.loop_range import LoopRange, replace_range
 
 
 class Bar:

@@ -21,24 +21,8 @@ from skipgs_plug.core.errors import SkipGSError
 
 CYCLE_ENDS = (0.125, 0.25, 1.0)
 ONE_CYCLE = (1.0,)  # where nothing is to be foreseen: the share is given, or no view is watched
-LEAST_SHARE = 0.2
-LEAST_STEPS = 300  # fewer have no room to shrink in: 200 instead of 250 cost unmodified scripts 0.15 to 0.37 dB
-# Share at one visit of each view in all of refinement; it falls with the fourth root of the visits. On bonsai nothing
-# is lost from 0.35, 0.3 and 0.25 on, at 2, 6 and 12 visits.
-RARE_SHARE = 0.46
 WATCHED_SHARE = 1 / 12  # of the views
 LEAST_WATCHED, MOST_WATCHED = 3, 12  # fewer than three cannot tell a twentieth of a decibel: none then
-
-
-def needed_share(iterations: int, n_views: int) -> float:
-    """Share of the refinement iterations that may be needed, known beforehand.
-
-    A fifth, or more where views are many for so few iterations or these are few by themselves; all where not every view
-    comes up once.
-    """
-    if iterations < n_views:
-        return 1.0
-    return min(1.0, max(LEAST_SHARE, LEAST_STEPS / iterations, RARE_SHARE * (n_views / iterations) ** 0.25))
 
 
 def watched_views(names: Iterable[str], iterations: float, seed: int = 0) -> frozenset[str]:
@@ -56,7 +40,7 @@ def watched_views(names: Iterable[str], iterations: float, seed: int = 0) -> fro
     return frozenset(random.Random(seed).sample(names, count))
 
 
-class Foresight:
+class EarlyStopping:
     """Follows the cycles, and says when the rest is not worth its time.
 
     Args:

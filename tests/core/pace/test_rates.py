@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.refinement.rates import ScaledRates, group_factor, path_factor
+from skipgs_plug.core.pace.rates import ScaledRates, group_factor, path_factor
 
 
 def parameter(value=1.0):

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skipgs_plug.core.refinement.thinning import Thinning
+from skipgs_plug.core.pace.sampling import Sampling
 
 
 def ran(share: float, numbers: range, must: frozenset[int] = frozenset()) -> list[int]:
-    thinning = Thinning(share)
+    thinning = Sampling(share)
     return [n for n in numbers if thinning.runs(n in must)]
 
 
@@ -50,9 +50,9 @@ def test_no_view_starves_in_a_loop_that_takes_them_in_turn(share: float, n_views
 
 def test_a_saved_state_goes_on() -> None:
     whole = ran(0.37, range(500))
-    first = Thinning(0.37)
+    first = Sampling(0.37)
     begun = [n for n in range(300) if first.runs(False)]
-    second = Thinning(1.0)
+    second = Sampling(1.0)
     second.load_state_dict(json.loads(json.dumps(first.state_dict())))
     assert begun + [n for n in range(300, 500) if second.runs(False)] == whole
     assert (second.run, second.left_out) == (len(whole), 500 - len(whole))

@@ -9,8 +9,8 @@ from skipgs_plug.core import decision
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.ema import ViewMeans
+from skipgs_plug.core.pace.refining import Refining
 from skipgs_plug.core.policy import Policy
-from skipgs_plug.core.refinement.refinement import Refinement
 from skipgs_plug.core.state import refinement_policy_state
 
 
@@ -20,9 +20,9 @@ class RefinementPolicy(Policy):
     Structural changes need no pause: no mean decides.
     """
 
-    def __init__(self, config: SkipConfig, refinement: Refinement) -> None:
+    def __init__(self, config: SkipConfig, refining: Refining) -> None:
         self._config = config
-        self._refinement = refinement
+        self._refining = refining
         self._means = ViewMeans(config.ema_decay)
 
     @property
@@ -37,18 +37,18 @@ class RefinementPolicy(Policy):
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
         """Run the backward, unless the view is watched or refinement is over; the loss is finite."""
         self._means.update(view, loss)
-        refinement = self._refinement
-        if refinement.over:
+        refining = self._refining
+        if refining.over:
             return decision.OVER
-        if refinement.watching and view in refinement.watched:
-            assert refinement.foresight is not None
-            refinement.foresight.see(str(view), loss)
+        if refining.watching and view in refining.watched:
+            assert refining.stopping is not None
+            refining.stopping.see(str(view), loss)
             return decision.WATCHED
         return decision.FULL
 
     def notify_event(self, step: int, n_views: int) -> None:
-        """Tell the refinement, which may have ended."""
-        self._refinement.notify_event(n_views)
+        """Tell the phase, which may have ended."""
+        self._refining.notify_event(n_views)
 
     def state_dict(self) -> dict[str, Any]:
         return {"means": self._means.state_dict()}

@@ -12,7 +12,7 @@ STEPS = 100  # that are looked at
 ROWS = 8192  # of a gradient that are looked at
 
 
-class ShownShare:
+class Visibility:
     """Mean over the first steps of the share of Gaussians whose positions have a gradient."""
 
     def __init__(self) -> None:
@@ -23,6 +23,15 @@ class ShownShare:
     def share(self) -> float | None:
         """In (0, 1]; None before the first step, and of a model without such a group."""
         return self._sum / self._steps if self._steps else None
+
+    @property
+    def steps(self) -> int:
+        """Steps seen so far, at most `STEPS`."""
+        return self._steps
+
+    def restart(self) -> None:
+        """Forget everything: the scene has grown since."""
+        self._sum, self._steps = 0.0, 0
 
     def see(self, groups: list[dict[str, Any]], name: str | None) -> None:
         """An optimizer is about to step; `name` is that of groups without a `name`, if it is known.
@@ -47,7 +56,7 @@ class ShownShare:
 
 
 def positions(groups: list[dict[str, Any]], name: str | None) -> Iterator[Tensor]:
-    """Yield the parameters that may be positions [N, 3]; arguments as for `ShownShare.see`."""
+    """Yield the parameters that may be positions [N, 3]; arguments as for `Visibility.see`."""
     for group in groups:
         known = group.get("name", name)
         for param in group["params"] if known is None or known in POSITIONS else ():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from skipgs_plug import SkipGSError
-from skipgs_plug.core.refinement.loop_range import line_of
-from skipgs_plug.core.refinement.milestones import milestones
+from skipgs_plug.core.pace.loop_range import line_of
+from skipgs_plug.core.pace.milestones import milestones
 
 NUMBERS = range(50, 100)
 

@@ -7,7 +7,7 @@ import functools
 import inspect
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from types import CodeType
 from typing import Any, Protocol
 
@@ -92,24 +92,6 @@ def require_planned(numbers: range, last: int) -> None:
             f"Iterations up to {numbers[-1]} come after a plan that ends with {last}; "
             "give gate.iterations() all iterations of the run at once."
         )
-
-
-class Every:
-    """Owner of a loop that runs all its numbers; `at_end` is called when it is over, or was left."""
-
-    wants_loop = False
-
-    def __init__(self, at_end: Callable[[], None]) -> None:
-        self._at_end = at_end
-
-    def runs(self, loop: LoopRange, number: int) -> bool:
-        return True
-
-    def expected(self, loop: LoopRange) -> int:
-        return len(loop.numbers)
-
-    def ended(self, loop: LoopRange) -> None:
-        self._at_end()
 
 
 def replace_range(patches: Patches, names: dict[str, Any], functions: tuple[str, ...], owner: Owner) -> None:

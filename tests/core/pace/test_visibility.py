@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from skipgs_plug.core.refinement.rates import ScaledRates, path_factor
-from skipgs_plug.core.refinement.shown import ROWS, STEPS, ShownShare, reached_share
+from skipgs_plug.core.pace.rates import ScaledRates, path_factor
+from skipgs_plug.core.pace.visibility import ROWS, STEPS, Visibility, reached_share
 
 
 def positions(rows, reached, width=3):
@@ -35,14 +35,14 @@ def test_of_many_rows_some_are_looked_at():
 
 
 def test_the_mean_over_the_first_steps_counts():
-    shown = ShownShare()
+    shown = Visibility()
     assert shown.share is None
     for step in range(2 * STEPS):
         reached = 10 if step < STEPS else 40
         shown.see([{"name": "rotation", "params": [positions(40, 20, 4)]}], None)
         shown.see([{"name": "xyz", "params": [positions(40, reached)]}], None)
     assert shown.share == 0.25
-    again = ShownShare()
+    again = Visibility()
     again.load_state_dict(shown.state_dict())
     assert again.share == shown.share
 
@@ -59,13 +59,13 @@ def test_the_mean_over_the_first_steps_counts():
     ],
 )
 def test_positions_are_known_by_name_or_by_shape(group, name, expected):
-    shown = ShownShare()
+    shown = Visibility()
     shown.see([{"params": [positions(40, 40, 1)]}, {"params": [positions(40, 20)], **group}], name)
     assert shown.share == expected
 
 
 def test_what_has_no_gradient_says_nothing():
-    shown = ShownShare()
+    shown = Visibility()
     empty = torch.nn.Parameter(torch.zeros(40, 3))
     for _ in range(3):
         shown.see([{"params": [empty]}], "means")

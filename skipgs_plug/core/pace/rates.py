@@ -13,7 +13,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 from torch.utils.hooks import RemovableHandle
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.refinement.shown import ShownShare, positions
+from skipgs_plug.core.pace.visibility import Visibility, positions
 
 Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
 Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
@@ -105,8 +105,9 @@ class ScaledRates:
 
     def __init__(self, only: Optimizers | None = None) -> None:
         self.only = only
-        self.shown = ShownShare()
+        self.shown = Visibility()
         self._factor: float | None = None
+        self._evenly = False
         self._rows = self._rows_now = 0  # Gaussians in the iteration before and in this one; 0 where not known
         self._thread = threading.get_ident()
         self._depth: dict[int, int] = {}  # a step can call the step of its base class
@@ -115,8 +116,13 @@ class ScaledRates:
         self._watched: WeakKeyDictionary[torch.optim.Optimizer, list[RemovableHandle]] = WeakKeyDictionary()
         self._removed = False
 
-    def scale(self, factor: float) -> None:
+    def scale(self, factor: float, evenly: bool = False) -> None:
         """Scale the steps of the thread that calls this, which is the one that trains; see `group_factor`.
+
+        Args:
+            factor: On learning rates.
+            evenly: Scale all parameters of the Gaussians by this factor itself, with the trainer's memory of squares,
+                and leave everything else alone.
 
         Raises:
             SkipGSError: Another one scales steps in this thread, and one of the two does not know which are its own.
@@ -132,7 +138,7 @@ class ScaledRates:
                     "Another gate makes steps larger in this thread, and each would scale those of both: detach() it "
                     "first, or train in threads of their own."
                 )
-        self._factor, self._thread = factor, thread
+        self._factor, self._evenly, self._thread = factor, evenly, thread
         self._rows, self._rows_now = self._rows_now or self._rows, 0
         if not self._handles:
             _hooked.append(self)
@@ -140,6 +146,11 @@ class ScaledRates:
                 register_optimizer_step_pre_hook(self._scale),
                 register_optimizer_step_post_hook(self._put_back),
             ]
+
+    @property
+    def rows(self) -> int:
+        """Number of Gaussians in the last step of their positions; 0 if it is not known."""
+        return self._rows_now or self._rows
 
     def rest(self) -> None:
         """Touch nothing until the next `scale`."""
@@ -183,6 +194,10 @@ class ScaledRates:
             self._watched[optimizer] = self._watch(optimizer)
         for group in groups:
             longer = self._of_gaussians(group, names[0])
+            if self._evenly:
+                if longer and "lr" in group:
+                    group["lr"] = group["lr"] * self._factor
+                continue
             if "lr" in group:
                 factor = group_factor(group, self._factor, names[0]) if longer else BESIDE * min(self._factor, 1.0)
                 group["lr"] = group["lr"] * factor

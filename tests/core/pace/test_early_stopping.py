@@ -5,14 +5,15 @@ import json
 import pytest
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.refinement.foresight import CYCLE_ENDS, Foresight, mean_gain, needed_share, watched_views
+from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, EarlyStopping, mean_gain, watched_views
+from skipgs_plug.core.pace.needs import refining_share
 
 VIEWS = [f"{i}.png" for i in range(6)]
 
 
 def follow(losses, tolerance=0.05, iterations=800):
     """Go through all cycles; `losses(view, share done)` is what a view shows."""
-    foresight = Foresight(tolerance)
+    foresight = EarlyStopping(tolerance)
     for i in range(iterations):
         done = i / iterations
         foresight.progress(done)
@@ -50,13 +51,13 @@ def test_views_that_get_worse_say_nothing():
 
 
 def test_progress_runs_from_zero_to_one_in_every_cycle():
-    foresight = Foresight(0.05)
+    foresight = EarlyStopping(0.05)
     seen = [foresight.progress(i / 80) for i in range(80)]
     assert seen == pytest.approx([i / 10 for i in range(10)] * 2 + [i / 60 for i in range(60)])
 
 
 def test_without_two_watched_views_nothing_is_judged():
-    foresight = Foresight(0.05)
+    foresight = EarlyStopping(0.05)
     for i in range(100):
         foresight.progress(i / 100)
     assert foresight.gains == [] and foresight.foreseen is None and not foresight.ended
@@ -67,10 +68,10 @@ def test_a_saved_state_goes_on():
         return 0.1 * (1.0 - 0.3 * done) + 0.001 * VIEWS.index(view)
 
     whole, _ = follow(losses)
-    first = Foresight(0.05)
+    first = EarlyStopping(0.05)
     for i in range(800):
         if i == 150:
-            second = Foresight(0.05)
+            second = EarlyStopping(0.05)
             second.load_state_dict(json.loads(json.dumps(first.state_dict())))
             first = second
         first.progress(i / 800)
@@ -80,17 +81,17 @@ def test_a_saved_state_goes_on():
 
 
 def test_the_share_follows_from_the_visits():
-    assert needed_share(15_000, 100) == needed_share(1500, 17) == 0.2
-    assert needed_share(3000, 255) == pytest.approx(0.2484, abs=1e-4)
-    assert needed_share(1500, 255) == pytest.approx(0.2954, abs=1e-4)
-    assert needed_share(2000, 2000) == 0.46
-    assert needed_share(1999, 2000) == 1.0
+    assert refining_share(15_000, 100) == refining_share(1500, 17) == 0.2
+    assert refining_share(3000, 255) == pytest.approx(0.2484, abs=1e-4)
+    assert refining_share(1500, 255) == pytest.approx(0.2954, abs=1e-4)
+    assert refining_share(2000, 2000) == 0.46
+    assert refining_share(1999, 2000) == 1.0
 
 
 def test_a_short_refinement_needs_more_of_its_iterations():
-    assert needed_share(1000, 17) == 0.3
-    assert needed_share(400, 17) == 0.75
-    assert needed_share(300, 17) == needed_share(20, 17) == 1.0
+    assert refining_share(1000, 17) == 0.3
+    assert refining_share(400, 17) == 0.75
+    assert refining_share(300, 17) == refining_share(20, 17) == 1.0
 
 
 def test_watched_views_are_few_and_always_the_same():
@@ -110,10 +111,10 @@ def test_gain_in_decibels():
 
 
 def test_a_state_of_other_cycles_is_refused():
-    state = Foresight(0.05).state_dict()
+    state = EarlyStopping(0.05).state_dict()
     for damage in ({"ends": [0.5, 1.0]}, {"cycle": -1}, {"cycle": 3}):
         with pytest.raises(SkipGSError, match=r"which no run has; start the gate afresh"):
-            Foresight(0.05).load_state_dict({**state, **damage})
-    again = Foresight(0.05)
+            EarlyStopping(0.05).load_state_dict({**state, **damage})
+    again = EarlyStopping(0.05)
     again.load_state_dict({**state, "cycle": 0})
     assert again.cycle == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 
-class Thinning:
+class Sampling:
     """Runs one iteration in each slot of 1 / share iterations, at a place in it that looks random.
 
     Strictly even gaps would meet loops that take view `step % n` at the same views again and again. An iteration
@@ -25,8 +25,16 @@ class Thinning:
         self.left_out = 0
         self._due = 0  # how many should have run by now
 
-    def runs(self, must: bool) -> bool:
-        """Whether the next iteration runs; `must` says that something hangs on it."""
+    def runs(self, must: bool, barred: bool = False) -> bool:
+        """Whether the next iteration runs.
+
+        Args:
+            must: It runs in any case.
+            barred: It does not run, and a later one takes its turn.
+        """
+        if barred:
+            self.left_out += 1
+            return False
         if 0.0 < self.share < 1.0:
             asked = self.run + self.left_out
             while (self._due + _place(self._due)) / self.share < asked + 1:

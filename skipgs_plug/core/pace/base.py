@@ -1,0 +1,136 @@
+"""What the engine asks of a pace, and the pace of a run in which every iteration runs as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from types import CodeType
+from typing import Any
+
+from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.facts import Densification, TrainerFacts
+from skipgs_plug.core.pace.loop_range import LoopRange
+from skipgs_plug.core.policy import Policy, SkipPolicy
+
+Source = tuple[CodeType, Mapping[str, Any]]  # code of the function that holds a loop, and the names that it knew
+Always = Callable[[range], Iterable[int]]
+
+
+def nothing_always(numbers: range) -> Iterable[int]:
+    """No iteration must run but those that the loop's own conditions name."""
+    return ()
+
+
+class Pace:
+    """Every iteration runs, and learning rates stay as they are.
+
+    Other paces derive from this one. The engine asks one question per iteration, `LoopRange` asks it through `runs`,
+    and tells one thing, that the iteration begins (`begin`).
+
+    Attributes:
+        number: number of the iteration that the training loop is in; None while the loop is not known, and after it.
+        gap: iterations that were left out right before the present one.
+    """
+
+    number: int | None = None
+    gap: int = 0
+
+    def configure(self, start: int, facts: TrainerFacts, views: list[str] | None) -> None:
+        """Take the facts about the trainer.
+
+        Args:
+            start: First iteration of refinement.
+            facts: About the trainer.
+            views: Keys of all training views, None if unknown.
+
+        Raises:
+            SkipGSError: This pace cannot be kept in this trainer.
+        """
+
+    def policy(self, config: SkipConfig) -> Policy:
+        """Return the policy that decides about the backwards of iterations that run."""
+        return SkipPolicy.from_config(config)
+
+    def follow(
+        self,
+        numbers: range,
+        source: Source | None,
+        always: Iterable[int] = (),
+        views: list[str] | None = None,
+        events: Iterable[int] | None = None,
+    ) -> LoopRange:
+        """Return the loop that stands for `numbers` in a training loop of the user's own.
+
+        Args:
+            numbers: All iterations of the run, or all that are left.
+            source: Where the loop's conditions are read; None to read none.
+            always: Iterations that must run.
+            views: Keys of all training views, None if the trainer tells them.
+            events: Iterations that densify, None if they are unknown or the trainer's adapter knows them.
+
+        Raises:
+            SkipGSError: The numbers go on after those of an earlier plan.
+        """
+        return LoopRange(numbers, EveryNumber(lambda: None))
+
+    def begin(self, step: int, floor: float | None) -> None:
+        """Iteration `step` begins; `floor` is the least share of real backwards in force, None without one."""
+
+    def describe(
+        self,
+        always: Always = nothing_always,
+        pure: Iterable[str] = (),
+        densification: Densification | None = None,
+    ) -> None:
+        """Take facts that the loop's source does not show.
+
+        Args:
+            always: Gives further iterations that must run.
+            pure: Functions that only look at numbers, and may stand in the loop's conditions.
+            densification: How its densification events are told; None if `configure` says it, or nobody knows.
+        """
+
+    @property
+    def leaves_out(self) -> bool:
+        """Whether whole iterations may be left out, for which the pace needs the training loop."""
+        return False
+
+    @property
+    def lacks_loop(self) -> bool:
+        """Whether iterations are to be left out and no loop runs that could do so."""
+        return False
+
+    def needs_loop(self, step: int) -> bool:
+        """Whether iteration `step` belongs to a phase that leaves out iterations."""
+        return False
+
+    def remove(self) -> None:
+        """Let go of the loop, which runs all its numbers from now on."""
+
+    def report(self) -> dict[str, Any] | None:
+        """Return the entries of skipgs.json about iterations that were left out; None if none can be."""
+        return None
+
+    def state_dict(self) -> dict[str, Any] | None:
+        """Return everything that changes, None if nothing does."""
+        return None
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict()`."""
+
+
+class EveryNumber:
+    """Owner of a loop that runs all its numbers; `at_end` is called when the loop is over, or was left."""
+
+    wants_loop = False
+
+    def __init__(self, at_end: Callable[[], None]) -> None:
+        self._at_end = at_end
+
+    def runs(self, loop: LoopRange, number: int) -> bool:
+        return True
+
+    def expected(self, loop: LoopRange) -> int:
+        return len(loop.numbers)
+
+    def ended(self, loop: LoopRange) -> None:
+        self._at_end()

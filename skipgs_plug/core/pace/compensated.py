@@ -1,0 +1,70 @@
+"""The pace of the paper's gate with larger, shrinking steps, which make up for the backwards that it skips."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from skipgs_plug.core import distributed
+from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.facts import TrainerFacts
+from skipgs_plug.core.pace.base import EveryNumber, Pace, Source
+from skipgs_plug.core.pace.loop_range import LoopRange, require_planned
+from skipgs_plug.core.pace.rates import ScaledRates, path_factor
+
+
+class Compensated(Pace):
+    """Runs every iteration, and scales the learning rates of gated ones by the floor's share of backwards.
+
+    Args:
+        config: With `compensate`.
+        rates: Scales learning rates.
+    """
+
+    def __init__(self, config: SkipConfig, rates: ScaledRates) -> None:
+        self._config = config
+        self._rates = rates
+        self._start = 0
+        self._last: int | None = None  # iteration after which steps have no length
+
+    def configure(self, start: int, facts: TrainerFacts, views: list[str] | None) -> None:
+        self._start = start
+        if facts.max_steps is not None:
+            self._plan(range(facts.max_steps + 1))
+
+    def follow(
+        self,
+        numbers: range,
+        source: Source | None,
+        always: Iterable[int] = (),
+        views: list[str] | None = None,
+        events: Iterable[int] | None = None,
+    ) -> LoopRange:
+        self._plan(numbers)
+        return LoopRange(numbers, EveryNumber(self._rates.rest))
+
+    def begin(self, step: int, floor: float | None) -> None:
+        if self._last is None:
+            raise SkipGSError(
+                "compensate=True must know the last iteration: write the loop as "
+                "for step in gate.iterations(range(...))."
+            )
+        if step < self._start:
+            self._rates.rest()
+            return
+        # A trainer may go on after the end that it told: with steps of length 0.
+        progress = min((step - self._start) / max(self._last + 1 - self._start, 1), 1.0)
+        self._rates.scale(path_factor(floor or 1.0, progress, self._config.rate_peak, self._rates.shown.share))
+
+    def _plan(self, numbers: range) -> None:
+        if not numbers:
+            return
+        if self._last is not None:
+            require_planned(numbers, self._last)
+            return
+        if self._config.min_bwd_ratio == "auto":
+            distributed.refuse_several(
+                "compensate=True scales learning rates by a floor that each process finds by itself",
+                "give min_bwd_ratio, such as 0.5",
+            )
+        self._last = numbers[-1]

@@ -1,0 +1,182 @@
+"""The growing phase: fewer iterations and fewer densification events before refinement begins."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.facts import Densification
+from skipgs_plug.core.pace.events import Events
+from skipgs_plug.core.pace.needs import growing_factor, growing_share
+from skipgs_plug.core.pace.rates import ScaledRates
+from skipgs_plug.core.pace.sampling import Sampling
+
+MEASURED = 20  # steps over which the share of Gaussians that a view shows is averaged before it decides
+
+
+class Growing:
+    """Says which iterations run while the scene grows, and scales learning rates where that replaces iterations.
+
+    Iterations that run are spread evenly. Densification events run when enough stands behind them, and the iterations
+    of the others are left out, so that their statistics go on to the next. Everything else that depends on a number
+    happens as ever.
+
+    Args:
+        config: With `growing`.
+        rates: Scales learning rates, and measures what a view shows.
+
+    Attributes:
+        share: share of the iterations that runs; None before the phase begins.
+        sampling: counts the iterations that ran and that were left out.
+        events: densification events; None before the phase begins.
+        always: iterations that must run, by the reason.
+    """
+
+    def __init__(self, config: SkipConfig, rates: ScaledRates) -> None:
+        self._config = config
+        self._rates = rates
+        self.share: float | None = None if config.growing == "auto" else config.growing  # type: ignore[assignment]
+        self.sampling = Sampling(1.0)
+        self.events: Events | None = None
+        self.always: dict[str, set[int]] = {}
+        self._must: frozenset[int] = frozenset()
+        self._first_number: int | None = None
+        self._length = 0
+        self._n_views = 0
+        self._shown: float | None = None
+        self._settled = False
+        self._saved_events: dict[str, Any] | None = None
+        self._rows = self._grown = 0  # Gaussians when the last event was asked about, and those added since before it
+
+    @property
+    def first(self) -> int | None:
+        """First iteration that could be left out; None before the phase begins."""
+        return self._first_number
+
+    def begin(
+        self,
+        numbers: range,
+        found: Mapping[str, set[int]],
+        hidden: Iterable[int],
+        densification: Densification,
+        n_views: int | None,
+    ) -> None:
+        """Take what is known when the loop begins.
+
+        Args:
+            numbers: Iterations from the first that can be left out to the end of densification.
+            found: Iterations on which something depends, by the condition of the loop.
+            hidden: Further iterations that must run.
+            densification: The trainer's events.
+            n_views: Number of training views; None if unknown.
+
+        Raises:
+            SkipGSError: "auto" must know the number of views, and it is unknown.
+        """
+        if self.share is None and n_views is None:
+            raise SkipGSError(
+                'share="auto" must know the training views; give their names to gate.iterations() as views=, '
+                "or a share."
+            )
+        marks = densification.marks
+        events = set() if densification.numbers is None else set(densification.numbers(numbers))
+        for reason, hits in found.items():
+            if any(mark in reason for mark in marks):
+                events |= hits
+        others = {reason: hits for reason, hits in found.items() if not any(mark in reason for mark in marks)}
+        self.always = dict(others)
+        hidden = {n for n in hidden if n in numbers}
+        if hidden:
+            self.always["named for this trainer"] = hidden
+        self.events = Events(events, densification)
+        if self._saved_events is not None:
+            self.events.load_state_dict(self._saved_events)
+        # Of what shares its number with an event, only what happens less often than events keeps that number: what
+        # happens as often, such as a line in a log, comes round again.
+        rare = [hits for hits in others.values() if len(hits) < len(events)]
+        common = [hits for hits in others.values() if len(hits) >= len(events)]
+        self._must = frozenset(hidden).union(*rare, *(hits - events for hits in common))
+        if self._first_number is None:
+            self._first_number = numbers.start
+        self._length = numbers.stop - self._first_number
+        self._n_views = n_views or self._n_views
+
+    def runs(self, number: int) -> bool:
+        """Whether iteration `number` runs; asked once for each, in order."""
+        assert self.events is not None
+        self._settle()
+        assert self.share is not None
+        must, barred = number in self._must, False
+        if number in self.events and not must:
+            must = self.events.enough(number, self._shown) and not self._full()
+            barred = not must
+        self.sampling.share = self.share
+        runs = self.sampling.runs(must, barred)
+        if runs:
+            self.events.ran(number)
+        else:
+            self.events.skipped(number)
+        factor = growing_factor(self._length, self.share, self._shown) if self._config.compensates else 1.0
+        if factor > 1.0 or not self._settled or self._config.max_gaussians is not None:
+            self._rates.scale(factor, evenly=True)
+        else:
+            self._rates.rest()
+        return runs
+
+    def _settle(self) -> None:
+        """Set share and visibility by what is measured so far; once enough steps were seen, they stay."""
+        if self._settled:
+            return
+        if self._rates.shown.steps >= MEASURED:
+            self._shown = self._rates.shown.share
+            self._settled = True
+        if self._config.growing == "auto":
+            self.share = growing_share(self._length, self._n_views, self._shown)
+
+    def _full(self) -> bool:
+        """Whether one more event could grow the scene beyond the number of Gaussians that the user set."""
+        bound = self._config.max_gaussians
+        if bound is None:
+            return False
+        rows = self._rates.rows
+        if self._rows:
+            self._grown = max(rows - self._rows, 0)
+        self._rows = rows
+        return rows + self._grown > bound
+
+    def report(self) -> dict[str, Any]:
+        """Return `share`, `iterations_run`, `iterations_skipped`, `events_run`, `events_skipped`, `always_run`."""
+        events = self.events
+        return {
+            "share": self.share,
+            "iterations_run": self.sampling.run,
+            "iterations_skipped": self.sampling.left_out,
+            "events_run": 0 if events is None else events.kept,
+            "events_skipped": 0 if events is None else events.left_out,
+            "rate_factor": None
+            if self.share is None or not self._config.compensates
+            else growing_factor(self._length, self.share, self._shown),
+            "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "asked": self._config.growing,
+            "share": self.share,
+            "first": self._first_number,
+            "views": self._n_views,
+            "settled": self._settled,
+            "gaussians_shown": self._shown,
+            "sampling": self.sampling.state_dict(),
+            "events": self._saved_events if self.events is None else self.events.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict()`; `begin` follows."""
+        self.share, self._first_number = state["share"], state["first"]
+        self._n_views = state["views"]
+        self._settled, self._shown = state["settled"], state["gaussians_shown"]
+        self.sampling.load_state_dict(state["sampling"])
+        self._saved_events, self.events = state["events"], None

@@ -1,0 +1,59 @@
+"""Finds the loop that trains among all loops that count with `range`."""
+
+from __future__ import annotations
+
+from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.pace.loop_range import LoopRange
+
+SEARCHED = 10  # iterations that could be left out, after which the training loop must have been recognised
+
+
+class LoopFinder:
+    """The training loop is the one whose numbers the trainer's iterations follow.
+
+    Attributes:
+        found: the training loop, None until it is known.
+        expected: number with which the loop of a resumed run goes on; None in a fresh run.
+    """
+
+    def __init__(self) -> None:
+        self.found: LoopRange | None = None
+        self.expected: int | None = None
+        self._candidates: list[LoopRange] = []
+        self._without = 0
+
+    def asks(self, loop: LoopRange, number: int) -> bool:
+        """A loop asks about a number; True if it is the training loop."""
+        if self.found is None and number == self.expected:
+            self.found = loop
+        if loop is not self.found:
+            if self.found is None and loop not in self._candidates:
+                self._candidates.append(loop)
+            return False
+        self.expected = number + 1
+        return True
+
+    def begins(self, step: int, needed: bool) -> bool:
+        """The trainer begins iteration `step`; True if this shows which loop trains.
+
+        Args:
+            step: Number of the iteration.
+            needed: Whether the iteration belongs to a phase that leaves out iterations.
+
+        Raises:
+            AdapterMismatchError: No loop over a range counts the iterations.
+        """
+        if self.found is not None:
+            return False
+        self.found = next((loop for loop in self._candidates if loop.current == step), None)
+        self._candidates.clear()
+        if self.found is not None:
+            self.expected = step + 1
+            return True
+        self._without += needed
+        if self._without == SEARCHED:
+            raise AdapterMismatchError(
+                "No loop over range(...) counts the iterations of this trainer, so none can be left out; gate "
+                "without share and refine_share, or write the loop as: for step in gate.iterations(range(...))."
+            )
+        return False

@@ -1,0 +1,264 @@
+"""The pace of a run that leaves out iterations: joins the training loop, its phases and the learning rates."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from skipgs_plug.core import distributed
+from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.facts import Densification, TrainerFacts
+from skipgs_plug.core.pace.base import Always, Pace, Source, nothing_always
+from skipgs_plug.core.pace.growing import Growing
+from skipgs_plug.core.pace.loop_finder import LoopFinder
+from skipgs_plug.core.pace.loop_range import LoopRange, line_of, require_planned
+from skipgs_plug.core.pace.milestones import milestones
+from skipgs_plug.core.pace.policy import RefinementPolicy
+from skipgs_plug.core.pace.rates import ScaledRates
+from skipgs_plug.core.pace.refining import Refining
+from skipgs_plug.core.policy import Policy
+
+NAMED = "named for this trainer"
+
+
+class Phased(Pace):
+    """Asks the phase that an iteration belongs to whether it runs.
+
+    Args:
+        config: With `leaves_out`.
+        rates: Scales learning rates.
+        go_on: Loads the state that belongs to the checkpoint which training goes on from with an iteration, if any.
+
+    Attributes:
+        refining: the phase after densification.
+        growing: the phase before; None if it runs whole.
+    """
+
+    def __init__(self, config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None]) -> None:
+        self._config = config
+        self._rates = rates
+        self._go_on = go_on
+        self.refining = Refining(config, rates)
+        self.growing: Growing | None = None if config.growing is None else Growing(config, rates)
+        self._finder = LoopFinder()
+        self._densification: Densification | None = None
+        self._keeps_rates = False
+        self._views: list[str] | None = None
+        self._start = 0
+        self._last: int | None = None
+        self._hidden: Always = nothing_always
+        self._chosen = frozenset(config.always or ())
+        self._pure: tuple[str, ...] = ()
+        self._conditions: tuple[dict[str, set[int]], dict[str, set[int]]] | None = None  # of both phases
+        self._left_out = 0
+        self._configured = self._removed = False
+
+    # Facts about the trainer.
+
+    def configure(self, start: int, facts: TrainerFacts, views: list[str] | None) -> None:
+        self._refuse_several()
+        self._start, self._last, self._views = start, facts.max_steps, views
+        self._keeps_rates = facts.accumulates
+        self._densification = facts.densification or self._densification
+        self._configured = True
+
+    def policy(self, config: SkipConfig) -> Policy:
+        return RefinementPolicy(config, self.refining)
+
+    def describe(
+        self,
+        always: Always = nothing_always,
+        pure: Iterable[str] = (),
+        densification: Densification | None = None,
+    ) -> None:
+        self._hidden, self._pure, self._densification = always, tuple(pure), densification
+
+    def follow(
+        self,
+        numbers: range,
+        source: Source | None,
+        always: Iterable[int] = (),
+        views: list[str] | None = None,
+        events: Iterable[int] | None = None,
+    ) -> LoopRange:
+        self._refuse_several()
+        if events is not None:
+            known = frozenset(int(number) for number in events)
+            self._densification = Densification(numbers=lambda part: known.intersection(part))
+        self._chosen = frozenset((*always, *(self._config.always or ())))
+        if views is not None:
+            self._views = views
+        if self.refining.begun and self._last is not None:
+            require_planned(numbers, self._last)
+        self._finder.found = LoopRange(numbers, self, source)
+        return self._finder.found
+
+    def remove(self) -> None:
+        self._removed = True
+        self.refining.remove()
+
+    # What the engine and the hooks ask.
+
+    @property
+    def leaves_out(self) -> bool:
+        return True
+
+    @property
+    def lacks_loop(self) -> bool:
+        return self.number is None and not self._removed
+
+    def needs_loop(self, step: int) -> bool:
+        return self.growing is not None or step >= self._start
+
+    @property
+    def number(self) -> int | None:  # type: ignore[override]
+        loop = self._finder.found
+        return None if loop is None else loop.current
+
+    def begin(self, step: int, floor: float | None) -> None:
+        if self._finder.begins(step, self.needs_loop(step)) and step >= self._start and self.refining.first is None:
+            self.refining.first = step  # it began before its loop was known
+            self.refining.counts()
+
+    # What loops ask.
+
+    @property
+    def wants_loop(self) -> bool:
+        """Whether it is not known yet which loop trains."""
+        return self._finder.found is None
+
+    def runs(self, loop: LoopRange, number: int) -> bool:
+        """Whether the loop runs with this number; asked once for each, in order."""
+        if self._removed:
+            return True
+        if self.wants_loop and number == loop.numbers.start > 0:
+            self._go_on(number)
+        if not self._finder.asks(loop, number) or not self._configured:
+            return True
+        if self._conditions is None or loop.source is not None:
+            self._read(loop, number)
+        if number >= self._start:
+            runs = self._refine(loop, number)
+        else:
+            runs = self.growing is None or self.growing.runs(number)
+        if runs:
+            self.gap, self._left_out = self._left_out, 0
+        else:
+            self._left_out += 1
+        return runs
+
+    def expected(self, loop: LoopRange) -> int:
+        """How many numbers the loop will run, as far as is known. Ranges that no loop runs over are never asked."""
+        numbers = loop.numbers
+        before = len(range(numbers.start, min(max(self._start, numbers.start), numbers.stop)))
+        grown = 1.0 if self.growing is None else self.growing.share or 1.0
+        return round(before * grown) + round((len(numbers) - before) * (self.refining.share or 1.0))
+
+    def ended(self, loop: LoopRange) -> None:
+        """The loop is over, or was left: whatever steps afterwards is no part of it."""
+        if loop is self._finder.found:
+            self._rates.rest()
+
+    def _read(self, loop: LoopRange, number: int) -> None:
+        """Read the loop's conditions, with its first number that can be left out: nothing is refused later."""
+        self._require_events()
+        if self._last is None:
+            self._last = loop.numbers[-1]
+        if self.refining.first is None:
+            self.refining.first = max(self._start, number)
+        # Of a run that goes on, iterations behind it too: conditions are judged by how often they hold.
+        refined = range(self.refining.first, loop.numbers.stop)
+        begun = number if self.growing is None or self.growing.first is None else self.growing.first
+        grown = range(0) if self.growing is None else range(begun, min(self._start, loop.numbers.stop))
+        found: list[dict[str, set[int]]] = [{}, {}]
+        if loop.source is not None and self._config.always is None:
+            code, names = loop.source
+            line = line_of(code)
+            found = [
+                milestones(code, line, numbers, names, self._pure) if numbers else {} for numbers in (grown, refined)
+            ]
+        elif self._conditions is not None:
+            found = list(self._conditions)  # of this loop, in which a state is loaded
+        loop.source = None
+        hidden = {n for n in (*self._hidden(refined), *self._chosen) if n in refined}
+        if hidden:
+            found[1][NAMED] = hidden
+        self._conditions = found[0], found[1]
+        if self.growing is not None and grown:
+            n_views = None if self._views is None else len(self._views)
+            assert self._densification is not None
+            self.growing.begin(grown, found[0], [*self._hidden(grown), *self._chosen], self._densification, n_views)
+
+    def _require_events(self) -> None:
+        """Let growth run whole where its densification events are not known."""
+        if self.growing is None or self._densification is not None or self._start == 0:
+            return
+        if self._config.share is None:
+            raise SkipGSError(
+                "grow_share leaves out iterations of densification, whose events are not known in this trainer; leave "
+                "it out, or give events= to gate.iterations()."
+            )
+        warnings.warn(
+            "The densification events of this trainer are not known, so its densification runs whole, and iterations "
+            "are left out after it; in a loop of your own give events= to gate.iterations().",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        self.growing = None
+
+    def _refine(self, loop: LoopRange, number: int) -> bool:
+        if not self.refining.begun:
+            assert self._conditions is not None and self._last is not None
+            if self.growing is not None and self.refining.sampling.run == 0:
+                self._rates.shown.restart()  # what views show of the grown scene decides how long steps are
+            self.refining.begin(self._last, self._conditions[1], self._views, self._keeps_rates)
+        return self.refining.runs(number)
+
+    def _refuse_several(self) -> None:
+        for name in ("refining", "growing"):
+            if getattr(self._config, name) == "auto":
+                distributed.refuse_several(
+                    'share="auto" and refine_share="auto" decide by the losses of one process',
+                    "give a share, such as 0.4",
+                )
+
+    # State and report.
+
+    def report(self) -> dict[str, Any]:
+        return {
+            **self.refining.report(),
+            "gaussians_shown": self._rates.shown.share,
+            "growing": None if self.growing is None else self.growing.report(),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "start": self._start,
+            "last": self._last,
+            "keeps_rates": self._keeps_rates,
+            "next": self._finder.expected,
+            "refining": self.refining.state_dict(),
+            "growing": None if self.growing is None else self.growing.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        saved_growing = None if state["growing"] is None else state["growing"]["asked"]
+        asked = None if self.growing is None else self._config.growing
+        if (state["refining"]["asked"], saved_growing) != (self._config.refining, asked):
+            raise SkipGSError(
+                f"The gate state was saved with refine_share={state['refining']['asked']!r} and "
+                f"grow_share={saved_growing!r}, not {self._config.refining!r} and {asked!r}; go on with its settings, "
+                "or start the gate afresh."
+            )
+        self.refining.load_state_dict(state["refining"])
+        if self.growing is not None:
+            self.growing.load_state_dict(state["growing"])
+        self._finder.expected = state["next"]
+        # The loop asks about its first number before the trainer says anything.
+        if not self._configured:
+            self._start, self._last, self._keeps_rates = state["start"], state["last"], state["keeps_rates"]
+            self._configured = True
+        if self._finder.found is not None and self._conditions is not None:
+            self._read(self._finder.found, max(self._start, state["next"] or 0))

@@ -1,0 +1,202 @@
+"""The refining phase: fewer, larger, shrinking steps after densification."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, ONE_CYCLE, EarlyStopping, watched_views
+from skipgs_plug.core.pace.needs import refining_share
+from skipgs_plug.core.pace.rates import ScaledRates, path_factor
+from skipgs_plug.core.pace.sampling import Sampling
+
+log = logging.getLogger(__name__)
+
+RECOVERY = 500  # iterations that run after a structural change which comes when refinement has ended
+
+
+class Refining:
+    """Says which iterations of refinement run, and by what factor their learning rates are larger.
+
+    Where steps are larger and shrink to nothing, the iterations that run come first: trainers lower the rate of
+    positions by number, and an end that comes sooner leaves a finished model sooner. Elsewhere they are spread evenly.
+
+    Args:
+        config: With `refining`.
+        rates: Scales learning rates.
+
+    Attributes:
+        share: of the iterations that run, or may run where it is found automatically; None before refinement.
+        sampling: counts the iterations that ran and that were left out.
+        stopping: follows the cycles of steps that shrink, one where the share is given; None where rates stay.
+        always: iterations that must run, by the reason.
+        watched: views that are watched and not trained on while `stopping` says so.
+        first: first iteration of the phase; None before it is known.
+    """
+
+    def __init__(self, config: SkipConfig, rates: ScaledRates) -> None:
+        self._config = config
+        self._rates = rates
+        self.share: float | None = None if self._auto else config.refining  # type: ignore[assignment]
+        self.sampling = Sampling(1.0)
+        self.stopping: EarlyStopping | None = None
+        self.always: dict[str, set[int]] = {}
+        self.watched: frozenset[str] = frozenset()
+        self.first: int | None = None
+        self._last: int | None = None
+        self._must: frozenset[int] = frozenset()
+        self._recovery = self._recovered = 0  # iterations to run after a change, and those that have
+        self._over = False  # holds for the present iteration
+        self._begun = self._removed = False
+
+    @property
+    def begun(self) -> bool:
+        """Whether an iteration of the phase was asked about."""
+        return self._begun
+
+    def begin(self, last: int, always: dict[str, set[int]], views: list[str] | None, keeps_rates: bool) -> None:
+        """Refinement begins with iteration `first`.
+
+        Args:
+            last: Last iteration of the run.
+            always: Iterations that must run, by the reason.
+            views: Keys of all training views; None if unknown.
+            keeps_rates: Leave learning rates alone: the trainer takes as many steps as before.
+
+        Raises:
+            SkipGSError: "auto" does not know the views, or a loaded state had larger steps, which are off now.
+        """
+        assert self.first is not None
+        self._begun, self._last, self.always = True, last, always
+        self._must = frozenset().union(*always.values()) if always else frozenset()
+        total = last + 1 - self.first
+        if self._auto and self.share is None:
+            if views is None:
+                raise SkipGSError(
+                    'refine_share="auto" must know the training views; give their names to gate.iterations() as views='
+                    ", or a share."
+                )
+            self.share = refining_share(total, len(views))
+        assert self.share is not None
+        if self._auto and views is not None and self.stopping is None:
+            self.watched = watched_views(views, self.share * total)
+        if not self._scales(keeps_rates):
+            if self.stopping is not None:
+                raise SkipGSError(
+                    "The gate state was saved with larger, shrinking steps, which are off now; go on with compensate "
+                    "as it was, or start the gate afresh."
+                )
+            self.sampling.share = self.share
+        elif self.stopping is None:
+            self.stopping = EarlyStopping(self._config.tolerance, CYCLE_ENDS if self.watched else ONE_CYCLE)
+        log.info(
+            "Refinement: at most %.0f %% of iterations %d to %d run, %d of them in any case.",
+            100 * self.share,
+            self.first,
+            last,
+            len(self._must),
+        )
+
+    def runs(self, number: int) -> bool:
+        """Whether iteration `number` runs; asked once for each, in order."""
+        self._set_pace()
+        return self.sampling.runs(number in self._must or number == self._last)
+
+    def counts(self) -> None:
+        """The present iteration began before the training loop was known: it counts as one that ran."""
+        self.sampling.runs(must=True)
+
+    def remove(self) -> None:
+        """Watch no view any more, and train in every iteration."""
+        self._removed = True
+
+    @property
+    def watching(self) -> bool:
+        """Whether watched views are left out of training at present."""
+        return self.stopping is not None and self.stopping.watching and not self._removed
+
+    @property
+    def over(self) -> bool:
+        """Whether steps have shrunk to nothing, so that what still runs need not train."""
+        return self._over and not self._removed
+
+    def notify_event(self, n_views: int) -> None:
+        """A structural change happened; when refinement has ended, the model is given time to recover."""
+        if self.stopping is not None and self.stopping.ended:
+            pause = self._config.pause_iters
+            self._recovery, self._recovered = max(n_views, RECOVERY) if pause is None else pause, 0
+
+    @property
+    def _auto(self) -> bool:
+        return self._config.refining == "auto"
+
+    def _scales(self, keeps_rates: bool) -> bool:
+        if keeps_rates or not self._config.compensates:
+            return False
+        return self._config.rate_peak is not None or (self.share is not None and self.share < 1.0)
+
+    def _set_pace(self) -> None:
+        """Set the share and the factor with which the next number is decided on; without larger steps both stay."""
+        if self.stopping is None:
+            return
+        assert self.first is not None and self._last is not None and self.share is not None
+        if self._recovered < self._recovery:
+            factor = 1.0 - self._recovered / self._recovery
+            self._recovered += 1
+            self._over = False
+        else:
+            progress = self.stopping.progress(self.sampling.run / (self.share * (self._last + 1 - self.first)))
+            factor = path_factor(self.share, progress, self._config.rate_peak, self._rates.shown.share)
+            self._over = self.stopping.ended
+        self.sampling.share = 0.0 if self._over else 1.0
+        self._rates.scale(factor)
+
+    def report(self) -> dict[str, Any]:
+        """Return `refine_share`, `iterations_run`, `iterations_skipped`, `always_run`, `foresight`."""
+        stopping = self.stopping
+        return {
+            "refine_share": self.share,
+            "iterations_run": self.sampling.run,
+            "iterations_skipped": self.sampling.left_out,
+            "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
+            "foresight": None
+            if stopping is None or not self._auto
+            else {
+                "ended_early": stopping.early,
+                "cycle": stopping.cycle,
+                "gains_db": [list(gain) for gain in stopping.gains],
+                "rest_worth_db": stopping.foreseen,
+                "watched": sorted(self.watched),
+            },
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "asked": self._config.refining,
+            "share": self.share,
+            "first": self.first,
+            "sampling": self.sampling.state_dict(),
+            "watched": sorted(self.watched),
+            "recovery": [self._recovery, self._recovered],
+            "stopping": None if self.stopping is None else self.stopping.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict()`; `begin` follows.
+
+        Raises:
+            SkipGSError: No run has such a state.
+        """
+        share = state["share"]
+        if not (self._auto and state["first"] is None if share is None else 0.0 < share <= 1.0):
+            raise SkipGSError(f"The gate state has share={share!r}, expected one in (0, 1]; start the gate afresh.")
+        self.share, self.first = share, state["first"]
+        self.sampling.load_state_dict(state["sampling"])
+        self.watched = frozenset(state["watched"])
+        self._recovery, self._recovered = state["recovery"]
+        if state["stopping"] is not None:
+            self.stopping = EarlyStopping(self._config.tolerance)
+            self.stopping.load_state_dict(state["stopping"])
+        self._begun = False

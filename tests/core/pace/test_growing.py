@@ -1,0 +1,185 @@
+"""Fewer iterations and fewer densification events while the scene grows."""
+
+import json
+
+import pytest
+import torch
+
+from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.core.facts import Densification
+from skipgs_plug.core.pace.events import VISITS_BEHIND, Events
+from skipgs_plug.core.pace.needs import growing_factor, growing_share
+
+VIEWS = [f"{i}.png" for i in range(4)]
+INTERVAL, START, LAST = 20, 400, 600
+
+
+class Loop:
+    """A loop that densifies every 20 iterations until 400, saves every 60 and has six Gaussians, all of them shown."""
+
+    def __init__(self, begin=0, means=None, moments=None):
+        self.begin = begin
+        self.means = torch.nn.Parameter(torch.arange(18.0).reshape(6, 3) if means is None else means.clone())
+        self.optimizer = torch.optim.Adam([{"params": [self.means], "name": "xyz"}], lr=0.1)
+        if moments is not None:
+            self.optimizer.load_state_dict(moments)
+        self.ran, self.grown, self.saved, self.rates = [], [], [], {}
+
+    def train(self, gate, until=LAST, **options):
+        for step in gate.iterations(
+            range(self.begin, LAST), views=VIEWS, events=range(INTERVAL, START, INTERVAL), **options
+        ):
+            self.ran.append(step)
+            loss = (self.means - step % 3).square().sum()
+            if gate.backward(loss, view=VIEWS[step % 4], step=step):
+                self.optimizer.step()
+                self.optimizer.zero_grad(set_to_none=True)
+            if step % INTERVAL == 0 and 0 < step < START:
+                self.grown.append(step)
+            if step % 60 == 0:
+                self.saved.append(step)
+            if step >= until:
+                break
+        return self
+
+
+def test_a_share_of_both_phases_runs_and_nothing_that_depends_on_numbers_is_lost():
+    with SkipGate(start_iter=START, share=0.25) as gate:
+        loop = Loop().train(gate)
+    assert loop.saved == list(range(0, LAST, 60))
+    grown = [step for step in loop.ran if step < START]
+    assert len(grown) == pytest.approx(0.25 * START, abs=2)
+    report = gate.report()
+    assert report["growing"]["iterations_run"] == len(grown)
+    assert report["growing"]["iterations_skipped"] == START - len(grown)
+    assert report["growing"]["events_run"] == len(loop.grown)
+    assert report["growing"]["events_run"] + report["growing"]["events_skipped"] == len(
+        range(INTERVAL, START, INTERVAL)
+    )
+    assert report["refine_share"] == 0.25 and report["iterations_run"] >= 50
+    assert "densification events" in gate.summary()
+
+
+def test_an_event_waits_until_enough_stands_behind_it():
+    with SkipGate(start_iter=START, share=0.25) as gate:
+        loop = Loop().train(gate)
+    before = 0
+    for event in loop.grown:
+        if event % 60:  # a save must run, and its event with it
+            ran = [step for step in loop.ran if before < step <= event]
+            assert len(ran) >= VISITS_BEHIND
+        before = event
+    assert 5 <= len(loop.grown) < 19
+
+
+def test_an_iteration_of_an_event_that_is_not_kept_is_left_out():
+    with SkipGate(start_iter=START, share=0.25) as gate:
+        loop = Loop().train(gate)
+    events = set(range(INTERVAL, START, INTERVAL))
+    assert events & set(loop.ran) == set(loop.grown)
+
+
+def test_rates_stay_while_the_scene_grows_unless_longer_steps_replace_iterations():
+    seen = {}
+
+    def note(optimizer, args, kwargs):
+        seen[loop.ran[-1]] = optimizer.param_groups[0]["lr"]
+
+    loop = Loop()
+    loop.optimizer.register_step_pre_hook(note)
+    with SkipGate(start_iter=START, share=0.25) as gate:
+        loop.train(gate)
+    # Every view shows all: once that is measured, steps are 4 times as long, which 100 iterations are short of.
+    factors = [seen[step] / 0.1 for step in sorted(seen) if step < START]
+    assert factors[0] == pytest.approx(1.0) and factors[-1] == pytest.approx(4.0)
+    assert gate.report()["growing"]["rate_factor"] == pytest.approx(4.0)
+
+
+def test_interrupted_and_resumed_leaves_out_the_same():
+    with SkipGate(start_iter=START, share=0.25) as gate:
+        whole = Loop().train(gate)
+    for until in (whole.ran[12], whole.ran[60], whole.ran[-20]):
+        with SkipGate(start_iter=START, share=0.25) as first:
+            one = Loop().train(first, until)
+            state = json.loads(json.dumps(first.state_dict()))
+        with SkipGate(start_iter=START, share=0.25) as second:
+            second.load_state_dict(state)
+            other = Loop(one.ran[-1] + 1, one.means.detach(), one.optimizer.state_dict()).train(second)
+        assert one.ran + other.ran == whole.ran
+        assert torch.equal(other.means, whole.means)
+
+
+def test_off_is_bit_identical():
+    plain = Loop().train(SkipGate(start_iter=0, enabled=False))
+    for settings in ({"share": 1.0}, {"share": 0.2, "enabled": False}):
+        with SkipGate(start_iter=START, **settings) as gate:
+            loop = Loop().train(gate)
+        assert loop.ran == plain.ran and torch.equal(loop.means, plain.means)
+
+
+def test_events_stop_before_the_bound_on_gaussians():
+    with SkipGate(start_iter=START, share=0.25, max_gaussians=6) as gate:
+        assert set(Loop().train(gate).grown)
+    with SkipGate(start_iter=START, share=0.25, max_gaussians=5) as gate:
+        assert all(event % 60 == 0 for event in Loop().train(gate).grown)  # what must run densifies all the same
+    with pytest.raises(SkipGSError, match="give share or grow_share"):
+        SkipGate(start_iter=START, max_gaussians=5)
+
+
+def test_a_loop_without_known_events_grows_whole():
+    with SkipGate(start_iter=10, share=0.5, pause_iters=0) as gate, pytest.warns(RuntimeWarning, match="events="):
+        ran = [step for step in gate.iterations(range(40), always=()) if [gate.backward(value(), "a", step)]]
+    assert ran[:10] == list(range(10)) and len(ran) < 40
+    gate = SkipGate(start_iter=10, grow_share=0.5)
+    with pytest.raises(SkipGSError, match="events="):
+        list(gate.iterations(range(40)))
+
+
+def value():
+    return torch.ones((), requires_grad=True) * 1.0
+
+
+def test_what_shares_its_number_with_events_keeps_it_if_it_is_rarer():
+    ran = []
+    with SkipGate(start_iter=400, share=0.1) as gate:
+        for step in gate.iterations(range(500), events=range(20, 400, 20), views=VIEWS):
+            gate.backward(value(), VIEWS[step % 4], step)
+            ran.append(step)
+            if step % 100 == 0:  # rarer than events
+                pass
+            if step % 20 == 0:  # as often as events, as a line in a log
+                pass
+    assert {100, 200, 300} <= set(ran)
+    assert len(set(range(20, 400, 20)) & set(ran)) < 10
+
+
+def test_needs_of_an_event():
+    def kept(needs, shown, every, numbers=range(100, 2001, 100), last=2000):
+        events = Events(numbers, Densification(needs=needs))
+        found = []
+        for number in range(last + 1):
+            if number in events:
+                if events.enough(number, shown):
+                    found.append(number)
+                    events.ran(number)
+                else:
+                    events.skipped(number)
+            elif number % every == 0:
+                events.ran(number)
+        return found
+
+    assert kept("nothing", 0.3, 10) == list(range(100, 2001, 100))
+    assert kept("visits", 1.0, 1) == list(range(100, 2001, 100))
+    assert kept("visits", 0.3, 5)[:2] == [300, 600]  # 50 iterations show each Gaussian 15 times
+    assert kept("visits", 0.95, 5)[:3] == [100, 200, 300]
+    assert kept("iterations", 0.95, 5)[:2] == [600, 1200]
+
+
+def test_shares_that_auto_chooses():
+    assert growing_share(15_000, 255, None) == 0.1
+    assert growing_share(15_000, 1000, None) == pytest.approx(1 / 3)
+    assert growing_share(1500, 17, 0.96) == 0.4
+    assert growing_share(1500, 17, 0.3) == 0.8
+    assert growing_share(500, 17, 0.3) == growing_share(0, 17, 0.3) == 1.0
+    assert growing_factor(1500, 0.4, 0.96) == 2.5
+    assert growing_factor(1500, 0.4, 0.3) == growing_factor(15_000, 0.1, 0.96) == 1.0
