@@ -1,12 +1,12 @@
 """Every example runs on the CPU: the loops as they are, the others on checkouts made of the look-alikes."""
 
 import difflib
-import importlib
 import json
 import runpy
 import sys
 from pathlib import Path
 
+import cases
 import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -53,39 +53,22 @@ def make_checkout(folder, lookalike, script):
     )
 
 
-SCRIPTS = [
-    ("train_inria.py", "inria", "train.py"),
-    ("train_fastgs.py", "fastgs", "train.py"),
-    ("train_taming.py", "taming", "train.py"),
-    ("train_speedy_splat.py", "speedy_splat", "train.py"),
-    ("train_lightgaussian.py", "lightgaussian_prune_finetune", "prune_finetune.py"),
-    ("train_lightgaussian.py", "lightgaussian_densify_prune", "train_densify_prune.py"),
-    ("train_lightgaussian.py", "lightgaussian_distill", "distill_train.py"),
-    ("train_gaussianspa.py", "gaussianspa", "train_imp_score.py"),
-    ("train_gaussianspa.py", "gaussianspa_op", "train_op.py"),
-    ("train_mcmc.py", "mcmc", "train.py"),
-    ("train_mip_splatting.py", "mip_splatting", "train.py"),
-    ("train_absgs.py", "absgs", "train.py"),
-    ("train_pixel_gs.py", "pixel_gs", "train.py"),
-    ("train_2dgs.py", "surfels", "train.py"),
-    ("train_scaffold_gs.py", "scaffold_gs", "train.py"),
-    ("train_dash_gaussian.py", "dash_gaussian", "train_dash.py"),
-    ("train_improved_gs.py", "improved_gs", "train.py"),
-]
+SCRIPTS = {case.module.__name__.rpartition(".")[2]: case.module for case in cases.SCRIPTS}
 
 
-@pytest.mark.parametrize(("example", "lookalike", "script"), SCRIPTS, ids=[row[1] for row in SCRIPTS])
-def test_script_of_a_checkout_is_run_gated(example, lookalike, script, run_example, tmp_path, capfd):
+@pytest.mark.parametrize("lookalike", SCRIPTS)
+def test_script_of_a_checkout_is_run_gated(lookalike, run_example, tmp_path, capfd):
+    module = SCRIPTS[lookalike]
+    example, script = f"train_{module.ADAPTER}.py", getattr(module, "SCRIPT", "train.py")
     make_checkout(tmp_path / "checkout", lookalike, script)
     (tmp_path / "output").mkdir()
-    choice = ["--script", script] if "lightgaussian" in example or "gaussianspa" in example else []
+    choice = ["--script", script] if "--script" in (EXAMPLES / example).read_text() else []
     code = run_example(
         example, "--repo", tmp_path / "checkout", *choice, "--warmup", "3", "--pause-iters", "4", "--", "-s"
     )
     assert code == 0
     assert capfd.readouterr().out.endswith("Training complete.\n")
     report = json.loads((tmp_path / "output" / "skipgs.json").read_text())
-    module = importlib.import_module(f"lookalikes.{lookalike}")
     assert report["settings"]["adapter"] == module.ADAPTER and report["settings"]["start_iter"] == module.START
     assert report["iterations"] == module.LAST + 1 - module.FIRST
     assert report["backwards_skipped"] > 0

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from skipgs_plug.adapters.inria import InriaFamily
 
 
@@ -21,7 +18,5 @@ class AbsGS(InriaFamily):
         "From `densify_until_iter` on. With `--use_prune_weight` every prune until `prune_until_iter` pauses the gate."
     )
     left_alone = "Blend weights are gathered in skipped iterations too: they come from the forward."
+    stand_ins = "absgs"
     mark = "use_prune_weight"
-
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        return int(opt.densify_until_iter)

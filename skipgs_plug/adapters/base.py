@@ -30,6 +30,8 @@ class AbstractAdapter(ABC):
         project: its name and home, in Markdown, for docs/adapters.md; as are the next two.
         gated: from when on the gate decides, and what pauses it.
         left_alone: what else is done or left alone in skipped iterations, beyond what holds for every trainer.
+        stand_ins: which of the stand-ins of `skipgs_plug.compat` serve the CUDA modules that its scripts import, for
+            `--cpu`; empty where there are none.
         checked: upstream version or commit that it was checked with, and in brackets how; part of error messages.
         saved_state: gives the state of the gate that belongs to the checkpoint which the trainer goes on from,
             if any; called once, with the first iteration. Set before the gate is made.
@@ -43,6 +45,7 @@ class AbstractAdapter(ABC):
     project: ClassVar[str] = ""
     gated: ClassVar[str] = ""
     left_alone: ClassVar[str] = ""
+    stand_ins: ClassVar[str] = ""
     saved_state: Callable[[int], dict[str, Any] | None] | None = None
     output_folder: str | None = None
     replaced: Sequence[str] = ()
@@ -59,6 +62,11 @@ class AbstractAdapter(ABC):
     def recognises_script(cls, code: LoopCode) -> bool:
         """Whether a training script with these names is of the trainer that the adapter knows."""
         return False
+
+    @classmethod
+    def stand_ins_for(cls, command: Sequence[str]) -> str:
+        """Which stand-ins serve a script with this command line; see `stand_ins`."""
+        return cls.stand_ins
 
     @abstractmethod
     def attach(self, hooks: Hooks) -> None:
@@ -99,7 +107,7 @@ class AbstractAdapter(ABC):
 
 
 # Marks a `torch.multiprocessing.spawn` that attaches a gate in each process.
-GATES_CHILDREN = "__skipgs_gates_children__"
+GATES_SPAWNED = "__skipgs_gates_spawned__"
 
 
 def refuse_other_processes(hooks: Hooks) -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from skipgs_plug.adapters.inria import InriaFamily
 from skipgs_plug.core.facts import Densification
 
@@ -17,8 +14,6 @@ class DashGaussian(InriaFamily):
     project = "[DashGaussian, `train_dash.py`](https://github.com/YouyuChen0207/DashGaussian)"
     gated = "From `densify_until_iter` on, where resolution and number of Gaussians are constant."
     left_alone = "Both optimizers, sparse Adam too. Its `train.py` is Inria's, and so is the adapter for it."
+    stand_ins = "dash_gaussian"
     mark = "TrainingScheduler"
     densification = Densification(marks=("densification_interval",), needs="nothing")
-
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        return int(opt.densify_until_iter)

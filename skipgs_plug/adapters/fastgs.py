@@ -26,11 +26,9 @@ class FastGS(InriaFamily):
         "`optimizer_step(iteration)`: it steps every 16th, 32nd or 64th iteration on what the backwards since then "
         "have left, and does so in an iteration that is skipped itself."
     )
+    stand_ins = "fastgs"
     mark = "render_fastgs"
     renders = ("render_fastgs",)
-
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        return int(opt.densify_until_iter)
 
     def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
         default = getattr(opt, "optimizer_type", "default") == "default"

@@ -23,6 +23,7 @@ class GaussianSpa(InriaFamily):
     left_alone = (
         "A gate that you start earlier runs all iterations with the ADMM term and keeps their losses out of the means."
     )
+    stand_ins = "gaussianspa"
     mark = "OptimizingSpa"
     renders = ("render_imp", "render")
     structural = (*InriaFamily.structural, "reinitial_pts")

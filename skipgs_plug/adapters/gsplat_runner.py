@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from skipgs_plug.adapters.base import GATES_CHILDREN, AbstractAdapter, refuse_other_processes
+from skipgs_plug.adapters.base import GATES_SPAWNED, AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import (
     gradients_read_until,
     leave_out_noise,
@@ -42,6 +42,7 @@ class GsplatRunner(AbstractAdapter):
         "attaches a gate in each: a backward is left out when all of them would (checked with gloo on the CPU, not on "
         "GPUs)."
     )
+    stand_ins = "gsplat"
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
@@ -64,7 +65,7 @@ class GsplatRunner(AbstractAdapter):
             return original(rank, size, fn, *args, **kwargs)
 
         # The launcher attaches in each process that is spawned; nobody else does.
-        if not getattr(torch.multiprocessing.spawn, GATES_CHILDREN, False):
+        if not getattr(torch.multiprocessing.spawn, GATES_SPAWNED, False):
             refuse_other_processes(hooks)
         hooks.wrap(importlib.import_module("gsplat.distributed"), "_distributed_worker", started)
 

@@ -25,12 +25,10 @@ class ImprovedGS(InriaFamily):
         "Both optimizers step every 5th and later every 20th iteration on what the backwards since then have left, in "
         "skipped iterations too."
     )
+    stand_ins = "improved_gs"
     mark = "compute_edge_score"
     densification = Densification(marks=("densification_interval",), needs="nothing")
     structural = (*InriaFamily.structural, "only_prune")
-
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        return int(opt.densify_until_iter)
 
     def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
         return opt.optimizer_type == "default" and self.start_iter(opt, loop) >= ACCUMULATES_FROM

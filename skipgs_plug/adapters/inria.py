@@ -12,7 +12,6 @@ import sys
 import types
 import warnings
 import weakref
-from abc import abstractmethod
 from collections import ChainMap
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -22,9 +21,9 @@ import torch
 
 from skipgs_plug.adapters import registry
 from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.drift_check import DriftCheck
 from skipgs_plug.adapters.loop_code import LOOP, LoopCode
-from skipgs_plug.adapters.stillness import Stillness
-from skipgs_plug.adapters.strangers import refuse_strangers
+from skipgs_plug.adapters.unknown_forks import refuse_unknown_forks
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.hooks import Hooks
@@ -92,14 +91,14 @@ class InriaFamily(AbstractAdapter):
     def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
         """Keep what later answers need of a run, which begins now; arguments as for `start_iter`."""
 
-    @abstractmethod
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        """First iteration that may be skipped.
+        """First iteration that may be skipped: by default the first one that does not densify.
 
         Args:
             opt: The run's optimization options.
             loop: Everything that `training` has a name for, when its first iteration begins. Not to be kept.
         """
+        return int(opt.densify_until_iter)
 
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
         """First iteration whose gradients only the optimizers read; arguments as for `start_iter`."""
@@ -143,7 +142,7 @@ class InriaFamily(AbstractAdapter):
                 f"it was checked with {self.checked}."
             )
 
-        stillness = Stillness(hooks.state)
+        drift = DriftCheck(hooks.state)
 
         def heartbeat(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             # Frame 2 is the loop. Its variables are read once, before they hold an iteration's graph.
@@ -155,7 +154,7 @@ class InriaFamily(AbstractAdapter):
             else:
                 self._step = hooks.number(self._step + 1)
                 own = [one for one in vars(args[0]).values() if isinstance(one, torch.optim.Optimizer)]
-                if moved := stillness.moved(own):
+                if moved := drift.moved(own):
                     self._give_up(hooks, moved)
                     return original(*args, **kwargs)
             hooks.iteration(self._step)
@@ -261,6 +260,7 @@ class Inria(InriaFamily):
         "only), the gate warns and tells views apart by their position. A fork that no adapter knows is refused when "
         "its loop draws noise or writes into tensors, and otherwise gated with a list of what was not recognised."
     )
+    stand_ins = "inria"
 
     @classmethod
     def recognises(cls, names: Container[str]) -> bool:
@@ -268,10 +268,12 @@ class Inria(InriaFamily):
 
     def examine(self, code: LoopCode, namespace: Mapping[str, Any], model: type) -> None:
         if "render" in namespace:  # else `attach` says so
-            refuse_strangers(code, namespace["render"], model, self.structural)
+            refuse_unknown_forks(code, namespace["render"], model, self.structural)
 
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        return int(opt.densify_until_iter)
+    @classmethod
+    def stand_ins_for(cls, command: Sequence[str]) -> str:
+        # Its train.py takes the presence of SparseGaussianAdam for the accelerated branch of the rasterizer.
+        return "inria_accelerated" if "sparse_adam" in command else cls.stand_ins
 
 
 def namespace_of(trainer: Any) -> dict[str, Any] | None:

@@ -26,6 +26,7 @@ class LightGaussian(InriaFamily):
         "prunes pause the gate. `distill_train.py`: from the first iteration on."
     )
     left_alone = "Jittered cameras (two of three iterations with `--augmented_view`) have means of their own."
+    stand_ins = "lightgaussian"
     mark = "calculate_v_imp_score"
     scenes = ("scene", "student_scene")
 

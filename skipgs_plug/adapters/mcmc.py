@@ -36,6 +36,7 @@ class MCMC(InriaFamily):
         "The position noise between the lines of the loop is zero where the gradient step is left out; its random "
         "numbers are drawn as ever."
     )
+    stand_ins = "mcmc"
     mark = NOISE
     densification = Densification(marks=("densification_interval",), needs="nothing")
 
@@ -47,9 +48,6 @@ class MCMC(InriaFamily):
         interval = int(opt.densification_interval)
         first = int(opt.densify_from_iter) // interval * interval + interval
         self._relocations = range(first, int(opt.densify_until_iter), interval)
-
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        return int(opt.densify_until_iter)
 
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return 0

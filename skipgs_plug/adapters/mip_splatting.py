@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from skipgs_plug.adapters.inria import InriaFamily
 
 
@@ -22,7 +19,5 @@ class MipSplatting(InriaFamily):
         "The 3D filter is computed anew every hundredth iteration, skipped or not: where nothing moved it is what it "
         "was, so it does not pause the gate."
     )
+    stand_ins = "mip_splatting"
     mark = "create_offset_gt"
-
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        return int(opt.densify_until_iter)

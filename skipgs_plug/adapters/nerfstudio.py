@@ -40,6 +40,7 @@ class Nerfstudio(AbstractAdapter):
         "-- ns-train splatfacto ...` (also `-m nerfstudio.scripts.train`). `skipgs.json` lies beside its "
         "`config.yml`."
     )
+    stand_ins = "nerfstudio"
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)

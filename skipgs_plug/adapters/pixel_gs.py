@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from skipgs_plug.adapters.inria import InriaFamily
 
 
@@ -16,7 +13,5 @@ class PixelGS(InriaFamily):
     project = "[Pixel-GS](https://github.com/zhengzhang01/Pixel-GS)"
     gated = "From `densify_until_iter` on."
     left_alone = "Pixel counts and the gradients they weight are read by densification alone."
+    stand_ins = "pixel_gs"
     mark = "depth_threshold"
-
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        return int(opt.densify_until_iter)

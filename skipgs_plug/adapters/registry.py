@@ -26,7 +26,7 @@ BUILTIN = {
     "mip_splatting": "skipgs_plug.adapters.mip_splatting:MipSplatting",
     "absgs": "skipgs_plug.adapters.absgs:AbsGS",
     "pixel_gs": "skipgs_plug.adapters.pixel_gs:PixelGS",
-    "2dgs": "skipgs_plug.adapters.surfels:Surfels",
+    "2dgs": "skipgs_plug.adapters.two_d_gs:TwoDGS",
     "scaffold_gs": "skipgs_plug.adapters.scaffold_gs:ScaffoldGS",
     "dash_gaussian": "skipgs_plug.adapters.dash_gaussian:DashGaussian",
     "improved_gs": "skipgs_plug.adapters.improved_gs:ImprovedGS",

@@ -17,6 +17,7 @@ class ScaffoldGS(InriaFamily):
     project = "[Scaffold-GS](https://github.com/city-super/Scaffold-GS)"
     gated = "From `update_until` on, where anchors are neither grown nor pruned any more."
     left_alone = "Networks and anchors have one optimizer, which is left alone."
+    stand_ins = "scaffold_gs"
     mark = "prefilter_voxel"
     densification = Densification(marks=("update_interval",), needs="iterations")
     structural = ("prune_anchor", "training_setup")

@@ -23,6 +23,7 @@ class SpeedySplat(InriaFamily):
         "`prune_interval` until the end, and each pauses the gate."
     )
     left_alone = "The backwards that compute pruning scores always run."
+    stand_ins = "speedy_splat"
     mark = "score_func"
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:

@@ -41,6 +41,7 @@ class StepTrainer(AbstractAdapter):
         "`before_optim_hook`, which reads gradients, is left out with the backward. Attach to the outermost trainer; "
         "wrappers added later are fine."
     )
+    stand_ins = "pip_gaussian_splatting"
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from skipgs_plug.adapters.inria import InriaFamily
 from skipgs_plug.core.facts import Densification
 
@@ -23,8 +20,6 @@ class Taming(InriaFamily):
         "Both optimizers keep their schedules, with `--sh_lower` too. Freezing the opacity at `ho_iteration` changes "
         "no image and does not pause the gate."
     )
+    stand_ins = "taming"
     mark = "get_count_array"
     densification = Densification(marks=("densification_interval",), needs="nothing")
-
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        return int(opt.densify_until_iter)

@@ -15,20 +15,17 @@ import tyro
 
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.adapters.base import AbstractAdapter
-from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
+from skipgs_plug.adapters.registry import builtin_adapters, find_script_adapter, get_adapter
 from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster.compat import FAMILIES, serve
 from skipgs_plug.fallback_raster.optimizer import REPLACED as ADAM_REPLACED
 from skipgs_plug.fallback_raster.optimizer import instead_of_torchs_adam
-from skipgs_plug.scripts import children
+from skipgs_plug.scripts import spawned
 from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
 from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED
 from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu, exclusive_cores
 from skipgs_plug.scripts.launch import Attach, run_script, source_of
-
-# Stand-ins are named after the extension modules, which not every adapter has to itself.
-FAMILY_OF = {"step_trainer": "pip_gaussian_splatting"}
 
 
 @dataclass
@@ -76,18 +73,18 @@ def run(args: Args, command: list[str]) -> int:
     if args.adapter == "auto":
         args = dataclasses.replace(args, adapter=find_script_adapter(source_of(command)).name)
         say(f"{script_name(command)} is run as {args.adapter}.")
-    with children.gated_when_spawned(functools.partial(run_spawned, args, command)) as spawned:
+    with spawned.gated_when_spawned(functools.partial(run_spawned, args, command)) as processes:
         code, gate = run_gated(args, command, functools.partial(run_script, command))
     if code == 0 and gate is not None and gate.trained:
         gate.verify()
-    elif code == 0 and not spawned:
+    elif code == 0 and not processes:
         say(f"{script_name(command)} ended without a training iteration; nothing was gated.")
     return code
 
 
 def run_spawned(args: Args, command: list[str], rank: int, call: bytes) -> None:
     """What a process does that the script spawns: all of `run`, with the script's call at the end."""
-    code, gate = run_gated(args, command, lambda attach: children.run_call(command, attach, rank, call), rank)
+    code, gate = run_gated(args, command, lambda attach: spawned.run_call(command, attach, rank, call), rank)
     if code:
         sys.exit(code)
     if gate is not None and gate.trained:
@@ -149,11 +146,9 @@ def cpu_instead_of_cuda(args: Args, command: Sequence[str]) -> Iterator[None]:
     Raises:
         SkipGSError: There are no stand-ins for what this trainer imports.
     """
-    family = FAMILY_OF.get(args.adapter, args.adapter)
-    if family == "inria" and "sparse_adam" in command:
-        family = "inria_accelerated"
+    family = get_adapter(args.adapter).stand_ins_for(command)
     if family not in FAMILIES:
-        names = sorted((set(FAMILIES) | set(FAMILY_OF)) - {"inria_accelerated", *FAMILY_OF.values()})
-        raise SkipGSError(f"--cpu has no stand-ins for {args.adapter!r}; it has for {', '.join(names)}.")
+        served = [adapter.name for adapter in builtin_adapters() if adapter.stand_ins]
+        raise SkipGSError(f"--cpu has no stand-ins for {args.adapter!r}; it has for {', '.join(sorted(served))}.")
     with serve(family), cuda_on_cpu(), exclusive_cores(), instead_of_torchs_adam():
         yield

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.scripts.missing import what_brings
+from skipgs_plug.scripts.import_hints import what_brings
 
 Attach = Callable[[], dict[str, Any]]  # see `run_script`
 

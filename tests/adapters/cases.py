@@ -27,8 +27,8 @@ from lookalikes import (
     scaffold_gs,
     speedy_splat,
     step_trainer,
-    surfels,
     taming,
+    two_d_gs,
 )
 from lookalikes.splats import NAMES, log, new_log
 
@@ -135,7 +135,7 @@ SCRIPTS = [
     script("mip_splatting", mip_splatting),
     script("absgs", absgs),
     script("pixel_gs", pixel_gs),
-    script("surfels", surfels),
+    script("two_d_gs", two_d_gs),
     script("scaffold_gs", scaffold_gs),
     script("dash_gaussian", dash_gaussian),
     script("improved_gs", improved_gs),

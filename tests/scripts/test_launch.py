@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.scripts.import_hints import what_brings
 from skipgs_plug.scripts.launch import run_script
-from skipgs_plug.scripts.missing import what_brings
 
 
 @pytest.fixture

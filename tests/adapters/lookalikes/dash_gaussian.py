@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import torch
 from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
 
+SCRIPT = "train_dash.py"
 ADAPTER, FIRST, START, LAST = "dash_gaussian", 1, 20, 60
 
 

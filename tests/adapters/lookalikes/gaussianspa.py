@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import torch
 from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
 
+SCRIPT = "train_imp_score.py"
 ADAPTER, FIRST, START, LAST = "gaussianspa", 1, 41, 80
 
 

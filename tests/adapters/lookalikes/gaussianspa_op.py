@@ -6,6 +6,7 @@ import torch
 from lookalikes.gaussianspa import OptimizingSpa
 from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
 
+SCRIPT = "train_op.py"
 ADAPTER, FIRST, START, LAST = "gaussianspa", 1, 41, 80
 
 

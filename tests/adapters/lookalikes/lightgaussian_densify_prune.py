@@ -7,6 +7,7 @@ from lookalikes.lightgaussian_prune_finetune import calculate_v_imp_score, prune
 from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
 from torch.optim.lr_scheduler import ExponentialLR
 
+SCRIPT = "train_densify_prune.py"
 ADAPTER, FIRST, START, LAST = "lightgaussian", 1, 20, 60
 
 

@@ -8,6 +8,7 @@ from lookalikes.lightgaussian_prune_finetune import calculate_v_imp_score, prune
 from lookalikes.splats import NAMES, Scene, SplatModel, dataset, draw, log, note_step, pick
 from torch.optim.lr_scheduler import ExponentialLR
 
+SCRIPT = "distill_train.py"
 ADAPTER, FIRST, START, LAST = "lightgaussian", 31, 31, 80
 VIEWS = NAMES + [f"{name}/jittered" for name in NAMES]
 

@@ -6,6 +6,7 @@ import torch
 from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
 from torch.optim.lr_scheduler import ExponentialLR
 
+SCRIPT = "prune_finetune.py"
 ADAPTER, FIRST, START, LAST = "lightgaussian", 31, 32, 80
 
 

@@ -12,7 +12,7 @@ from skipgs_plug.core.optimizers import has_pending_gradient
 CHECKED_SKIPS = 5  # skipped iterations that are looked at, from the second on
 
 
-class Stillness:
+class DriftCheck:
     """Compares the parameters before and after skipped iterations without pending gradients or events.
 
     What changes them there is something of the loop's own that belongs to the gradient step, such as noise, and

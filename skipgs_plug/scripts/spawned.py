@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from skipgs_plug.adapters.base import GATES_CHILDREN
+from skipgs_plug.adapters.base import GATES_SPAWNED
 from skipgs_plug.scripts.launch import Attach, run_in_script
 
 Enter = Callable[[int, bytes], None]
@@ -45,7 +45,7 @@ def gated_when_spawned(enter: Enter) -> Iterator[list[int]]:
         finally:
             sys.modules["__main__"] = main
 
-    setattr(spawn_gated, GATES_CHILDREN, True)
+    setattr(spawn_gated, GATES_SPAWNED, True)
     torch.multiprocessing.spawn = spawn_gated
     try:
         yield spawned

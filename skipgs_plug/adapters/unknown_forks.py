@@ -30,7 +30,7 @@ CALLS = frozenset(
 ARGUMENTS = frozenset({"scaling_modifier", "override_color", "separate_sh", "use_trained_exp"})
 
 
-def refuse_strangers(code: LoopCode, render: Callable[..., Any], model: type, events: Iterable[str]) -> None:
+def refuse_unknown_forks(code: LoopCode, render: Callable[..., Any], model: type, events: Iterable[str]) -> None:
     """Refuse a loop that changes tensors itself; warn of one that does more than Inria's.
 
     Args:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from skipgs_plug.adapters.inria import InriaFamily
 
 
-class Surfels(InriaFamily):
+class TwoDGS(InriaFamily):
     """The gate decides on the whole loss, with normal consistency and depth distortion.
 
     Both weights are constant from iteration 7,000 on. A gate that starts earlier sees losses rise there, and runs
@@ -21,6 +18,3 @@ class Surfels(InriaFamily):
     gated = "From `densify_until_iter` on; decided on the whole loss, with normal consistency and depth distortion."
     left_alone = "Needs CUDA: `--cpu` has no stand-in for its surfel rasterizer."
     mark = "render_net_image"
-
-    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        return int(opt.densify_until_iter)
