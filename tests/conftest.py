@@ -12,6 +12,10 @@ import pytest
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--all-lookalikes", action="store_true", help="tests/device: all look-alikes instead of five")
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Folder of reference data and real scenes, which is not part of the repository.

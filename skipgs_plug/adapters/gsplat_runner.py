@@ -20,6 +20,7 @@ from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.host_copy import HostCopy
 
 EXPECTED = ("cfg", "parser", "trainset", "rasterize_splats", "world_size")
 BATCH = "batch"  # one key for the joint loss of random batches, which never recur
@@ -79,18 +80,22 @@ class GsplatRunner(AbstractAdapter):
         strategy = runner.cfg.strategy
         batched = runner.cfg.batch_size > 1
         names = [BATCH] if batched else view_names(runner)
-        rendered: list[torch.Tensor] = []  # ids of the views rendered last, on the device
+        # Id of the view rendered last. It lies on the device: it is on its way before the render is launched.
+        rendered: list[HostCopy] = []
+        enabled = hooks.state.config.enabled
 
         def remember(*args: Any, image_ids: torch.Tensor | None = None, **kwargs: Any) -> None:
-            if image_ids is not None and torch.is_grad_enabled():  # else the viewer's or an evaluation
-                rendered[:] = [image_ids]
+            if enabled and not batched and image_ids is not None and torch.is_grad_enabled():
+                rendered[:] = [HostCopy(image_ids)]  # else the viewer's render, or an evaluation's
 
         def forwarded(own: Any, *args: Any, step: int, **kwargs: Any) -> None:
             if own is strategy:
                 hooks.iteration(step)
-                if rendered:
-                    ids = rendered.pop()
-                    hooks.view(BATCH if batched else lambda: names[int(ids)])
+                if batched or not enabled:
+                    hooks.view(BATCH)
+                elif rendered:
+                    view = rendered.pop()
+                    hooks.view(lambda: names[int(view.value())])
 
         # HEAD's stage took hold of rasterize_splats when the runner was built.
         stage = getattr(runner, "stage", None)

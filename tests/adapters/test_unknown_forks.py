@@ -99,3 +99,19 @@ def test_what_moves_the_model_in_skipped_iterations_ends_the_gate_and_not_the_tr
         assert not gate.patched
     assert gate.report()["backwards_skipped"] == 2  # 20, before which nothing is compared, and 21
     assert log.backwards == [*range(1, 20), *range(22, 41)]
+
+
+def test_a_nan_that_stays_in_a_parameter_is_no_drift(recwarn):
+    """The model has a hole, but nothing of the loop's moves it in skipped iterations."""
+    module = stranger(extra="gaussians.values['f_rest'].data[0] = float('nan')")
+    with SkipGate(module, policy=SkipAlways()) as gate:
+        train(module)
+        assert gate.patched
+    assert gate.report()["backwards_skipped"] == 21 and not [w for w in recwarn if "moved" in str(w.message)]
+
+
+def test_what_moves_beside_a_nan_is_still_found():
+    module = stranger(extra="gaussians.values['f_rest'].data[0] = float('nan'); gaussians.shake()")
+    with pytest.warns(RuntimeWarning), SkipGate(module, policy=SkipAlways()) as gate:
+        train(module)
+    assert not gate.patched
