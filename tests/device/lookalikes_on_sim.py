@@ -1,6 +1,6 @@
 """Trains look-alikes on the simulated device and writes their host reads, iteration by iteration, as JSON.
 
-    python lookalikes_on_sim.py [--mutant NAME] NAME ...
+    python lookalikes_on_sim.py [--mutant NAME] [--turn DAY | --turn all] [NAME ...]
 
 A process of its own: autograd counts devices at the first backward, and no other test shall see this one.
 """
@@ -20,6 +20,7 @@ sys.path[:0] = [str(Path(__file__).parents[1] / "adapters"), str(Path(__file__).
 
 import torch  # noqa: E402
 from simulated import SIM, OnSim, host, to_host, to_sim  # noqa: E402
+from turns import chosen  # noqa: E402
 
 FACTORIES = {
     *(torch.tensor, torch.zeros, torch.ones, torch.full, torch.empty, torch.eye),
@@ -186,17 +187,19 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--mutant", action="append", default=[])
     parser.add_argument("--settings", nargs="*", default=list(SETTINGS))
+    parser.add_argument("--turn", help="a number of days, or all: instead of names")
     parser.add_argument("names", nargs="*")
     asked = parser.parse_args()
     warnings.simplefilter("ignore")
     from cases import CASES
     from lookalikes import splats
 
+    names = chosen([case.name for case in CASES], asked.turn) if asked.turn else asked.names
     splats.rasterization = rasterization_on_sim(splats.rasterization)
     found: dict[str, Any] = {}
     for name in asked.mutant or [None]:
         for case in CASES:
-            if case.name not in asked.names:
+            if case.name not in names:
                 continue
             for label in asked.settings:
                 try:
