@@ -270,9 +270,8 @@ class SkipGate:
     def stats(self) -> dict[str, Any]:
         """Counters and seconds, by their names in skipgs.json; see `skipgs_plug.core.report`."""
         own = None if self.adapter is None else self.adapter.timing()
-        clock = self._engine.clock
-        t_total, t_post = (clock.t_total, clock.t_post) if own is None else own
-        return counters(self._engine.stats, self._floor, t_total, t_post, self._engine.pace.report())
+        times = self._engine.clock.times if own is None else own
+        return counters(self._engine.stats, self._floor, times, self._engine.pace.report())
 
     def report(self) -> dict[str, Any]:
         """The content of skipgs.json: settings, counters, seconds, per-view table."""

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import torch
 
 from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.core.clock import Times
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.hooks import Hooks
 
@@ -101,8 +102,8 @@ class AbstractAdapter(ABC):
         """Optimizers whose learning rates may be scaled, where the trainer knows them; see `Hooks.own_loop`."""
         return ()
 
-    def timing(self) -> tuple[float, float] | None:
-        """Seconds of training in all and after densification, when the trainer keeps them itself."""
+    def timing(self) -> Times | None:
+        """Seconds of training, when the trainer keeps them itself."""
         return None
 
 

@@ -9,6 +9,7 @@ import torch
 
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.gsplat_strategy import opacity_resets, strategy_events
+from skipgs_plug.core.clock import Times
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.events import MIN_PAUSE_ITERS
@@ -62,8 +63,9 @@ class ReferenceTrainer(AbstractAdapter):
     def optimizers(self) -> Iterable[torch.optim.Optimizer]:
         return self.trainer.all_optimizers
 
-    def timing(self) -> tuple[float, float] | None:
-        return self.trainer.t_total, self.trainer.t_post
+    def timing(self) -> Times | None:
+        wall, processor = self.trainer.clock.wall, self.trainer.clock.processor
+        return Times(wall.total, wall.post, processor.total, processor.post)
 
 
 def _densification(trainer: Any) -> Densification | None:

@@ -141,7 +141,7 @@ class Bench:
 
     def _trainer(self, seed: int) -> Trainer:
         trainer = Trainer(dataclasses.replace(self.config, seed=seed), self.scene, self.backend)
-        trainer.clock = TrainClock(self.backend.device, processor=self.clock == "processor")
+        trainer.clock = TrainClock(self.backend.device, by_processor=self.clock == "processor")
         return trainer
 
     def _densified(self, trainer: Trainer) -> dict[str, Any]:

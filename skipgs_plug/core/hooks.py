@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Protocol
 
 import torch
 
+from skipgs_plug.core.clock import Times
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.facts import Densification, TrainerFacts
@@ -39,7 +40,7 @@ class Adapter(Protocol):
 
     def optimizers(self) -> Iterable[torch.optim.Optimizer]: ...
 
-    def timing(self) -> tuple[float, float] | None: ...
+    def timing(self) -> Times | None: ...
 
 
 class Hooks:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any, Protocol
 
+from skipgs_plug.core.clock import Times
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.files import write_aside
@@ -28,7 +29,7 @@ class Reporting(Protocol):
 
 
 def counters(
-    stats: GateStats, floor: float | None, t_total: float, t_post: float, left_out: dict[str, Any] | None = None
+    stats: GateStats, floor: float | None, times: Times, left_out: dict[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return what was counted and timed.
 
@@ -37,8 +38,9 @@ def counters(
         `backwards_run` + `backwards_skipped`); `min_bwd_ratio_effective` (floor in force, None for a policy
         without); `paused`, `non_finite` (gated iterations with that reason); `reasons` (all of them);
         `events` (structural changes by kind); `t_total`, `t_post` (seconds of training, and of its part from
-        start_iter on); `refine_share` (share of the iterations from start_iter on that run or may run, None when
-        none is left out), `gaussians_shown` (share of the Gaussians that a view shows, None where it is not known),
+        start_iter on), `t_total_processor`, `t_post_processor` (the same in processor seconds, see `Times`);
+        `refine_share` (share of the iterations from start_iter on that run or may run, None when none is left out),
+        `gaussians_shown` (share of the Gaussians that a view shows, None where it is not known),
         `iterations_run`, `iterations_skipped`, `always_run`, `foresight` (see
         `Refining.report`), `growing` (see `Growing.report`; None if that phase runs whole).
     """
@@ -52,8 +54,7 @@ def counters(
         "non_finite": stats.reasons.get("non-finite", 0),
         "reasons": dict(stats.reasons),
         "events": dict(stats.events),
-        "t_total": t_total,
-        "t_post": t_post,
+        **times._asdict(),
         **(left_out or {**NO_REFINEMENT, "iterations_run": stats.gated}),
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from numbers import Real
 from typing import Any, TypedDict
@@ -57,6 +58,8 @@ class ClockState(TypedDict):
 
     t_total: float
     t_post: float
+    t_total_processor: float
+    t_post_processor: float
 
 
 class SamplingState(TypedDict):
@@ -212,6 +215,8 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
             )
         # States from before iterations could be left out, and before steps depended on what a view shows.
         state = {"pace": None, "shown": [0.0, 0], **state}
+        if isinstance(state.get("clock"), Mapping):  # and from before processor seconds were counted
+            state["clock"] = {"t_total_processor": math.nan, "t_post_processor": math.nan, **state["clock"]}
         _require(state, GateState, "state")
     return dict(state)
 

@@ -2,11 +2,27 @@
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 
 PHASES = ("forward", "loss", "backward", "optimizer", "strategy")
+
+
+@dataclass
+class Sums:
+    """Seconds of training: all, and those after densification."""
+
+    total: float = 0.0
+    post: float = 0.0
+
+    def add(self, seconds: float, after_densification: bool) -> None:
+        self.total += seconds
+        if after_densification:
+            self.post += seconds
 
 
 class TrainClock:
@@ -15,17 +31,32 @@ class TrainClock:
     On CUDA every phase border synchronises, so that a phase holds its own kernels.
 
     Args:
-        processor: count the seconds for which the threads of this process are running, all together, instead of those
-            of a clock on the wall; without CUDA. Other programs on the machine hardly change them.
+        device: of the trainer.
+        by_processor: `t_total`, `t_post` and `phase_seconds` are processor seconds instead of those on the wall.
+
+    Attributes:
+        wall: seconds by the clock on the wall.
+        processor: seconds for which threads of this process were running, added up over them. Other programs on the
+            machine hardly change them, and a GPU's work is not in them. NaN after a checkpoint without them.
+        phase_seconds: by phase.
     """
 
-    def __init__(self, device: torch.device, processor: bool = False) -> None:
+    def __init__(self, device: torch.device, by_processor: bool = False) -> None:
         self._cuda = device.type == "cuda"
-        self._read = time.process_time if processor else time.perf_counter
+        self._by_processor = by_processor
+        self.wall, self.processor = Sums(), Sums()
         self.phase_seconds = dict.fromkeys(PHASES, 0.0)
-        self.t_total = 0.0
-        self.t_post = 0.0
-        self._started = self._last = 0.0
+        self._started = self._last = (0.0, 0.0)
+
+    @property
+    def t_total(self) -> float:
+        """Seconds of training."""
+        return self._chosen.total
+
+    @property
+    def t_post(self) -> float:
+        """Seconds of training after densification."""
+        return self._chosen.post
 
     def start(self) -> None:
         self._started = self._last = self._now()
@@ -33,23 +64,42 @@ class TrainClock:
     def mark(self, phase: str) -> None:
         """Book the time since the previous border to `phase`."""
         now = self._now()
-        self.phase_seconds[phase] += now - self._last
+        self.phase_seconds[phase] += now[self._by_processor] - self._last[self._by_processor]
         self._last = now
 
     def stop(self, after_densification: bool) -> None:
-        elapsed = self._last - self._started
-        self.t_total += elapsed
-        if after_densification:
-            self.t_post += elapsed
+        self.wall.add(self._last[0] - self._started[0], after_densification)
+        self.processor.add(self._last[1] - self._started[1], after_densification)
+
+    def seconds(self) -> dict[str, float]:
+        """Return `t_total`, `t_post` on the wall and, with `_processor` after the name, of the processor."""
+        return {
+            "t_total": self.wall.total,
+            "t_post": self.wall.post,
+            "t_total_processor": self.processor.total,
+            "t_post_processor": self.processor.post,
+        }
 
     def state_dict(self) -> dict[str, float]:
-        return {"t_total": self.t_total, "t_post": self.t_post, **self.phase_seconds}
+        return {**self.seconds(), **self.phase_seconds}
+
+    @staticmethod
+    def can_load(state: Mapping[str, float]) -> bool:
+        """Whether this is a state, be it of a version without processor seconds."""
+        return {"t_total", "t_post", *PHASES} <= state.keys() <= {*TrainClock(torch.device("cpu")).state_dict()}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        self.t_total, self.t_post = state["t_total"], state["t_post"]
+        """Continue from `state_dict()`; a state of a version without processor seconds leaves them unknown."""
+        self.wall = Sums(state["t_total"], state["t_post"])
+        self.processor = Sums(state.get("t_total_processor", math.nan), state.get("t_post_processor", math.nan))
         self.phase_seconds.update({phase: state[phase] for phase in PHASES})
 
-    def _now(self) -> float:
+    @property
+    def _chosen(self) -> Sums:
+        return self.processor if self._by_processor else self.wall
+
+    def _now(self) -> tuple[float, float]:
+        """Return the seconds on the wall and of the processor."""
         if self._cuda:
             torch.cuda.synchronize()
-        return self._read()
+        return time.perf_counter(), time.process_time()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -59,8 +60,10 @@ class RunFolder:
         return path
 
     def write_stats(self, trainer: Trainer, stats: dict[str, Any], split: str = "val") -> Path:
+        """Write an evaluation with the seconds of training that led to it; NaN is written as null."""
+        seconds = {name: None if math.isnan(value) else value for name, value in trainer.clock.seconds().items()}
         path = self.root / "stats" / f"{split}_step{trainer.step - 1}.json"
-        write_json(path, stats)
+        write_json(path, {**stats, **seconds})
         return path
 
     def write_renders(self, trainer: Trainer, split: str = "val") -> None:

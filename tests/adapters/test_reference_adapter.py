@@ -86,6 +86,9 @@ def test_seconds_are_the_trainers_own(trainer: Trainer) -> None:
         trainer.train(progress=False)
     stats = gate.stats()
     assert (stats["t_total"], stats["t_post"]) == (trainer.t_total, trainer.t_post)
+    processor = trainer.clock.processor
+    assert (stats["t_total_processor"], stats["t_post_processor"]) == (processor.total, processor.post)
+    assert 0 < processor.post < processor.total
 
 
 def test_nothing_is_left_behind(trainer: Trainer) -> None:

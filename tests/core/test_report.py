@@ -25,6 +25,8 @@ KEYS = {
     "events",
     "t_total",
     "t_post",
+    "t_total_processor",
+    "t_post_processor",
     "refine_share",
     "gaussians_shown",
     "iterations_run",
@@ -53,6 +55,7 @@ def test_content_adds_up(tmp_path) -> None:
     assert set(report) == KEYS
     assert report == gate.report()
     assert report["schema_version"] == 1
+    assert 0 < report["t_post_processor"] <= report["t_total_processor"]
     assert report["iterations"] == 20
     assert report["gated_iterations"] == 15 == report["backwards_run"] + report["backwards_skipped"]
     assert report["paused"] == 3

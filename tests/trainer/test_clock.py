@@ -1,5 +1,6 @@
 """What counts as time of training."""
 
+import math
 import time
 
 import torch
@@ -8,7 +9,7 @@ from skipgs_plug.trainer.clock import TrainClock
 
 
 def worked_and_slept(processor: bool) -> TrainClock:
-    clock = TrainClock(torch.device("cpu"), processor)
+    clock = TrainClock(torch.device("cpu"), by_processor=processor)
     clock.start()
     end = time.process_time() + 0.05
     while time.process_time() < end:
@@ -18,6 +19,26 @@ def worked_and_slept(processor: bool) -> TrainClock:
     clock.mark("loss")
     clock.stop(after_densification=True)
     return clock
+
+
+def test_both_clocks_run_whichever_is_chosen() -> None:
+    for by_processor in (False, True):
+        clock = worked_and_slept(by_processor)
+        seconds = clock.seconds()
+        assert seconds["t_total"] >= 0.35 > 0.25 > seconds["t_total_processor"] >= 0.05
+        assert (seconds["t_post"], seconds["t_post_processor"]) == (seconds["t_total"], seconds["t_total_processor"])
+        restored = TrainClock(torch.device("cpu"), by_processor)
+        restored.load_state_dict(clock.state_dict())
+        assert restored.state_dict() == clock.state_dict()
+
+
+def test_a_state_without_processor_seconds_leaves_them_unknown() -> None:
+    state = worked_and_slept(processor=False).state_dict()
+    del state["t_total_processor"], state["t_post_processor"]
+    assert TrainClock.can_load(state) and not TrainClock.can_load({"t_total": 1.0})
+    clock = TrainClock(torch.device("cpu"))
+    clock.load_state_dict(state)
+    assert clock.t_total == state["t_total"] and math.isnan(clock.processor.total)
 
 
 def test_the_wall_clock_counts_waiting() -> None:
