@@ -20,3 +20,4 @@ class AbsGS(InriaFamily):
     left_alone = "Blend weights are gathered in skipped iterations too: they come from the forward."
     stand_ins = "absgs"
     mark = "use_prune_weight"
+    calls = ("reduce_opacity", "initial_prune")

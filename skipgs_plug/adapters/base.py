@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import torch
@@ -37,6 +39,7 @@ class AbstractAdapter(ABC):
         saved_state: gives the state of the gate that belongs to the checkpoint which the trainer goes on from,
             if any; called once, with the first iteration. Set before the gate is made.
         output_folder: where the trainer writes, as far as it is known.
+        released: why the gate let go of a run that then trained on without it; None where it did not.
         replaced: names that whoever runs the trainer has replaced around it, for `SkipGate.patched`. Set before the
             gate is made.
     """
@@ -49,6 +52,7 @@ class AbstractAdapter(ABC):
     stand_ins: ClassVar[str] = ""
     saved_state: Callable[[int], dict[str, Any] | None] | None = None
     output_folder: str | None = None
+    released: str | None = None
     replaced: Sequence[str] = ()
 
     def __init__(self, trainer: Any = None) -> None:
@@ -89,7 +93,8 @@ class AbstractAdapter(ABC):
 
         def begins(original: Callable[..., Any], trainer: Any, *args: Any, **kwargs: Any) -> Any:
             self.trainer = trainer
-            self.attach(hooks)
+            with released_on_error(hooks, self):
+                self.attach(hooks)
             return original(trainer, *args, **kwargs)
 
         hooks.wrap(owner, method, begins)
@@ -105,6 +110,32 @@ class AbstractAdapter(ABC):
     def timing(self) -> Times | None:
         """Seconds of training, when the trainer keeps them itself."""
         return None
+
+
+def release(hooks: Hooks, adapter: AbstractAdapter, reason: str) -> None:
+    """Take the gate off a run that goes on without it, and say why: an error would throw away what was trained."""
+    hooks.restore()
+    adapter.released = reason
+    warnings.warn(reason, RuntimeWarning, stacklevel=3)
+
+
+@contextmanager
+def released_on_error(hooks: Hooks, adapter: AbstractAdapter) -> Iterator[None]:
+    """Release the gate when the adapter's own code fails, so that no run is lost to it.
+
+    A refusal ends the script, as long as nothing is trained; of a gate that is off, it ends nothing at all.
+
+    Raises:
+        SkipGSError: The gate is on, and refuses this run in its first iteration.
+    """
+    trained = hooks.trained
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, SkipGSError) and hooks.state.config.enabled and not trained:
+            raise
+        name = "" if isinstance(error, SkipGSError) else f"{type(error).__name__}: "
+        release(hooks, adapter, f"The gate is released, and training goes on without it: {name}{error}")
 
 
 # Marks a `torch.multiprocessing.spawn` that attaches a gate in each process.

@@ -16,4 +16,6 @@ class DashGaussian(InriaFamily):
     left_alone = "Both optimizers, sparse Adam too. Its `train.py` is Inria's, and so is the adapter for it."
     stand_ins = "dash_gaussian"
     mark = "TrainingScheduler"
+    calls = ("prune_and_densify",)
+    arguments = ("render_size",)
     densification = Densification(marks=("densification_interval",), needs="nothing")

@@ -28,6 +28,8 @@ class FastGS(InriaFamily):
     )
     stand_ins = "fastgs"
     mark = "render_fastgs"
+    calls = ("densify_and_prune_fastgs", "final_prune_fastgs", "optimizer_step")
+    arguments = ("get_flag", "metric_map")
     renders = ("render_fastgs",)
 
     def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:

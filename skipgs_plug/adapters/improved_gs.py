@@ -27,6 +27,8 @@ class ImprovedGS(InriaFamily):
     )
     stand_ins = "improved_gs"
     mark = "compute_edge_score"
+    calls = ("add_densification_stats_abs", "densify_and_prune_Improved")
+    arguments = ("pixel_weights",)
     densification = Densification(marks=("densification_interval",), needs="nothing")
     structural = (*InriaFamily.structural, "only_prune")
 

@@ -7,7 +7,6 @@ Everything the gate needs happens through names that can be wrapped, whoever imp
 
 from __future__ import annotations
 
-import importlib
 import sys
 import types
 import warnings
@@ -20,14 +19,19 @@ from typing import Any, ClassVar
 import torch
 
 from skipgs_plug.adapters import registry
-from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.base import AbstractAdapter, release, released_on_error
 from skipgs_plug.adapters.drift_check import DriftCheck
+from skipgs_plug.adapters.import_hook import when_imported
+from skipgs_plug.adapters.loop_bounds import last_calls
 from skipgs_plug.adapters.loop_code import LOOP, LoopCode
-from skipgs_plug.adapters.unknown_forks import refuse_unknown_forks
+from skipgs_plug.adapters.unknown_forks import BY_HAND, Unrecognised, unrecognised
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.views import view_key
+
+# Modules of a checkout, each loaded when the script asks for it.
+RENDERER, MODEL = "gaussian_renderer", "scene.gaussian_model"
 
 
 class InriaFamily(AbstractAdapter):
@@ -38,6 +42,9 @@ class InriaFamily(AbstractAdapter):
         renders: names of the functions that render a training view; at least one must exist.
         structural: methods of `GaussianModel` that make losses jump.
         scenes: names that the loop's variable for its Scene can have.
+        calls: what the loop does beyond Inria's, and the adapter knows: methods of the model, functions that draw
+            noise, methods that change a tensor in place.
+        arguments: arguments of the renderer that the adapter knows, beyond Inria's.
         densification: how its densification events are told; None if growth must run whole.
     """
 
@@ -45,6 +52,8 @@ class InriaFamily(AbstractAdapter):
     renders: ClassVar[tuple[str, ...]] = ("render",)
     structural: ClassVar[tuple[str, ...]] = ("prune_points", "reset_opacity", "training_setup")
     scenes: ClassVar[tuple[str, ...]] = ("scene",)
+    calls: ClassVar[tuple[str, ...]] = ()
+    arguments: ClassVar[tuple[str, ...]] = ()
     # Statistics are means over visits, so events with enough visits behind them may be fewer.
     densification: ClassVar[Densification | None] = Densification(marks=("densification_interval",))
 
@@ -53,6 +62,8 @@ class InriaFamily(AbstractAdapter):
         self._step = 0
         self._model: Callable[[], Any] = lambda: None  # a new model means a new run
         self._label = "image_name"  # attribute of a camera that names its view
+        self._code: LoopCode | None = None
+        self._strange = Unrecognised(*5 * (frozenset(),))
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:
@@ -76,17 +87,32 @@ class InriaFamily(AbstractAdapter):
         """
         return cls.mark in names
 
-    def examine(self, code: LoopCode, namespace: Mapping[str, Any], model: type) -> None:
-        """Look for what this adapter does not know, before anything runs.
+    def examine(self, code: LoopCode, renderers: Sequence[Callable[..., Any]], model: type) -> None:
+        """Look for what this adapter does not know, before anything is trained: refuse it, or say it.
 
         Args:
             code: The training script.
-            namespace: Where its renderers are.
+            renderers: Those of its renderers that the adapter asks for.
             model: Its GaussianModel.
 
         Raises:
             AdapterMismatchError: It cannot be gated.
         """
+        calls = (*self.calls, *self.structural)
+        self._code, self._strange = code, unrecognised(code, renderers, model, calls, self.arguments)
+        self._strange.refuse(self.stranger(code))
+        if self._strange.listed:
+            warnings.warn(
+                f"{self.stranger(code)}. Recognised: {', '.join(self.renders[:1])}, backward, "
+                f"{', '.join(sorted(self._strange.known))}. Not recognised, and left to go on in skipped iterations: "
+                f"{self._strange.listed}.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+
+    def stranger(self, code: LoopCode) -> str:
+        """Beginning of a sentence about a script that does more than this adapter knows."""
+        return f"{code.place} does more than {self.checked.partition(' (')[0]}, which adapter {self.name!r} is for"
 
     def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
         """Keep what later answers need of a run, which begins now; arguments as for `start_iter`."""
@@ -117,8 +143,10 @@ class InriaFamily(AbstractAdapter):
             )
         code = LoopCode.of_module(names)
         self._refuse_fork(code)
-        self.examine(code, names, names["GaussianModel"])
-        self._attach_to(hooks, names, names["GaussianModel"], names)
+        self.examine(code, self._renderers(names), names["GaussianModel"])
+        self._attach_to_renderer(hooks, names)
+        self._attach_to_model(hooks, names)
+        self._attach_to_loop(hooks, names)
 
     def attach_script(self, hooks: Hooks) -> None:
         code = LoopCode.of_script(Path(sys.argv[0]))
@@ -128,37 +156,36 @@ class InriaFamily(AbstractAdapter):
                 f"it was checked with {self.checked}."
             )
         self._refuse_fork(code)
-        # The script binds these names when it imports them, so they are replaced before.
-        renderer = importlib.import_module("gaussian_renderer")
-        model = importlib.import_module("scene.gaussian_model").GaussianModel
-        self.examine(code, vars(renderer), model)
-        self._attach_to(hooks, vars(renderer), model, hooks.script_globals)
+        # The script binds names of these modules when it imports them: they are replaced right before.
+        loaded: dict[str, dict[str, Any]] = {}
 
-    def _attach_to(self, hooks: Hooks, names: dict[str, Any], model: type, script: dict[str, Any]) -> None:
-        present = [name for name in self.renders if name in names]
+        def examined(module: types.ModuleType, attach: Callable[[Hooks, dict[str, Any]], None]) -> None:
+            with released_on_error(hooks, self):
+                loaded[module.__name__] = vars(module)
+                if len(loaded) == 2:
+                    self.examine(code, self._renderers(loaded[RENDERER]), loaded[MODEL]["GaussianModel"])
+                attach(hooks, vars(module))
+
+        when_imported(hooks, MODEL, lambda module: examined(module, self._attach_to_model))
+        when_imported(hooks, RENDERER, lambda module: examined(module, self._attach_to_renderer))
+        self._attach_to_loop(hooks, hooks.script_globals)
+
+    def _renderers(self, names: Mapping[str, Any]) -> list[Callable[..., Any]]:
+        """Those renderers of a namespace that the adapter asks for.
+
+        Raises:
+            AdapterMismatchError: There are none.
+        """
+        present = [names[name] for name in self.renders if name in names]
         if not present:
             raise AdapterMismatchError(
                 f"Adapter {self.name!r} found none of {', '.join(self.renders)} in {names.get('__name__')}; "
                 f"it was checked with {self.checked}."
             )
+        return present
 
-        drift = DriftCheck(hooks.state)
-
-        def heartbeat(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            # Frame 2 is the loop. Its variables are read once, before they hold an iteration's graph.
-            if self._model() is not args[0]:
-                frame = sys._getframe(2)
-                self._refuse_fork(LoopCode.of_module(frame.f_globals))
-                self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
-                self._model = weakref.ref(args[0])
-            else:
-                self._step = hooks.number(self._step + 1)
-                own = [one for one in vars(args[0]).values() if isinstance(one, torch.optim.Optimizer)]
-                if moved := drift.moved(own):
-                    self._give_up(hooks, moved)
-                    return original(*args, **kwargs)
-            hooks.iteration(self._step)
-            return original(*args, **kwargs)
+    def _attach_to_renderer(self, hooks: Hooks, names: dict[str, Any]) -> None:
+        """Learn the training view from what is rendered."""
 
         def rendered(original: Callable[..., Any], camera: Any, *args: Any, **kwargs: Any) -> Any:
             # Not a training camera without a name: the viewer's, which renders before the training view.
@@ -166,10 +193,38 @@ class InriaFamily(AbstractAdapter):
                 hooks.view(key)
             return original(camera, *args, **kwargs)
 
+        self._renderers(names)
+        for name in self.renders:
+            if name in names:
+                hooks.wrap(names, name, rendered)
+
+    def _attach_to_model(self, hooks: Hooks, names: dict[str, Any]) -> None:
+        """Learn iterations and structural changes from calls of the model's methods."""
+        model = names["GaussianModel"]
+        drift = DriftCheck(hooks.state)
+
+        def heartbeat(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            frame = sys._getframe(2)  # the loop's
+            with released_on_error(hooks, self):
+                # Variables of the loop are read once, before they hold an iteration's graph.
+                if self._model() is not args[0]:
+                    self._refuse_fork(LoopCode.of_module(frame.f_globals))
+                    self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
+                    self._model = weakref.ref(args[0])
+                else:
+                    self._step = hooks.number(self._step + 1)
+                    own = [one for one in vars(args[0]).values() if isinstance(one, torch.optim.Optimizer)]
+                    if moved := drift.moved(own):
+                        self._give_up(hooks, moved)
+                        return original(*args, **kwargs)
+                hooks.iteration(self._step)
+            return original(*args, **kwargs)
+
         hooks.wrap(model, "update_learning_rate", heartbeat)
-        for name in present:
-            hooks.wrap(names, name, rendered)
         hooks.events(model, *(name for name in self.structural if hasattr(model, name)))
+
+    def _attach_to_loop(self, hooks: Hooks, script: dict[str, Any]) -> None:
+        """Hold on to the loop's backward and to its range."""
         hooks.gate_tensor_backward(LOOP)
         hooks.loop(script, LOOP, always=self.always_run, densification=self.densification)
 
@@ -201,13 +256,12 @@ class InriaFamily(AbstractAdapter):
 
     def _give_up(self, hooks: Hooks, moved: list[str]) -> None:
         """Let training go on ungated: an error would throw away what was trained so far."""
-        hooks.restore()
-        warnings.warn(
+        release(
+            hooks,
+            self,
             f"The loop moved {', '.join(moved)} in iteration {self._step - 1}, whose backward was skipped: it does "
             f"something of its own that adapter {self.name!r} does not know. The gate is detached, and training goes "
             "on without it. Gate this loop by hand with SkipGate(start_iter=...).",
-            RuntimeWarning,
-            stacklevel=2,
         )
 
     def _read_run(self, hooks: Hooks, loop: Mapping[str, Any]) -> None:
@@ -234,13 +288,33 @@ class InriaFamily(AbstractAdapter):
         self.begin(opt, loop)
         hooks.ready(
             TrainerFacts(
-                self.start_iter(opt, loop),
+                self._start_after_changes(opt, loop),
                 view_names=[view_key(key) for key in self.view_keys(cameras)],
                 max_steps=opt.iterations,
                 gradients_read_until=self.gradients_read_until(opt, loop),
                 accumulates=self.accumulates(opt, loop),
             )
         )
+
+    def _start_after_changes(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        """`start_iter`, or the end of whatever this adapter does not know, where it ends later than that."""
+        start = self.start_iter(opt, loop)
+        if self._code is None or self._code.syntax is None:
+            return start
+        ends = last_calls(self._code.syntax, self.may_end_later(), loop)
+        late = {name: end for name, end in ends.items() if start < end <= opt.iterations}
+        if late:
+            listed = ", ".join(f"{name}() until iteration {end - 1}" for name, end in sorted(late.items()))
+            warnings.warn(
+                f"The gate begins with iteration {max(late.values())} in place of {start}: the loop calls {listed}.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        return max([start, *late.values()])
+
+    def may_end_later(self) -> frozenset[str]:
+        """Methods of the model that the gate does not begin before the loop has called for the last time."""
+        return self._strange.calls
 
 
 class Inria(InriaFamily):
@@ -258,7 +332,8 @@ class Inria(InriaFamily):
         "Both optimizers of the current version, sparse Adam too. Renders of the viewer and of evaluations are not "
         "taken for training. When two images have the same name in different folders (older versions keep the name "
         "only), the gate warns and tells views apart by their position. A fork that no adapter knows is refused when "
-        "its loop draws noise or writes into tensors, and otherwise gated with a list of what was not recognised."
+        "its loop changes tensors in place. Otherwise the gate lists what it did not recognise, and begins after the "
+        "last iteration that the loop's conditions give for it."
     )
     stand_ins = "inria"
 
@@ -266,9 +341,16 @@ class Inria(InriaFamily):
     def recognises(cls, names: Container[str]) -> bool:
         return True  # asked last: what is not a fork's is the original's
 
-    def examine(self, code: LoopCode, namespace: Mapping[str, Any], model: type) -> None:
-        if "render" in namespace:  # else `attach` says so
-            refuse_unknown_forks(code, namespace["render"], model, self.structural)
+    def stranger(self, code: LoopCode) -> str:
+        return f"{code.place} is a fork of Inria 3DGS that no adapter knows"
+
+    def examine(self, code: LoopCode, renderers: Sequence[Callable[..., Any]], model: type) -> None:
+        if "densify_until_iter" not in code.used:
+            raise AdapterMismatchError(f"{self.stranger(code)}: its loop never asks for densify_until_iter. {BY_HAND}")
+        super().examine(code, renderers, model)
+
+    def may_end_later(self) -> frozenset[str]:
+        return super().may_end_later() | {"densify_and_prune", "prune_points", "reset_opacity"}
 
     @classmethod
     def stand_ins_for(cls, command: Sequence[str]) -> str:

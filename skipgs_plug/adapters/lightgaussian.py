@@ -28,6 +28,7 @@ class LightGaussian(InriaFamily):
     left_alone = "Jittered cameras (two of three iterations with `--augmented_view`) have means of their own."
     stand_ins = "lightgaussian"
     mark = "calculate_v_imp_score"
+    calls = ("prune_gaussians", "onedownSHdegree", "load_ply", "randn")
     scenes = ("scene", "student_scene")
 
     def __init__(self, trainer: Any = None) -> None:

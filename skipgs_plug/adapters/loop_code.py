@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import dis
 import types
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from skipgs_plug.adapters.loop_bounds import function_of
 from skipgs_plug.core.errors import AdapterMismatchError
 
 LOOP = "training"  # name of the function that holds the loop, in the whole Inria family
@@ -17,22 +20,34 @@ class LoopCode(NamedTuple):
 
     Attributes:
         place: file of the script, or name of the module, for sentences.
-        names: global names of the script, and every global and attribute that its loop uses.
-        used: those of the loop alone, which is its function `training`; none where it has no such function.
-        keywords: names by which the loop passes arguments.
+        names: global names of the script, and every global and attribute that its function `training` uses.
+        used: every global and attribute that `training` uses, and the functions of the script that it calls;
+            none where there is no such function.
+        repeated: of these, the ones used inside the loop itself or by functions that it calls.
+        keywords: names by which arguments are passed.
+        stored: attributes that are assigned to inside the loop.
+        syntax: syntax of `training`; None where there is no source.
     """
 
     place: str
     names: frozenset[str]
     used: frozenset[str] = frozenset()
+    repeated: frozenset[str] = frozenset()
     keywords: frozenset[str] = frozenset()
+    stored: frozenset[str] = frozenset()
+    syntax: ast.FunctionDef | None = None
 
     @classmethod
     def of_module(cls, namespace: Mapping[str, Any]) -> LoopCode:
         """Of a module that was imported."""
         place = str(namespace.get("__file__") or namespace.get("__name__"))
-        code = getattr(namespace.get(LOOP), "__code__", None)
-        return cls._made(place, set(namespace), code)
+        functions = {
+            name: value.__code__
+            for name, value in namespace.items()
+            if isinstance(value, types.FunctionType) and value.__globals__ is namespace
+        }
+        syntax = function_of(namespace[LOOP], LOOP) if LOOP in functions else None
+        return cls._made(place, set(namespace), functions, syntax)
 
     @classmethod
     def of_script(cls, path: Path) -> LoopCode:
@@ -45,16 +60,19 @@ class LoopCode(NamedTuple):
             script = compile(path.read_bytes(), str(path), "exec")
         except (SyntaxError, ValueError) as error:
             raise AdapterMismatchError(f"{path} is not a Python script: {error}.") from error
-        inner = [const for const in script.co_consts if isinstance(const, types.CodeType)]
-        code = next((one for one in inner if one.co_name == LOOP), None)
-        return cls._made(str(path), {*script.co_names, *(one.co_name for one in inner)}, code)
+        functions = {const.co_name: const for const in script.co_consts if isinstance(const, types.CodeType)}
+        return cls._made(str(path), {*script.co_names, *functions}, functions, function_of(path, LOOP))
 
     @classmethod
-    def _made(cls, place: str, own: set[str], code: types.CodeType | None) -> LoopCode:
-        if code is None:
+    def _made(
+        cls, place: str, own: set[str], functions: Mapping[str, types.CodeType], syntax: ast.FunctionDef | None
+    ) -> LoopCode:
+        if LOOP not in functions:
             return cls(place, frozenset(own))
-        parts = list(_with_inner(code))
-        used = frozenset(name for part in parts for name in part.co_names)
+        training = functions[LOOP]
+        repeated, stored = _in_loop(training)
+        called = _called(repeated, functions)
+        parts = [part for code in (training, *called) for part in _with_inner(code)]
         # The names of keywords stand together in one constant.
         keywords = frozenset(
             word
@@ -63,7 +81,50 @@ class LoopCode(NamedTuple):
             if isinstance(const, tuple) and const and all(isinstance(word, str) for word in const)
             for word in const
         )
-        return cls(place, frozenset(own) | used, used, keywords)
+        of_called = {name for code in called for part in _with_inner(code) for name in part.co_names}
+        of_loop = {name for part in _with_inner(training) for name in part.co_names}
+        return cls(
+            place,
+            frozenset(own | of_loop),
+            frozenset(of_loop | of_called),
+            frozenset(repeated | of_called),
+            keywords,
+            frozenset(stored),
+            syntax,
+        )
+
+
+def _called(used: set[str], functions: Mapping[str, types.CodeType]) -> list[types.CodeType]:
+    """Functions of the script that these names call, and those that they call in turn."""
+    found: dict[str, types.CodeType] = {}
+    waiting = [name for name in used if name in functions and name != LOOP]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found[name] = functions[name]
+            inner = {used for part in _with_inner(functions[name]) for used in part.co_names}
+            waiting += [one for one in inner if one in functions and one != LOOP]
+    return list(found.values())
+
+
+def _in_loop(code: types.CodeType) -> tuple[set[str], set[str]]:
+    """Names used inside the loop that calls `backward`, and attributes assigned there; all of the code if none does."""
+    steps = list(dis.get_instructions(code))
+    backwards = [step.offset for step in steps if step.argval == "backward"]
+    loops = [
+        (step.argval, step.offset)
+        for step in steps
+        if "JUMP" in step.opname and isinstance(step.argval, int) and step.argval < step.offset
+    ]
+    around = [loop for loop in loops if any(loop[0] <= offset <= loop[1] for offset in backwards)]
+    first = min((loop[0] for loop in around), default=0)
+    last = max((loop[1] for loop in around), default=steps[-1].offset)
+    inside = [step for step in steps if first <= step.offset <= last]
+    names = {step.argval for step in inside if isinstance(step.argval, str) and step.argval in code.co_names}
+    for step in inside:  # comprehensions and inner functions
+        if isinstance(step.argval, types.CodeType):
+            names |= {name for part in _with_inner(step.argval) for name in part.co_names}
+    return names, {step.argval for step in inside if step.opname == "STORE_ATTR"}
 
 
 def _with_inner(code: types.CodeType) -> Iterator[types.CodeType]:

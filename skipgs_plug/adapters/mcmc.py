@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -38,6 +37,7 @@ class MCMC(InriaFamily):
     )
     stand_ins = "mcmc"
     mark = NOISE
+    calls = ("add_new_gs", "relocate_gs", "add_", "randn_like", "randn")
     densification = Densification(marks=("densification_interval",), needs="nothing")
 
     def __init__(self, trainer: Any = None) -> None:
@@ -55,8 +55,8 @@ class MCMC(InriaFamily):
     def must_run(self, step: int) -> bool:
         return step in self._relocations
 
-    def _attach_to(self, hooks: Hooks, names: dict[str, Any], model: type, script: dict[str, Any]) -> None:
-        super()._attach_to(hooks, names, model, script)
+    def _attach_to_model(self, hooks: Hooks, names: dict[str, Any]) -> None:
+        super()._attach_to_model(hooks, names)
 
         def covariance(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             factor = original(*args, **kwargs)
@@ -64,6 +64,4 @@ class MCMC(InriaFamily):
             in_loop = sys._getframe(2).f_code.co_name == LOOP
             return torch.zeros_like(factor) if in_loop and hooks.state.skipped else factor
 
-        # A script takes it from this module when it imports it.
-        owner = vars(importlib.import_module("scene.gaussian_model")) if self.trainer is None else names
-        hooks.wrap(owner, NOISE, covariance)
+        hooks.wrap(names, NOISE, covariance)

@@ -15,3 +15,4 @@ class PixelGS(InriaFamily):
     left_alone = "Pixel counts and the gradients they weight are read by densification alone."
     stand_ins = "pixel_gs"
     mark = "depth_threshold"
+    arguments = ("depth_threshold",)

@@ -25,6 +25,8 @@ class SpeedySplat(InriaFamily):
     left_alone = "The backwards that compute pruning scores always run."
     stand_ins = "speedy_splat"
     mark = "score_func"
+    calls = ("prune_gaussians",)
+    arguments = ("scores",)
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter) + 1

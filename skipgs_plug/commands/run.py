@@ -75,9 +75,8 @@ def run(args: Args, command: list[str]) -> int:
         say(f"{script_name(command)} is run as {args.adapter}.")
     with spawned.gated_when_spawned(functools.partial(run_spawned, args, command)) as processes:
         code, gate = run_gated(args, command, functools.partial(run_script, command))
-    if code == 0 and gate is not None and gate.trained:
-        gate.verify()
-    elif code == 0 and not processes:
+    verify(code, gate)
+    if code == 0 and not processes and not (args.no_gate if gate is None else gate.trained):
         say(f"{script_name(command)} ended without a training iteration; nothing was gated.")
     return code
 
@@ -87,7 +86,18 @@ def run_spawned(args: Args, command: list[str], rank: int, call: bytes) -> None:
     code, gate = run_gated(args, command, lambda attach: spawned.run_call(command, attach, rank, call), rank)
     if code:
         sys.exit(code)
-    if gate is not None and gate.trained:
+    verify(code, gate)
+
+
+def verify(code: int, gate: SkipGate | None) -> None:
+    """Ask a gate that saw a whole run whether it saw all that it should have.
+
+    Raises:
+        SkipGSError: It did not, and did not say so before.
+    """
+    if code or gate is None or not gate.trained or not gate.config.enabled:
+        return
+    if gate.adapter is None or gate.adapter.released is None:
         gate.verify()
 
 
@@ -105,7 +115,13 @@ def run_gated(
     def attach() -> dict[str, Any]:
         if not args.no_gate:
             adapter.saved_state = checkpoints.state_for
-        gates.append(SkipGate(adapter=adapter, **settings))
+        try:
+            gates.append(SkipGate(adapter=adapter, **settings))
+        except SkipGSError as error:
+            if not args.no_gate:
+                raise
+            say(f"{script_name(command)} runs without a gate, and so without skipgs.json: {error}")
+            return {}
         checkpoints.gate = gates[0]
         return gates[0].script_globals
 

@@ -30,6 +30,7 @@ class Adapter(Protocol):
     checked: ClassVar[str]
     saved_state: Callable[[int], dict[str, Any] | None] | None
     output_folder: str | None
+    released: str | None
     replaced: Sequence[str]
 
     def attach(self, hooks: Hooks) -> None: ...

@@ -43,7 +43,7 @@ def test_wrong_fork_of_a_script_is_noticed_in_its_first_iteration():
     with SkipGate(copied(inria)) as gate:
         adapter, hooks = gate.adapter, gate._hooks
         gate.detach()
-        adapter._attach_to(hooks, vars(module), module.GaussianModel, vars(module))  # as attach_script does
+        adapter._attach_to_model(hooks, vars(module))  # as attach_script does
         with pytest.raises(AdapterMismatchError, match="looks like the training script of 'speedy_splat'"):
             module.training(dataset(), types.SimpleNamespace(last=5, iterations=5), None)
 
@@ -123,13 +123,15 @@ BACKWARDS = {
 
 
 @pytest.mark.parametrize("backward", BACKWARDS.values(), ids=BACKWARDS)
-def test_not_one_backward_per_iteration_is_noticed_after_ten_at_the_latest(backward):
+def test_not_one_backward_per_iteration_releases_the_gate_after_ten_and_loses_no_run(backward):
     module = train_module(backward)
     opt = types.SimpleNamespace(iterations=40, densify_until_iter=20)
-    with pytest.raises(AdapterMismatchError, match="where one per iteration was expected") as error, SkipGate(module):
-        module.training(dataset(), opt, None)
-    assert module.done == list(range(1, 11))
-    assert "8a70a8cd" in str(error.value)
+    with SkipGate(module) as gate:
+        with pytest.warns(RuntimeWarning, match="goes on without it: .* where one per iteration was expected") as seen:
+            module.training(dataset(), opt, None)
+        assert not gate.patched
+    assert module.done == list(range(1, 41))
+    assert "8a70a8cd" in str(seen[0].message) and "8a70a8cd" in gate.adapter.released
 
 
 def test_script_shorter_than_ten_iterations_is_judged_at_its_end():

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from skipgs_plug import cli
+from skipgs_plug.adapters.speedy_splat import SpeedySplat
 from skipgs_plug.scripts.checkpoints import Checkpoints
 
 RENDERER = """
@@ -319,3 +320,29 @@ def test_torch_keeps_to_one_thread_on_the_cpu(checkout, tmp_path, capfd):
         assert "threads 1\n" in capfd.readouterr().out and torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
+
+
+def test_script_in_a_subfolder_may_extend_its_path_first(checkout, tmp_path, capfd):
+    script = Path(checkout)
+    inner = script.parent / "ms" / "train.py"
+    inner.parent.mkdir()
+    lines = "import os, sys\nsys.path.append(os.path.join(os.path.dirname(os.path.abspath(__file__)), '..'))\n"
+    inner.write_text(lines + script.read_text())
+    script.unlink()
+    assert cli.main(["run", "auto", "--cpu", "--warmup", "10", "--", str(inner), str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "skipgs.json").read_text())["backwards_skipped"] > 0
+    assert not any("_Finder" in repr(finder) for finder in sys.meta_path)
+
+
+def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(SpeedySplat, "stand_ins", "inria")  # the look-alike has Inria's rasterizer
+    wrong = ["run", "speedy_splat", "--no-gate", "--cpu", "--", checkout, str(tmp_path)]
+    assert cli.main(wrong) == 0 and (tmp_path / "model.pth").exists()
+    assert "train.py runs without a gate, and so without skipgs.json: Adapter 'speedy_s" in capfd.readouterr().err
+    forget()
+    script = Path(checkout)
+    script.write_text(script.read_text().replace("loss.backward()", "loss.mul_(1); loss.backward()"))
+    with pytest.warns(RuntimeWarning, match=r"goes on without it: .* changes values itself \(mul_\)"):
+        assert cli.main(["run", "auto", "--no-gate", "--cpu", "--", checkout, str(tmp_path)]) == 0
+    forget()
+    assert cli.main(["run", "auto", "--cpu", "--", checkout, str(tmp_path)]) == cli.BAD_INPUT

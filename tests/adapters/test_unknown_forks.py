@@ -8,12 +8,14 @@ from cases import SkipAlways
 from lookalikes.splats import Scene, SplatModel, dataset, draw, log, new_log, photo_loss, pick
 
 from skipgs_plug import AdapterMismatchError, SkipGate
+from skipgs_plug.adapters.inria import Inria
 
 TRAIN = """
 def training(dataset, opt, pipe):
     gaussians = GaussianModel()
     scene = Scene(dataset, gaussians)
     gaussians.training_setup(opt)
+    {before}
     for iteration in range(1, opt.iterations + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
@@ -41,17 +43,32 @@ def render(camera, gaussians, kernel_size=0.3):
     return draw(camera, gaussians.values)
 
 
-def stranger(argument="", extra="pass", until="densify_until_iter"):
+@pytest.fixture
+def from_file(tmp_path):
+    """Make the training module from a file, whose conditions can be read."""
+
+    def make(**parts):
+        return stranger(**parts, file=tmp_path / "train.py")
+
+    return make
+
+
+def stranger(argument="", extra="pass", until="densify_until_iter", before="pass", file=None, helper=""):
     module = types.ModuleType("train")
     own = {"GaussianModel": type("GaussianModel", (GaussianModel,), {}), "render": render, "Scene": Scene}
     module.__dict__.update(own, log=log, pick=pick, photo_loss=photo_loss, torch=torch)
-    exec(TRAIN.format(argument=argument, extra=extra, until=until), vars(module))
+    source = TRAIN.format(argument=argument, extra=extra, until=until, before=before) + helper
+    if file is not None:
+        file.write_text(source)
+    exec(compile(source, str(file or "train"), "exec"), vars(module))
     return module
 
 
-def train(module):
+def train(module, **options):
     new_log()
-    module.training(dataset(), types.SimpleNamespace(iterations=40, densify_until_iter=20), None)
+    opt = types.SimpleNamespace(iterations=40, densify_until_iter=20, prune_until_iter=30)
+    opt.__dict__.update(options)
+    module.training(dataset(), opt, None)
 
 
 def test_loop_of_inrias_own_is_no_stranger():
@@ -64,7 +81,8 @@ def test_loop_of_inrias_own_is_no_stranger():
 @pytest.mark.parametrize(
     ("extra", "sentence"),
     [
-        ("torch.randn_like(gaussians.values['xyz'])", r"changes values itself \(randn_like\)"),
+        ("gaussians.values['xyz'].add_(torch.randn(30, 3))", r"changes values itself \(add_, randn\)"),
+        ("gaussians.values['xyz'].data += 0.1", r"changes values itself \(data\)"),
         ("gaussians.values['xyz'].add_(0.1)", r"changes values itself \(add_\)"),
         ("[v.mul_(0.9) for v in gaussians.values.values()]", r"changes values itself \(mul_\)"),
     ],
@@ -115,3 +133,90 @@ def test_what_moves_beside_a_nan_is_still_found():
     with pytest.warns(RuntimeWarning), SkipGate(module, policy=SkipAlways()) as gate:
         train(module)
     assert not gate.patched
+
+
+def test_noise_for_a_network_is_listed_and_not_refused():
+    with pytest.warns(RuntimeWarning, match=r"left to go on in skipped iterations: randn\(\)"):
+        gate = SkipGate(stranger(extra="noise = torch.randn(3)"), policy=SkipAlways())
+    with gate:
+        train(gate.adapter.trainer)
+    assert gate.report()["backwards_skipped"] == 21
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"before": "gaussians.values['xyz'].requires_grad_(False).requires_grad_(True)"},
+        {"before": "torch.zeros(3).fill_(1.0)"},
+        {"extra": "torch.zeros(3).requires_grad_(False)"},
+    ],
+    ids=["freeze before", "write before", "freeze"],
+)
+def test_what_changes_no_values_in_the_loop_is_not_refused(parts):
+    with SkipGate(stranger(**parts), policy=SkipAlways()) as gate:
+        train(gate.adapter.trainer)
+    assert gate.report()["backwards_skipped"] == 21
+
+
+def test_functions_that_the_loop_calls_are_read_too():
+    helper = "\ndef nudge(gaussians):\n    inner(gaussians)\n\ndef inner(gaussians):\n    gaussians.count()\n"
+    with pytest.warns(RuntimeWarning, match=r"in skipped iterations: count\(\)"):
+        SkipGate(stranger(extra="nudge(gaussians)", helper=helper)).detach()
+    writes = helper.replace("gaussians.count()", "gaussians.values['xyz'].add_(1.0)")
+    with pytest.raises(AdapterMismatchError, match=r"changes values itself \(add_\)"):
+        SkipGate(stranger(extra="nudge(gaussians)", helper=writes))
+
+
+@pytest.mark.parametrize(
+    ("extra", "start"),
+    [
+        ("if iteration < opt.prune_until_iter: gaussians.count()", 30),
+        ("if opt.prune_until_iter >= iteration and iteration % 5 == 0: gaussians.count()", 31),
+        ("if iteration in [24, 28]: gaussians.count()", 29),
+        ("if iteration == 300: gaussians.count()", 20),  # after the last iteration: never
+        ("gaussians.count()", 20),
+        ("if iteration > 10: gaussians.count()", 20),
+        ("if iteration < 25 or opt.prune_until_iter: gaussians.count()", 20),
+    ],
+)
+def test_gate_begins_after_the_last_call_that_is_not_recognised(extra, start, from_file):
+    with pytest.warns(RuntimeWarning, match="count"):
+        gate = SkipGate(from_file(extra=extra), policy=SkipAlways())
+    with gate:
+        if start > 20:
+            with pytest.warns(RuntimeWarning, match=rf"begins with iteration {start} in place of 20: .* count\(\)"):
+                train(gate.adapter.trainer)
+        else:
+            train(gate.adapter.trainer)
+    assert gate.config.start_iter == start and gate.report()["backwards_skipped"] == 41 - start
+
+
+def test_later_prunes_of_a_fork_put_the_start_off_too(from_file):
+    extra = "if iteration <= opt.prune_until_iter: gaussians.prune_points(torch.zeros(30, dtype=torch.bool))"
+    sentence = r"the loop calls prune_points\(\) until iteration 30"
+    with SkipGate(from_file(extra=extra), policy=SkipAlways()) as gate, pytest.warns(RuntimeWarning, match=sentence):
+        train(gate.adapter.trainer)
+    assert gate.config.start_iter == 31
+
+
+def test_failure_of_the_gates_own_code_loses_no_run(monkeypatch):
+    def broken(self, opt, loop):
+        return opt.no_such_option
+
+    monkeypatch.setattr(Inria, "start_iter", broken)
+    sentence = "released, and training goes on without it: AttributeError: .*no_such_option"
+    with SkipGate(stranger()) as gate:
+        with pytest.warns(RuntimeWarning, match=sentence):
+            train(gate.adapter.trainer)
+        assert not gate.patched
+    assert log.backwards == [*range(1, 41)]
+
+
+def test_a_gate_that_is_off_refuses_nothing_in_the_first_iteration(monkeypatch):
+    monkeypatch.setattr(Inria, "scenes", ("no_scene",))
+    sentence = "expects no_scene among the variables"
+    with SkipGate(stranger(), enabled=False) as gate, pytest.warns(RuntimeWarning, match=sentence):
+        train(gate.adapter.trainer)
+    assert log.backwards == [*range(1, 41)]
+    with SkipGate(stranger()) as gate, pytest.raises(AdapterMismatchError, match="expects no_scene"):
+        train(gate.adapter.trainer)

@@ -48,14 +48,14 @@ def training(dataset, opt, pipe, checkpoint=None):
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
                 if iteration % 5 == 0:
-                    gaussians.prune_gaussians(0.05, gaussians.values["opacity"])
+                    gaussians._prune_gaussians(0.05, gaussians.values["opacity"])
                 if iteration % 4 == 0:
                     gaussians.reduce_opacity()
             if opt.use_prune_weight and iteration < opt.prune_until_iter and iteration % 12 == 0:
                 gaussians.prune_points(gaussians.max_weight < gaussians.max_weight.quantile(0.1))
                 gaussians.max_weight *= 0
             if iteration < opt.iterations:
-                note_step(gaussians.optimizers())
+                note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
     return gaussians.capture(), iteration

@@ -24,7 +24,7 @@ class GaussianModel(SplatModel):
         self.exposure_optimizer = torch.optim.Adam([self.exposure], lr=0.01)
 
     def prune_and_densify(self, min_opacity):
-        self.prune_gaussians(min_opacity, self.values["opacity"])
+        self._prune_gaussians(min_opacity, self.values["opacity"])
         return 0
 
 
@@ -68,7 +68,7 @@ def training(dataset, opt, pipe, checkpoint=None):
             if iteration < opt.iterations:
                 gaussians.exposure_optimizer.step()
                 gaussians.exposure_optimizer.zero_grad(set_to_none=True)
-                note_step(gaussians.optimizers())
+                note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
     return gaussians.capture(), iteration

@@ -14,7 +14,7 @@ class GaussianModel(SplatModel):
         self.optimizer = self.adam([self.group(name) for name in self.rates if name != "f_rest"], eps=1e-15)
         self.shoptimizer = self.adam([self.group("f_rest")], eps=1e-15)
 
-    def optimizers(self):
+    def _optimizers(self):
         return [self.optimizer, self.shoptimizer]
 
     def optimizer_step(self, iteration):
@@ -27,7 +27,7 @@ class GaussianModel(SplatModel):
             optimizer.zero_grad(set_to_none=True)
 
     def final_prune_fastgs(self, min_opacity, pruning_score=None):
-        self.prune_gaussians(0.2, pruning_score)
+        self._prune_gaussians(0.2, pruning_score)
 
 
 def render_fastgs(viewpoint_camera, pc, pipe, bg_color, mult, get_flag=None, metric_map=None):
@@ -62,7 +62,7 @@ def training(dataset, opt, pipe, checkpoint=None):
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
                 if iteration % 5 == 0:
                     score = compute_gaussian_score_fastgs(scene.getTrainCameras()[:2], gaussians, pipe, None, opt)
-                    gaussians.prune_gaussians(0.05, score)
+                    gaussians._prune_gaussians(0.05, score)
             if iteration in PRUNES:
                 score = compute_gaussian_score_fastgs(scene.getTrainCameras(), gaussians, pipe, None, opt)
                 gaussians.final_prune_fastgs(min_opacity=0.1, pruning_score=score)

@@ -67,11 +67,11 @@ def training(dataset, opt, pipe, checkpoint, args):
             elif alternates and iteration <= opt.optimizing_spa_stop_iter:
                 optimizing_spa.z = update_imp_score(scene, gaussians, pipe).clamp(min=0)
             if iteration == args.simp_iteration1:
-                gaussians.prune_gaussians(0.3, update_imp_score(scene, gaussians, pipe))
+                gaussians._prune_gaussians(0.3, update_imp_score(scene, gaussians, pipe))
                 gaussians.reinitial_pts()
                 gaussians.training_setup(opt)
             if iteration == opt.optimizing_spa_stop_iter:
-                gaussians.prune_gaussians(0.4, update_imp_score(scene, gaussians, pipe))
+                gaussians._prune_gaussians(0.4, update_imp_score(scene, gaussians, pipe))
             if iteration < opt.iterations:
                 note_step([gaussians.optimizer])
                 gaussians.optimizer.step()

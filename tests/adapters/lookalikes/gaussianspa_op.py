@@ -51,7 +51,7 @@ def training(dataset, opt, pipe, checkpoint=None):
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
             if iteration == opt.optimizing_spa_stop_iter:
-                gaussians.prune_gaussians(0.4, gaussians.values["opacity"].detach())
+                gaussians._prune_gaussians(0.4, gaussians.values["opacity"].detach())
     return gaussians.capture(), iteration
 
 

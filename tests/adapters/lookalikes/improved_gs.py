@@ -13,14 +13,14 @@ class GaussianModel(SplatModel):
         self.optimizer = self.adam([self.group(name) for name in self.rates if name != "f_rest"], eps=1e-15)
         self.shoptimizer = self.adam([self.group("f_rest")], eps=1e-15)
 
-    def optimizers(self):
+    def _optimizers(self):
         return [self.optimizer, self.shoptimizer]
 
     def add_densification_stats_abs(self, viewspace_points):
         self.add_densification_stats(viewspace_points)
 
     def only_prune(self, share):
-        self.prune_gaussians(share, self.values["opacity"])
+        self._prune_gaussians(share, self.values["opacity"])
 
 
 def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, override_color=None, pixel_weights=None):
@@ -33,8 +33,8 @@ def compute_edge_score(camlist, gaussians, pipe, bg):
 
 
 def step(gaussians):
-    note_step(gaussians.optimizers())
-    for optimizer in gaussians.optimizers():
+    note_step(gaussians._optimizers())
+    for optimizer in gaussians._optimizers():
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
 
@@ -62,7 +62,7 @@ def training(dataset, opt, pipe, checkpoint, args):
                 gaussians.add_densification_stats_abs(render_pkg["viewspace_points"])
                 if iteration % 5 == 0:
                     score = compute_edge_score(scene.getTrainCameras()[: args.cams], gaussians, pipe, None)
-                    gaussians.prune_gaussians(0.05, score)
+                    gaussians._prune_gaussians(0.05, score)
                 if iteration % 8 == 0:
                     gaussians.reset_opacity()
             if iteration < opt.iterations:

@@ -11,7 +11,7 @@ ADAPTER, FIRST, START, LAST = "inria", 1, 20, 60
 
 class GaussianModel(SplatModel):
     def densify_and_prune(self, share):
-        self.prune_gaussians(share, self.values["opacity"])
+        self._prune_gaussians(share, self.values["opacity"])
 
 
 def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0):

@@ -18,7 +18,7 @@ class GaussianModel(SplatModel):
         return self.optimizer.param_groups[0]["lr"]
 
     @property
-    def covariance(self):
+    def _covariance(self):
         """As upstream, the model calls the loop's function too."""
         return build_scaling_rotation(torch.exp(self.values["scaling"]), self.values["rotation"])
 
@@ -29,7 +29,7 @@ class GaussianModel(SplatModel):
 
 
 def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0):
-    assert pc.covariance.any()  # also in an iteration whose noise is left out
+    assert pc._covariance.any()  # also in an iteration whose noise is left out
     return draw(viewpoint_camera, pc.values)
 
 
@@ -53,7 +53,7 @@ def training(dataset, opt, pipe, checkpoint=None):
             if iteration < opt.densify_until_iter and iteration % 5 == 0:
                 gaussians.relocate_gs(dead_mask=gaussians.values["opacity"][:, 0] < 0.2)
             if iteration < opt.iterations:
-                note_step(gaussians.optimizers())
+                note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
                 L = build_scaling_rotation(torch.exp(gaussians.values["scaling"]), gaussians.values["rotation"])

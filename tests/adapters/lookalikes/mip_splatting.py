@@ -14,7 +14,7 @@ class GaussianModel(SplatModel):
         self.filter_3D = 0.02 * depths.detach().abs().amin(dim=0)[:, None]
 
     @property
-    def with_3D_filter(self):
+    def _with_3D_filter(self):
         scales = torch.exp(2 * self.values["scaling"]) + self.filter_3D**2
         return {**self.values, "scaling": 0.5 * torch.log(scales)}
 
@@ -24,7 +24,7 @@ def create_offset_gt(image, offset):
 
 
 def render(viewpoint_camera, pc, pipe, bg_color, kernel_size, scaling_modifier=1.0, subpixel_offset=None):
-    return draw(viewpoint_camera, pc.with_3D_filter)
+    return draw(viewpoint_camera, pc._with_3D_filter)
 
 
 def training(dataset, opt, pipe, checkpoint=None):
@@ -50,13 +50,13 @@ def training(dataset, opt, pipe, checkpoint=None):
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
                 if iteration % 5 == 0:
-                    gaussians.prune_gaussians(0.05, gaussians.values["opacity"])
+                    gaussians._prune_gaussians(0.05, gaussians.values["opacity"])
                     gaussians.compute_3D_filter(cameras=trainCameras)
             if iteration % 8 == 0 and opt.densify_until_iter < iteration < opt.iterations - 8:
                 gaussians.compute_3D_filter(cameras=trainCameras)
                 log.structure.append((log.now, "filter", len(gaussians.values["xyz"])))
             if iteration < opt.iterations:
-                note_step(gaussians.optimizers())
+                note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
     return gaussians.capture(), iteration

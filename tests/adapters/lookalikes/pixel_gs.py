@@ -37,11 +37,11 @@ def training(dataset, opt, pipe, checkpoint=None):
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"], render_pkg["pixels"])
                 if iteration % 5 == 0:
-                    gaussians.prune_gaussians(0.05, gaussians.values["opacity"])
+                    gaussians._prune_gaussians(0.05, gaussians.values["opacity"])
                 if iteration % 8 == 0:
                     gaussians.reset_opacity()
             if iteration < opt.iterations:
-                note_step(gaussians.optimizers())
+                note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
     return gaussians.capture(), iteration

@@ -69,7 +69,7 @@ def training(dataset, opt, pipe, dataset_name, checkpoint=None):
             elif iteration == opt.update_until:
                 del gaussians.offset_gradient_accum
             if iteration < opt.iterations:
-                note_step(gaussians.optimizers())
+                note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
     return gaussians.capture(), iteration

@@ -107,11 +107,11 @@ class SplatModel:
     def group(self, name):
         return {"params": [self.values[name]], "lr": self.rates[name], "name": name}
 
-    def optimizers(self):
+    def _optimizers(self):
         return [self.optimizer]
 
     def update_learning_rate(self, iteration, opt=None):
-        for optimizer in self.optimizers():
+        for optimizer in self._optimizers():
             for group in optimizer.param_groups:
                 if group["name"] == "xyz":
                     group["lr"] = 0.01 * 0.99**iteration
@@ -120,7 +120,7 @@ class SplatModel:
         self.gradients_read += float(viewspace_points.grad.norm())  # fails without a backward
 
     def prune_points(self, mask):
-        for optimizer in self.optimizers():
+        for optimizer in self._optimizers():
             for group in optimizer.param_groups:
                 old = group["params"][0]
                 new = torch.nn.Parameter(old.detach()[~mask])
@@ -130,11 +130,13 @@ class SplatModel:
                 group["params"][0] = self.values[group["name"]] = new
         log.structure.append((log.now, "prune", len(self.values["xyz"])))
 
-    def prune_gaussians(self, share, scores):
+    def _prune_gaussians(self, share, scores):
         keep = torch.argsort(scores.flatten(), descending=True)[round(share * len(scores)) :]
         mask = torch.ones(len(scores), dtype=torch.bool)
         mask[keep] = False
         self.prune_points(mask)
+
+    prune_gaussians = _prune_gaussians  # the name that Speedy-Splat and LightGaussian have for it
 
     def reset_opacity(self):
         with torch.no_grad():

@@ -14,7 +14,7 @@ class GaussianModel(SplatModel):
         self.optimizer = self.adam([self.group(name) for name in self.rates if name != "f_rest"], eps=1e-15)
         self.shoptimizer = self.adam([self.group("f_rest")], eps=1e-15)
 
-    def optimizers(self):
+    def _optimizers(self):
         return [self.optimizer, self.shoptimizer]
 
     def modify_functions(self):
@@ -61,7 +61,7 @@ def training(dataset, opt, pipe, checkpoint, args):
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
                 if iteration % 5 == 0:
                     score = compute_gaussian_score(scene, scene.getTrainCameras()[:2], gaussians, pipe, None)
-                    gaussians.prune_gaussians(0.05, score)
+                    gaussians._prune_gaussians(0.05, score)
             if iteration == args.ho_iteration:
                 gaussians.modify_functions()
             if iteration < opt.iterations:
