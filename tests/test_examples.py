@@ -142,7 +142,7 @@ def test_installed_command_is_run_gated(example, run_example, tmp_path, monkeypa
 
 
 def test_every_example_is_tested():
-    tested = {row[0] for row in SCRIPTS} | set(MODULES) | {"train_gsplat.py"}
+    tested = {f"train_{module.ADAPTER}.py" for module in SCRIPTS.values()} | set(MODULES) | {"train_gsplat.py"}
     assert {path.name for path in EXAMPLES.glob("train_*.py")} == tested
 
 
