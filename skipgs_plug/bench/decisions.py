@@ -2,7 +2,7 @@
 
     {"kind": "skipgs-decisions", "schema_version": 1, "start": 1500,
      "views": {"0": "12 3 15 ..."},                          by seed: index of the view of each iteration that ran
-     "runs": {"0": {"ungated": "-1500", "gate": "w34dD3b"}}}  by seed and policy: letters, each with its repetitions
+     "runs": {"0": {"own": "-1500", "gate": "w34dD3b"}}}  by seed and policy: letters, each with its repetitions
 
 The letters are those of REASON_CODES; upper case means that the backward was skipped, a point that the whole iteration
 was left out. All policies of a seed see the same views in the same order, one that runs fewer iterations only the first

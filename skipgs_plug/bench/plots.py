@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ import numpy as np
 from skipgs_plug.bench.policies import POLICIES
 from skipgs_plug.bench.record import RunRecord, Trace
 from skipgs_plug.bench.summary import HEADLINE, Quantity, Row
+from skipgs_plug.bench.whole_policies import WHOLE_POLICIES
 from skipgs_plug.trainer.files import write_aside
 
 if TYPE_CHECKING:
@@ -20,20 +22,24 @@ if TYPE_CHECKING:
 
 COLOURS = ("#000000", "#D55E00", "#E69F00", "#CC79A7", "#0072B2", "#56B4E9", "#009E73")
 MARKERS = "so^vDPX"
-PHASES = {"forward": "#0072B2", "loss": "#56B4E9", "backward": "#D55E00", "optimizer": "#E69F00"}
+PHASES = {"forward": "#0072B2", "loss": "#56B4E9", "backward": "#D55E00", "optimizer": "#E69F00", "strategy": "#009E73"}
 NOT_VISITED, RUN, SKIPPED = 0, 1, 2
 EXAMPLES = 3  # views shown one by one
 SMALL = 9
 
 
-def write_plots(folder: Path, records: Sequence[RunRecord], rows: Sequence[Row], view_names: Sequence[str]) -> None:
-    """Write every picture that the finished runs give data for."""
+def write_plots(
+    folder: Path, records: Sequence[RunRecord], rows: Sequence[Row], view_names: Sequence[str], whole: bool = False
+) -> None:
+    """Write every picture that the finished runs, whole ones or refinements, give data for."""
     done = [record for record in records if record.status == "done"]
     if not done:
         return
-    save(folder / "psnr_over_time.png", psnr_over_time(done, rows))
-    save(folder / "time_against_error.png", time_against_error(rows))
-    save(folder / "phases.png", phases(rows))
+    save(folder / "psnr_over_time.png", psnr_over_time(done, rows, whole))
+    save(folder / "time_against_error.png", time_against_error(rows, whole))
+    save(folder / "phases.png", phases(rows, whole))
+    if whole:
+        return
     skipping = [record for record in done if record.skips]
     gated = next((record for record in skipping if looks_at_losses(record)), None)
     if gated is not None:
@@ -43,8 +49,9 @@ def write_plots(folder: Path, records: Sequence[RunRecord], rows: Sequence[Row],
 
 
 def style(policy: str) -> tuple[str, str]:
-    """Return colour and marker of a policy by its place in POLICIES, the last ones for one that is not there."""
-    place = list(POLICIES).index(policy) if policy in POLICIES else -1
+    """Return colour and marker of a policy by its place in its table, the last ones for one that is in none."""
+    known = [*POLICIES, *(name for name in WHOLE_POLICIES if name not in POLICIES)]
+    place = known.index(policy) if policy in known else zlib.crc32(policy.encode()) % len(COLOURS) - len(COLOURS)
     # The markers lag behind the colours by one in every further round, so that the pairs differ.
     return COLOURS[place % len(COLOURS)], MARKERS[(place + place // len(COLOURS)) % len(MARKERS)]
 
@@ -54,8 +61,8 @@ def looks_at_losses(run: RunRecord) -> bool:
     return run.trace is not None and any(mean is not None for mean in run.trace.mean)
 
 
-def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row]) -> Figure:
-    """Mean held-out PSNR over seeds against seconds of refinement, one curve per policy."""
+def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row], whole: bool = False) -> Figure:
+    """Mean held-out PSNR over seeds against seconds, of the whole run or of refinement, one curve per policy."""
     figure, axes = new_figure(9.0, 4.6)
     for row in rows:
         runs = [r for r in records if r.policy == row.policy]
@@ -65,30 +72,31 @@ def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row]) -> Figure:
         psnr = np.mean([[point.metrics[HEADLINE] for point in run.points] for run in runs], axis=0)
         colour, marker = style(row.policy)
         axes.plot(seconds, psnr, color=colour, marker=marker, markersize=5, linewidth=1.6, label=row.policy)
-    axes.set_xlabel("training time since the end of densification (s)")
+    axes.set_xlabel("training time, T_total (s)" if whole else "training time since the end of densification (s)")
     axes.set_ylabel("held-out PSNR (dB)")
     figure.legend(frameon=False, fontsize=SMALL, loc="outside right center")
     axes.set_title(f"Quality against time, {seeds_text(rows)}", loc="left", fontsize=11)
     return figure
 
 
-def time_against_error(rows: Sequence[Row]) -> Figure:
-    """Refinement time against final PSNR: absolute, and against the ungated run of the same seed."""
+def time_against_error(rows: Sequence[Row], whole: bool = False) -> Figure:
+    """Time of the whole run or of refinement against final PSNR: absolute, and against the own run of the same seed."""
+    name, label = ("t_total", "time of the whole run T_total") if whole else ("t_post", "refinement time T_post")
     paired = any("psnr_gain" in row.values for row in rows)
     figure, *axes = new_figure(9.6 if paired else 6.0, 4.4, columns=2 if paired else 1)
-    scatter(axes[0], rows, "t_post", "psnr")
-    axes[0].set_xlabel("refinement time T_post (s)")
+    scatter(axes[0], rows, name, "psnr")
+    axes[0].set_xlabel(f"{label} (s)")
     axes[0].set_ylabel("held-out PSNR (dB)")
     axes[0].set_title(f"Time and quality, {seeds_text(rows)}", loc="left", fontsize=11)
     figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=5 if paired else 3,
                   loc="outside lower center")  # fmt: skip
     if paired:
-        scatter(axes[1], rows, "t_post_saved", "psnr_gain")
+        scatter(axes[1], rows, f"{name}_saved", "psnr_gain")
         axes[1].axhline(0, color="0.7", linewidth=0.8, zorder=0)
         axes[1].axvline(0, color="0.7", linewidth=0.8, zorder=0)
-        axes[1].set_xlabel("refinement time saved (%)")
-        axes[1].set_ylabel("PSNR above ungated (dB)")
-        axes[1].set_title("Against the ungated run of the same seed", loc="left", fontsize=11)
+        axes[1].set_xlabel(f"{name.capitalize()} saved (%)")
+        axes[1].set_ylabel("PSNR above the own run (dB)")
+        axes[1].set_title("Against the own run of the same seed", loc="left", fontsize=11)
     return figure
 
 
@@ -109,18 +117,21 @@ def bar(quantity: Quantity) -> float:
     return quantity.spread or 0.0
 
 
-def phases(rows: Sequence[Row]) -> Figure:
-    """Seconds of refinement by phase, one bar per policy."""
+def phases(rows: Sequence[Row], whole: bool = False) -> Figure:
+    """Seconds of the whole run or of refinement by phase, one bar per policy."""
+    time = "t_total" if whole else "t_post"
     rows = [row for row in rows if row.seeds]
     figure, axes = new_figure(7.6, 0.9 + 0.45 * len(rows))
     left = np.zeros(len(rows))
     names = [row.policy for row in rows]
     for phase, colour in PHASES.items():
-        width = np.array([r.values[f"share_{phase}"].mean * r.values["t_post"].mean / 100 for r in rows])
+        if any(f"share_{phase}" not in row.values for row in rows):
+            continue  # of refinements there is no densification
+        width = np.array([r.values[f"share_{phase}"].mean * r.values[time].mean / 100 for r in rows])
         axes.barh(names, width, left=left, color=colour, label=phase, height=0.7)
         left += width
     axes.invert_yaxis()
-    axes.set_xlabel("refinement time (s)")
+    axes.set_xlabel("training time (s)" if whole else "refinement time (s)")
     axes.tick_params(left=False)
     axes.grid(axis="y", visible=False)
     figure.legend(frameon=False, fontsize=SMALL, ncols=4, loc="outside upper center")

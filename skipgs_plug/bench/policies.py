@@ -1,14 +1,16 @@
-"""What is compared: an ungated run, the gate in three settings, and the controls.
+"""What is compared after one densification: the trainer's own refinement, the gate, thinned refinement, and controls.
 
-A new policy is one entry of POLICIES. It makes its gate and its number of iterations itself, from a trainer that
+A policy is called by what a user would give to `SkipGate`: `gate`, `refine_share=auto`, and further settings after a
+comma. A new one is one entry of POLICIES. It makes its gate and its number of iterations itself, from a trainer that
 stands at the end of densification and from the finished runs of the same seed, of which it may copy rate or time.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from skipgs_plug import SkipGate
 from skipgs_plug.bench.controls import PlannedSkipping, periodic_skipping, random_skipping
@@ -17,8 +19,8 @@ from skipgs_plug.core.pace.rates import path_factor
 from skipgs_plug.trainer import Trainer
 from skipgs_plug.trainer.errors import InputError
 
-REFERENCE = "ungated"  # what the others are compared with
-SHARE = 0.4  # of the iterations, where whole ones are left out
+REFERENCE = "own"  # what the others are compared with
+THINNED = "refine_share=0.4"  # whose steps and iterations controls share
 Earlier = Mapping[str, RunRecord]
 GateMaker = Callable[[Trainer, Earlier], SkipGate | None]
 Plan = Callable[[int, int, int, int], PlannedSkipping]  # of first, end, number of skips, seed
@@ -43,7 +45,7 @@ def planned_as(name: str, plan: Plan, **settings: Any) -> GateMaker:
 
 
 def as_long_as(name: str) -> Callable[[Trainer, Earlier], int]:
-    """Return what tells how many ungated iterations take as long as policy `name` did."""
+    """Return what tells how many iterations of the own run take as long as policy `name` did."""
 
     def iterations(trainer: Trainer, earlier: Earlier) -> int:
         full = all_iterations(trainer, earlier)
@@ -52,11 +54,11 @@ def as_long_as(name: str) -> Callable[[Trainer, Earlier], int]:
     return iterations
 
 
-def stepping_as(name: str, share: float) -> GateMaker:
-    """Return what runs every iteration, with the factors on rates of policy `name`, which runs `share` of them."""
+def stepping_as(name: str) -> GateMaker:
+    """Return what runs every iteration, with the factors on rates of policy `name`, which leaves some out."""
 
     def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
-        peak = path_factor(share, 0.0, shown=earlier[name].gaussians_shown)
+        peak = path_factor(float(name.partition("=")[2]), 0.0, shown=earlier[name].gaussians_shown)
         return gate_with(refine_share=1.0, rate_peak=peak)(trainer, earlier)  # type: ignore[return-value]
 
     return make
@@ -72,7 +74,7 @@ def thinned_as_long_as(name: str) -> GateMaker:
 
 
 def share_of_time(name: str, earlier: Earlier) -> float:
-    """Return the refinement time of policy `name`, as a share of ungated's, at most 1."""
+    """Return the refinement time of policy `name`, as a share of the own run's, at most 1."""
     return min(1.0, earlier[name].t_post / earlier[REFERENCE].t_post)
 
 
@@ -86,110 +88,149 @@ def all_iterations(trainer: Trainer, earlier: Earlier) -> int:
 
 
 @dataclass(frozen=True)
-class PolicySpec:
-    """One row of the comparison.
+class Policy:
+    """One row of a comparison.
 
     Attributes:
         name: as given to --policies.
         meaning: one line for people.
-        gate: attaches the gate of this policy to a trainer and returns it; None for a run without.
-        iterations: number of iterations; fewer than are left run through the same schedule, compressed.
         needs: policies of the same seed that must have run before, because it copies their rate or time.
     """
 
     name: str
     meaning: str
-    gate: GateMaker = no_gate
-    iterations: Callable[[Trainer, Earlier], int] = all_iterations
     needs: tuple[str, ...] = ()
 
 
-POLICIES = {
-    spec.name: spec
-    for spec in (
-        PolicySpec(REFERENCE, "every backward runs"),
-        PolicySpec("gate", "the paper's gate, default settings", gate_with()),
-        PolicySpec("gate-no-floor", "the gate without a floor", gate_with(min_bwd_ratio=0.0)),
-        PolicySpec(
-            "random",
-            "control: as many skips as the gate, drawn by chance",
-            planned_as("gate", random_skipping),
-            needs=("gate",),
-        ),
-        PolicySpec(
-            "periodic",
-            "control: as many skips as the gate, evenly spread",
-            planned_as("gate", lambda first, end, n_skips, seed: periodic_skipping(first, end, n_skips)),
-            needs=("gate",),
-        ),
-        PolicySpec(
-            "shortened",
-            "control: no skips, fewer iterations, schedule compressed to the gate's time",
-            iterations=as_long_as("gate"),
-            needs=(REFERENCE, "gate"),
-        ),
-        PolicySpec(
-            "ungated-larger",
-            "every iteration runs, with the larger, shrinking steps of thinned",
-            stepping_as("thinned", SHARE),
-            needs=("thinned",),
-        ),
-        PolicySpec(
-            "thinned", "40 % of the iterations run, with larger, shrinking steps", gate_with(refine_share=SHARE)
-        ),
-        PolicySpec("thinned-quarter", "25 % of the iterations run, likewise", gate_with(refine_share=0.25)),
-        PolicySpec("thinned-fifth", "20 % of the iterations run, likewise", gate_with(refine_share=0.2)),
-        PolicySpec("automatic", "as many iterations as the scene needs, likewise", gate_with(refine_share="auto")),
-        PolicySpec(
-            "thinned-plain",
-            "control: 40 % of the iterations run, steps as they are",
-            gate_with(refine_share=SHARE, compensate=False),
-        ),
-        PolicySpec("gate-larger", "the paper's gate, with larger, shrinking steps", gate_with(compensate=True)),
-        PolicySpec(
-            "random-larger",
-            "control: random, with larger, shrinking steps",
-            planned_as("gate", random_skipping, compensate=True),
-            needs=("gate",),
-        ),
-        PolicySpec(
-            "periodic-larger",
-            "control: periodic, with larger, shrinking steps",
-            planned_as(
-                "gate", lambda first, end, n_skips, seed: periodic_skipping(first, end, n_skips), compensate=True
-            ),
-            needs=("gate",),
-        ),
-        PolicySpec(
-            "shortened-larger",
-            "control: iterations thinned to the gate's time, with larger, shrinking steps",
-            thinned_as_long_as("gate"),
-            needs=(REFERENCE, "gate"),
-        ),
-    )
-}
+@dataclass(frozen=True)
+class PolicySpec(Policy):
+    """One row of the comparison of refinements.
+
+    Attributes:
+        gate: attaches the gate of this policy to a trainer and returns it; None for a run without.
+        iterations: number of iterations; fewer than are left run through the same schedule, compressed.
+    """
+
+    gate: GateMaker = no_gate
+    iterations: Callable[[Trainer, Earlier], int] = all_iterations
 
 
-def check_policies(names: Sequence[str]) -> None:
-    """Raise InputError for no policy, one that does not exist, is given twice, or lacks one that it needs."""
+AnyPolicy = TypeVar("AnyPolicy", bound=Policy)
+
+
+def table_of(*specs: AnyPolicy) -> dict[str, AnyPolicy]:
+    return {spec.name: spec for spec in specs}
+
+
+def _periodic(first: int, end: int, n_skips: int, seed: int) -> PlannedSkipping:
+    return periodic_skipping(first, end, n_skips)
+
+
+POLICIES = table_of(
+    PolicySpec(REFERENCE, "the trainer's own refinement: every iteration runs as it is"),
+    PolicySpec("gate", "the paper's gate, default settings", gate=gate_with()),
+    PolicySpec("gate,min_bwd_ratio=0", "the gate without a floor", gate=gate_with(min_bwd_ratio=0.0)),
+    PolicySpec(
+        "random",
+        "control: as many backwards skipped as by the gate, drawn by chance",
+        ("gate",),
+        planned_as("gate", random_skipping),
+    ),
+    PolicySpec(
+        "periodic",
+        "control: as many backwards skipped as by the gate, evenly spread",
+        ("gate",),
+        planned_as("gate", _periodic),
+    ),
+    PolicySpec(
+        "shortened",
+        "control: no skips, fewer iterations, schedule compressed to the gate's time",
+        (REFERENCE, "gate"),
+        iterations=as_long_as("gate"),
+    ),
+    PolicySpec(
+        "own,compensate",
+        f"every iteration runs, with the larger, shrinking steps of {THINNED}",
+        (THINNED,),
+        stepping_as(THINNED),
+    ),
+    PolicySpec(THINNED, "40 % of the iterations run, with larger, shrinking steps", gate=gate_with(refine_share=0.4)),
+    PolicySpec(
+        "refine_share=auto",
+        "as many iterations as the scene needs, with larger, shrinking steps",
+        gate=gate_with(refine_share="auto"),
+    ),
+    PolicySpec(
+        f"{THINNED},no-compensate",
+        "control: 40 % of the iterations run, steps as they are",
+        gate=gate_with(refine_share=0.4, compensate=False),
+    ),
+    PolicySpec("gate,compensate", "the paper's gate, with larger, shrinking steps", gate=gate_with(compensate=True)),
+    PolicySpec(
+        "random,compensate",
+        "control: random, with larger, shrinking steps",
+        ("gate",),
+        planned_as("gate", random_skipping, compensate=True),
+    ),
+    PolicySpec(
+        "periodic,compensate",
+        "control: periodic, with larger, shrinking steps",
+        ("gate",),
+        planned_as("gate", _periodic, compensate=True),
+    ),
+    PolicySpec(
+        "shortened,compensate",
+        "control: iterations left out down to the gate's time, with larger, shrinking steps",
+        (REFERENCE, "gate"),
+        thinned_as_long_as("gate"),
+    ),
+)
+
+
+def refinement_policy(name: str) -> PolicySpec | None:
+    """Return the policy of a name; None if there is none. `refine_share=` takes any number in (0, 1]."""
+    if name in POLICIES:
+        return POLICIES[name]
+    share = number_after("refine_share", name)
+    if share is None:
+        return None
+    meaning = f"{100 * share:g} % of the iterations run, with larger, shrinking steps"
+    return PolicySpec(name, meaning, gate=gate_with(refine_share=share))
+
+
+def number_after(setting: str, name: str) -> float | None:
+    """Return X of a policy called `setting=X`, in (0, 1]; None if it is not called so."""
+    found = re.fullmatch(rf"{setting}=(\d*\.?\d+)", name)
+    return float(found[1]) if found is not None and 0.0 < float(found[1]) <= 1.0 else None
+
+
+def check_policies(names: Sequence[str], find: Callable[[str], Policy | None], known: Mapping[str, Policy]) -> None:
+    """Raise InputError for no policy, one that does not exist, is given twice, or lacks one that it needs.
+
+    Args:
+        names: Policies that are to run.
+        find: Returns the policy of a name, None if there is none.
+        known: Policies to name in a refusal.
+    """
     if not names:
-        raise InputError(f"--policies names none; give some of {', '.join(POLICIES)}, or leave it out for all.")
+        raise InputError(f"--policies names none; give some of {', '.join(known)}, or leave it out for all.")
     for name in names:
-        if name not in POLICIES:
-            raise InputError(f"There is no policy {name!r}; the policies are {', '.join(POLICIES)}.")
+        spec = find(name)
+        if spec is None:
+            raise InputError(f"There is no policy {name!r}; the policies are {', '.join(known)}.")
         if names.count(name) > 1:
             raise InputError(f"Policy {name!r} is given twice.")
-        missing = [other for other in POLICIES[name].needs if other not in names]
+        missing = [other for other in spec.needs if other not in names]
         if missing:
             raise InputError(f"Policy {name!r} copies what {missing[0]!r} measured; add {missing[0]} to --policies.")
 
 
-def rounds(names: Sequence[str], position: int) -> list[list[PolicySpec]]:
+def rounds(specs: Sequence[AnyPolicy], position: int) -> list[list[AnyPolicy]]:
     """Return what may run in turns: policies that copy nothing, then those that copy from them, and so on.
 
     The order within a round is rotated by `position`, that of the seed.
     """
-    waiting = [POLICIES[name] for name in names]
+    waiting = list(specs)
     done: set[str] = set()
     found = []
     while waiting:

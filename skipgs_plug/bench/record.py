@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 # One letter per iteration; upper case means that the backward was skipped.
 REASON_CODES = {
-    "ungated": "-",
+    "own": "-",
     "warm-up": "w",
     "new view": "n",
     "deviation": "d",
@@ -30,7 +30,7 @@ DIGITS = 5  # significant digits of losses and means in a trace
 
 @dataclass
 class Trace:
-    """Every decision of one refinement, one entry per iteration number.
+    """Every decision of one refinement, or whole run, one entry per iteration number.
 
     Attributes:
         start: iteration of the first entry.
@@ -80,10 +80,10 @@ class Trace:
 
 @dataclass
 class Point:
-    """One evaluation on held-out views during refinement, outside the clock."""
+    """One evaluation on held-out views, outside the clock."""
 
     step: int
-    seconds: float  # of refinement so far
+    seconds: float  # of refinement, or of the whole run, so far
     metrics: dict[str, float]  # by the names of trainer.metrics.METRICS
 
     def as_dict(self) -> dict[str, Any]:
@@ -109,12 +109,18 @@ class RunRecord:
         floor: least share of backwards in force at the end; None without a gate.
         gaussians_shown: share of them that a view shows, as larger steps know it; None without these.
         reasons: gated decisions by reason; empty without a gate.
-        t_post, t_total: seconds of training, of refinement and in all.
-        phases: seconds of refinement in forward, loss, backward, optimizer, strategy.
+        t_post, t_total: seconds of training, of refinement and in all, by the clock of the bench.
+        seconds: both by both clocks, see `TrainClock.seconds`.
+        phases: seconds of refinement, or of the whole run, in forward, loss, backward, optimizer, strategy.
         metrics: held-out, by the names of trainer.metrics.METRICS; num_GS.
         train_metrics: the same on the training views, without LPIPS.
+        exact_views: held-out views that are hit exactly in the end, whose PSNR is infinite.
         points: evaluations on held-out views: before, on the way, at the end.
-        peak_memory: bytes on the GPU during refinement, of other runs in turns excluded; None on the CPU.
+        peak_memory: most bytes in use, on the GPU or of the process, those of other runs in turns excluded; None where
+            the system does not tell.
+        chosen: shares and factor on rates in a whole run that leaves out iterations: `grow_share`, `grow_rate_factor`,
+            `refine_share`; empty otherwise.
+        tries: settings that a search tried and what they gave; empty without a search.
         commit: of this package, when it ran.
     """
 
@@ -131,12 +137,16 @@ class RunRecord:
     reasons: dict[str, int] = field(default_factory=dict)
     t_post: float = 0.0
     t_total: float = 0.0
+    seconds: dict[str, float] = field(default_factory=dict)
     phases: dict[str, float] = field(default_factory=dict)
     metrics: dict[str, float] = field(default_factory=dict)
     train_metrics: dict[str, float] = field(default_factory=dict)
+    exact_views: int = 0
     points: list[Point] = field(default_factory=list)
     trace: Trace | None = None
     peak_memory: int | None = None
+    chosen: dict[str, float | None] = field(default_factory=dict)
+    tries: list[dict[str, float]] = field(default_factory=list)
     commit: str | None = None
 
     @property

@@ -12,7 +12,8 @@ from typing import Any
 import torch
 
 from skipgs_plug import SkipGate
-from skipgs_plug.bench.policies import Earlier, PolicySpec
+from skipgs_plug.bench.memory import memory_meter
+from skipgs_plug.bench.policies import REFERENCE, Earlier, PolicySpec
 from skipgs_plug.bench.record import Point, RunRecord, Trace
 from skipgs_plug.trainer import Trainer
 from skipgs_plug.trainer.loop import Iteration
@@ -22,8 +23,15 @@ from skipgs_plug.trainer.scalars import ScalarLog
 PARTS = 10  # of refinement, each followed by an evaluation; one more comes before the first
 
 
+MOST_DB = 100.0  # PSNR that an image counts with at most: one that is hit exactly, such as bare background, has none
+
+
 class DivergedError(Exception):
     """A loss or a metric is not finite any more; one sentence says where."""
+
+
+class NotRunError(Exception):
+    """A policy has no meaning for this run; one sentence says why."""
 
 
 def densify(trainer: Trainer, progress: bool = True, scalars: Path | None = None) -> None:
@@ -71,21 +79,21 @@ def refine(
         logged(trainer, scalars, gate) as log,
         recorded(trainer, trace, gate, log),
     ):
-        record.points.append(point(trainer, trainer.evaluate("test"), log))
+        record.points.append(point(trainer, trainer.evaluate("test"), log, trainer.t_post))
         for part in range(1, PARTS + 1):
             with peak_memory(trainer, record):
                 trainer.train(until=start + round(part * iterations / PARTS), progress=False)
             if part < PARTS:
-                record.points.append(point(trainer, trainer.evaluate("test"), log))
+                record.points.append(point(trainer, trainer.evaluate("test"), log, trainer.t_post))
                 yield
         stats = trainer.evaluate("test", lpips_net)
-        record.points.append(point(trainer, stats, log))
-        record.metrics = measured(stats)
-        record.train_metrics = measured(trainer.evaluate("train"))
+        record.points.append(point(trainer, stats, log, trainer.t_post))
+        record.metrics, record.exact_views = measured(stats)
+        record.train_metrics, _ = measured(trainer.evaluate("train"))
         if gate is not None:
             gate.verify()
     trace.fill(start + iterations)
-    record.t_post, record.t_total = trainer.t_post, trainer.t_total
+    record.t_post, record.t_total, record.seconds = trainer.t_post, trainer.t_total, trainer.clock.seconds()
     record.phases = {name: seconds - phases_before[name] for name, seconds in trainer.phase_seconds.items()}
     record.iterations_run = record.backwards = sum(trace.ran)
     if gate is not None:
@@ -98,26 +106,35 @@ def refine(
     return record
 
 
-def measured(stats: dict[str, Any]) -> dict[str, float]:
-    """Return the metrics and the model's size in an evaluation."""
-    return {name: stats[name] for name in (*METRICS, "num_GS") if name in stats}
+def measured(stats: dict[str, Any]) -> tuple[dict[str, float], int]:
+    """Return the metrics and the model's size in an evaluation, and how many views are hit exactly.
+
+    The PSNR of such a view is infinite; it counts with MOST_DB, so that the mean stays one of all views.
+    """
+    found = {name: stats[name] for name in (*METRICS, "num_GS") if name in stats}
+    exact: set[str] = set()
+    for name, metric in METRICS.items():
+        if metric.unit == "dB" and name in found:
+            rows = [row[name] for row in stats["per_view"]]
+            if math.inf in rows:
+                exact.update(row["view"] for row in stats["per_view"] if row[name] == math.inf)
+                found[name] = sum(min(value, MOST_DB) for value in rows) / len(rows)
+    return found, len(exact)
 
 
 @contextlib.contextmanager
 def peak_memory(trainer: Trainer, record: RunRecord) -> Iterator[None]:
-    """Raise `record.peak_memory` to what this part used on the GPU; other runs in turns stay out of it."""
-    device = trainer.backend.device
-    if device.type != "cuda":
+    """Raise `record.peak_memory` to what this part used; other runs in turns stay out of it."""
+    meter = memory_meter(trainer.backend.device)
+    if meter is None:
         yield
         return
-    torch.cuda.reset_peak_memory_stats(device)
-    before = torch.cuda.memory_allocated(device)
     moments = (state.values() for optimizer in trainer.optimizers.values() for state in optimizer.state.values())
     held = [*trainer.splats.values(), *itertools.chain(*moments)]
     own = sum(tensor.nbytes for tensor in held if torch.is_tensor(tensor))
+    before = meter.reset()
     yield
-    peak = torch.cuda.max_memory_allocated(device) - before + own
-    record.peak_memory = max(record.peak_memory or 0, peak)
+    record.peak_memory = max(record.peak_memory or 0, meter.peak() - before + own)
 
 
 @contextlib.contextmanager
@@ -180,7 +197,7 @@ def recorded(trainer: Trainer, trace: Trace, gate: SkipGate | None, log: ScalarL
         trace.fill(iteration.step)
         row = gate.trace[-1] if gate is not None and gate.trace else None
         if row is None or row.step != iteration.step:  # nothing was there to decide
-            trace.add(index[iteration.view], iteration.loss, None, "ungated", False)
+            trace.add(index[iteration.view], iteration.loss, None, REFERENCE, False)
         else:
             trace.add(index[row.view], row.loss, row.mean, row.reason, row.skip)
         if log is not None:
@@ -193,12 +210,13 @@ def recorded(trainer: Trainer, trace: Trace, gate: SkipGate | None, log: ScalarL
         trainer.on_step = None
 
 
-def point(trainer: Trainer, stats: dict[str, Any], log: ScalarLog | None) -> Point:
-    """Return an evaluation, written to the log too."""
+def point(trainer: Trainer, stats: dict[str, Any], log: ScalarLog | None, seconds: float) -> Point:
+    """Return an evaluation after so many seconds, written to the log too."""
     if log is not None:
         log.evaluation(stats)
-    metrics = {metric.name: stats[metric.name] for metric in chosen()}
+    found, _ = measured(stats)
+    metrics = {metric.name: found[metric.name] for metric in chosen()}
     for name, value in metrics.items():
         if not math.isfinite(value):
             raise DivergedError(f"held-out {name} {value} after iteration {trainer.step - 1}")
-    return Point(trainer.step, trainer.t_post, metrics)
+    return Point(trainer.step, seconds, metrics)

@@ -10,7 +10,7 @@ from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.bench.runner import Bench
 from skipgs_plug.bench.summary import ceiling, row_as_dict, summarise, timing_noise
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 KIND = "skipgs-bench"
 
 
@@ -18,14 +18,15 @@ def build_result(bench: Bench, records: Sequence[RunRecord], command: str) -> di
     """Return the content of bench.json.
 
     Returns:
-        `kind`, `schema_version`; `command`, `commits`, `versions`; `settings` (training, scene, machine, lpips);
-        `seeds`, `policies`; `refinement` (first and last iteration + 1); `view_names` (traces index into
-        them); `rows` (means and spreads); `ceiling`, `timing_noise` (see summary); `runs` (records without traces,
+        `kind`, `schema_version`; `command`, `commits`, `versions`; `settings` (training, scene, machine, lpips, clock,
+        whole); `seeds`, `policies`; `refinement` (first and last iteration + 1); `view_names` (traces index into
+        them); `rows` (means and spreads); `ceiling`, `timing_noise` (see summary; None for whole
+        runs, whose models differ); `runs` (records without traces,
         which are in runs/ and, without losses, in decisions.json).
     """
     last = bench.config.max_steps
     first = bench.refine_stop_iter
-    rows = summarise(records, bench.policies, last - first)
+    rows = summarise(records, bench.policies, last if bench.whole else last - first, bench.whole)
     return {
         "kind": KIND,
         "schema_version": SCHEMA_VERSION,
@@ -38,7 +39,7 @@ def build_result(bench: Bench, records: Sequence[RunRecord], command: str) -> di
         "refinement": [first, last],
         "view_names": [view.name for view in bench.scene.train],
         "rows": [row_as_dict(row) for row in rows],
-        "ceiling": ceiling(rows),
-        "timing_noise": timing_noise(records),
+        "ceiling": None if bench.whole else ceiling(rows),
+        "timing_noise": None if bench.whole else timing_noise(records),
         "runs": [record.as_dict(with_trace=False) for record in records],
     }

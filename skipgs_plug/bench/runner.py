@@ -1,18 +1,22 @@
-"""All runs of a bench: per seed densify once, then refine under each policy, in turns."""
+"""All runs of a bench, in turns: per seed one densification, refined under each policy, or whole runs."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from skipgs_plug.bench import provenance
-from skipgs_plug.bench.policies import PolicySpec, check_policies, rounds
+from skipgs_plug.bench.find import find_policy, known_policies
+from skipgs_plug.bench.policies import Earlier, Policy, check_policies, refinement_policy, rounds
 from skipgs_plug.bench.record import RunRecord
-from skipgs_plug.bench.refine import DivergedError, densify, refine
+from skipgs_plug.bench.refine import DivergedError, NotRunError, densify, refine
 from skipgs_plug.bench.store import BenchFolder
+from skipgs_plug.bench.whole import Maker
+from skipgs_plug.bench.whole_policies import whole_policy
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.backend import resolve_backend
 from skipgs_plug.trainer.clock import TrainClock
@@ -20,6 +24,8 @@ from skipgs_plug.trainer.metrics import LPIPS_WEIGHTS, require_lpips
 
 Clock = Literal["wall", "processor"]
 NOT_SETTINGS = ("data_dir", "result_dir", "seed", "backend")
+WARM_UP = 20  # iterations that load and compile what all runs need, so that memory of the first does not hold it
+Begin = Callable[[str, Earlier], Generator[None, None, RunRecord]]
 
 
 class Bench:
@@ -29,7 +35,9 @@ class Bench:
         config: settings of training; its seed is replaced by each of `seeds`.
         say: called with one line per event.
         tensorboard: write TensorBoard scalars of every run that is missing.
-        clock: see `TrainClock`.
+        clock: of the times that are compared, see `TrainClock`; None for the processor's in whole runs on the CPU, and
+            the wall's otherwise.
+        whole: each policy trains from the first iteration on, instead of from one densification per seed.
 
     Raises:
         InputError: an unknown policy, no held-out views, processor time with a GPU, or a folder made with other
@@ -46,13 +54,14 @@ class Bench:
         say: Callable[[str], None] = print,
         progress: bool = True,
         tensorboard: bool = False,
-        clock: Clock = "wall",
+        clock: Clock | None = None,
+        whole: bool = False,
     ) -> None:
-        check_policies(policies)
+        check_policies(policies, lambda name: find_policy(name, whole), known_policies(whole))
         if not seeds or len(set(seeds)) < len(seeds):
             raise InputError("Give at least one seed, each once.")
         stop = config.scaled(config.recipe.refine_stop_iter)
-        if stop >= config.max_steps:
+        if stop >= config.max_steps and not whole:
             raise InputError(
                 f"Densification ends at iteration {stop:,} of {config.max_steps:,}, "
                 "which leaves nothing to refine; lower --refine-stop-iter."
@@ -63,7 +72,8 @@ class Bench:
         self.seeds, self.policies = list(seeds), list(policies)
         self.say, self.progress, self.tensorboard = say, progress, tensorboard
         self.backend = resolve_backend(config.backend)
-        self.clock = clock
+        self.whole = whole
+        self.clock = clock or ("processor" if whole and self.backend.device.type == "cpu" else "wall")
         if clock == "processor" and self.backend.device.type != "cpu":
             raise InputError("A GPU works while no thread is running: --clock processor is for the CPU; leave it out.")
         self.lpips_net = available_lpips()
@@ -73,7 +83,8 @@ class Bench:
             "scene": provenance.scene_facts(scene, config),
             "machine": provenance.machine(self.backend),
             "lpips": self.lpips_net,
-            "clock": clock,
+            "whole": whole,
+            "clock": self.clock,
         }
         folder.require_settings(self.settings)
 
@@ -86,11 +97,12 @@ class Bench:
         """Return one record per seed and policy, by seed, in the order of `policies`."""
         records = []
         for position, seed in enumerate(self.seeds):
-            found = self._run_seed(seed, rounds(self.policies, position))
+            specs = [spec for name in self.policies if (spec := find_policy(name, self.whole)) is not None]
+            found = self._run_seed(seed, rounds(specs, position))
             records += [found[name] for name in self.policies]
         return records
 
-    def _run_seed(self, seed: int, order: list[list[PolicySpec]]) -> dict[str, RunRecord]:
+    def _run_seed(self, seed: int, order: list[list[Policy]]) -> dict[str, RunRecord]:
         found: dict[str, RunRecord] = {}
         for spec in itertools.chain(*order):
             stored = self.folder.load(seed, spec.name)
@@ -99,7 +111,7 @@ class Bench:
         if len(found) == len(self.policies):
             return found
         try:
-            snapshot = self._densified(self._trainer(seed))
+            begin = self._whole_runs(seed) if self.whole else self._refinements(seed)
         except DivergedError as error:
             for spec in itertools.chain(*order):
                 if spec.name not in found:
@@ -107,14 +119,14 @@ class Bench:
                     found[spec.name] = self._store(RunRecord(seed, spec.name, "diverged", note))
             return found
         for group in order:
-            for record in self._in_turns(seed, [spec for spec in group if spec.name not in found], snapshot, found):
+            for record in self._in_turns(seed, [spec for spec in group if spec.name not in found], begin, found):
                 found[record.policy] = self._store(record)
         return found
 
     def _in_turns(
-        self, seed: int, specs: list[PolicySpec], snapshot: dict[str, Any], earlier: dict[str, RunRecord]
+        self, seed: int, specs: list[Policy], begin: Begin, earlier: dict[str, RunRecord]
     ) -> Iterator[RunRecord]:
-        """Refine `snapshot` under each policy, a part of one after a part of the other; yields what has finished.
+        """Train under each policy, a part of one after a part of the other; yields what has finished.
 
         A machine that slows down hits all alike. Each run has a trainer of its own.
         """
@@ -125,9 +137,7 @@ class Bench:
                 note = f"{lost[0]} of this seed, which it copies, did not finish"
                 yield RunRecord(seed, spec.name, "not run", note)
                 continue
-            trainer = self._trainer(seed)
-            trainer.restore(snapshot)
-            runs[spec.name] = refine(trainer, spec, earlier, self.lpips_net, self._scalars(seed, spec.name))
+            runs[spec.name] = begin(spec.name, earlier)
         while runs:
             for name in list(runs):
                 try:
@@ -138,9 +148,37 @@ class Bench:
                 except DivergedError as error:
                     del runs[name]
                     yield RunRecord(seed, name, "diverged", str(error))
+                except NotRunError as error:
+                    del runs[name]
+                    yield RunRecord(seed, name, "not run", str(error))
 
-    def _trainer(self, seed: int) -> Trainer:
-        trainer = Trainer(dataclasses.replace(self.config, seed=seed), self.scene, self.backend)
+    def _refinements(self, seed: int) -> Begin:
+        """Densify once; returns what refines that under a policy."""
+        snapshot = self._densified(self._trainer(seed))
+
+        def begin(name: str, earlier: Earlier) -> Generator[None, None, RunRecord]:
+            trainer, spec = self._trainer(seed), refinement_policy(name)
+            assert spec is not None
+            trainer.restore(snapshot)
+            return refine(trainer, spec, earlier, self.lpips_net, self._scalars(seed, name))
+
+        return begin
+
+    def _whole_runs(self, seed: int) -> Begin:
+        """Return what trains under a policy from the first iteration on."""
+        self._trainer(seed).train(until=WARM_UP, progress=False)
+
+        def begin(name: str, earlier: Earlier) -> Generator[None, None, RunRecord]:
+            record, spec = RunRecord(seed, name), whole_policy(name)
+            assert spec is not None
+            make = Maker(partial(self._trainer, seed), self.lpips_net, self._scalars(seed, name))
+            yield from spec.run(make, earlier, record)
+            return record
+
+        return begin
+
+    def _trainer(self, seed: int, **changes: Any) -> Trainer:
+        trainer = Trainer(dataclasses.replace(self.config, seed=seed, **changes), self.scene, self.backend)
         trainer.clock = TrainClock(self.backend.device, by_processor=self.clock == "processor")
         return trainer
 
@@ -164,13 +202,14 @@ class Bench:
         self.folder.store(record)
         if record.status == "done":
             share = 100 * record.backwards / record.iterations
+            time = f"T_total {record.t_total:7.1f} s" if self.whole else f"T_post {record.t_post:7.1f} s"
             self.say(
-                f"seed {record.seed}: {record.policy:16} T_post {record.t_post:7.1f} s, "
+                f"seed {record.seed}: {record.policy:24} {time}, "
                 f"{record.backwards:,} of {record.iterations:,} backwards ({share:.0f} %), "
-                f"PSNR {record.metrics['psnr']:.2f} dB"
+                f"{record.metrics['num_GS']:,} Gaussians, PSNR {record.metrics['psnr']:.2f} dB"
             )
         else:
-            self.say(f"seed {record.seed}: {record.policy:16} {record.status}: {record.note}")
+            self.say(f"seed {record.seed}: {record.policy:24} {record.status}: {record.note}")
         return record
 
 

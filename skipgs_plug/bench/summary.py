@@ -10,7 +10,6 @@ from typing import Any
 
 from skipgs_plug.bench.policies import REFERENCE
 from skipgs_plug.bench.record import Point, RunRecord
-from skipgs_plug.trainer.clock import PHASES
 from skipgs_plug.trainer.metrics import METRICS
 
 HEADLINE = "psnr"  # the metric that "time to reach" is about
@@ -36,13 +35,13 @@ class Row:
     Attributes:
         seeds: those that the means are over.
         excluded: the others, with the reason.
-        values: by name: `t_post t_total` (s), `t_post_saved t_total_saved` (% less than
-            ungated, same seed), `time_to_ungated` (s of refinement until the final PSNR of ungated, same
-            seed, missing where it is not reached), `iterations_run`, `backwards_share` (% of the refinement
-            iterations of the full schedule), `share_forward ...` (% of t_post), every metric by its own name,
-            `train_` before it on training views, `_gain` after it above ungated, same seed; `num_GS`,
-            `peak_memory_gib`; `wanted` and `held_back`: backwards after warm-up that a gate's rule asked for, and
-            skips that its floor forbade (% of the iterations after warm-up).
+        values: by name: `t_post t_total` (s), the same with `_wall` and `_processor`, `t_post_saved t_total_saved`
+            (% less than the own run, same seed), `t_total_share` (% of its), `time_to_own` (s until the final PSNR of
+            the own run, same seed, missing where it is not reached), `iterations_run`, `backwards_share` (% of the
+            iterations of the full schedule), `share_forward ...` (% of the time that is compared), every metric by its
+            own name, `train_` before it on training views, `_gain` after it above the own run, same seed; `num_GS`,
+            `num_GS_share` (% of the own run's), `peak_memory_gib`; `wanted` and `held_back`: backwards after warm-up
+            that a gate's rule asked for, and skips that its floor forbade (% of the iterations after warm-up).
     """
 
     policy: str
@@ -51,40 +50,48 @@ class Row:
     values: dict[str, Quantity] = field(default_factory=dict)
 
 
-def summarise(records: Sequence[RunRecord], policies: Sequence[str], full_iterations: int) -> list[Row]:
-    """Return one row per policy; runs that did not finish are named in it and enter no mean."""
-    ungated = {r.seed: r for r in records if r.policy == REFERENCE and r.status == "done"}
+def summarise(
+    records: Sequence[RunRecord], policies: Sequence[str], full_iterations: int, whole: bool = False
+) -> list[Row]:
+    """Return one row per policy; runs, whole ones or refinements, that did not finish are named and enter no mean."""
+    own = {r.seed: r for r in records if r.policy == REFERENCE and r.status == "done"}
     rows = []
     for policy in policies:
         mine = [record for record in records if record.policy == policy]
         done = [record for record in mine if record.status == "done"]
         row = Row(policy, [r.seed for r in done], {r.seed: f"{r.status}: {r.note}" for r in mine if r not in done})
-        samples = [measured(record, ungated.get(record.seed), full_iterations) for record in done]
+        samples = [measured(record, own.get(record.seed), full_iterations, whole) for record in done]
         for name in dict.fromkeys(name for sample in samples for name in sample):
             row.values[name] = quantity([sample[name] for sample in samples if name in sample], len(samples))
         rows.append(row)
     return rows
 
 
-def measured(record: RunRecord, ungated: RunRecord | None, full_iterations: int) -> dict[str, float]:
-    """Return the quantities of one run; those against ungated only where that seed has an ungated run."""
+def measured(record: RunRecord, own: RunRecord | None, full_iterations: int, whole: bool = False) -> dict[str, float]:
+    """Return the quantities of one run; those against the own run only where that seed has one."""
     values: dict[str, float] = {"t_post": record.t_post, "t_total": record.t_total}
-    if ungated is not None:
-        values["t_post_saved"] = 100 * (1 - record.t_post / ungated.t_post)
-        values["t_total_saved"] = 100 * (1 - record.t_total / ungated.t_total)
-        reached = time_to_reach(record.points, ungated.metrics[HEADLINE])
+    for name in ("t_post", "t_total"):
+        values[f"{name}_wall"] = record.seconds[name]
+        values[f"{name}_processor"] = record.seconds[f"{name}_processor"]
+    if own is not None:
+        values["t_post_saved"] = 100 * (1 - record.t_post / own.t_post) if own.t_post else 0.0
+        values["t_total_saved"] = 100 * (1 - record.t_total / own.t_total)
+        values["t_total_share"] = 100 * record.t_total / own.t_total
+        reached = time_to_reach(record.points, own.metrics[HEADLINE])
         if reached is not None:
-            values["time_to_ungated"] = reached
+            values["time_to_own"] = reached
     values["iterations_run"] = record.iterations_run
     values["backwards_share"] = 100 * record.backwards / full_iterations
-    for phase in PHASES:
-        if phase != "strategy":  # nothing is left of it after densification
-            values[f"share_{phase}"] = 100 * record.phases[phase] / sum(record.phases.values())
+    for phase, seconds in record.phases.items():
+        if phase == "strategy" and not whole:
+            continue  # nothing is left of it after densification
+        values[f"share_{phase}"] = 100 * seconds / sum(record.phases.values())
     values.update(record.metrics)
     values.update({f"train_{name}": value for name, value in record.train_metrics.items() if name in METRICS})
-    if ungated is not None:
-        shared = [name for name in METRICS if name in record.metrics and name in ungated.metrics]
-        values.update({f"{name}_gain": record.metrics[name] - ungated.metrics[name] for name in shared})
+    if own is not None:
+        shared = [name for name in METRICS if name in record.metrics and name in own.metrics]
+        values.update({f"{name}_gain": record.metrics[name] - own.metrics[name] for name in shared})
+        values["num_GS_share"] = 100 * record.metrics["num_GS"] / own.metrics["num_GS"]
     after_warm_up = record.iterations_run - record.warm_up
     if "deviation" in record.reasons and after_warm_up > 0:
         held_back = record.reasons.get("budget", 0)
@@ -96,7 +103,7 @@ def measured(record: RunRecord, ungated: RunRecord | None, full_iterations: int)
 
 
 def time_to_reach(points: Sequence[Point], target: float) -> float | None:
-    """Return the seconds of refinement after which the held-out PSNR first was `target` dB, None if it never was.
+    """Return the seconds after which the held-out PSNR first was `target` dB, None if it never was.
 
     Between two evaluations it is taken to change evenly with time.
     """
@@ -120,11 +127,11 @@ def ceiling(rows: Sequence[Row]) -> dict[str, float] | None:
     """Return what a perfect gate could save at the gate's skip rate, in % of refinement time.
 
     A skipped iteration still pays forward, loss and decision, so no gate can save more than the share of
-    backward and optimizer in ungated time, times the share of iterations skipped.
+    backward and optimizer in the own run's time, times the share of iterations skipped.
 
     Returns:
-        `share` (% of ungated t_post in backward and optimizer), `skipped` (% of iterations), `most` (their
-        product, %), `measured` (% saved); None without an ungated and a gate row.
+        `share` (% of the own t_post in backward and optimizer), `skipped` (% of iterations), `most` (their
+        product, %), `measured` (% saved); None without the rows of both.
     """
     by_name = {row.policy: row.values for row in rows if row.seeds}
     if "gate" not in by_name or REFERENCE not in by_name or "t_post_saved" not in by_name["gate"]:

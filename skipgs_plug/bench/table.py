@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from skipgs_plug.bench.policies import POLICIES
+from skipgs_plug.bench.find import find_policy
+from skipgs_plug.bench.refine import MOST_DB
 from skipgs_plug.bench.summary import Row
 from skipgs_plug.trainer.clock import PHASES
 from skipgs_plug.trainer.metrics import METRICS, Metric
@@ -25,15 +26,15 @@ class Column:
 
 
 def metric_columns(metric: Metric) -> tuple[Column, Column]:
-    """Return the held-out value and its difference to ungated."""
-    gain = Column(f"vs ungated {metric.unit}".strip(), f"{metric.name}_gain", metric.digits, signed=True)
+    """Return the held-out value and its difference to the own run."""
+    gain = Column(f"vs own {metric.unit}".strip(), f"{metric.name}_gain", metric.digits, signed=True)
     return Column(metric.heading, metric.name, metric.digits), gain
 
 
-RESULTS = (
+REFINEMENT = (
     Column("T_post s", "t_post", 1),
     Column("saved %", "t_post_saved", 1),
-    Column("s to ungated's PSNR", "time_to_ungated", 1, absent="not reached"),
+    Column("s to own PSNR", "time_to_own", 1, absent="not reached"),
     Column("T_total s", "t_total", 1),
     Column("saved %", "t_total_saved", 1),
     Column("iterations", "iterations_run", 0),
@@ -41,19 +42,44 @@ RESULTS = (
     *itertools.chain(*map(metric_columns, METRICS.values())),
     Column("peak GiB", "peak_memory_gib", 2),
 )
+WHOLE = (
+    Column("T_total s", "t_total", 1),
+    Column("% of own", "t_total_share", 1),
+    Column("on the wall s", "t_total_wall", 1),
+    Column("s to own PSNR", "time_to_own", 1, absent="not reached"),
+    Column("T_post s", "t_post", 1),
+    Column("iterations", "iterations_run", 0),
+    Column("Gaussians", "num_GS", 0),
+    Column("% of own", "num_GS_share", 1),
+    *itertools.chain(*map(metric_columns, METRICS.values())),
+    Column("peak GiB", "peak_memory_gib", 2),
+)
 TRAINING = tuple(Column(metric.heading, f"train_{metric.name}", metric.digits) for metric in METRICS.values())
 SHARES = tuple(Column(phase, f"share_{phase}", 1) for phase in PHASES)
-CLOCKS = {"wall": "", "processor": " for which its threads were running"}
-TABLES = {
-    "Time and quality, mean ± spread over seeds": RESULTS,
-    "Quality on the training views, to see overfitting": TRAINING,
-    "Share of refinement time, %": SHARES,
-}
+CLOCKS = {"wall": "on the wall", "processor": "for which its threads were running"}
+REFINEMENT_READING = (
+    "Mean ± sample standard deviation over seeds; saved % and vs own within each seed. T_post: seconds of refinement "
+    "{clock}, T_total: densification too; evaluation and compilation are in neither. S to own PSNR: of refinement "
+    "until the final held-out PSNR of the same seed's own run, interpolated between evaluations. Backwards % of the "
+    "iterations of the own run."
+)
+WHOLE_READING = (
+    "Mean ± sample standard deviation over seeds; % of own and vs own within each seed. T_total: seconds of the whole "
+    "run {clock}, T_post: of its refinement; evaluation and compilation are in neither. S to own PSNR: of the whole "
+    "run until the final held-out PSNR of the same seed's own run, interpolated between evaluations. More Gaussians "
+    "are a better picture at more memory: compare pictures at equal numbers. Peak GiB: most memory beyond what other "
+    "runs held, on the CPU that of the process."
+)
 
 
-def tables(rows: Sequence[Row]) -> list[tuple[str, list[list[str]]]]:
-    """Return (caption, lines) of every table that some row has values for."""
-    found = [(caption, cells(rows, columns)) for caption, columns in TABLES.items()]
+def tables(rows: Sequence[Row], whole: bool = False) -> list[tuple[str, list[list[str]]]]:
+    """Return (caption, lines) of every table that some row has values for, of whole runs or of refinements."""
+    contents = {
+        "Time and quality, mean ± spread over seeds": WHOLE if whole else REFINEMENT,
+        "Quality on the training views, to see overfitting": TRAINING,
+        "Share of time, %" if whole else "Share of refinement time, %": SHARES,
+    }
+    found = [(caption, cells(rows, columns)) for caption, columns in contents.items()]
     return [(caption, lines) for caption, lines in found if len(lines[0]) > 2]
 
 
@@ -104,7 +130,7 @@ def notes(rows: Sequence[Row], bench: dict[str, Any]) -> list[str]:
     if most is not None:
         sentences.append(
             f"A perfect gate at this skip rate could save {most['most']:.1f} % of refinement: backward and optimizer "
-            f"take {most['share']:.1f} % of ungated time, and {most['skipped']:.1f} % of them are skipped. "
+            f"take {most['share']:.1f} % of the own run's time, and {most['skipped']:.1f} % of them are skipped. "
             f"Measured: {most['measured']:.1f} %."
         )
     for row in rows:
@@ -119,20 +145,28 @@ def notes(rows: Sequence[Row], bench: dict[str, Any]) -> list[str]:
             "The forward pass is nearly the same work under every policy; within a seed its time per iteration "
             f"differed by up to {bench['timing_noise']:.0f} %. Differences in time below that are noise of the machine."
         )
+    for run in bench["runs"]:
+        if run.get("exact_views"):
+            sentences.append(
+                f"Seed {run['seed']} of {run['policy']} hits {run['exact_views']} held-out views exactly (background "
+                f"alone, say); their PSNR is infinite and counts as {MOST_DB:.0f} dB."
+            )
+        sentences += [searched(run)] if run.get("tries") else []
     shown = [metric for metric in METRICS.values() if any(metric.name in row.values for row in rows)]
     scene, machine = bench["settings"]["scene"], bench["settings"]["machine"]
     first, last = bench["refinement"]
+    whole = is_whole(bench)
+    span = (
+        f"whole runs of {last:,} iterations, densification to {first:,}"
+        if whole
+        else f"iterations {first:,} to {last:,} after one densification per seed"
+    )
+    clock = CLOCKS[bench["settings"].get("clock", "wall")]
     sentences += [
         f"{scene['name']}, {', '.join(scene['image_sizes'])} pixels ({scene['images']}), {scene['train_views']} "
-        f"training and {scene['test_views']} held-out views ({scene['split']}); iterations {first:,} to {last:,} "
-        f"after one densification per seed, backend {machine['backend']} on {machine['gpu'] or machine['cpu']}, "
-        f"{machine['threads']} threads.",
-        "Mean ± sample standard deviation over seeds; saved % and vs ungated within each seed. T_post: seconds of "
-        "refinement"
-        + CLOCKS[bench["settings"].get("clock", "wall")]
-        + ", T_total: densification too; evaluation and compilation are in neither. S to ungated's PSNR: of "
-        "refinement until the final held-out PSNR of the same seed's ungated run, interpolated between evaluations. "
-        "Backwards % of the iterations of the ungated run.",
+        f"training and {scene['test_views']} held-out views ({scene['split']}); {span}, backend {machine['backend']} "
+        f"on {machine['gpu'] or machine['cpu']}, {machine['threads']} threads.",
+        WHOLE_READING.format(clock=clock) if whole else REFINEMENT_READING.format(clock=clock),
         " ".join(f"{metric.label}: {metric.flavour}." for metric in shown)
         + ("" if any(metric.net for metric in shown) else " LPIPS is left out: no backbone weights on this machine."),
     ]
@@ -141,7 +175,18 @@ def notes(rows: Sequence[Row], bench: dict[str, Any]) -> list[str]:
     return sentences
 
 
-def legend(rows: Sequence[Row]) -> list[tuple[str, str]]:
-    """Return (policy, meaning) of every row."""
-    unknown = "a policy of another version"
-    return [(row.policy, POLICIES[row.policy].meaning if row.policy in POLICIES else unknown) for row in rows]
+def searched(run: dict[str, Any]) -> str:
+    """Return a sentence about what a search tried."""
+    tries = "; ".join(", ".join(f"{name} {value:.6g}" for name, value in one.items()) for one in run["tries"])
+    return f"Seed {run['seed']} of {run['policy']} was found by these tries: {tries}."
+
+
+def is_whole(bench: dict[str, Any]) -> bool:
+    """Whether a bench compares whole runs."""
+    return bool(bench["settings"].get("whole", False))
+
+
+def legend(rows: Sequence[Row], whole: bool = False) -> list[tuple[str, str]]:
+    """Return (policy, meaning) of every row, of whole runs or of refinements."""
+    found = [(row.policy, find_policy(row.policy, whole)) for row in rows]
+    return [(name, "a policy of another version" if spec is None else spec.meaning) for name, spec in found]

@@ -11,8 +11,9 @@ import tyro
 
 from skipgs_plug.bench.decisions import FILE as DECISIONS
 from skipgs_plug.bench.decisions import write_decisions
+from skipgs_plug.bench.find import find_policy, known_policies
 from skipgs_plug.bench.plots import write_plots
-from skipgs_plug.bench.policies import POLICIES, check_policies
+from skipgs_plug.bench.policies import check_policies
 from skipgs_plug.bench.result import build_result
 from skipgs_plug.bench.runner import Bench, Clock
 from skipgs_plug.bench.store import BenchFolder
@@ -38,7 +39,7 @@ class Options(TrainConfig):
 
 @dataclass
 class Args:
-    """Densify once per seed, refine that snapshot under each policy, compare time and quality.
+    """Train under each policy, compare time and quality: refinement from one snapshot per seed, or whole runs.
 
     Evaluation, loading and compilation are outside the clock. A killed bench continues where it stopped when
     the same command is given again.
@@ -50,13 +51,16 @@ class Args:
     """Folder for table, plots and runs."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of training; each densifies once."""
-    policies: tuple[str, ...] = tuple(POLICIES)
-    """What to compare; controls copy rate or time of gate."""
+    whole: bool = False
+    """Train from the first iteration under each policy, instead of refining one densified snapshot per seed."""
+    policies: tuple[str, ...] | None = None
+    """What to compare, all unless given; controls copy rate, time or size of others."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
     tensorboard: bool = False
     """Log gsplat's scalars and the gate's counters of every run to OUT/tb; the clock stands meanwhile."""
-    clock: Clock = "wall"
-    """Seconds by the clock on the wall, or for which the processor worked for us: for a machine that others use too."""
+    clock: Clock | None = None
+    """Seconds by the clock on the wall, or for which the processor worked for us: for a machine that others use too.
+    Processor seconds unless given for whole runs on the CPU, else the wall's."""
     no_progress: bool = False
     """No progress bars."""
 
@@ -70,16 +74,22 @@ def main(argv: list[str]) -> int:
 def run(args: Args, command: str) -> list[Row]:
     """Run what is missing, print the table, write bench.json, decisions.json, table.md and plots; returns the rows."""
     require_names(("SCENE", args.scene), ("--out", args.out))
-    check_policies(args.policies)
+    whole, known = args.whole, known_policies(args.whole)
+    policies = tuple(known) if args.policies is None else args.policies
+    check_policies(policies, lambda name: find_policy(name, whole), known)
     config = dataclasses.replace(args.train, data_dir=args.scene, result_dir=args.out)
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
     folder = BenchFolder(args.out)
     progress, tensorboard, clock = not args.no_progress, args.tensorboard, args.clock
     bench = Bench(
-        scene, config, folder, args.seeds, args.policies, progress=progress, tensorboard=tensorboard, clock=clock
+        *(scene, config, folder, args.seeds, policies),
+        progress=progress,
+        tensorboard=tensorboard,
+        clock=clock,
+        whole=whole,
     )
     print(
-        f"{scene.name}: {len(args.seeds)} seeds x {len(args.policies)} policies, iterations to {config.max_steps:,}, "
+        f"{scene.name}: {len(args.seeds)} seeds x {len(policies)} policies, iterations to {config.max_steps:,}, "
         f"densification to {bench.refine_stop_iter:,}, backend {bench.backend.name}"
     )
     with exclusive(folder.root):
@@ -87,16 +97,16 @@ def run(args: Args, command: str) -> list[Row]:
     result = build_result(bench, records, command)
     rows = [row_from_dict(row) for row in result["rows"]]
     parts = [
-        *(f"{caption}:\n\n{markdown(lines)}" for caption, lines in tables(rows)),
+        *(f"{caption}:\n\n{markdown(lines)}" for caption, lines in tables(rows, whole)),
         "\n\n".join(notes(rows, result)),
-        "\n".join(f"- {name}: {meaning}" for name, meaning in legend(rows)),
+        "\n".join(f"- {name}: {meaning}" for name, meaning in legend(rows, whole)),
     ]
     text = "\n\n".join(parts) + "\n"
     write_json(folder.root / "bench.json", result)
     write_decisions(folder.root / DECISIONS, records)
     with write_aside(folder.root / "table.md") as temporary:
         temporary.write_text(text)
-    write_plots(folder.root, records, rows, result["view_names"])
+    write_plots(folder.root, records, rows, result["view_names"], whole)
     page = next_command("report", folder.root)
     print(f"\n{text}\nTable, plots and bench.json: {folder.root}; {page} makes one page.")
     return rows

@@ -7,7 +7,7 @@ from typing import Any
 
 from skipgs_plug.bench.store import flat
 from skipgs_plug.bench.summary import row_from_dict
-from skipgs_plug.bench.table import legend, notes, tables
+from skipgs_plug.bench.table import is_whole, legend, notes, tables
 from skipgs_plug.report import plots
 from skipgs_plug.report.blocks import Block, Details, Picture, Section, Strip, Table, Text, write_page
 from skipgs_plug.report.source import BenchSource, RunSource
@@ -133,13 +133,13 @@ def gate_blocks(name: str, data: dict[str, Any]) -> list[Block]:
 def bench_section(bench: BenchSource) -> Section:
     data = bench.data
     rows = [row_from_dict(row) for row in data["rows"]]
-    blocks: list[Block] = [Table(caption, lines[0], lines[1:]) for caption, lines in tables(rows)]
+    blocks: list[Block] = [Table(caption, lines[0], lines[1:]) for caption, lines in tables(rows, is_whole(data))]
     blocks.append(Text(notes(rows, data)))
     blocks += [Picture(plots.inline_png(path), text, wide=True) for path, text in bench.pictures]
     if any(any(trace.skipped) for trace in bench.decisions.values()):
         text = "Share of backwards skipped in the course of refinement, one curve per policy that skips."
         blocks.append(picture(plots.skips_over_time(bench.decisions), text))
-    blocks.append(Table("Policies", ("policy", "meaning"), legend(rows), text=True))
+    blocks.append(Table("Policies", ("policy", "meaning"), legend(rows, is_whole(data)), text=True))
     facts = {"command": data["command"], "commits": ", ".join(data["commits"]), **data["versions"], **data["settings"]}
     blocks.append(Details("Command, machine, versions, settings", [settings_table("Settings", facts)]))
     return Section(f"Bench: {data['settings']['scene']['name']}", blocks)

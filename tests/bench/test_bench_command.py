@@ -28,9 +28,9 @@ def bench(packed: str, out, *more: str) -> int:
 
 def test_command_prints_the_table_and_leaves_json_and_plots(packed, tmp_path, capsys):
     out = tmp_path / "out"
-    assert bench(packed, out, "--policies", "ungated", "gate", "random") == 0
+    assert bench(packed, out, "--policies", "own", "gate", "random") == 0
     printed = capsys.readouterr().out
-    for name in ("ungated", "gate", "random"):
+    for name in ("own", "gate", "random"):
         assert f"| {name} " in printed
     assert "20 to 40" in printed and "6 training and 2 held-out views" in printed
     assert (out / "table.md").read_text() in printed
@@ -48,7 +48,7 @@ def test_command_prints_the_table_and_leaves_json_and_plots(packed, tmp_path, ca
     [
         (("--policies", "gatee"), "There is no policy 'gatee'"),
         (("--policies",), "--policies names none"),
-        (("--policies", "random", "ungated"), "add gate to --policies"),
+        (("--policies", "random", "own"), "add gate to --policies"),
         (("--seeds", "1", "1"), "each once"),
         (("--max-steps", "1"), "nothing to refine"),
     ],
@@ -61,8 +61,8 @@ def test_bad_input_is_one_sentence(packed, tmp_path, capsys, more, sentence):
 
 
 def test_plots_are_drawn_from_whatever_finished(finished, tmp_path):
-    records = [finished.run("ungated", 0)]
-    rows = summarise(records, ("ungated",), 40)
+    records = [finished.run("own", 0)]
+    rows = summarise(records, ("own",), 40)
     names = [view.name for view in finished.bench.scene.train]
     write_plots(tmp_path, records, rows, names)
     assert {path.stem for path in tmp_path.iterdir()} == {"psnr_over_time", "time_against_error", "phases"}

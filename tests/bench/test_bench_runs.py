@@ -40,7 +40,7 @@ def test_every_policy_ran_from_the_same_point(finished):
 
 def test_every_policy_saw_the_same_views_in_the_same_order(finished):
     for seed in SEEDS:
-        full = finished.run("ungated", seed).trace.view
+        full = finished.run("own", seed).trace.view
         assert len(full) == MAX_STEPS - START
         for policy in POLICIES:
             record = finished.run(policy, seed)
@@ -48,7 +48,7 @@ def test_every_policy_saw_the_same_views_in_the_same_order(finished):
             seen = [view for view in record.trace.view if view is not None]
             assert seen == full[: record.iterations_run]  # views take turns among the iterations that run
             assert len(record.trace.view) == record.iterations
-    assert finished.run("ungated", 0).trace.view != finished.run("ungated", 1).trace.view
+    assert finished.run("own", 0).trace.view != finished.run("own", 1).trace.view
 
 
 def test_controls_skip_exactly_as_often_as_the_gate(finished):
@@ -73,8 +73,8 @@ def test_what_the_rule_asked_for_is_told_from_what_the_floor_forbade(finished):
     assert after.count("b") > 0
 
 
-def test_ungated_runs_every_backward(finished):
-    record = finished.run("ungated")
+def test_own_runs_every_backward(finished):
+    record = finished.run("own")
     assert record.backwards == record.iterations_run == record.iterations == MAX_STEPS - START
     assert set(record.trace.codes) == {"-"}
 
@@ -109,7 +109,7 @@ def test_policies_take_turns(scene, tmp_path, monkeypatch):
         train(trainer, until, progress)
 
     monkeypatch.setattr(Trainer, "train", noted)
-    make_bench(scene, tmp_path, seeds=(0,), policies=("ungated", "gate")).run()
+    make_bench(scene, tmp_path, seeds=(0,), policies=("own", "gate")).run()
     parts = seen[1:]  # after densification
     assert [until for _, until in parts] == [START + 4 * part for part in range(1, PARTS + 1) for _ in range(2)]
     assert [owner for owner, _ in parts] == [parts[0][0], parts[1][0]] * PARTS and parts[0][0] != parts[1][0]
@@ -117,8 +117,8 @@ def test_policies_take_turns(scene, tmp_path, monkeypatch):
 
 def test_a_run_in_turns_equals_one_alone(scene, finished, tmp_path):
     with early_floor():
-        (alone,) = make_bench(scene, tmp_path, seeds=(0,), policies=("gate-accumulate",)).run()
-    together = finished.run("gate-accumulate")
+        (alone,) = make_bench(scene, tmp_path, seeds=(0,), policies=("gate,min_bwd_ratio=0",)).run()
+    together = finished.run("gate,min_bwd_ratio=0")
     assert alone.trace == together.trace and alone.metrics == together.metrics
 
 
@@ -147,8 +147,8 @@ def test_a_policy_that_leaves_out_whole_iterations_is_one_entry(scene, tmp_path,
     def every_second(trainer, earlier):
         trainer.iterations = lambda until: [n for n in range(trainer.step, until) if n % 2 == 0]
 
-    monkeypatch.setitem(POLICIES, "halved", PolicySpec("halved", "every second iteration", every_second))
-    full, record = make_bench(scene, tmp_path, seeds=(0,), policies=("ungated", "halved")).run()
+    monkeypatch.setitem(POLICIES, "halved", PolicySpec("halved", "every second iteration", gate=every_second))
+    full, record = make_bench(scene, tmp_path, seeds=(0,), policies=("own", "halved")).run()
     assert (record.iterations, record.iterations_run, record.backwards, record.skips) == (40, 20, 20, 0)
     assert record.trace.codes == "-." * 20
     assert all(
@@ -156,7 +156,7 @@ def test_a_policy_that_leaves_out_whole_iterations_is_one_entry(scene, tmp_path,
         for i, (view, loss) in enumerate(zip(record.trace.view, record.trace.loss, strict=True))
     )
     assert 0.0 < record.t_post < full.t_post
-    row = summarise([full, record], ("ungated", "halved"), 40)[1]
+    row = summarise([full, record], ("own", "halved"), 40)[1]
     assert row.values["iterations_run"].mean == 20 and row.values["backwards_share"].mean == 50.0
 
 
@@ -212,19 +212,21 @@ def test_a_killed_bench_continues_where_it_stopped(scene, finished, tmp_path):
 def test_a_run_that_diverges_is_named_and_its_copies_are_not_run(scene, tmp_path):
     bench = make_bench(scene, tmp_path, seeds=(5,))
     turn = 1 + (MAX_STEPS - START) // PARTS  # compilation, and the iterations of a part
-    bench.backend = failing_backend(1 + START + turn + 1 + 3)  # densification, ungated's turn, the gate's third loss
+    bench.backend = failing_backend(
+        1 + START + turn + 1 + 3
+    )  # densification, the own run's turn, the gate's third loss
     found = {record.policy: record for record in bench.run()}
-    assert found["ungated"].status == "done"
+    assert found["own"].status == "done"
     assert found["gate"].status == "diverged"
     assert f"loss nan at iteration {START + 2} on view" in found["gate"].note
-    assert found["gate-no-floor"].status == "done"
+    assert found["gate,min_bwd_ratio=0"].status == "done"
     for policy in ("random", "periodic", "shortened"):
         assert found[policy].status == "not run" and "gate" in found[policy].note
     assert json.loads((tmp_path / "runs" / "seed5_gate.json").read_text())["status"] == "diverged"
 
 
 def test_a_seed_that_diverges_in_densification_is_named_under_every_policy(scene, tmp_path):
-    bench = make_bench(scene, tmp_path, seeds=(5,), policies=("ungated", "gate"))
+    bench = make_bench(scene, tmp_path, seeds=(5,), policies=("own", "gate"))
     bench.backend = failing_backend(10)
     records = bench.run()
     assert [record.status for record in records] == ["diverged", "diverged"]
@@ -264,7 +266,7 @@ def test_a_schedule_without_refinement_is_refused(scene, tmp_path):
     config = TrainConfig(max_steps=100, refine_stop_iter=30_000)
     bench = make_bench(scene, tmp_path)
     with pytest.raises(InputError, match="nothing to refine"):
-        type(bench)(scene, config, bench.folder, (0,), ("ungated",))
+        type(bench)(scene, config, bench.folder, (0,), ("own",))
 
 
 def test_a_damaged_run_is_named(scene, finished, tmp_path):
@@ -284,4 +286,4 @@ def test_densify_stops_where_refinement_begins(scene):
 def test_processor_time_is_for_the_cpu(monkeypatch, tmp_path, scene):
     monkeypatch.setattr(runner, "resolve_backend", lambda name: SimpleNamespace(device=torch.device("cuda")))
     with pytest.raises(InputError, match="--clock processor is for the CPU"):
-        runner.Bench(scene, TrainConfig(max_steps=40), BenchFolder(tmp_path), [0], ["ungated"], clock="processor")
+        runner.Bench(scene, TrainConfig(max_steps=40), BenchFolder(tmp_path), [0], ["own"], clock="processor")

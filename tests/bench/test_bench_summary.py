@@ -9,7 +9,8 @@ from skipgs_plug.bench.plots import style
 from skipgs_plug.bench.policies import POLICIES
 from skipgs_plug.bench.record import REASON_CODES, Point, RunRecord, Trace
 from skipgs_plug.bench.summary import Row, ceiling, row_as_dict, row_from_dict, summarise, time_to_reach, timing_noise
-from skipgs_plug.bench.table import RESULTS, SHARES, cells, legend, markdown, metric_columns, notes, tables
+from skipgs_plug.bench.table import REFINEMENT, SHARES, cells, legend, markdown, metric_columns, notes, tables
+from skipgs_plug.bench.whole_policies import WHOLE_POLICIES
 from skipgs_plug.core import decision
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.trainer.metrics import METRICS, Metric
@@ -18,10 +19,12 @@ T_DENSIFY = 10.0
 
 
 def record(policy: str, seed: int, t_post: float, backwards: int = 100, psnr: float = 20.0) -> RunRecord:
+    seconds = dict.fromkeys(("t_post", "t_post_processor"), t_post)
+    seconds.update(dict.fromkeys(("t_total", "t_total_processor"), T_DENSIFY + t_post))
     phases = {"forward": 0.4 * t_post, "loss": 0.1 * t_post, "backward": 0.4 * t_post, "optimizer": 0.1 * t_post}
     return RunRecord(
         seed, policy, iterations=100, iterations_run=100, backwards=backwards, t_post=t_post,
-        t_total=T_DENSIFY + t_post, phases={**phases, "strategy": 0.0},
+        t_total=T_DENSIFY + t_post, seconds=seconds, phases={**phases, "strategy": 0.0},
         metrics={"psnr": psnr, "ssim": 0.5, "num_GS": 10}, train_metrics={"psnr": psnr + 2, "ssim": 0.6},
         points=[Point(0, 0.0, {"psnr": 19.0}), Point(100, t_post, {"psnr": psnr})],
         trace=Trace(0, [0], [0.1], [None], "w"),
@@ -30,14 +33,14 @@ def record(policy: str, seed: int, t_post: float, backwards: int = 100, psnr: fl
 
 def test_means_spreads_and_differences_within_each_seed():
     records = [
-        record("ungated", 0, 10.0, psnr=20.0),
-        record("ungated", 1, 20.0, psnr=22.0),
+        record("own", 0, 10.0, psnr=20.0),
+        record("own", 1, 20.0, psnr=22.0),
         record("gate", 0, 8.0, 60, psnr=19.5),
         record("gate", 1, 10.0, 50, psnr=22.1),
     ]
-    ungated, gate = summarise(records, ("ungated", "gate"), 100)
-    assert ungated.values["t_post"].mean == 15.0
-    assert ungated.values["t_post"].spread == statistics.stdev([10.0, 20.0])
+    own, gate = summarise(records, ("own", "gate"), 100)
+    assert own.values["t_post"].mean == 15.0
+    assert own.values["t_post"].spread == statistics.stdev([10.0, 20.0])
     assert gate.values["t_post_saved"].mean == pytest.approx((20 + 50) / 2)
     assert gate.values["t_total_saved"].mean == pytest.approx(100 * (2 / 20 + 10 / 30) / 2)
     assert gate.values["psnr_gain"].mean == pytest.approx((-0.5 + 0.1) / 2)
@@ -56,36 +59,36 @@ def test_time_to_reach_is_interpolated_at_the_first_crossing():
     assert time_to_reach(points, 20.0) == time_to_reach(points, 19.0) == 0.0
 
 
-def test_time_to_ungated_says_where_it_is_not_reached():
-    records = [record("ungated", seed, 10.0, psnr=20.0) for seed in (0, 1)]
+def test_time_to_own_says_where_it_is_not_reached():
+    records = [record("own", seed, 10.0, psnr=20.0) for seed in (0, 1)]
     records += [record("gate", 0, 8.0, psnr=21.0), record("gate", 1, 8.0, psnr=19.9)]
     records += [record("random", seed, 8.0, psnr=19.5) for seed in (0, 1)]
-    heading, ungated, gate, chance = cells(summarise(records, ("ungated", "gate", "random"), 100), RESULTS)
-    column = heading.index("s to ungated's PSNR")
-    assert ungated[column] == "10.0 ± 0.0"
+    heading, own, gate, chance = cells(summarise(records, ("own", "gate", "random"), 100), REFINEMENT)
+    column = heading.index("s to own PSNR")
+    assert own[column] == "10.0 ± 0.0"
     assert gate[column] == "4.0 (1 of 2)"  # half of the way from 19 to 21 dB
     assert chance[column] == "not reached"
 
 
 def test_ceiling_is_backward_and_optimizer_share_times_skip_rate():
-    rows = summarise([record("ungated", 0, 10.0), record("gate", 0, 8.0, 60)], ("ungated", "gate"), 100)
+    rows = summarise([record("own", 0, 10.0), record("gate", 0, 8.0, 60)], ("own", "gate"), 100)
     most = ceiling(rows)
     assert most == pytest.approx({"share": 50.0, "skipped": 40.0, "most": 20.0, "measured": 20.0})
     assert ceiling(rows[:1]) is None
 
 
 def test_timing_noise_compares_forward_passes_within_a_seed():
-    assert timing_noise([record("ungated", 0, 10.0), record("gate", 1, 12.0)]) is None
-    records = [record("ungated", 0, 10.0), record("gate", 0, 12.0), record("ungated", 1, 99.0)]
+    assert timing_noise([record("own", 0, 10.0), record("gate", 1, 12.0)]) is None
+    records = [record("own", 0, 10.0), record("gate", 0, 12.0), record("own", 1, 99.0)]
     assert timing_noise(records) == pytest.approx(20.0)
 
 
 def test_a_diverged_seed_is_left_out_visibly():
     lost = RunRecord(1, "gate", "diverged", "loss nan at iteration 7 on view a.png")
-    records = [record("ungated", 0, 10.0), record("ungated", 1, 10.0), record("gate", 0, 8.0, 60), lost]
-    rows = summarise(records, ("ungated", "gate"), 100)
+    records = [record("own", 0, 10.0), record("own", 1, 10.0), record("gate", 0, 8.0, 60), lost]
+    rows = summarise(records, ("own", "gate"), 100)
     assert rows[1].seeds == [0] and rows[1].values["t_post"].mean == 8.0
-    line = cells(rows, RESULTS)[2]
+    line = cells(rows, REFINEMENT)[2]
     assert line[:2] == ["gate", "1 of 2 !"]
     assert "Seed 1 of gate is left out of its means: diverged: loss nan at iteration 7 on view a.png." in notes(
         rows, result_of(rows)
@@ -93,23 +96,23 @@ def test_a_diverged_seed_is_left_out_visibly():
 
 
 def test_a_policy_without_any_finished_seed_keeps_its_row():
-    rows = summarise([record("ungated", 0, 1.0), RunRecord(0, "gate", "diverged", "x")], ("ungated", "gate"), 100)
-    assert cells(rows, RESULTS)[2][:3] == ["gate", "0 of 1 !", "-"]
+    rows = summarise([record("own", 0, 1.0), RunRecord(0, "gate", "diverged", "x")], ("own", "gate"), 100)
+    assert cells(rows, REFINEMENT)[2][:3] == ["gate", "0 of 1 !", "-"]
 
 
 def test_one_seed_has_no_spread_and_absent_columns_are_left_out():
-    rows = summarise([record("ungated", 0, 10.0)], ("ungated",), 100)
-    heading, line = cells(rows, RESULTS)
+    rows = summarise([record("own", 0, 10.0)], ("own",), 100)
+    heading, line = cells(rows, REFINEMENT)
     assert line[heading.index("T_post s")] == "10.0"
     assert not any("LPIPS" in name for name in heading)
     assert cells(rows, SHARES) == [
         ["policy", "seeds", "forward", "loss", "backward", "optimizer"],
-        ["ungated", "1", "40.0", "10.0", "40.0", "10.0"],
+        ["own", "1", "40.0", "10.0", "40.0", "10.0"],
     ]
 
 
 def test_tables_without_a_column_are_left_out():
-    rows = summarise([record("ungated", 0, 10.0)], ("ungated",), 100)
+    rows = summarise([record("own", 0, 10.0)], ("own",), 100)
     assert [caption.split()[0] for caption, _ in tables(rows)] == ["Time", "Quality", "Share"]
     del rows[0].values["train_psnr"], rows[0].values["train_ssim"]
     assert [caption.split()[0] for caption, _ in tables(rows)] == ["Time", "Share"]
@@ -118,11 +121,12 @@ def test_tables_without_a_column_are_left_out():
 def test_a_row_of_a_policy_that_this_version_lacks_is_shown():
     rows = [Row("gone", [0])]
     assert legend(rows) == [("gone", "a policy of another version")]
-    assert style("gone") == style("another") and cells(rows, RESULTS) == [["policy", "seeds"], ["gone", "1"]]
+    assert style("gone") == style("gone") and cells(rows, REFINEMENT) == [["policy", "seeds"], ["gone", "1"]]
 
 
 def test_every_policy_looks_different():
-    assert len({style(name) for name in POLICIES}) == len(POLICIES)
+    names = {*POLICIES, *WHOLE_POLICIES}
+    assert len({style(name) for name in names}) == len(names)
 
 
 def test_a_new_metric_is_one_entry(scene, tmp_path, monkeypatch):
@@ -130,10 +134,10 @@ def test_a_new_metric_is_one_entry(scene, tmp_path, monkeypatch):
         "worst", "Worst pixel", 3, "greatest difference", lambda a, b, mask: float((a - b).abs().max()), unit="%"
     )
     monkeypatch.setitem(METRICS, "worst", worst)
-    bench = make_bench(scene, tmp_path, seeds=(0,), policies=("ungated",), max_steps=20, tensorboard=True)
+    bench = make_bench(scene, tmp_path, seeds=(0,), policies=("own",), max_steps=20, tensorboard=True)
     (done,) = bench.run()
     assert 0 < done.metrics["worst"] < 3 and "worst" in done.train_metrics and "worst" in done.points[3].metrics
-    rows = summarise([done], ("ungated",), 10)
+    rows = summarise([done], ("own",), 10)
     assert rows[0].values["worst_gain"].mean == 0.0
     assert [column.name for column in metric_columns(worst)] == ["worst", "worst_gain"]
     assert "Worst pixel: greatest difference." in " ".join(notes(rows, result_of(rows)))
@@ -160,7 +164,7 @@ def test_markdown_is_aligned():
 
 
 def test_rows_survive_json():
-    rows = summarise([record("ungated", 0, 10.0), RunRecord(1, "ungated", "diverged", "x")], ("ungated",), 100)
+    rows = summarise([record("own", 0, 10.0), RunRecord(1, "own", "diverged", "x")], ("own",), 100)
     assert row_from_dict(row_as_dict(rows[0])) == rows[0]
 
 
@@ -179,5 +183,6 @@ def result_of(rows):
         "timing_noise": None,
         "settings": {"scene": scene, "machine": machine, "lpips": None},
         "refinement": [50, 100],
+        "runs": [],
         "commits": ["abc"],
     }

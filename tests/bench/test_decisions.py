@@ -35,8 +35,8 @@ def test_runs_that_did_not_finish_are_left_out(finished, tmp_path):
 
 def test_iterations_that_were_left_out_have_no_view(tmp_path):
     records = [
-        RunRecord(0, "ungated", trace=Trace(10, [3, 1, 2, 0], codes="----")),
-        RunRecord(0, "thinned", trace=Trace(10, [3, None, None, 1], codes="-..-")),
+        RunRecord(0, "own", trace=Trace(10, [3, 1, 2, 0], codes="----")),
+        RunRecord(0, "refine_share=0.4", trace=Trace(10, [3, None, None, 1], codes="-..-")),
     ]
     write_decisions(tmp_path / "decisions.json", records)
     traces = read_decisions(tmp_path / "decisions.json")

@@ -102,7 +102,7 @@ def test_a_full_disk_ends_the_curves_and_not_the_run(scene, tmp_path, monkeypatc
 def test_bench_writes_every_run(packed, tmp_path):
     out = tmp_path / "bench"
     command = ["bench", packed, "--out", str(out), "--max-steps", "40", "--seeds", "3", "--no-progress"]
-    policies = ("ungated", "gate", "random")
+    policies = ("own", "gate", "random")
     assert main([*command, "--policies", *policies, "--tensorboard"]) == 0
     assert {path.name for path in (out / "tb").iterdir()} == {f"seed3_{name}" for name in ("densify", *policies)}
     densify = read(out / "tb" / "seed3_densify")
@@ -110,7 +110,7 @@ def test_bench_writes_every_run(packed, tmp_path):
     for policy in policies:
         logged = read(out / "tb" / f"seed3_{policy}")
         gated = {tag for tag in logged if tag.startswith("skipgs/")}
-        assert set(logged) - gated == TRAIN | VAL and bool(gated) == (policy != "ungated")
+        assert set(logged) - gated == TRAIN | VAL and bool(gated) == (policy != "own")
         assert list(logged["train/mem"]) == [20, 30]
         run = json.loads((out / "runs" / f"seed3_{policy}.json").read_text())
         assert logged["val/psnr"] == {p["step"] - 1: pytest.approx(p["psnr"], rel=1e-6) for p in run["points"]}

@@ -45,7 +45,7 @@ def ungated_folder(scene_file: str, tmp_path_factory: pytest.TempPathFactory) ->
 def bench_folder(scene_file: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bench") / "small"
     command = ["bench", scene_file, "--out", str(folder), "--max-steps", "40", "--seeds", "0", "--no-progress"]
-    assert main([*command, "--policies", "ungated", "gate", "random"]) == 0
+    assert main([*command, "--policies", "own", "gate", "random"]) == 0
     return folder
 
 

@@ -93,9 +93,9 @@ def test_the_curve_of_a_run_goes_on_after_a_resume(scene_file, tmp_path):
 def test_browser_shows_a_bench(bench_folder, tmp_path, dump_dom):
     dom = dump_dom(make_page(tmp_path, bench_folder))
     rows = rows_of(dom, "Time and quality")
-    assert [row[0] for row in rows] == ["ungated", "gate", "random"]
+    assert [row[0] for row in rows] == ["own", "gate", "random"]
     assert all(len(row) == len(rows[0]) > 8 for row in rows)
-    assert [row[0] for row in rows_of(dom, "Share of refinement time")] == ["ungated", "gate", "random"]
+    assert [row[0] for row in rows_of(dom, "Share of refinement time")] == ["own", "gate", "random"]
     assert "A perfect gate at this skip rate could save" in dom
     assert "Share of backwards skipped in the course of refinement" in dom
     assert body_count(dom, "images") == body_count(dom, "decoded") == 6

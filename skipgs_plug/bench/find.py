@@ -1,0 +1,18 @@
+"""Policies by name, of both kinds of bench."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from skipgs_plug.bench.policies import POLICIES, Policy, refinement_policy
+from skipgs_plug.bench.whole_policies import WHOLE_POLICIES, whole_policy
+
+
+def find_policy(name: str, whole: bool) -> Policy | None:
+    """Return the policy of a name in whole runs, or in refinements; None if there is none."""
+    return whole_policy(name) if whole else refinement_policy(name)
+
+
+def known_policies(whole: bool) -> Mapping[str, Policy]:
+    """Return the policies that run unless others are named."""
+    return WHOLE_POLICIES if whole else POLICIES

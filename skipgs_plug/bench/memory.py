@@ -1,0 +1,73 @@
+"""Peak memory of a part of a process: of PyTorch on the GPU, of the whole process on the CPU."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Protocol
+
+import torch
+
+from skipgs_plug.fallback_raster.buffers import release_memory
+
+STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+RESET_PEAK = "5"  # as proc(5) has it
+
+
+class MemoryMeter(Protocol):
+    """Tells peaks since it was reset."""
+
+    def reset(self) -> int:
+        """Forget the peak so far; returns the bytes in use."""
+        ...
+
+    def peak(self) -> int:
+        """Most bytes in use since then."""
+        ...
+
+
+class CudaMeter:
+    """Bytes that PyTorch has given out on a GPU."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+
+    def reset(self) -> int:
+        torch.cuda.reset_peak_memory_stats(self._device)
+        return torch.cuda.memory_allocated(self._device)
+
+    def peak(self) -> int:
+        return torch.cuda.max_memory_allocated(self._device)
+
+
+class ProcessMeter:
+    """Bytes of this process that lie in memory, as Linux counts them."""
+
+    def reset(self) -> int:
+        release_memory()  # else a run would find buffers that another left, and seem to need none
+        CLEAR.write_text(RESET_PEAK)
+        return _status("VmRSS")
+
+    def peak(self) -> int:
+        return _status("VmHWM")
+
+
+def memory_meter(device: torch.device) -> MemoryMeter | None:
+    """Return what measures on this device; None where this system does not tell."""
+    if device.type == "cuda":
+        return CudaMeter(device)
+    meter = ProcessMeter()
+    try:
+        meter.reset()
+        meter.peak()
+    except OSError:
+        return None
+    return meter
+
+
+def _status(name: str) -> int:
+    """Return a line of /proc/self/status in bytes."""
+    found = re.search(rf"^{name}:\s*(\d+) kB$", STATUS.read_text(), re.MULTILINE)
+    if found is None:
+        raise OSError(f"{STATUS} has no line {name}")
+    return 1024 * int(found[1])

@@ -1,0 +1,117 @@
+"""What is compared over the whole run, from its first iteration on, and the controls.
+
+A policy is called by what a user would give to `SkipGate`, as in `policies`. A new one is one entry of WHOLE_POLICIES:
+a name, a line for people, the policies that it copies from, and what runs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+
+from skipgs_plug import SkipGate
+from skipgs_plug.bench.policies import REFERENCE, Earlier, Policy, gate_with, number_after, table_of
+from skipgs_plug.bench.record import RunRecord
+from skipgs_plug.bench.thinning import periodic_numbers, random_numbers
+from skipgs_plug.bench.whole import Maker, as_many_gaussians, planned, shortened, whole_run
+from skipgs_plug.core.pace.rates import path_factor
+from skipgs_plug.trainer import Trainer
+
+COPIED = "share=auto"  # controls copy its share, time or number of Gaussians
+Run = Callable[[Maker, Earlier, RunRecord], Generator[None, None, None]]
+
+
+@dataclass(frozen=True)
+class WholePolicy(Policy):
+    """One row of the comparison of whole runs.
+
+    Attributes:
+        run: trains with trainers that it makes, fills the record, and pauses now and then for others.
+    """
+
+    run: Run = None  # type: ignore[assignment]
+
+
+def own(make: Maker, earlier: Earlier, record: RunRecord) -> Generator[None, None, None]:
+    """Train as the trainer does by itself."""
+    yield from whole_run(make(), None, record, make)
+
+
+def gated(**settings: object) -> Run:
+    """Return what trains with a gate; `settings` are arguments of SkipGate."""
+
+    def run(make: Maker, earlier: Earlier, record: RunRecord) -> Generator[None, None, None]:
+        trainer = make()
+        yield from whole_run(trainer, gate_with(**settings)(trainer, earlier), record, make)
+
+    return run
+
+
+def larger_steps(trainer: Trainer, earlier: Earlier) -> SkipGate:
+    """Attach the factors on rates that make a refinement as short as this go as far as the own run's."""
+    full = earlier[REFERENCE].iterations
+    peak = path_factor(min(1.0, trainer.max_steps / full), 0.0, shown=earlier[COPIED].gaussians_shown)
+    gate = gate_with(refine_share=1.0, rate_peak=peak)(trainer, earlier)
+    assert gate is not None
+    return gate
+
+
+WHOLE_POLICIES = table_of(
+    WholePolicy(REFERENCE, "the trainer's own run: every iteration runs as it is", run=own),
+    WholePolicy("gate", "the paper's gate, default settings, after densification", run=gated()),
+    WholePolicy(
+        "refine_share=auto",
+        "densification as it is, then as many iterations as the scene needs, with larger, shrinking steps",
+        run=gated(refine_share="auto"),
+    ),
+    WholePolicy(COPIED, "as many iterations as the scene needs in the whole run", run=gated(share="auto")),
+    WholePolicy("share=0.4", "40 % of the iterations of the whole run", run=gated(share=0.4)),
+    WholePolicy(
+        f"{COPIED},no-compensate",
+        f"control: {COPIED} with steps as they are",
+        run=gated(share="auto", compensate=False),
+    ),
+    WholePolicy(
+        "shortened",
+        f"control: a schedule with all its milestones compressed to the time of {COPIED}",
+        (REFERENCE, COPIED),
+        shortened(COPIED),
+    ),
+    WholePolicy(
+        "shortened,compensate",
+        "control: the same with larger, shrinking steps in refinement",
+        (REFERENCE, COPIED),
+        shortened(COPIED, larger_steps),
+    ),
+    WholePolicy(
+        "random",
+        f"control: as many iterations as {COPIED} in each phase, drawn by chance, with all events, steps as they are",
+        (COPIED,),
+        planned(COPIED, random_numbers),
+    ),
+    WholePolicy(
+        "periodic",
+        f"control: as many iterations as {COPIED} in each phase, evenly spread, with all events, steps as they are",
+        (COPIED,),
+        planned(COPIED, periodic_numbers),
+    ),
+    WholePolicy(
+        "own,grow_grad2d",
+        f"control: the own run with grow_grad2d set so that it ends with as many Gaussians as {COPIED}",
+        (REFERENCE, COPIED),
+        as_many_gaussians(COPIED),
+    ),
+)
+
+
+def whole_policy(name: str) -> WholePolicy | None:
+    """Return the policy of a name; None if there is none. `share=` and `refine_share=` take any number in (0, 1]."""
+    if name in WHOLE_POLICIES:
+        return WHOLE_POLICIES[name]
+    share, refined = number_after("share", name), number_after("refine_share", name)
+    if share is not None:
+        return WholePolicy(name, f"{100 * share:g} % of the iterations of the whole run", run=gated(share=share))
+    if refined is not None:
+        meaning = f"densification as it is, then {100 * refined:g} % of the iterations, with larger, shrinking steps"
+        return WholePolicy(name, meaning, run=gated(refine_share=refined))
+    return None
