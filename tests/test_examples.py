@@ -46,8 +46,10 @@ def make_checkout(folder, lookalike, script):
     source = (LOOKALIKES / "lookalikes" / f"{lookalike}.py").read_text()
     renderers = [word for word in ("render_fastgs", "render_imp", "render") if f"def {word}(" in source]
     of_model = [word for word in ("GaussianModel", "build_scaling_rotation") if f" {word}(" in source]
+    (folder / script).parent.mkdir(exist_ok=True)
+    above = "import os, sys\nsys.path.append(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))\n"
     (folder / script).write_text(
-        f"{source}\nfrom gaussian_renderer import {', '.join(renderers)}\n"
+        f"{above if '/' in script else ''}{source}\nfrom gaussian_renderer import {', '.join(renderers)}\n"
         f"from scene.gaussian_model import {', '.join(of_model)}\n"
         "if __name__ == '__main__':\n    train()\n    print('Training complete.')\n"
     )

@@ -63,6 +63,7 @@ class InriaFamily(AbstractAdapter):
         self._model: Callable[[], Any] = lambda: None  # a new model means a new run
         self._label = "image_name"  # attribute of a camera that names its view
         self._code: LoopCode | None = None
+        self._drift: DriftCheck
         self._strange = Unrecognised(*5 * (frozenset(),))
 
     @classmethod
@@ -201,27 +202,30 @@ class InriaFamily(AbstractAdapter):
     def _attach_to_model(self, hooks: Hooks, names: dict[str, Any]) -> None:
         """Learn iterations and structural changes from calls of the model's methods."""
         model = names["GaussianModel"]
-        drift = DriftCheck(hooks.state)
 
         def heartbeat(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            frame = sys._getframe(2)  # the loop's
-            with released_on_error(hooks, self):
-                # Variables of the loop are read once, before they hold an iteration's graph.
-                if self._model() is not args[0]:
-                    self._refuse_fork(LoopCode.of_module(frame.f_globals))
-                    self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
-                    self._model = weakref.ref(args[0])
-                else:
-                    self._step = hooks.number(self._step + 1)
-                    own = [one for one in vars(args[0]).values() if isinstance(one, torch.optim.Optimizer)]
-                    if moved := drift.moved(own):
-                        self._give_up(hooks, moved)
-                        return original(*args, **kwargs)
-                hooks.iteration(self._step)
+            self._begins(hooks, args[0], sys._getframe(2))  # frame 2 is the loop's
             return original(*args, **kwargs)
 
         hooks.wrap(model, "update_learning_rate", heartbeat)
         hooks.events(model, *(name for name in self.structural if hasattr(model, name)))
+
+    def _begins(self, hooks: Hooks, model: Any, frame: types.FrameType) -> None:
+        """An iteration begins in the loop that this frame is of; the first one reads the run."""
+        with released_on_error(hooks, self):
+            # Variables of the loop are read once, before they hold an iteration's graph.
+            if self._model() is not model:
+                self._refuse_fork(LoopCode.of_module(frame.f_globals))
+                self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
+                self._model = weakref.ref(model)
+                self._drift = DriftCheck(hooks.state)
+            else:
+                self._step = hooks.number(self._step + 1)
+                own = [one for one in vars(model).values() if isinstance(one, torch.optim.Optimizer)]
+                if moved := self._drift.moved(own):
+                    self._give_up(hooks, moved)
+                    return
+            hooks.iteration(self._step)
 
     def _attach_to_loop(self, hooks: Hooks, script: dict[str, Any]) -> None:
         """Hold on to the loop's backward and to its range."""

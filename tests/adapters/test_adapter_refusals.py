@@ -65,7 +65,11 @@ def copied(module):
     return copy_of
 
 
-@pytest.mark.parametrize("case", SCRIPTS, ids=lambda case: case.name)
+# The render is what begins an iteration of Deformable, whose learning rates are set at its end.
+BEGUN_BY_METHOD = [case for case in SCRIPTS if case.name != "deformable"]
+
+
+@pytest.mark.parametrize("case", BEGUN_BY_METHOD, ids=lambda case: case.name)
 def test_renamed_method_is_named(case, monkeypatch):
     monkeypatch.delattr(SplatModel, "update_learning_rate")
     if "update_learning_rate" in vars(case.module.GaussianModel):

@@ -1,0 +1,13 @@
+r"""Octree-GS, its own training script, unedited and gated.
+
+    python examples/train_octree_gs.py --repo path/to/Octree-GS -- \
+        -s data/garden --eval
+
+Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+"""
+
+import sys
+
+from _checkout import run_in_checkout
+
+sys.exit(run_in_checkout("octree_gs", "train.py"))

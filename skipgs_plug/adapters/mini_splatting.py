@@ -1,0 +1,34 @@
+"""Mini-Splatting: ms/train.py and ms_d/train.py, which sample and prune after densification."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+
+
+class MiniSplatting(InriaFamily):
+    """Both simplifications change the model after the backward of their iteration, and make a new optimizer.
+
+    Iterations are counted, since `update_learning_rate` is called with shifted numbers.
+    """
+
+    name = "mini_splatting"
+    checked = "fatPeter/mini-splatting c0d5581 (both loops read, and a look-alike)"
+    project = "[Mini-Splatting](https://github.com/fatPeter/mini-splatting)"
+    gated = (
+        "`ms/train.py`: from `simp_iteration2` + 1 on, after a pause for the prune in that iteration. `ms_d/train.py`, "
+        "which does not simplify: from `densify_until_iter` on."
+    )
+    left_alone = "Scores and depths for pruning are rendered without gradients and always run."
+    stand_ins = "gaussianspa"
+    mark = "num_depth"
+    renders = ("render_imp",)
+    structural = (*InriaFamily.structural, "reinitial_pts")
+    calls = ("densify_and_prune_split",)
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        args = loop["args"]
+        simplified = [getattr(args, name) + 1 for name in ("simp_iteration1", "simp_iteration2") if hasattr(args, name)]
+        return max(int(opt.densify_until_iter), *map(int, simplified), 0)

@@ -1,0 +1,50 @@
+"""Octree-GS: Scaffold-GS with anchors on levels, which are shown from coarse to fine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.core.facts import Densification
+
+
+class OctreeGS(InriaFamily):
+    """Anchors are grown and pruned before `update_until`, and levels are added until `coarse_iter`.
+
+    With several resolution scales an image has a camera, and a mean, for each of them.
+    """
+
+    name = "octree_gs"
+    checked = "city-super/Octree-GS 9db64fe (its loop read, and a look-alike)"
+    project = "[Octree-GS](https://github.com/city-super/Octree-GS)"
+    gated = "From `update_until` on, or with `progressive` from the end of `coarse_iter` on, whichever is later."
+    left_alone = "Networks and anchors have one optimizer, which is left alone. The mask of levels is a forward's."
+    stand_ins = "scaffold_gs"
+    mark = "set_coarse_interval"
+    densification = Densification(marks=("update_interval",), needs="iterations")
+    structural = ("prune_anchor", "training_setup")
+    calls = (
+        "adjust_anchor",
+        "eval",
+        "get_anchor",
+        "set_anchor_mask",
+        "set_coarse_interval",
+        "train",
+        "training_statis",
+    )
+    arguments = ("retain_grad", "visible_mask")
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        coarse = int(opt.coarse_iter) + 1 if loop["dataset"].progressive else 0
+        return max(int(opt.update_until), coarse)
+
+    def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return int(opt.update_until)
+
+    def view_key(self, camera: Any) -> Any:
+        key, scale = super().view_key(camera), getattr(camera, "resolution_scale", 1.0)
+        return key if key is None or scale == 1.0 else (key, scale)
+
+    def view_keys(self, cameras: Sequence[Any]) -> list[Any]:
+        return [self.view_key(camera) for camera in cameras]

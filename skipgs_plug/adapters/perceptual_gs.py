@@ -1,0 +1,31 @@
+"""Perceptual-GS: sensitivities trained beside the scene until densification ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skipgs_plug.adapters.inria import InriaFamily
+
+
+class PerceptualGS(InriaFamily):
+    """The loss has a term on sensitivities up to and with `densify_until_iter`, whose iteration may rebuild the model.
+
+    Images with alpha are trained with prunes every hundredth iteration until the end, each of which pauses the gate.
+    """
+
+    name = "perceptual_gs"
+    checked = "eezkni/Perceptual-GS 991f196 (its loop read, and a look-alike)"
+    project = "[Perceptual-GS](https://github.com/eezkni/Perceptual-GS)"
+    gated = (
+        "From `densify_until_iter` + 1 on, after a pause where that iteration rebuilds the model. With images that "
+        "have alpha, prunes every hundredth iteration pause the gate until the end."
+    )
+    left_alone = "Renders of sensitivity and alpha are of the same view, and belong to its loss."
+    stand_ins = "gaussianspa"
+    mark = "get_sensitivity"
+    structural = (*InriaFamily.structural, "reinitial_pts")
+    calls = ("get_alpha", "get_sensitivity")
+
+    def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
+        return int(opt.densify_until_iter) + 1
