@@ -377,6 +377,7 @@ class SkipGate:
         if kept:
             torch.stack(kept).sum().backward()
             self._iteration.ran = True
+            self._engine.rates.ran()
         self._engine.clock.mark()
         return bool(kept)
 

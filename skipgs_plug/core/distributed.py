@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import weakref
+from typing import Any
 
 import torch
 import torch.distributed as dist
+from torch import Tensor
 
 from skipgs_plug.core import decision
 from skipgs_plug.core.decision import Decision
@@ -39,14 +42,18 @@ def refuse_several(because: str, instead: str) -> None:
         raise SkipGSError(f"{because}, but {group_size()} train together; {instead}.")
 
 
-def agree(own: Decision) -> Decision:
+def agree(own: Decision, device: torch.device | None = None) -> Decision:
     """Reduce this rank's decision with those of all others: skip only when every rank would.
+
+    Args:
+        own: Of this rank.
+        device: Of the loss, where votes go if the group has nothing on the CPU; None if it is a plain number.
 
     Raises:
         SkipGSError: Another rank stopped with an error, or does not answer.
     """
     vote = _SKIP if own.skip else _RUN
-    lowest = _lowest(_POISONED if own is decision.NON_FINITE else vote)
+    lowest = _lowest(_POISONED if own is decision.NON_FINITE else vote, device)
     if lowest == _ABORT:
         raise SkipGSError("The gate of another process stopped with an error; see its output.")
     if lowest == _POISONED:
@@ -56,20 +63,68 @@ def agree(own: Decision) -> Decision:
     return own
 
 
-def abort() -> None:
+def abort(device: torch.device | None = None) -> None:
     """Tell the other ranks that this one raises, so that they do not wait for it; they may be gone themselves."""
     with contextlib.suppress(SkipGSError):
-        _lowest(_ABORT)
+        _lowest(_ABORT, device)
 
 
-def _lowest(vote: int) -> int:
-    device = "cuda" if dist.get_backend() == "nccl" else "cpu"
-    votes = torch.tensor(vote, dtype=torch.int32, device=device)
+def mean(values: Tensor) -> list[float]:
+    """Return the mean of each value [K] over all ranks, which call this together; one read of a device.
+
+    Raises:
+        SkipGSError: Another rank does not answer.
+    """
+    size = group_size()
+    if size == 1:
+        return values.cpu().tolist()  # type: ignore[no-any-return]
+    total = _reduced(values.detach().clone(), dist.ReduceOp.SUM)
+    return [value / size for value in total]
+
+
+def largest(value: int) -> int:
+    """Return the largest of a number over all ranks, which call this together."""
+    return value if group_size() == 1 else int(_reduced(torch.tensor([value]), dist.ReduceOp.MAX)[0])
+
+
+def _lowest(vote: int, device: torch.device | None) -> int:
+    at = device if device is not None and device.type in _devices() and "cpu" not in _devices() else "cpu"
+    return int(_reduced(torch.tensor([vote], dtype=torch.int32, device=at), dist.ReduceOp.MIN)[0])
+
+
+def _reduced(values: Tensor, operation: Any) -> list[float]:
+    """Reduce values over all ranks where the group can, and return them."""
+    group = None
+    if values.device.type not in _devices():
+        values = values.cpu()
+        if "cpu" not in _devices():
+            group = _gloo_group()
     try:
-        dist.all_reduce(votes, op=dist.ReduceOp.MIN)
-        return int(votes)
+        dist.all_reduce(values, op=operation, group=group)
+        return values.cpu().tolist()  # type: ignore[no-any-return]
     except RuntimeError as error:  # also of NCCL, which reports a peer that is gone when the result is read
         raise SkipGSError(
             "Another process of the group did not answer: it ended, or waited longer than the time-out of "
-            "init_process_group(); see its output, and resume all from their last checkpoint."
+            "init_process_group(); see its output, and resume all from their last checkpoint. PyTorch says: "
+            f"{str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__}"
         ) from error
+
+
+def _devices() -> set[str]:
+    """Types of the devices whose tensors the process group takes: "cpu", "cuda"."""
+    return {str(torch.device(one).type) for one in _world()._device_types}
+
+
+def _world() -> Any:
+    return dist.group.WORLD
+
+
+_own_groups: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()  # of gloo, by the group beside which
+
+
+def _gloo_group() -> Any:
+    """A group on the CPU beside one that has none, such as `cuda:nccl`; all ranks make it with their first vote."""
+    world = _world()
+    if world not in _own_groups:
+        _own_groups[world] = dist.new_group(backend="gloo")
+    return _own_groups[world]

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from skipgs_plug.core import decision, distributed
@@ -168,6 +169,8 @@ class Engine:
         if not skip:
             run()
             self.iteration.ran = True
+            if self.active:
+                self.rates.ran()
         self.clock.mark()
         return not skip
 
@@ -184,7 +187,8 @@ class Engine:
             return now.decision
         loss = float(signal.detach() if isinstance(signal, Tensor) else signal)
         mean = None if self.trace is None else self.mean(view)
-        answer = now.decision = self._agreed(view, loss, now.step)
+        device = signal.device if isinstance(signal, Tensor) else None
+        answer = now.decision = self._agreed(view, loss, now.step, device)
         if self.stats.record(answer, view, loss) and self._view_names is None:
             warn_unless_recurring(self.stats.n_views, self.stats.gated)
         if self.trace is not None:
@@ -268,7 +272,7 @@ class Engine:
         if state is not None:
             self.pace.load_state_dict(state)
 
-    def _agreed(self, view: str, loss: float, step: int) -> Decision:
+    def _agreed(self, view: str, loss: float, step: int, device: torch.device | None) -> Decision:
         if distributed.group_size() == 1:
             if not self._ranks_checked:
                 distributed.refuse_unreachable_ranks()
@@ -277,9 +281,9 @@ class Engine:
         try:
             own = self._own(view, loss, step)
         except SkipGSError:
-            distributed.abort()
+            distributed.abort(device)
             raise
-        answer = distributed.agree(own)
+        answer = distributed.agree(own, device)
         if answer is not own:
             assert self.policy is not None
             self.policy.overrule(own, answer)

@@ -137,7 +137,7 @@ class GateState(TypedDict):
     clock: ClockState
     step: int | None
     pace: PaceState | None
-    shown: tuple[float, int]  # as `Visibility.state_dict`
+    shown: tuple[float, float, int, float, float]  # as `Visibility.state_dict`
 
 
 class ReleaseStats(TypedDict):

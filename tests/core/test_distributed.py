@@ -19,6 +19,7 @@ import torch.distributed as dist
 import torch.multiprocessing as mp
 
 from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.core import distributed
 
 STEPS = 300
 
@@ -133,3 +134,40 @@ def test_ranks_in_trouble_end_within_the_time_out(tmp_path: Path, kind: str, siz
         assert set(said.values()) == {"done"}
     else:
         assert all("did not answer" in sentence for sentence in said.values())
+
+
+def refine(rank: int, folder: str, share: float | str, nothing_on_the_cpu: bool) -> None:
+    """Replicas whose views show different shares of the Gaussians, and whose reduced gradients are the same."""
+    start(rank, folder)
+    if nothing_on_the_cpu:
+        distributed._devices = lambda: {"cuda"}  # as a group of cuda:nccl says
+    torch.manual_seed(0)
+    value = torch.nn.Parameter(torch.zeros(40, 3))
+    optimizer = torch.optim.Adam([{"params": [value], "lr": 0.01, "name": "means"}])
+    goal = torch.randn(40, 3)
+    gate = SkipGate(start_iter=20, refine_share=share)
+    ran = []
+    for step in gate.iterations(range(400), views=[f"{view}.png" for view in range(40)]):
+        ran.append(step)
+        seen = torch.zeros(40, 1)
+        seen[: 10 + 25 * rank] = 1.0
+        loss = ((value - goal).abs() * seen).mean()
+        if gate.backward(loss, view=f"{(step * 2 + rank) % 40}.png", step=step):
+            optimizer.step()
+            optimizer.zero_grad()
+            with torch.no_grad():
+                dist.all_reduce(value)
+                value /= 2
+    report = gate.report()
+    result = {"ran": ran, "shown": report["gaussians_shown"], "share": report["refine_share"], "end": value.tolist()}
+    Path(folder, f"{rank}.json").write_text(json.dumps(result))
+    dist.destroy_process_group()
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("share, nothing_on_the_cpu", [(0.4, False), ("auto", False), (0.4, True)])
+def test_ranks_agree_on_what_views_show(tmp_path: Path, share: float | str, nothing_on_the_cpu: bool) -> None:
+    mp.spawn(refine, args=(str(tmp_path), share, nothing_on_the_cpu), nprocs=2)
+    one, two = (json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2))
+    assert one == two and 20 < len(one["ran"]) < 400
+    assert one["shown"] == pytest.approx((0.25 + 0.875) / 2)

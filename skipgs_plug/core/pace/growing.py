@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.facts import Densification
@@ -140,7 +141,7 @@ class Growing:
         bound = self._config.max_gaussians
         if bound is None:
             return False
-        rows = self._rates.rows
+        rows = distributed.largest(self._rates.rows)  # ranks leave out the same events
         if self._rows:
             self._grown = max(rows - self._rows, 0)
         self._rows = rows

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.facts import Densification, TrainerFacts
@@ -58,7 +57,6 @@ class Phased(Pace):
     # Facts about the trainer.
 
     def configure(self, start: int, facts: TrainerFacts, views: list[str] | None) -> None:
-        self._refuse_several()
         self._start, self._last, self._views = start, facts.max_steps, views
         self._keeps_rates = facts.accumulates
         self._densification = facts.densification or self._densification
@@ -83,7 +81,6 @@ class Phased(Pace):
         views: list[str] | None = None,
         events: Iterable[int] | None = None,
     ) -> LoopRange:
-        self._refuse_several()
         if events is not None:
             known = frozenset(int(number) for number in events)
             self._densification = Densification(numbers=lambda part: known.intersection(part))
@@ -215,14 +212,6 @@ class Phased(Pace):
                 self._rates.shown.restart()  # what views show of the grown scene decides how long steps are
             self.refining.begin(self._last, self._conditions[1], self._views, self._keeps_rates)
         return self.refining.runs(number)
-
-    def _refuse_several(self) -> None:
-        for name in ("refining", "growing"):
-            if getattr(self._config, name) == "auto":
-                distributed.refuse_several(
-                    'share="auto" and refine_share="auto" decide by the losses of one process',
-                    "give a share, such as 0.4",
-                )
 
     # State and report.
 

@@ -2,38 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
+import warnings
+import weakref
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import torch
-from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
+from torch.optim.optimizer import register_optimizer_step_pre_hook
 from torch.utils.hooks import RemovableHandle
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.pace.visibility import Visibility, positions
+from skipgs_plug.core.pace.parts import OptimizerFacts
+from skipgs_plug.core.pace.step_reads import LiteralBetas, WatchedGroup, is_torchs, shorter_memory, unwatch, watch
+from skipgs_plug.core.pace.visibility import Visibility
 
 Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
 Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 
-# What a group of parameters takes of the factor that is meant for all; opacities take none beyond the trainer's rate.
-HIGHER_BANDS, GEOMETRY, OTHERS, CONSTANT_BAND = 4.0, 2.0, 1.0, 0.5
-NAMED = {
-    **dict.fromkeys(("f_rest", "shN", "features_rest"), HIGHER_BANDS),
-    **dict.fromkeys(("f_dc", "sh0", "features_dc"), CONSTANT_BAND),
-    **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
-}
-OPACITIES = ("opacity", "opacities")
 BESIDE = 0.25  # of the trainer's rate, at most, for what has no row for each Gaussian
-OF_A_GAUSSIAN = ((), (1,), (2,), (3,), (4,))  # shapes of its parameters beside colours [K, 3]
 LONGEST_AT = 0.25  # of the iterations; below, steps that are longer still lose more than the path gains
 SHOWN = 1 / 3  # of the Gaussians by a view, where it is not known: as in a room photographed from within
 # Of Adam's running mean of squares (beta2), at most. By the gradient of a single view a parameter can move its rate
 # over the root of 1 - beta2: 32 times the rate at the usual 0.999, too far where rates are larger.
 SQUARES_KEPT = 0.98
-SETTINGS = ("lr", "betas")  # of a group, that are other ones for the length of a step
+# Iterations in a row that ran with larger steps while no optimizer of PyTorch stepped: then a warning, then an error.
+UNSTEPPED_WARNS, UNSTEPPED_RAISES = 50, 200
 
 _hooked: list[ScaledRates] = []  # all whose hooks PyTorch holds
 
@@ -57,28 +53,6 @@ def path_factor(share: float, progress: float, peak: float | None = None, shown:
     if peak is None:
         peak = 2.0 * math.sqrt(3.0 * (SHOWN if shown is None else shown)) / max(share, LONGEST_AT)
     return peak * (1.0 - progress)
-
-
-def group_factor(group: dict[str, Any], factor: float, name: str | None = None) -> float:
-    """Factor on the learning rate of a group of an optimizer, where `factor` is that of all.
-
-    The image is linear in the colours, so their higher bands, whose rate trainers set to a twentieth of the constant
-    band's, bear the longest steps, and the constant band, which all views agree on, needs shorter ones. Positions,
-    whose rate has fallen to a tenth when refinement begins, and scales bear longer steps. Opacities are never raised:
-    their rate is large as it is, and steps beyond it flicker. All are known by the group's name, or else the `name` of
-    its optimizer; without either by shape: [N, 1, 3] is the constant band, [N, K, 3] higher ones, [N, 1] opacities.
-    """
-    name = group.get("name", name)
-    if name is not None:
-        return min(factor, 1.0) if name in OPACITIES else NAMED.get(name, OTHERS) * factor
-    shapes = [tuple(param.shape[1:]) for param in group["params"]]
-    if all(shape == (1,) for shape in shapes):
-        return min(factor, 1.0)
-    if all(shape == (1, 3) for shape in shapes):
-        return CONSTANT_BAND * factor
-    if all(len(shape) == 2 and shape[0] > 1 and shape[1] == 3 for shape in shapes):
-        return HIGHER_BANDS * factor
-    return factor
 
 
 class ScaledRates:
@@ -110,10 +84,11 @@ class ScaledRates:
         self._evenly = False
         self._rows = self._rows_now = 0  # Gaussians in the iteration before and in this one; 0 where not known
         self._thread = threading.get_ident()
-        self._depth: dict[int, int] = {}  # a step can call the step of its base class
-        self._under_way: dict[int, _Step] = {}
+        self._under_way: dict[int, _Steps] = {}
         self._handles: list[RemovableHandle] = []
-        self._watched: WeakKeyDictionary[torch.optim.Optimizer, list[RemovableHandle]] = WeakKeyDictionary()
+        self._steps: dict[int, _Steps] = {}  # by id of the optimizer
+        self._own: dict[int, tuple[str | None, torch.optim.Optimizer]] = {}  # of this iteration, by id
+        self._unstepped = 0  # iterations in a row that ran without a step
         self._removed = False
 
     def scale(self, factor: float, evenly: bool = False) -> None:
@@ -142,10 +117,7 @@ class ScaledRates:
         self._rows, self._rows_now = self._rows_now or self._rows, 0
         if not self._handles:
             _hooked.append(self)
-            self._handles = [
-                register_optimizer_step_pre_hook(self._scale),
-                register_optimizer_step_post_hook(self._put_back),
-            ]
+            self._handles = [register_optimizer_step_pre_hook(self._scale)]
 
     @property
     def rows(self) -> int:
@@ -157,103 +129,232 @@ class ScaledRates:
         self._factor = None
         for step in self._under_way.values():  # one that raised had no end
             step.put_back()
+            step.watched = None
+            step.longer.clear()
         self._under_way.clear()
-        self._depth.clear()
+        self._own.clear()
 
     def remove(self) -> None:
         """Take the hooks back, for good."""
         self.rest()
         self._removed = True
-        for handles in (self._handles, *self._watched.values()):
+        for handles in (self._handles, *(steps.handles for steps in self._steps.values())):
             while handles:
                 handles.pop().remove()
         if self in _hooked:
             _hooked.remove(self)
 
-    def _scale(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        if self._factor is None or threading.get_ident() != self._thread:
+    def ran(self) -> None:
+        """A backward ran in the present iteration, so that some optimizer is about to step.
+
+        Raises:
+            SkipGSError: None has stepped for many iterations: larger steps do not arrive.
+        """
+        if self._factor is None or self._factor == 1.0:
             return
-        own = {None: optimizer} if self.only is None else self.only()
-        named = own.items() if isinstance(own, Mapping) else ((None, one) for one in own)
-        names = [name for name, one in named if one is optimizer]
-        if not names:
+        self._unstepped += 1
+        if self._unstepped in (UNSTEPPED_WARNS, UNSTEPPED_RAISES):
+            sentence = (
+                f"{self._unstepped} iterations ran with larger steps, and no torch.optim.Optimizer stepped: what "
+                "updates the parameters is none, so its steps are not larger. Derive it from torch.optim.Optimizer and "
+                "let it read the lr of its param_groups, or give compensate=False."
+            )
+            if self._unstepped == UNSTEPPED_RAISES:
+                raise SkipGSError(sentence)
+            warnings.warn(sentence, RuntimeWarning, stacklevel=2)
+
+    def _scale(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        factor = self._factor
+        if factor is None or threading.get_ident() != self._thread:
             return
         key = id(optimizer)
-        self._depth[key] = self._depth.get(key, 0) + 1
-        if self._depth[key] > 1:
+        if key in self._under_way:
+            self._under_way[key].depth += 1  # a step can call the step of its base class
             return
-        # An optimizer can be wrapped in another one, which has the same groups.
-        scaled = {id(group) for step in self._under_way.values() for group, _ in step.before}
-        groups = [group for group in optimizer.param_groups if id(group) not in scaled]
-        self.shown.see(groups, names[0])
+        name = None
+        if self.only is not None:
+            found = self._own.get(key)
+            if found is None or found[1] is not optimizer:
+                found = self._find_own(optimizer)
+                if found is None:
+                    return
+            name = found[0]
+        self._unstepped = 0
+        if self._under_way:
+            self._pass_on(optimizer)
+        step = self._steps.get(key)
+        if step is None or step.optimizer() is not optimizer:
+            self._steps = {at: one for at, one in self._steps.items() if one.optimizer() is not None}
+            step = self._steps[key] = _Steps(optimizer, name, self._watch(optimizer))
+        elif not step.facts.fits(optimizer, name):
+            step.facts = OptimizerFacts(optimizer, name)
+        facts = step.facts
+        groups = facts.groups
+        if self._under_way:  # an optimizer can be wrapped in another one, which has the same groups
+            scaled = {id(group) for other in self._under_way.values() for group, _, _ in other.before}
+            groups = [one for one in groups if id(one.group) not in scaled]
+        if not self.shown.complete:
+            self.shown.see([one.group for one in groups], name)
         # Without names a camera's position has the shape of a Gaussian's, but there are fewer.
-        self._rows_now = max([self._rows_now, *map(len, positions(groups, names[0]))])
-        before = [(group, {name: group[name] for name in SETTINGS if name in group}) for group in groups]
-        self._under_way[key] = _Step(before)
-        if optimizer not in self._watched:
-            self._watched[optimizer] = self._watch(optimizer)
-        for group in groups:
-            longer = self._of_gaussians(group, names[0])
-            if self._evenly:
-                if longer and "lr" in group:
-                    group["lr"] = group["lr"] * self._factor
-                continue
-            if "lr" in group:
-                factor = group_factor(group, self._factor, names[0]) if longer else BESIDE * min(self._factor, 1.0)
-                group["lr"] = group["lr"] * factor
-            if longer and "betas" in group:
-                first, second, *others = group["betas"]
-                group["betas"] = (first, min(second, SQUARES_KEPT), *others)
+        for param in facts.positions:
+            if param.shape[0] > self._rows_now:
+                self._rows_now = param.shape[0]
+        rows = self._rows_now if self._rows_now > self._rows else self._rows
+        self._under_way[key] = step
+        step.depth = 1
+        capped = 1.0 if factor > 1.0 else factor
+        evenly = self._evenly
+        for one in groups:
+            group = one.group
+            longer = one.of_gaussians(rows)
+            if evenly:
+                if not longer:
+                    continue
+                times = factor
+            elif longer:
+                times = capped if one.part is None else one.part * factor
+            else:
+                times = BESIDE * capped
+            rate, betas = group.get("lr"), group.get("betas")
+            step.before.append((group, rate, betas))
+            if betas is not None and longer and not evenly:
+                group["betas"] = one.short if betas is one.betas else one.shorter(betas, SQUARES_KEPT)
+                if step.memory_stays:
+                    times = max(min(times, 1.0), times * shorter_memory(one.betas, SQUARES_KEPT))
+            if rate is not None:
+                group["lr"] = rate * times
+            if longer and not step.judged and times != 1.0 and one.has_gradient():
+                step.longer.append(group)
+        if step.longer or step.literal is not None:
+            step.prepare(optimizer)
 
-    def _of_gaussians(self, group: dict[str, Any], name: str | None) -> bool:
-        rows = max(self._rows, self._rows_now)
-        if rows:
-            return all(param.shape[:1] == (rows,) for param in group["params"])
-        # Inria's exposures step before the positions do. Groups with names are a model's, of anchors for example.
-        shapes = [tuple(param.shape[1:]) for param in group["params"]]
-        known = group.get("name", name) is not None
-        return known or all(shape in OF_A_GAUSSIAN or (len(shape) == 2 and shape[1] == 3) for shape in shapes)
+    def _find_own(self, optimizer: torch.optim.Optimizer) -> tuple[str | None, torch.optim.Optimizer] | None:
+        """Name of an optimizer among those that are meant, and itself; None if it is not meant."""
+        assert self.only is not None
+        own = self.only()
+        named = own.items() if isinstance(own, Mapping) else ((None, one) for one in own)
+        self._own = {id(one): (name, one) for name, one in reversed([*named])}
+        return self._own.get(id(optimizer))
+
+    def _pass_on(self, optimizer: torch.optim.Optimizer) -> None:
+        """An optimizer that is wrapped in another one steps inside its step, with the same groups."""
+        own = {id(group) for group in optimizer.param_groups}
+        for other in self._under_way.values():
+            if other.watched is not None and any(id(one) in own or id(one.group) in own for one in other.watched):
+                other.stop_watching()
 
     def _put_back(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        key = id(optimizer)
-        if key not in self._depth:
+        step = self._under_way.get(id(optimizer))
+        if step is None:
             return
-        self._depth[key] -= 1
-        if self._depth[key] == 0:
-            del self._depth[key]
-            self._under_way.pop(key).put_back()
+        step.depth -= 1
+        if step.depth == 0:
+            del self._under_way[id(optimizer)]
+            step.put_back()
+            if step.watched is not None:
+                step.judge(optimizer)
 
     def _watch(self, optimizer: torch.optim.Optimizer) -> list[RemovableHandle]:
         """Put the trainer's settings back before anybody else looks at them."""
-        ends = optimizer.register_step_post_hook(self._put_back_first)
+        ends = optimizer.register_step_post_hook(self._put_back)
         # The trainer's own hooks after a step, of a scheduler for example, find and set its rates.
         optimizer._optimizer_step_post_hooks.move_to_end(ends.id, last=False)  # type: ignore[attr-defined]
         # A checkpoint is written although a step raised: it holds the trainer's rates, too.
         return [ends, optimizer.register_state_dict_pre_hook(self._put_back_all)]
-
-    def _put_back_first(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        if self._depth.get(id(optimizer)) == 1:
-            self._under_way[id(optimizer)].put_back()
 
     def _put_back_all(self, _: torch.optim.Optimizer) -> None:
         for step in self._under_way.values():
             step.put_back()
 
 
-class _Step:
-    """A step under way, whose groups have other settings than the trainer's.
+class _Steps:
+    """The steps of one optimizer: facts about its groups, and the settings that its trainer has while one is under way.
 
-    Args:
-        before: Groups, and what the trainer has set there.
+    Attributes:
+        optimizer: a weak reference to it.
+        facts: about its groups.
+        handles: of hooks on it.
+        depth: calls of its `step` within each other.
+        before: groups, and the rate and betas that the trainer has set there; None for a setting that it lacks.
+        longer: groups with a gradient whose rates are other ones now; filled until it is judged.
+        watched: copies in place of all groups, in the first longer step of an optimizer that is not PyTorch's.
+        judged: whether it is known what its step reads.
+        literal: replaces betas that its step passes as literal numbers; None if it passes none.
+        memory_stays: whether its step keeps a memory of squares that cannot be made shorter from outside.
     """
 
-    def __init__(self, before: list[tuple[dict[str, Any], dict[str, Any]]]) -> None:
-        self.before = before
-        self._scaled = True
+    __slots__ = (
+        *("_until_end", "before", "depth", "facts", "handles", "judged", "literal"),
+        *("longer", "memory_stays", "optimizer", "watched"),
+    )
+
+    def __init__(self, optimizer: torch.optim.Optimizer, name: str | None, handles: list[RemovableHandle]) -> None:
+        self.optimizer = weakref.ref(optimizer)
+        self.facts = OptimizerFacts(optimizer, name)
+        self.handles = handles
+        self.depth = 0
+        self.before: list[tuple[dict[str, Any], Any, Any]] = []
+        self.longer: list[dict[str, Any]] = []
+        self.watched: list[WatchedGroup] | None = None
+        self.judged = is_torchs(optimizer)
+        self.literal: LiteralBetas | None = None
+        self.memory_stays = False
+        self._until_end: contextlib.ExitStack | None = None
+
+    def prepare(self, optimizer: torch.optim.Optimizer) -> None:
+        """See what the first longer step reads; replace literal betas, which it may pass on."""
+        self._until_end = contextlib.ExitStack()
+        if not self.judged:
+            betas = next((betas for _, _, betas in self.before if betas is not None), None)
+            self.literal = None if betas is None else LiteralBetas(optimizer, betas, SQUARES_KEPT)
+            self.watched = watch(optimizer.param_groups)
+            self._until_end.callback(unwatch, optimizer.param_groups)
+        if self.literal is not None:
+            self._until_end.enter_context(self.literal.in_place())
+
+    def stop_watching(self) -> None:
+        """Nothing is to be said of this step, whose groups another optimizer inside it uses."""
+        if self._until_end is not None:
+            self._until_end.close()
+        self.watched = self.literal = None
 
     def put_back(self) -> None:
         """Once: what the trainer sets afterwards stays."""
-        if self._scaled:
-            for group, settings in self.before:
-                group.update(settings)
-        self._scaled = False
+        for group, rate, betas in self.before:
+            if rate is not None:
+                group["lr"] = rate
+            if betas is not None:
+                group["betas"] = betas
+        self.before.clear()
+        if self._until_end is not None:
+            self._until_end.close()
+            self._until_end = None
+
+    def judge(self, optimizer: torch.optim.Optimizer) -> None:
+        """Say what the watched step read, which has ended.
+
+        Raises:
+            SkipGSError: Not the learning rates: larger steps never arrive.
+        """
+        watched, self.watched = self.watched or [], None
+        longer = [group for group in watched if any(group.group is one for one in self.longer)]
+        self.judged = True
+        self.longer.clear()
+        kind = type(optimizer).__name__
+        if any("lr" not in group.read or "lr" not in group for group in longer):
+            raise SkipGSError(
+                f"Steps of {kind} do not read the lr of its param_groups, so they are not larger; let it read them, or "
+                "give compensate=False."
+            )
+        fixed = [group for group in longer if "betas" in group and "betas" not in group.read]
+        if fixed and self.literal is not None and self.literal.replaced:
+            return
+        self.literal, self.memory_stays = None, bool(fixed)
+        if fixed:
+            bound = shorter_memory(fixed[0].group["betas"], SQUARES_KEPT)
+            warnings.warn(
+                f"Steps of {kind} do not read the betas of its param_groups, so squares of gradients cannot be "
+                f"forgotten sooner: its learning rates are raised {bound:.2f} times as far.",
+                RuntimeWarning,
+                stacklevel=2,
+            )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Any
 
+from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, ONE_CYCLE, EarlyStopping, watched_views
@@ -80,7 +81,8 @@ class Refining:
                 )
             self.share = refining_share(total, len(views))
         assert self.share is not None
-        if self._auto and views is not None and self.stopping is None:
+        # Several processes train on different views at a time, so none can be kept out of training and watched.
+        if self._auto and views is not None and self.stopping is None and distributed.group_size() == 1:
             self.watched = watched_views(views, self.share * total)
         if not self._scales(keeps_rates):
             if self.stopping is not None:

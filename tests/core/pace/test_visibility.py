@@ -97,4 +97,4 @@ def test_other_optimizers_are_not_looked_at():
     rates.rest()
     own.step()
     rates.remove()
-    assert rates.shown.state_dict() == [0.25, 1]
+    assert rates.shown.state_dict() == [0.25, 1, 1, 0, 0]

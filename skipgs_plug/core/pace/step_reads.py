@@ -1,0 +1,180 @@
+"""Whether an optimizer's step uses the settings of its groups, without which larger steps never arrive."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import types
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+
+MISSING = object()
+
+
+class WatchedGroup(dict[str, Any]):
+    """A copy of a parameter group, in its place for one step, that knows what was read of it.
+
+    Attributes:
+        group: the group itself, which takes all that is written.
+        read: keys that were read.
+    """
+
+    def __init__(self, group: dict[str, Any]) -> None:
+        super().__init__(group)
+        self.group = group
+        self.read: set[str] = set()
+
+    def __getitem__(self, key: str) -> Any:
+        self.read.add(key)
+        return super().__getitem__(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        self.read.add(key)
+        return super().get(key, default)
+
+    def __iter__(self) -> Iterator[str]:
+        self.read.update(super().keys())
+        return super().__iter__()
+
+    def keys(self) -> Any:
+        self.read.update(super().keys())
+        return super().keys()
+
+    def items(self) -> Any:
+        self.read.update(super().keys())
+        return super().items()
+
+    def values(self) -> Any:
+        self.read.update(super().keys())
+        return super().values()
+
+    def copy(self) -> dict[str, Any]:
+        self.read.update(super().keys())
+        return dict(super().items())
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        super().__setitem__(key, value)
+        self.group[key] = value
+
+    def setdefault(self, key: str, default: Any = None) -> Any:
+        if key not in self:
+            self[key] = default
+        return self[key]
+
+    def update(self, *args: Any, **kwargs: Any) -> None:
+        for key, value in dict(*args, **kwargs).items():
+            self[key] = value
+
+    def pop(self, key: str, default: Any = MISSING) -> Any:
+        self.read.add(key)
+        value = super().pop(key) if default is MISSING else super().pop(key, default)
+        self.group.pop(key, None)
+        return value
+
+
+def watch(groups: list[dict[str, Any]]) -> list[WatchedGroup]:
+    """Put watched copies in place of the groups of an optimizer."""
+    watched = [WatchedGroup(group) for group in groups]
+    groups[:] = watched
+    return watched
+
+
+def unwatch(groups: list[dict[str, Any]]) -> None:
+    """Put the groups themselves back."""
+    groups[:] = [group.group if isinstance(group, WatchedGroup) else group for group in groups]
+
+
+def is_torchs(optimizer: torch.optim.Optimizer) -> bool:
+    """Whether its step is one of PyTorch's own, which read all settings."""
+    return str(getattr(inspect.unwrap(type(optimizer).step), "__module__", "")).startswith("torch.optim")
+
+
+def shorter_memory(betas: tuple[Any, ...], second: float) -> float:
+    """Factor on the rate that bounds a step as a shorter memory does, where the memory stays.
+
+    By the gradient of one view a parameter moves its rate over the root of 1 - beta2 at most.
+    """
+    return min(1.0, math.sqrt((1.0 - betas[1]) / (1.0 - second))) if betas[1] > second else 1.0
+
+
+class LiteralBetas:
+    """Gives a step that passes its betas as literal numbers to an extension other ones.
+
+    `SparseGaussianAdam` of the accelerated rasterizers calls `_C.adamUpdate(..., lr, 0.9, 0.999, eps, N, M)`: `_C` is a
+    global name of the module of its `step`, and for the length of a step it is another object, whose functions replace
+    the pair among their arguments.
+
+    Args:
+        optimizer: Whose step is meant.
+        betas: The pair that it passes.
+        second: What takes the place of the second.
+
+    Attributes:
+        replaced: calls in which the pair was replaced, so far.
+    """
+
+    def __init__(self, optimizer: torch.optim.Optimizer, betas: tuple[float, float], second: float) -> None:
+        self._betas = (float(betas[0]), float(betas[1]))
+        self._second = second
+        self.replaced = 0
+        step = inspect.unwrap(type(optimizer).step)
+        self._globals: dict[str, Any] = getattr(step, "__globals__", {})
+        names = _names(getattr(step, "__code__", None))
+        self._called = [name for name in names if name in self._globals and _is_foreign(self._globals[name])]
+
+    @contextmanager
+    def in_place(self) -> Iterator[None]:
+        """Replace the pair inside the block."""
+        before = {name: self._globals[name] for name in self._called}
+        self._globals.update({name: _Caller(value, self._call) for name, value in before.items()})
+        try:
+            yield
+        finally:
+            self._globals.update(before)
+
+    def _call(self, function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        given = list(args)
+        for place, value in enumerate(args):
+            if isinstance(value, tuple) and value[:2] == self._betas:
+                given[place] = (value[0], self._second, *value[2:])
+                break
+            if _is_number(value) and (value, *args[place + 1 : place + 2]) == self._betas:
+                given[place + 1] = self._second
+                break
+        else:
+            return function(*args, **kwargs)
+        self.replaced += 1
+        return function(*given, **kwargs)
+
+
+class _Caller:
+    """Stands for a module, or a function of one, whose calls go through `call`."""
+
+    def __init__(self, target: Any, call: Any) -> None:
+        self._target, self._through = target, call
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self._through(self._target, args, kwargs)
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._target, name)
+        return _Caller(value, self._through) if callable(value) and not isinstance(value, type) else value
+
+
+def _names(code: types.CodeType | None) -> list[str]:
+    return [] if code is None else list(code.co_names)
+
+
+def _is_foreign(value: Any) -> bool:
+    if isinstance(value, type):
+        return False
+    name = value.__name__ if isinstance(value, types.ModuleType) else getattr(value, "__module__", None)
+    called = isinstance(value, types.ModuleType) or callable(value)
+    return called and str(name or "").split(".")[0] not in ("torch", "math", "builtins", "numpy")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float)
