@@ -21,6 +21,7 @@ class LoopCode(NamedTuple):
     Attributes:
         place: file of the script, or name of the module, for sentences.
         names: global names of the script, and every global and attribute that its function `training` uses.
+        functions: names of its functions and classes.
         used: every global and attribute that `training` uses, and the functions of the script that it calls;
             none where there is no such function.
         repeated: of these, the ones used inside the loop itself or by functions that it calls.
@@ -31,6 +32,7 @@ class LoopCode(NamedTuple):
 
     place: str
     names: frozenset[str]
+    functions: frozenset[str]
     used: frozenset[str] = frozenset()
     repeated: frozenset[str] = frozenset()
     keywords: frozenset[str] = frozenset()
@@ -68,7 +70,7 @@ class LoopCode(NamedTuple):
         cls, place: str, own: set[str], functions: Mapping[str, types.CodeType], syntax: ast.FunctionDef | None
     ) -> LoopCode:
         if LOOP not in functions:
-            return cls(place, frozenset(own))
+            return cls(place, frozenset(own), frozenset(functions))
         training = functions[LOOP]
         repeated, stored = _in_loop(training)
         called = _called(repeated, functions)
@@ -86,6 +88,7 @@ class LoopCode(NamedTuple):
         return cls(
             place,
             frozenset(own | of_loop),
+            frozenset(functions),
             frozenset(of_loop | of_called),
             frozenset(repeated | of_called),
             keywords,

@@ -41,6 +41,8 @@ BUILTIN = {
     "inria": "skipgs_plug.adapters.inria:Inria",
 }
 
+SHOWN = 6  # functions of an unknown script that are named, so that it is one sentence
+
 _registered: dict[str, type[AbstractAdapter]] = {}
 
 
@@ -114,7 +116,16 @@ def find_script_adapter(script: Path) -> type[AbstractAdapter]:
         adapter = get_adapter(candidate)
         if adapter.recognises_script(code):
             return adapter
-    raise UnknownTrainerError(f"No adapter knows {script}; name one of {', '.join(adapter_names())} instead of auto.")
+    if code.used:
+        found = "a function training(), but no GaussianModel"
+    elif functions := sorted(name for name in code.functions if not name.startswith("_")):
+        found = f"no function training(), but {', '.join(functions[:SHOWN])}{' ...' if functions[SHOWN:] else ''}"
+    else:
+        found = "no function at all"
+    raise UnknownTrainerError(
+        f"No adapter knows {script}, which has {found}: name the script that holds the training loop, gate that loop "
+        "by hand with SkipGate(start_iter=...) and gate.backward(loss, view, step), or write an adapter (CONTRIBUTING.md)."
+    )
 
 
 def _load(place: str) -> type[AbstractAdapter]:

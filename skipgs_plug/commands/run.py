@@ -74,7 +74,7 @@ def run(args: Args, command: list[str]) -> int:
         args = dataclasses.replace(args, adapter=find_script_adapter(source_of(command)).name)
         say(f"{script_name(command)} is run as {args.adapter}.")
     with spawned.gated_when_spawned(functools.partial(run_spawned, args, command)) as processes:
-        code, gate = run_gated(args, command, functools.partial(run_script, command))
+        code, gate = run_gated(args, command, functools.partial(run_script, command, on_cpu=args.cpu))
     verify(code, gate)
     if code == 0 and not processes and not (args.no_gate if gate is None else gate.trained):
         say(f"{script_name(command)} ended without a training iteration; nothing was gated.")
@@ -83,7 +83,7 @@ def run(args: Args, command: list[str]) -> int:
 
 def run_spawned(args: Args, command: list[str], rank: int, call: bytes) -> None:
     """What a process does that the script spawns: all of `run`, with the script's call at the end."""
-    code, gate = run_gated(args, command, lambda attach: spawned.run_call(command, attach, rank, call), rank)
+    code, gate = run_gated(args, command, lambda attach: spawned.run_call(command, attach, rank, call, args.cpu), rank)
     if code:
         sys.exit(code)
     verify(code, gate)

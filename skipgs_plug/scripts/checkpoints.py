@@ -42,6 +42,7 @@ class Checkpoints:
         self._search = resume == "auto"
         self._given = None if resume in ("auto", "off") else Path(resume)
         self._found: list[Path] = []
+        self._without: list[Path] = []  # checkpoints that were loaded and have no state beside them
         if self._given is not None:
             _read(self._given)
 
@@ -58,8 +59,9 @@ class Checkpoints:
 
         @functools.wraps(load)
         def load_and_remember(f: Any, *args: Any, **kwargs: Any) -> Any:
-            if self._search and isinstance(f, (str, os.PathLike)) and _beside(Path(f)).is_file():
-                self._found.append(_beside(Path(f)))
+            if self._search and isinstance(f, (str, os.PathLike)):
+                beside = _beside(Path(f))
+                (self._found if beside.is_file() else self._without).append(beside)
             return load(f, *args, **kwargs)
 
         torch.save, torch.load = save_both, load_and_remember
@@ -81,6 +83,7 @@ class Checkpoints:
                     f"The gate state {self._given} is of iteration {content['gate']['step']}, but the script goes on "
                     f"with {first}: give the one beside the checkpoint that it loads, or --resume-gate off."
                 )
+            _say(f"The gate takes its state from {self._given}.")
             return content["gate"]
         refused = ""
         for path in self._found:
@@ -92,6 +95,8 @@ class Checkpoints:
                 f"The gate starts afresh: {path} is of {content['script']} and iteration {content['gate']['step']}, "
                 f"while {self._run['script']} begins with {first}."
             )
+        if not refused and self._without and first > 1:
+            refused = f"The gate starts afresh in iteration {first}: there is no {self._without[-1]}."
         if refused:
             _say(refused)
         return None

@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.scripts.import_hints import what_brings
+from skipgs_plug.scripts.import_hints import foreign_rasterizer, what_brings
 
 Attach = Callable[[], dict[str, Any]]  # see `run_script`
 
 
-def run_script(command: Sequence[str], attach: Attach | None = None) -> int:
+def run_script(command: Sequence[str], attach: Attach | None = None, on_cpu: bool = False) -> int:
     """Execute an unmodified script in its own checkout and give its exit code.
 
     The script sees its own folder first on `sys.path`, its own `sys.argv`, and `__name__ == "__main__"`.
@@ -33,20 +33,25 @@ def run_script(command: Sequence[str], attach: Attach | None = None) -> int:
             Or the name of a command that an installed package brings, such as `ns-train`, and its arguments.
         attach: Called where the script would be: its folder is on `sys.path`, nothing of it is imported. Gives
             names that the script is to find among its globals.
+        on_cpu: CUDA modules are served by CPU stand-ins, which an error may be about.
 
     Raises:
         SkipGSError: There is no such script or module, or a module of the script's checkout was imported
             before from somewhere else.
     """
-    return _run(_resolve(command), attach, None)
+    return _run(_resolve(command), attach, None, on_cpu)
 
 
-def run_in_script(command: Sequence[str], attach: Attach, run: Callable[[str, dict[str, Any]], None]) -> int:
+def run_in_script(
+    command: Sequence[str], attach: Attach, run: Callable[[str, dict[str, Any]], None], on_cpu: bool = False
+) -> int:
     """As `run_script`, with `run(file of the script, names for its globals)` in place of running it."""
-    return _run(_resolve(command), attach, run)
+    return _run(_resolve(command), attach, run, on_cpu)
 
 
-def _run(program: _Program, attach: Attach | None, instead: Callable[[str, dict[str, Any]], None] | None) -> int:
+def _run(
+    program: _Program, attach: Attach | None, instead: Callable[[str, dict[str, Any]], None] | None, on_cpu: bool
+) -> int:
     with _as_main_program(program), _whole_checkpoints():
         try:
             names = {} if attach is None else attach()
@@ -59,9 +64,12 @@ def _run(program: _Program, attach: Attach | None, instead: Callable[[str, dict[
         except SkipGSError:
             raise
         except BaseException as error:
+            if on_cpu and (sentence := foreign_rasterizer(error)):
+                print(f"skipgs-plug: {sentence}", file=sys.stderr)
+                return 1
             _print_traceback(error, program)
             if isinstance(error, ModuleNotFoundError) and error.name:
-                print(f"skipgs-plug: {what_brings(error.name, program.source)}", file=sys.stderr)
+                print(f"skipgs-plug: {what_brings(error.name, program.source, on_cpu)}", file=sys.stderr)
             return 130 if isinstance(error, KeyboardInterrupt) else 1
     return 0
 

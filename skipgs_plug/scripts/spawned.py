@@ -53,7 +53,7 @@ def gated_when_spawned(enter: Enter) -> Iterator[list[int]]:
         torch.multiprocessing.spawn = spawn
 
 
-def run_call(command: Sequence[str], attach: Attach, rank: int, call: bytes) -> int:
+def run_call(command: Sequence[str], attach: Attach, rank: int, call: bytes, on_cpu: bool = False) -> int:
     """In a spawned process: import the script as Python would there, and call what the script had spawned.
 
     Args:
@@ -61,6 +61,7 @@ def run_call(command: Sequence[str], attach: Attach, rank: int, call: bytes) -> 
         attach: As for `run_script`.
         rank: Number of the process.
         call: What `gated_when_spawned` gave to `enter`.
+        on_cpu: As for `run_script`.
     """
 
     def run(script: str, names: dict[str, Any]) -> None:
@@ -70,4 +71,4 @@ def run_call(command: Sequence[str], attach: Attach, rank: int, call: bytes) -> 
         fn, args = pickle.loads(call)
         fn(rank, *args)
 
-    return run_in_script(command, attach, run)
+    return run_in_script(command, attach, run, on_cpu)

@@ -285,7 +285,9 @@ def test_auto_recognises_the_script_before_it_runs(checkout, tmp_path, capfd):
     other = tmp_path / "other.py"
     other.write_text("def main():\n    pass\n")
     assert cli.main(["run", "auto", "--", str(other)]) == cli.BAD_INPUT
-    assert "No adapter knows" in capfd.readouterr().err
+    error = capfd.readouterr().err
+    assert "other.py, which has no function training(), but main: name the script that holds the training loop" in error
+    assert "name one of" not in error and error.count("\n") == 1
 
 
 def test_wrong_adapter_is_refused_before_anything_is_imported(checkout, tmp_path, capfd):
@@ -346,3 +348,42 @@ def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
         assert cli.main(["run", "auto", "--no-gate", "--cpu", "--", checkout, str(tmp_path)]) == 0
     forget()
     assert cli.main(["run", "auto", "--cpu", "--", checkout, str(tmp_path)]) == cli.BAD_INPUT
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ("sh_degree=0,", "sh_degree=0, kernel_size=0.1,", "unexpected keyword argument 'kernel_size'"),
+        ("means2D=points,", "means2D=points, means2D_densify=points,", "unexpected keyword argument 'means2D_densify'"),
+        ("image, radii =", "image, radii, depth =", "not enough values to unpack (expected 3, got 2)"),
+        (
+            "import GaussianRasterizationSettings,",
+            "import Slang, GaussianRasterizationSettings,",
+            "import name 'Slang'",
+        ),
+    ],
+    ids=["setting", "argument", "result", "name"],
+)
+def test_rasterizer_of_a_forks_own_is_one_sentence(checkout, tmp_path, capfd, old, new, found):
+    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
+    renderer.write_text(renderer.read_text().replace(old, new))
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
+    error = capfd.readouterr().err
+    assert "has a rasterizer of its own, which --cpu has no stand-in for" in error and found in error
+    assert "Traceback" not in error
+
+
+def test_no_advice_to_give_what_is_given(checkout, tmp_path, capfd):
+    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
+    renderer.write_text("import diff_plane_rasterization\n" + renderer.read_text())
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
+    error = capfd.readouterr().err
+    assert "diff_plane_rasterization is a CUDA extension that has no CPU stand-in" in error
+    assert "with --cpu before" not in error
+
+
+def test_a_resumed_run_without_a_state_says_so(train, capfd):
+    _, off = train("off", "--save", gate=["--no-gate"])
+    code, _ = train("on", "--start", str(off / "chkpnt40.pth"))
+    state = off / "chkpnt40.pth.skipgs.json"
+    assert code == 0 and f"The gate starts afresh in iteration 41: there is no {state}." in capfd.readouterr().err

@@ -9,6 +9,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+# COLMAP's camera models by their numbers.
+MODELS = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "OPENCV_FISHEYE",
+    "FULL_OPENCV",
+    "FOV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+)
+
 
 class Image(NamedTuple):
     """A registered image: its pose takes world points to the camera."""
@@ -24,10 +39,11 @@ class Image(NamedTuple):
 
 
 class Camera:
-    """A camera: `camera_type` names COLMAP's model; `fx fy cx cy` in pixels, and its distortion `k1 k2 p1 ...`."""
+    """A camera: `fx fy cx cy` in pixels, its distortion `k1 k2 p1 ...`, and `camera_type`, the number of its model."""
 
     def __init__(self, camera: Any) -> None:
-        self.camera_type = getattr(camera.model, "name", str(camera.model))
+        # gsplat compares it with numbers alone when it warns of distortion.
+        self.camera_type = MODELS.index(getattr(camera.model, "name", str(camera.model)))
         self.width, self.height = camera.width, camera.height
         K = camera.calibration_matrix()
         self.fx, self.fy, self.cx, self.cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
