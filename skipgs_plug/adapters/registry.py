@@ -124,7 +124,8 @@ def find_script_adapter(script: Path) -> type[AbstractAdapter]:
         found = "no function at all"
     raise UnknownTrainerError(
         f"No adapter knows {script}, which has {found}: name the script that holds the training loop, gate that loop "
-        "by hand with SkipGate(start_iter=...) and gate.backward(loss, view, step), or write an adapter (CONTRIBUTING.md)."
+        "by hand with SkipGate(start_iter=...) and gate.backward(loss, view, step), or write an adapter "
+        "(CONTRIBUTING.md)."
     )
 
 

@@ -358,8 +358,8 @@ def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
         ("image, radii =", "image, radii, depth =", "not enough values to unpack (expected 3, got 2)"),
         (
             "import GaussianRasterizationSettings,",
-            "import Slang, GaussianRasterizationSettings,",
-            "import name 'Slang'",
+            "import S, GaussianRasterizationSettings,",
+            "import name 'S'",
         ),
     ],
     ids=["setting", "argument", "result", "name"],
