@@ -1,4 +1,4 @@
-"""`skipgs-plug demo`: densify once, refine from that snapshot ungated, gated and in fewer iterations, compare."""
+"""`skipgs-plug demo`: densify once, refine from that snapshot as it is, gated and in fewer iterations, compare."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from skipgs_plug.trainer.synthetic import make_scene
 
 @dataclass
 class Args:
-    """Train a scene the package makes itself: ungated, with the paper's gate, and in fewer iterations. No download."""
+    """Train a scene the package makes itself: as it is, with the paper's gate, in fewer iterations. No download."""
 
     out: str = "skipgs_demo"
     """Folder for models, pictures and numbers."""
@@ -40,8 +40,8 @@ class Args:
     """No progress bars."""
 
 
-# Arguments of the gate by name of the refinement; None for none.
-GATES: dict[str, dict[str, Any] | None] = {"ungated": None, "gated": {}, "thinned": {"refine_share": 0.4}}
+# Arguments of the gate by name of the refinement, as in the bench; None for the trainer's own.
+GATES: dict[str, dict[str, Any] | None] = {"own": None, "gate": {}, "refine_share=0.4": {"refine_share": 0.4}}
 
 
 @dataclass
@@ -122,9 +122,9 @@ def table(results: list[Result], trainer: Trainer) -> str:
         rows.append(
             (r.name, f"{r.t_post:.1f}", f"{r.t_total:.1f}", f"{rate:.1f}", str(r.run), str(r.skipped), psnr, ssim)
         )
-    lines = ["".join(f"{cell:>11}" for cell in row) for row in rows]
-    plain, gated, thinned = results
-    saved = [100 * (1 - one.t_post / plain.t_post) for one in (gated, thinned)]
+    lines = [f"{name:>18}" + "".join(f"{cell:>11}" for cell in row) for name, *row in rows]
+    plain, *others = results
+    saved = [100 * (1 - one.t_post / plain.t_post) for one in others]
     return "\n".join(
         [
             "",
