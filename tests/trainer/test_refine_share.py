@@ -93,3 +93,18 @@ def test_exposures_take_shorter_steps_not_larger_ones(scene) -> None:
     refined = [part[step] for step in sorted(part) if step >= trainer.refine_stop_iter]
     assert all(value == 1.0 for step, value in part.items() if step < trainer.refine_stop_iter)
     assert max(refined) == pytest.approx(0.25) and refined == sorted(refined, reverse=True) and refined[-1] < 0.05
+
+
+def test_a_run_that_is_trained_in_parts_is_planned_as_a_whole(scene) -> None:
+    """The first loop says where it ends, not where the run does: events of later parts are known all the same."""
+    config = TrainConfig(max_steps=600, seed=3)  # densification to 300, events at 100 and 200
+    whole, parted = Trainer(config, scene), Trainer(config, scene)
+    with SkipGate(whole, share=0.4) as one:
+        whole.train(progress=False)
+    with SkipGate(parted, share=0.4) as other:
+        for until in (60, 150, 320, 600):
+            parted.train(until=until, progress=False)
+    assert other.report()["growing"] == one.report()["growing"]
+    assert one.report()["growing"]["events_run"] == 2
+    assert (parted.step, parted.ran) == (whole.step, whole.ran)
+    assert all(torch.equal(a, b) for a, b in zip(left(whole), left(parted), strict=True))

@@ -166,9 +166,11 @@ class Phased(Pace):
         if self.refining.first is None:
             self.refining.first = max(self._start, number)
         # Of a run that goes on, iterations behind it too: conditions are judged by how often they hold.
-        refined = range(self.refining.first, loop.numbers.stop)
+        # A trainer that is trained in parts, train(until=1000) first, has more numbers than its first loop.
+        end = loop.numbers.stop if loop.source is not None else max(loop.numbers.stop, self._last + 1)
+        refined = range(self.refining.first, end)
         begun = number if self.growing is None or self.growing.first is None else self.growing.first
-        grown = range(0) if self.growing is None else range(begun, min(self._start, loop.numbers.stop))
+        grown = range(0) if self.growing is None else range(begun, min(self._start, end))
         found: list[dict[str, set[int]]] = [{}, {}]
         if loop.source is not None and self._config.always is None:
             code, names = loop.source
