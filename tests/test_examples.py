@@ -1,6 +1,7 @@
 """Every example runs on the CPU: the loops as they are, the others on checkouts made of the look-alikes."""
 
 import difflib
+import importlib
 import json
 import runpy
 import sys
@@ -8,6 +9,8 @@ from pathlib import Path
 
 import cases
 import pytest
+
+from skipgs_plug.adapters.registry import find_script_adapter
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 LOOKALIKES = Path(__file__).parent / "adapters"
@@ -143,8 +146,56 @@ def test_installed_command_is_run_gated(example, run_example, tmp_path, monkeypa
     assert report["iterations"] == 60 and report["backwards_skipped"] > 0
 
 
+# Script, module that it imports its trainer from, and the names that it has there.
+OBJECTS = {
+    "litegs": ("example_train.py", "litegs/training/trainer.py", "start"),
+    "faster_gs": ("scripts/train.py", "Methods/FasterGS/Trainer.py", "FasterGSTrainer"),
+    "edgs": ("train.py", "source/trainer.py", "EDGSTrainer"),
+    "threedgrut": ("train.py", "threedgrut/trainer.py", "Trainer3DGRUT"),
+    "fvdb": ("train.py", "fvdb_reality_capture/training/scene_optimization_runner.py", "SceneOptimizationRunner"),
+}
+TRAINS = {
+    "litegs": "litegs.training.trainer.train()",
+    "faster_gs": "DiscoverSourcePath = Framework = None\n    FasterGSTrainer().run(None)",
+    "edgs": "EDGSTrainer().train()",
+    "threedgrut": "Trainer3DGRUT().run_training()",
+    "fvdb": "SceneOptimizationRunner().train()",
+}
+
+
+@pytest.mark.parametrize("lookalike", OBJECTS)
+def test_script_around_a_trainer_object_is_run_gated(lookalike, run_example, tmp_path, monkeypatch):
+    script, module, name = OBJECTS[lookalike]
+    source = (LOOKALIKES / "lookalikes" / f"{lookalike}.py").read_text()
+    package = tmp_path / "checkout" / module
+    package.parent.mkdir(parents=True)
+    package.write_text(source)
+    dotted = module.removesuffix(".py").replace("/", ".")
+    file = tmp_path / "checkout" / script
+    file.parent.mkdir(exist_ok=True)
+    above = "import os, sys\nsys.path.append(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))\n"
+    file.write_text(
+        f"{above if '/' in script else ''}import {dotted}\nfrom {dotted} import {name}\n"
+        f"if __name__ == '__main__':\n    {TRAINS[lookalike]}\n"
+    )
+    (tmp_path / "results").mkdir()
+    adapter = importlib.import_module(f"lookalikes.{lookalike}").ADAPTER
+    top = dotted.partition(".")[0]
+    try:
+        assert find_script_adapter(file).name == adapter
+        options = ["--warmup", "3", "--pause-iters", "4"]
+        assert run_example(f"train_{adapter}.py", "--repo", tmp_path / "checkout", *options, "--", "-s") == 0
+    finally:
+        for loaded in [one for one in sys.modules if one.partition(".")[0] == top]:
+            del sys.modules[loaded]
+    report = json.loads((tmp_path / "results" / "skipgs.json").read_text())
+    assert report["settings"]["adapter"] == adapter and report["backwards_skipped"] > 0
+
+
 def test_every_example_is_tested():
-    tested = {f"train_{module.ADAPTER}.py" for module in SCRIPTS.values()} | set(MODULES) | {"train_gsplat.py"}
+    objects = [importlib.import_module(f"lookalikes.{name}") for name in OBJECTS]
+    tested = {f"train_{module.ADAPTER}.py" for module in [*SCRIPTS.values(), *objects]}
+    tested |= {*MODULES, "train_gsplat.py"}
     assert {path.name for path in EXAMPLES.glob("train_*.py")} == tested
 
 

@@ -112,6 +112,19 @@ class AbstractAdapter(ABC):
         return None
 
 
+def gate_backwards_only(hooks: Hooks, adapter: AbstractAdapter) -> None:
+    """Refuse settings that leave out whole iterations, for a trainer whose loop is not counted with a range.
+
+    Raises:
+        SkipGSError: There are such settings.
+    """
+    if hooks.state.pace.leaves_out:
+        raise SkipGSError(
+            f"Adapter {adapter.name!r} cannot leave out whole iterations, since its trainer's loop does not count with "
+            "range(): leave out share and refine_share, and it gates backwards as in the paper."
+        )
+
+
 def release(hooks: Hooks, adapter: AbstractAdapter, reason: str) -> None:
     """Take the gate off a run that goes on without it, and say why: an error would throw away what was trained."""
     hooks.restore()

@@ -16,6 +16,9 @@ Views are known by image name. A gate that would start while densification still
 
 `skipgs-plug run NAME -- SCRIPT ...` takes the name, or `auto`, which reads the script and finds it. How each was
 checked beyond its last line stands in [examples/README.md](../examples/README.md).
+
+Trainers with a compiled core offer no place to attach to, since loss and backward never pass through Python: Brush
+(Rust), LichtFeld Studio and OpenSplat (C++) and Postshot (closed). The gate cannot be attached to them.
 """
 
 _WRAP = textwrap.TextWrapper(118, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)

@@ -12,7 +12,10 @@ from lookalikes import (
     absgs,
     dash_gaussian,
     deformable,
+    edgs,
+    faster_gs,
     fastgs,
+    fvdb,
     gaussianspa,
     gaussianspa_op,
     gns,
@@ -23,6 +26,7 @@ from lookalikes import (
     lightgaussian_densify_prune,
     lightgaussian_distill,
     lightgaussian_prune_finetune,
+    litegs,
     mcmc,
     mini_splatting,
     mini_splatting2,
@@ -36,6 +40,7 @@ from lookalikes import (
     speedy_splat,
     step_trainer,
     taming,
+    threedgrut,
     two_d_gs,
 )
 from lookalikes.splats import NAMES, log, new_log
@@ -59,6 +64,7 @@ class Case:
         settled: iteration from which nothing changes when everything is skipped.
         pending: gradients are left over when skipping begins, and are to be applied right before `settled`.
         views: keys of all training views.
+        leaves_out: its loop counts with a range, so that whole iterations can be left out.
     """
 
     name: str
@@ -67,7 +73,8 @@ class Case:
     resume: Callable[[Any], tuple[Any, Callable[..., Any]]] | None = None
     settled: int | None = None
     pending: bool = False
-    views: tuple[str, ...] = tuple(NAMES)
+    views: tuple[Any, ...] = tuple(NAMES)
+    leaves_out: bool = True
 
     @property
     def iterations(self) -> range:
@@ -124,7 +131,43 @@ def pip() -> Case:
         dataset = step_trainer.dataset()
         return trainer, lambda last=step_trainer.LAST: step_trainer.training(trainer, dataset, last)
 
-    return Case("step_trainer", step_trainer, make, resume)
+    return Case("step_trainer", step_trainer, make, resume, leaves_out=False)
+
+
+def runner(
+    name: str,
+    module: ModuleType,
+    cls: type,
+    method: str,
+    views: Any = NAMES,
+    again: Callable[[Any], None] = lambda trainer: None,
+    settled: int | None = None,
+    **options: Any,
+) -> Case:
+    """A trainer object whose method trains up to an iteration; resumed as a copy, which `again` prepares."""
+
+    def trained(trainer: Any) -> tuple[Any, Callable[..., Any]]:
+        arguments = (None,) if method == "run" else ()
+        return trainer, lambda last=module.LAST: getattr(trainer, method)(*arguments, last=last)
+
+    def resume(result: Any) -> tuple[Any, Callable[..., Any]]:
+        trainer = copy.deepcopy(result)
+        again(trainer)
+        return trained(trainer)
+
+    return Case(name, module, lambda: trained(cls(**options)), resume, settled, views=tuple(views), leaves_out=False)
+
+
+def lite() -> Case:
+    def make() -> tuple[Any, Callable[..., Any]]:
+        return litegs, lambda last=litegs.LAST: litegs.train(last)
+
+    return Case("litegs", litegs, make, leaves_out=False)
+
+
+def passes_over(trainer: Any) -> None:
+    """A resumed runner takes all minibatches again, and trains on those that are new."""
+    trainer._start_step = trainer._global_step
 
 
 SCRIPTS = [
@@ -164,6 +207,13 @@ CASES = [
     gsplat("gsplat_head_mcmc", gsplat_runner.HeadRunner, gsplat_runner.MCMCStrategy),
     gsplat("gsplat_batch", gsplat_runner.Runner, gsplat_runner.DefaultStrategy, batch_size=2),
     pip(),
+    lite(),
+    runner("faster_gs", faster_gs, faster_gs.FasterGSTrainer, "run", views=[str(i) for i in range(len(NAMES))]),
+    runner("faster_gs_mcmc", faster_gs, faster_gs.FasterGSTrainer, "run", ["0", "1", "2", "3", "4"], mcmc=True),
+    runner("edgs", edgs, edgs.EDGSTrainer, "train"),
+    runner("3dgrut", threedgrut, threedgrut.Trainer3DGRUT, "run_training"),
+    runner("3dgrut_mcmc", threedgrut, threedgrut.Trainer3DGRUT, "run_training", strategy=threedgrut.MCMCStrategy),
+    runner("fvdb", fvdb, fvdb.SceneOptimizationRunner, "train", ["0", "1", "2", "3", "4"], passes_over, 26),
     studio("nerfstudio"),
     studio("nerfstudio_mcmc", strategy=gsplat_runner.MCMCStrategy()),
     studio("nerfstudio_scaled", scaled=True, max_norm=1.0),

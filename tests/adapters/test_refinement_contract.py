@@ -9,9 +9,9 @@ from lookalikes import inria, step_trainer
 from lookalikes.splats import Log, log, new_log
 
 from skipgs_plug import SkipGate
-from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 
-LOOPS = [case for case in CASES if case.name != "step_trainer"]  # its loop is the script's, not the trainer's
+LOOPS = [case for case in CASES if case.leaves_out]
 each = pytest.mark.parametrize("case", LOOPS, ids=lambda case: case.name)
 resumable = [case for case in LOOPS if case.resume]
 SHARE = 0.4
@@ -173,3 +173,14 @@ def test_a_loop_around_a_pip_trainer_is_written_with_the_gates_iterations():
     trainer = step_trainer.make()
     with SkipGate(trainer, refine_share=SHARE), pytest.raises(AdapterMismatchError, match="No loop over range"):
         train(iter(list(range(1, 61))), trainer)
+
+
+ONLY_BACKWARDS = [case for case in CASES if not case.leaves_out and case.name != "step_trainer"]
+
+
+@pytest.mark.parametrize("case", ONLY_BACKWARDS, ids=lambda case: case.name)
+def test_a_loop_that_cannot_be_shortened_is_refused_before_anything_runs(case, begun):
+    trainer, _ = case.make()
+    with pytest.raises(SkipGSError, match="cannot leave out whole iterations"):
+        SkipGate(trainer, refine_share=SHARE)
+    assert begun == [] and torch.Tensor.backward.__module__ == "torch._tensor"

@@ -1,0 +1,77 @@
+"""EDGS: correspondences in place of densification, in a trainer object around Inria 3DGS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, released_on_error
+from skipgs_plug.adapters.import_hook import when_imported
+from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.facts import TrainerFacts
+from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.views import view_key
+
+MODULE, STEP = "source.trainer", "train_step_gs"
+EXPECTED = (STEP, "train", "GS", "gs_step", "training_config", "scene")
+EVENTS = ("prune_points", "reset_opacity", "training_setup")
+
+
+class EDGS(AbstractAdapter):
+    """One `train_step_gs`: learning rates, forward of `GS`, backward, step. Densifying or pruning follows it.
+
+    With `no_densify` it prunes after every iteration before `densify_until_iter`, the last of which pauses the gate.
+    """
+
+    name = "edgs"
+    checked = "CompVis/EDGS eb21ad5 (its loop read, and a look-alike)"
+    project = "[EDGS](https://github.com/CompVis/EDGS)"
+    gated = "From `gs.opt.densify_until_iter` on: until then it densifies, or prunes after every iteration."
+    left_alone = (
+        "Whole iterations cannot be left out: its loop counts with tqdm's `trange`. Needs CUDA: its initialization "
+        "matches images with a network."
+    )
+
+    @classmethod
+    def matches(cls, trainer: Any) -> bool:
+        return all(hasattr(trainer, name) for name in EXPECTED)
+
+    @classmethod
+    def recognises_script(cls, code: LoopCode) -> bool:
+        return "EDGSTrainer" in code.names
+
+    def attach_script(self, hooks: Hooks) -> None:
+        gate_backwards_only(hooks, self)
+        when_imported(hooks, MODULE, lambda module: self.attach_on_call(hooks, module.EDGSTrainer, "train"))
+
+    def attach(self, hooks: Hooks) -> None:
+        trainer = self.trainer
+        if not self.matches(trainer):
+            raise AdapterMismatchError(
+                f"Adapter {self.name!r} expects an EDGSTrainer with {', '.join(EXPECTED)}, as in {self.checked}."
+            )
+        gate_backwards_only(hooks, self)
+
+        def stepped(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            with released_on_error(hooks, self):
+                hooks.iteration(trainer.gs_step + 1)
+            return original(*args, **kwargs)
+
+        def rendered(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            camera = kwargs.get("viewpoint_cam", args[0] if args else None)
+            if torch.is_grad_enabled() and camera is not None:
+                hooks.view(camera.image_name)
+            return original(*args, **kwargs)
+
+        hooks.wrap(trainer, STEP, stepped)
+        hooks.wrap(trainer.GS, "forward", rendered)
+        gaussians = type(trainer.GS.gaussians)
+        hooks.events(gaussians, *(name for name in EVENTS if hasattr(gaussians, name)))
+        hooks.gate_tensor_backward(STEP)
+        self.output_folder = getattr(trainer.scene, "model_path", None)
+        end = int(trainer.training_config.densify_until_iter)
+        views = [view_key(camera.image_name) for camera in trainer.scene.getTrainCameras()]
+        hooks.ready(TrainerFacts(end, view_names=views, gradients_read_until=end))

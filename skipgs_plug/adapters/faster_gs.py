@@ -1,0 +1,83 @@
+"""Faster-GS, a method of NeRFICG: callbacks around `training_iteration`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, released_on_error
+from skipgs_plug.adapters.import_hook import when_imported
+from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.facts import TrainerFacts
+from skipgs_plug.core.hooks import Hooks
+
+MODULE, LOOP = "Methods.FasterGS.Trainer", "training_iteration"
+EXPECTED = (LOOP, "renderer", "model", "DENSIFICATION_END_ITERATION", "NUM_ITERATIONS")
+EVENTS = (
+    "adaptive_density_control",
+    "mcmc_densification",
+    "reset_opacities",
+    "importance_pruning",
+)
+
+
+class FasterGS(AbstractAdapter):
+    """An iteration begins with `renderer.render_image_training(view=...)`, and counts from 0.
+
+    The densification callback still runs in iteration `DENSIFICATION_END_ITERATION`, before its training step. MCMC's
+    noise is left out where the gradient step is: alone it is a random walk.
+    """
+
+    name = "faster_gs"
+    checked = "nerficg-project/faster-gaussian-splatting 3cb0b75 in NeRFICG c743712 (its loop read, and a look-alike)"
+    project = "[Faster-GS](https://github.com/nerficg-project/faster-gaussian-splatting)"
+    gated = (
+        "From `DENSIFICATION_END_ITERATION` + 1 on. With Speedy-Splat's pruning each later prune pauses the gate. As "
+        "in a shell: `skipgs-plug run faster_gs -- scripts/train.py -c config.yaml`, in the folder of NeRFICG."
+    )
+    left_alone = (
+        "MCMC's position noise is left out where the gradient step is. Whole iterations cannot be left out: its "
+        "callbacks hang on their numbers. Views are known by their frame's number. Needs CUDA: `--cpu` has no stand-in."
+    )
+
+    @classmethod
+    def matches(cls, trainer: Any) -> bool:
+        return all(hasattr(trainer, name) for name in EXPECTED)
+
+    @classmethod
+    def recognises_script(cls, code: LoopCode) -> bool:
+        return {"Framework", "DiscoverSourcePath"} <= code.names
+
+    def attach_script(self, hooks: Hooks) -> None:
+        gate_backwards_only(hooks, self)
+        when_imported(hooks, MODULE, lambda module: self.attach_on_call(hooks, module.FasterGSTrainer, "run"))
+
+    def attach(self, hooks: Hooks) -> None:
+        trainer = self.trainer
+        if not self.matches(trainer):
+            raise AdapterMismatchError(
+                f"Adapter {self.name!r} expects a FasterGSTrainer with {', '.join(EXPECTED)}, as in {self.checked}."
+            )
+        gate_backwards_only(hooks, self)
+
+        def rendered(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            frame = sys._getframe(2)
+            if frame.f_code.co_name == LOOP:
+                with released_on_error(hooks, self):
+                    hooks.iteration(frame.f_locals["iteration"])
+                    hooks.view(int((kwargs["view"] if "view" in kwargs else args[0]).global_frame_idx))
+            return original(*args, **kwargs)
+
+        def stepped(original: Callable[..., Any], gaussians: Any, inject_noise: bool) -> Any:
+            return original(gaussians, inject_noise=inject_noise and not hooks.state.skipped)
+
+        gaussians = type(trainer.model.gaussians)
+        hooks.wrap(trainer.renderer, "render_image_training", rendered)
+        hooks.wrap(gaussians, "post_optimizer_step", stepped)
+        hooks.events(gaussians, *(name for name in EVENTS if hasattr(gaussians, name)))
+        hooks.gate_tensor_backward(LOOP)
+        self.output_folder = str(trainer.output_directory) if hasattr(trainer, "output_directory") else None
+        end = int(trainer.DENSIFICATION_END_ITERATION)
+        hooks.ready(TrainerFacts(end + 1, max_steps=int(trainer.NUM_ITERATIONS) - 1, gradients_read_until=end))

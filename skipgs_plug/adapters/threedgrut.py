@@ -1,0 +1,105 @@
+"""3DGRUT: `Trainer3DGRUT` for 3DGRT and 3DGUT, with the strategies GS and MCMC."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, released_on_error
+from skipgs_plug.adapters.import_hook import when_imported
+from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.facts import TrainerFacts
+from skipgs_plug.core.hooks import Hooks
+
+MODULE, STEP = "threedgrut.trainer", "run_train_iter"
+EXPECTED = (STEP, "run_training", "strategy", "train_dataset", "conf")
+# Sections of the strategy's configuration that change the number or density of Gaussians.
+CHANGES = (
+    "densify",
+    "prune",
+    "prune_weight",
+    "prune_scale",
+    "density_decay",
+    "reset_density",
+    "relocate",
+    "add",
+)
+EVENTS = (
+    "densify_gaussians",
+    "prune_gaussians_opacity",
+    "prune_gaussians_scale",
+    "prune_gaussians_weight",
+    "reset_density",
+    "decay_density",
+    "relocate_gaussians",
+    "add_new_gaussians",
+)
+
+
+class ThreeDGRUT(AbstractAdapter):
+    """One `run_train_iter(global_step, ...)`, counted from 0; the strategy is told of the view before the backward.
+
+    MCMC's `perturb_gaussians` is left out where the gradient step is: alone it is a random walk.
+    """
+
+    name = "3dgrut"
+    checked = "nv-tlabs/3dgrut a37ef72 (its loop read, and a look-alike)"
+    project = "[3DGRUT](https://github.com/nv-tlabs/3dgrut)"
+    gated = "From the latest `end_iteration` of the strategy on, where nothing is densified, pruned or reset any more."
+    left_alone = (
+        "MCMC's position noise is left out where the gradient step is. Views are known by image path, or by frame "
+        "where the dataset has no paths. Whole iterations cannot be left out: epochs iterate over a "
+        "DataLoader. Needs CUDA."
+    )
+
+    @classmethod
+    def matches(cls, trainer: Any) -> bool:
+        return all(hasattr(trainer, name) for name in EXPECTED)
+
+    @classmethod
+    def recognises_script(cls, code: LoopCode) -> bool:
+        return any(name.startswith("threedgrut.") for name in code.names)
+
+    def attach_script(self, hooks: Hooks) -> None:
+        gate_backwards_only(hooks, self)
+        when_imported(hooks, MODULE, lambda module: self.attach_on_call(hooks, module.Trainer3DGRUT, "run_training"))
+
+    def attach(self, hooks: Hooks) -> None:
+        trainer = self.trainer
+        if not self.matches(trainer):
+            raise AdapterMismatchError(
+                f"Adapter {self.name!r} expects a Trainer3DGRUT with {', '.join(EXPECTED)}, as in {self.checked}."
+            )
+        gate_backwards_only(hooks, self)
+        paths = getattr(trainer.train_dataset, "image_paths", None)
+        names = None if paths is None else [str(path) for path in paths]
+
+        def stepped(original: Callable[..., Any], global_step: int, *args: Any, **kwargs: Any) -> Any:
+            with released_on_error(hooks, self):
+                hooks.iteration(global_step)
+            return original(global_step, *args, **kwargs)
+
+        def told(*args: Any, batch: Any = None, **kwargs: Any) -> None:
+            if batch is not None and batch.frame_idx >= 0:
+                hooks.view(int(batch.frame_idx) if names is None else names[int(batch.frame_idx)])
+
+        strategy = trainer.strategy
+        hooks.wrap(trainer, STEP, stepped)
+        hooks.before(strategy, "pre_backward", told)
+        hooks.events(strategy, *(name for name in EVENTS if hasattr(strategy, name)))
+        if hasattr(strategy, "perturb_gaussians"):
+            hooks.suppress_on_skip(strategy, "perturb_gaussians")
+        hooks.gate_tensor_backward(STEP)
+        self.output_folder = getattr(getattr(trainer, "tracking", None), "output_dir", None)
+        end = last_change(trainer.conf.strategy)
+        hooks.ready(
+            TrainerFacts(end, view_names=names, max_steps=int(trainer.conf.n_iterations) - 1, gradients_read_until=end)
+        )
+
+
+def last_change(strategy: Any) -> int:
+    """First step at which a strategy of this configuration changes no Gaussians, except for changes without an end."""
+    sections = [getattr(strategy, name) for name in CHANGES if getattr(strategy, name, None) is not None]
+    ends = [int(one.end_iteration) for one in sections if one.start_iteration >= 0 and one.end_iteration >= 0]
+    return max(ends, default=0)
