@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
 from pathlib import Path
 from typing import Protocol
@@ -41,10 +42,18 @@ class CudaMeter:
 
 
 class ProcessMeter:
-    """Bytes of this process that lie in memory, as Linux counts them."""
+    """Bytes of this process that lie in memory, as Linux counts them.
+
+    Memory that was freed goes back to the system first: else a run would find what another left, and seem to need none.
+    """
+
+    def __init__(self) -> None:
+        self._trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc
 
     def reset(self) -> int:
-        release_memory()  # else a run would find buffers that another left, and seem to need none
+        release_memory()
+        if self._trim is not None:
+            self._trim(0)
         CLEAR.write_text(RESET_PEAK)
         return _status("VmRSS")
 
@@ -56,6 +65,8 @@ def memory_meter(device: torch.device) -> MemoryMeter | None:
     """Return what measures on this device; None where this system does not tell."""
     if device.type == "cuda":
         return CudaMeter(device)
+    if not CLEAR.exists():
+        return None
     meter = ProcessMeter()
     try:
         meter.reset()

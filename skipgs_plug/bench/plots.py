@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skipgs_plug.bench.policies import POLICIES
+from skipgs_plug.bench.find import known_policies
 from skipgs_plug.bench.record import RunRecord, Trace
 from skipgs_plug.bench.summary import HEADLINE, Quantity, Row
-from skipgs_plug.bench.whole_policies import WHOLE_POLICIES
 from skipgs_plug.trainer.files import write_aside
 
 if TYPE_CHECKING:
@@ -48,9 +47,9 @@ def write_plots(
         save(folder / "loss_and_mean.png", loss_and_mean(gated, view_names))
 
 
-def style(policy: str) -> tuple[str, str]:
-    """Return colour and marker of a policy by its place in its table, the last ones for one that is in none."""
-    known = [*POLICIES, *(name for name in WHOLE_POLICIES if name not in POLICIES)]
+def style(policy: str, whole: bool = False) -> tuple[str, str]:
+    """Return colour and marker of a policy by its place in its table, the last for one that is not there."""
+    known = list(known_policies(whole))
     place = known.index(policy) if policy in known else zlib.crc32(policy.encode()) % len(COLOURS) - len(COLOURS)
     # The markers lag behind the colours by one in every further round, so that the pairs differ.
     return COLOURS[place % len(COLOURS)], MARKERS[(place + place // len(COLOURS)) % len(MARKERS)]
@@ -70,7 +69,7 @@ def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row], whole: boo
             continue
         seconds = np.mean([[point.seconds for point in run.points] for run in runs], axis=0)
         psnr = np.mean([[point.metrics[HEADLINE] for point in run.points] for run in runs], axis=0)
-        colour, marker = style(row.policy)
+        colour, marker = style(row.policy, whole)
         axes.plot(seconds, psnr, color=colour, marker=marker, markersize=5, linewidth=1.6, label=row.policy)
     axes.set_xlabel("training time, T_total (s)" if whole else "training time since the end of densification (s)")
     axes.set_ylabel("held-out PSNR (dB)")
@@ -84,14 +83,14 @@ def time_against_error(rows: Sequence[Row], whole: bool = False) -> Figure:
     name, label = ("t_total", "time of the whole run T_total") if whole else ("t_post", "refinement time T_post")
     paired = any("psnr_gain" in row.values for row in rows)
     figure, *axes = new_figure(9.6 if paired else 6.0, 4.4, columns=2 if paired else 1)
-    scatter(axes[0], rows, name, "psnr")
+    scatter(axes[0], rows, name, "psnr", whole)
     axes[0].set_xlabel(f"{label} (s)")
     axes[0].set_ylabel("held-out PSNR (dB)")
     axes[0].set_title(f"Time and quality, {seeds_text(rows)}", loc="left", fontsize=11)
     figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=5 if paired else 3,
                   loc="outside lower center")  # fmt: skip
     if paired:
-        scatter(axes[1], rows, f"{name}_saved", "psnr_gain")
+        scatter(axes[1], rows, f"{name}_saved", "psnr_gain", whole)
         axes[1].axhline(0, color="0.7", linewidth=0.8, zorder=0)
         axes[1].axvline(0, color="0.7", linewidth=0.8, zorder=0)
         axes[1].set_xlabel(f"{name.capitalize()} saved (%)")
@@ -100,12 +99,12 @@ def time_against_error(rows: Sequence[Row], whole: bool = False) -> Figure:
     return figure
 
 
-def scatter(axes: Axes, rows: Sequence[Row], x_name: str, y_name: str) -> None:
+def scatter(axes: Axes, rows: Sequence[Row], x_name: str, y_name: str, whole: bool) -> None:
     for row in rows:
         x, y = row.values.get(x_name), row.values.get(y_name)
         if x is None or y is None:
             continue
-        colour, marker = style(row.policy)
+        colour, marker = style(row.policy, whole)
         axes.errorbar(
             x.mean, y.mean, xerr=bar(x), yerr=bar(y), color=colour, marker=marker, markersize=8, linestyle="none",
             linewidth=1.2, capsize=3, label=row.policy,

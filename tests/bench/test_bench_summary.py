@@ -5,12 +5,11 @@ import statistics
 import pytest
 from bench_fixtures import make_bench
 
+from skipgs_plug.bench.find import known_policies
 from skipgs_plug.bench.plots import style
-from skipgs_plug.bench.policies import POLICIES
 from skipgs_plug.bench.record import REASON_CODES, Point, RunRecord, Trace
 from skipgs_plug.bench.summary import Row, ceiling, row_as_dict, row_from_dict, summarise, time_to_reach, timing_noise
 from skipgs_plug.bench.table import REFINEMENT, SHARES, cells, legend, markdown, metric_columns, notes, tables
-from skipgs_plug.bench.whole_policies import WHOLE_POLICIES
 from skipgs_plug.core import decision
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.trainer.metrics import METRICS, Metric
@@ -125,8 +124,9 @@ def test_a_row_of_a_policy_that_this_version_lacks_is_shown():
 
 
 def test_every_policy_looks_different():
-    names = {*POLICIES, *WHOLE_POLICIES}
-    assert len({style(name) for name in names}) == len(names)
+    for whole in (False, True):
+        names = known_policies(whole)
+        assert len({style(name, whole) for name in names}) == len(names)
 
 
 def test_a_new_metric_is_one_entry(scene, tmp_path, monkeypatch):

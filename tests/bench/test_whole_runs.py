@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import json
 import math
@@ -14,13 +15,14 @@ from hypothesis import strategies as st
 
 from skipgs_plug.bench.memory import memory_meter
 from skipgs_plug.bench.record import RunRecord
-from skipgs_plug.bench.refine import MOST_DB, measured
+from skipgs_plug.bench.refine import MOST_DB, measured, peak_memory
 from skipgs_plug.bench.summary import summarise
 from skipgs_plug.bench.table import WHOLE, cells, notes, searched
 from skipgs_plug.bench.thinning import periodic_numbers, random_numbers
 from skipgs_plug.bench.whole import PARTS, events, nearest, next_setting, same, search
 from skipgs_plug.bench.whole_policies import WHOLE_POLICIES
 from skipgs_plug.trainer import TrainConfig, Trainer
+from skipgs_plug.trainer.synthetic import make_scene
 
 STEPS = 200  # densification ends at 100; the scene has 6 views
 SHARE = "share=0.4"
@@ -216,3 +218,22 @@ def test_memory_of_a_part_is_seen():
     del held
     assert meter.reset() - before < 32 * 2**20
     assert meter.peak() - before < 48 * 2**20
+
+
+def test_a_run_after_another_needs_as_much_memory():
+    """The first leaves memory that was freed in the process, which the second would find."""
+    import torch
+
+    if memory_meter(torch.device("cpu")) is None or not hasattr(ctypes.CDLL(None), "malloc_trim"):
+        pytest.skip("this system does not tell peak memory, or keeps what was freed")
+    scene = make_scene(n_views=4, width=256, height=192, n_points=4000)
+    records = [RunRecord(0, "own"), RunRecord(0, "gate")]
+    trainers = [Trainer(TrainConfig(max_steps=400), scene) for _ in records]
+    for _ in range(2):
+        for trainer, record in zip(trainers, records, strict=True):
+            with peak_memory(trainer, record):
+                trainer.train(until=trainer.step + 5, progress=False)
+    first, second = (record.peak_memory for record in records)
+    held = sum(parameter.nbytes for parameter in trainers[1].splats.values()) * 3  # with moments
+    assert second > 1.5 * held
+    assert second > 0.4 * first  # which loaded kernels too
