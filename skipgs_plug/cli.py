@@ -1,4 +1,4 @@
-"""The command `skipgs-plug`: a table of commands, each imported when it is called."""
+"""The command `skipgs-plug`: a table of commands, each imported when it is called, after its options were read."""
 
 from __future__ import annotations
 
@@ -98,7 +98,9 @@ def run(arguments: list[str]) -> int:
             print("not installed: run from a checkout")
         return 0
     if name in COMMANDS:
-        return importlib.import_module(f"skipgs_plug.commands.{name}").main(rest)
+        # What it takes is read before what it needs is loaded: --help and mistakes are answered at once.
+        args = importlib.import_module(f"skipgs_plug.commands.options.{name}").parse(rest)
+        return importlib.import_module(f"skipgs_plug.commands.{name}").run(args)
     if name and not name.startswith("-"):
         return fail(f"There is no command {name!r}; the commands are {', '.join(COMMANDS)}.")
     return overview(arguments) if arguments else overview(["--help"]) or BAD_INPUT
@@ -107,14 +109,14 @@ def run(arguments: list[str]) -> int:
 def overview(arguments: list[str]) -> int:
     """Answer --help and requests for shell completion.
 
-    `--tyro-print-completion bash` (or zsh, tcsh) needs the options of all commands, and so the packages of all.
+    `--tyro-print-completion bash` (or zsh, tcsh) needs the options of all commands.
     """
     import tyro
 
     complete = any(argument.startswith("--tyro-") for argument in arguments)
     options: list[Any] = []
     for name, command in COMMANDS.items():
-        module = importlib.import_module(f"skipgs_plug.commands.{name}") if complete else None
+        module = importlib.import_module(f"skipgs_plug.commands.options.{name}") if complete else None
         kind = getattr(module, "Args", None) or dataclasses.make_dataclass(name, ())
         options.append(Annotated[kind, tyro.conf.subcommand(name, description=command.meaning)])
     commands: Any = Union[tuple(options)]  # noqa: UP007 - made at run time

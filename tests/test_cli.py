@@ -170,3 +170,28 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_doctor_renders(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor"]) == 0
     assert re.search(r"ok  warp +renders and differentiates on cpu", capsys.readouterr().out)
+
+
+HEAVY = {"torch", "numpy", "warp", "gsplat", "pycolmap", "scipy", "matplotlib", "torchmetrics", "PIL", "viser", "tqdm"}
+UNUSED_IN_TRAINING = {"torchmetrics", "matplotlib", "scipy.signal", "viser", "torchvision", "pycolmap"}
+
+
+def loaded_by(code: str, heavy: set[str]) -> set[str]:
+    """Return which of these modules a fresh process has loaded after some code."""
+    code += f"\nimport sys\nsys.stderr.write('loaded:' + ' '.join(sorted({heavy!r} & set(sys.modules))))"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(ended.stderr.rpartition("loaded:")[2].split())
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help_loads_nothing_heavy(command: str) -> None:
+    arguments = [*command.split(), "--help"]
+    code = f"from skipgs_plug.cli import main\ntry: main({arguments!r})\nexcept SystemExit: pass"
+    assert loaded_by(code, HEAVY) == set()
+
+
+def test_training_loads_nothing_that_it_does_not_use(tmp_path: Path, packed: str) -> None:
+    arguments = ["train", packed, "--out", str(tmp_path / "run"), "--max-steps", "1", "--no-progress"]
+    code = f"from skipgs_plug.cli import main\nassert main({arguments!r}) == 0"
+    assert loaded_by(code, UNUSED_IN_TRAINING) == set()
+    assert loaded_by(code.replace("== 0", "== 2"), {"torch"}) == {"torch"}  # the probe sees what is there

@@ -7,9 +7,10 @@ import itertools
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from skipgs_plug.bench import provenance
+from skipgs_plug.bench.choices import Clock
 from skipgs_plug.bench.find import find_policy, known_policies
 from skipgs_plug.bench.policies import Earlier, Policy, check_policies, refinement_policy, rounds
 from skipgs_plug.bench.record import RunRecord
@@ -22,7 +23,6 @@ from skipgs_plug.trainer.backend import resolve_backend
 from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.metrics import LPIPS_WEIGHTS, require_lpips
 
-Clock = Literal["wall", "processor"]
 NOT_SETTINGS = ("data_dir", "result_dir", "seed", "backend")
 WARM_UP = 20  # iterations that load and compile what all runs need, so that memory of the first does not hold it
 Begin = Callable[[str, Earlier], Generator[None, None, RunRecord]]

@@ -1,1 +1,1 @@
-"""One file per command, each with `main(argv) -> exit code`; imported only when called."""
+"""One file per command, each with `run(args) -> exit code`, imported only when called; `options`: their arguments."""

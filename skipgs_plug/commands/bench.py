@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shlex
-from dataclasses import dataclass
-from typing import Annotated
-
-import tyro
 
 from skipgs_plug.bench.decisions import FILE as DECISIONS
 from skipgs_plug.bench.decisions import write_decisions
@@ -15,63 +10,25 @@ from skipgs_plug.bench.find import find_policy, known_policies
 from skipgs_plug.bench.plots import write_plots
 from skipgs_plug.bench.policies import check_policies
 from skipgs_plug.bench.result import build_result
-from skipgs_plug.bench.runner import Bench, Clock
+from skipgs_plug.bench.runner import Bench
 from skipgs_plug.bench.store import BenchFolder
 from skipgs_plug.bench.summary import Row, row_from_dict
 from skipgs_plug.bench.table import legend, markdown, notes, tables
 from skipgs_plug.commands.names import require_names
+from skipgs_plug.commands.options.bench import Args
 from skipgs_plug.install import next_command
-from skipgs_plug.trainer import TrainConfig, load_scene
+from skipgs_plug.trainer import load_scene
 from skipgs_plug.trainer.files import write_aside, write_json
 from skipgs_plug.trainer.lock import exclusive
 
 
-@dataclass
-class Options(TrainConfig):
-    """TrainConfig with a schedule that a CPU finishes, without folders and seed."""
-
-    data_dir: tyro.conf.Suppress[str] = ""
-    result_dir: tyro.conf.Suppress[str] = ""
-    seed: tyro.conf.Suppress[int] = 0
-    max_steps: int = 3000
-    """Training iterations."""
-
-
-@dataclass
-class Args:
-    """Train under each policy, compare time and quality: refinement from one snapshot per seed, or whole runs.
-
-    Evaluation, loading and compilation are outside the clock. A killed bench continues where it stopped when
-    the same command is given again.
-    """
-
-    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
-    """Folder with sparse/0, transforms.json or transforms_train.json, or packed .npz."""
-    out: str = "skipgs_bench"
-    """Folder for table, plots and runs."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of training; each densifies once."""
-    whole: bool = False
-    """Train from the first iteration under each policy, instead of refining one densified snapshot per seed."""
-    policies: tuple[str, ...] | None = None
-    """What to compare, all unless given; controls copy rate, time or size of others."""
-    train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
-    tensorboard: bool = False
-    """Log gsplat's scalars and the gate's counters of every run to OUT/tb; the clock stands meanwhile."""
-    clock: Clock | None = None
-    """Seconds by the clock on the wall, or for which the processor worked for us: for a machine that others use too.
-    Processor seconds unless given for whole runs on the CPU, else the wall's."""
-    no_progress: bool = False
-    """No progress bars."""
-
-
-def main(argv: list[str]) -> int:
-    args = tyro.cli(Args, args=argv, prog="skipgs-plug bench", config=(tyro.conf.FlagCreatePairsOff,))
-    run(args, "skipgs-plug bench " + shlex.join(argv))
+def run(args: Args) -> int:
+    """Run what is missing, and print and write what came of it; see `Args`."""
+    compare(args)
     return 0
 
 
-def run(args: Args, command: str) -> list[Row]:
+def compare(args: Args) -> list[Row]:
     """Run what is missing, print the table, write bench.json, decisions.json, table.md and plots; returns the rows."""
     require_names(("SCENE", args.scene), ("--out", args.out))
     whole, known = args.whole, known_policies(args.whole)
@@ -94,7 +51,7 @@ def run(args: Args, command: str) -> list[Row]:
     )
     with exclusive(folder.root):
         records = bench.run()
-    result = build_result(bench, records, command)
+    result = build_result(bench, records, args.command)
     rows = [row_from_dict(row) for row in result["rows"]]
     parts = [
         *(f"{caption}:\n\n{markdown(lines)}" for caption, lines in tables(rows, whole)),

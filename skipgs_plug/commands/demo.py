@@ -6,39 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from skipgs_plug import SkipGate
 from skipgs_plug.commands.names import require_names
+from skipgs_plug.commands.options.demo import Args
 from skipgs_plug.core.report import write_report
 from skipgs_plug.trainer import TrainConfig, Trainer
 from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.pictures import Curve, plot_refinement, save_comparison
 from skipgs_plug.trainer.run_folder import RunFolder
 from skipgs_plug.trainer.synthetic import make_scene
-
-
-@dataclass
-class Args:
-    """Train a scene the package makes itself: as it is, with the paper's gate, in fewer iterations. No download."""
-
-    out: str = "skipgs_demo"
-    """Folder for models, pictures and numbers."""
-    max_steps: int = 1500
-    """Iterations of the schedule; the first half densifies."""
-    views: int = 48
-    """Images on the dome around the scene; every 8th is held out."""
-    width: int = 160
-    """Image width; height is three quarters of it."""
-    points: int = 4000
-    """Surface points to start from."""
-    backend: str = "auto"
-    """auto, gsplat (CUDA) or warp (CPU)."""
-    seed: int = 42
-    """Seed of training."""
-    no_progress: bool = False
-    """No progress bars."""
-
 
 # Arguments of the gate by name of the refinement, as in the bench; None for the trainer's own.
 GATES: dict[str, dict[str, Any] | None] = {"own": None, "gate": {}, "refine_share=0.4": {"refine_share": 0.4}}
@@ -58,16 +34,16 @@ class Result:
     skipped: int
 
 
-def main(argv: list[str]) -> int:
-    args = tyro.cli(Args, args=argv, prog="skipgs-plug demo", config=(tyro.conf.FlagCreatePairsOff,))
+def run(args: Args) -> int:
+    """Run the demo in its folder; see `Args`."""
     require_names(("--out", args.out))
     with exclusive(Path(args.out)):
-        run(args)
+        compare(args)
     return 0
 
 
-def run(args: Args) -> list[Result]:
-    """Run the demo and return the results; prints the table, writes models and pictures to `out`."""
+def compare(args: Args) -> list[Result]:
+    """Train and return the results; prints the table, writes models and pictures to `out`."""
     out = Path(args.out)
     print(f"Ray tracing {args.views} images ...")
     scene = make_scene(args.views, args.width, args.width * 3 // 4, args.points)

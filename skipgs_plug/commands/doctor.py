@@ -37,11 +37,8 @@ IMPORT_ORDER = """
       Pillow is bound to the zlib of pycolmap (seen with 4.2.1), and the first PNG that is saved ends the process."""
 
 
-def main(argv: list[str]) -> int:
+def run(args: None) -> int:
     """Print the findings; 0 when a backend renders here, else 1."""
-    if argv:
-        print("usage: skipgs-plug doctor\n\nSay which backends and extras work here, and how to get the rest.")
-        return 0 if argv[0] in ("-h", "--help") else 2
     cuda = torch.cuda.get_device_name() if torch.cuda.is_available() else "no CUDA device"
     print(f"Python {platform.python_version()}, torch {torch.__version__}, {cuda}, {torch.get_num_threads()} threads")
     print("\nPackages")

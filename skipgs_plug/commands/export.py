@@ -2,37 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
-
-import tyro
-
+from skipgs_plug.commands.options.export import Args
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.ply import write_ply
 from skipgs_plug.view.model import open_snapshots
 
 FORMATS = {".compressed.ply": "ply_compressed", ".splat": "splat"}  # as gsplat.export_splats calls them
-
-
-@dataclass
-class Args:
-    """Convert the last model of a run folder, or any 3DGS PLY. The ending of OUT chooses the format.
-
-    .compressed.ply: SuperSplat, PlayCanvas; 61 bytes per Gaussian, invisible ones left out.
-    .splat: antimatter15 and most web viewers; 32 bytes, colours that do not change with direction.
-    .ply: 62 properties, exact.
-    """
-
-    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
-    """Run folder or PLY."""
-    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
-    """File to write."""
-
-
-def main(argv: list[str]) -> int:
-    return run(tyro.cli(Args, args=argv, prog="skipgs-plug export"))
 
 
 def run(args: Args) -> int:

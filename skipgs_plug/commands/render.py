@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
-import tyro
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from skipgs_plug.commands.options.render import Args
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.scene import View
 from skipgs_plug.view.draw import Painter, colour_depth, depth_range, to_bytes
@@ -20,36 +18,6 @@ from skipgs_plug.view.model import open_model
 from skipgs_plug.view.path import camera_path
 
 RANGE_FRAMES = 8  # frames that the colours of depth are fitted to
-
-
-@dataclass
-class Args:
-    """Render the last model of a run folder, or any 3DGS PLY, along a camera path or from the held-out cameras."""
-
-    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
-    """Run folder or PLY."""
-    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PATH")]
-    """Film to write (.mp4), or folder for PNG files."""
-    scene: str | None = None
-    """Scene that gives the cameras; default: the one the run folder names."""
-    cameras: Literal["path", "held-out"] = "path"
-    """A path through the training cameras in the order of names, or each held-out camera."""
-    show: Literal["colour", "depth", "both"] = "colour"
-    """Colour, depth (red is near), or both side by side."""
-    frames: int = 240
-    """Length of the path."""
-    fps: int = 30
-    """Frames per second of a film."""
-    data_factor: int | None = None
-    """Size of the frames, as that of the scene's images_{factor}; default: as in training."""
-    backend: str = "auto"
-    """auto, gsplat (CUDA) or warp (CPU)."""
-    no_progress: bool = False
-    """No progress bar."""
-
-
-def main(argv: list[str]) -> int:
-    return run(tyro.cli(Args, args=argv, prog="skipgs-plug render", config=(tyro.conf.FlagCreatePairsOff,)))
 
 
 def run(args: Args) -> int:

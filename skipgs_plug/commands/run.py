@@ -7,16 +7,13 @@ import dataclasses
 import functools
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.registry import builtin_adapters, find_script_adapter, get_adapter
-from skipgs_plug.commands.gate_options import GateOptions
+from skipgs_plug.commands.options.run import Args
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster.compat import FAMILIES, serve
 from skipgs_plug.fallback_raster.optimizer import REPLACED as ADAM_REPLACED
@@ -28,40 +25,7 @@ from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu, exclusive_cores
 from skipgs_plug.scripts.launch import Attach, run_script, source_of
 
 
-@dataclass
-class Args:
-    """Run a training script of another project, unedited and gated.
-
-    What follows `--` is what would follow `python`, for example: skipgs-plug run fastgs -- train.py -s data/garden.
-    Exit code, output and files are the script's own; skipgs.json is added to its output folder.
-    """
-
-    adapter: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ADAPTER -- SCRIPT ...")]
-    """Name of the trainer: inria, fastgs, taming, ...; or auto, to recognise it by its script."""
-    gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
-    resume_gate: str = "auto"
-    """State the gate goes on from: auto (the one beside the checkpoint the script loads), off (afresh), or a path."""
-    no_gate: bool = False
-    """Change nothing in training; skipgs.json then holds the seconds of the ungated run."""
-    cpu: bool = False
-    """Run on the CPU: CUDA requests are redirected, and CUDA modules are served by the CPU rasterizer."""
-
-
-def main(argv: list[str]) -> int:
-    ours, command = split(argv)
-    args = tyro.cli(Args, args=ours, prog="skipgs-plug run", config=(tyro.conf.FlagCreatePairsOff,))
-    return run(args, command)
-
-
-def split(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Separate our options from the script's command line."""
-    if "--" not in argv:
-        return list(argv), []
-    at = list(argv).index("--")
-    return list(argv[:at]), list(argv[at + 1 :])
-
-
-def run(args: Args, command: list[str]) -> int:
+def run(args: Args) -> int:
     """Run the script and write skipgs.json; see `Args`.
 
     Returns:
@@ -70,6 +34,7 @@ def run(args: Args, command: list[str]) -> int:
     Raises:
         SkipGSError: The script cannot be run or gated.
     """
+    command = list(args.command)
     if args.adapter == "auto":
         args = dataclasses.replace(args, adapter=find_script_adapter(source_of(command)).name)
         say(f"{script_name(command)} is run as {args.adapter}.")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from skipgs_plug import SkipGate
+from skipgs_plug.commands.options.session import SessionOptions
 from skipgs_plug.commands.signals import stop_on_signal
 from skipgs_plug.core.report import write_report
 from skipgs_plug.files import WriteError, keep_going
@@ -19,30 +19,6 @@ from skipgs_plug.trainer.loop import Iteration
 from skipgs_plug.trainer.run_folder import RunFolder
 from skipgs_plug.trainer.scalars import ScalarLog
 from skipgs_plug.view.live import LiveView
-
-
-@dataclass
-class SessionOptions:
-    """What a session writes and shows, and when; none of it changes what is trained."""
-
-    save_every: int | None = None
-    """Iterations between two checkpoints, of which two are kept; default: five minutes of training; 0: the end only."""
-    eval_every: int = 0
-    """Iterations between two evaluations on the way; 0: the end only."""
-    tensorboard: bool = False
-    """Log gsplat's scalars and the gate's counters to RUN/tb, every tenth iteration."""
-    view: bool = False
-    """Show training in the browser; costs at most 2 % of its time."""
-    lpips_net: Literal["alex", "vgg"] | None = None
-    """Also report LPIPS; its weights must be on this machine."""
-    no_progress: bool = False
-    """No progress bar."""
-
-    def __post_init__(self) -> None:
-        for name in ("save_every", "eval_every"):
-            value = getattr(self, name)
-            if value is not None and value < 0:
-                raise InputError(f"{name}={value} is not a number of iterations; 0 stands for the end only.")
 
 
 class Session:

@@ -7,48 +7,22 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
 from tqdm.auto import tqdm
 
+from skipgs_plug.commands.options.sfm import Args
 from skipgs_plug.install import next_command
 from skipgs_plug.photos import global_mapping
+from skipgs_plug.photos.choices import Mapping
 from skipgs_plug.photos.gather import check_source, gather
-from skipgs_plug.photos.reconstruct import Mapping, Matching, Reconstruction
+from skipgs_plug.photos.reconstruct import Reconstruction
 from skipgs_plug.photos.scene_folder import check_target, write_scene
 from skipgs_plug.photos.unplaced import explain_unplaced
 from skipgs_plug.trainer.errors import InputError
 
 NAMES_SHOWN = 6
-
-
-@dataclass
-class Args:
-    """Reconstruct where photographs were taken (COLMAP, on the CPU) and write a scene for `skipgs-plug train`.
-
-    Up to 100 photographs are matched each with each and placed one after another; more are matched with their
-    neighbours in the order of names and placed all at once.
-    """
-
-    photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")]
-    """Folder of photographs, or a video."""
-    scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
-    """COLMAP folder to write: images, images_2, images_4, images_8, sparse/0."""
-    frames: int = 100
-    """Frames to take from a video, each the sharpest of its group."""
-    matching: Matching = "auto"
-    """Which photographs are compared."""
-    mapping: Mapping = "auto"
-    """Placed one after another (incremental) or all at once (global)."""
-    no_progress: bool = False
-    """No progress bars."""
-
-
-def main(argv: list[str]) -> int:
-    return run(tyro.cli(Args, args=argv, prog="skipgs-plug sfm", config=(tyro.conf.FlagCreatePairsOff,)))
 
 
 def run(args: Args) -> int:

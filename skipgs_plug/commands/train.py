@@ -5,18 +5,15 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from skipgs_plug import SkipConfig, SkipGate
-from skipgs_plug.commands import sfm
-from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.commands.gate_settings import GateSettings
 from skipgs_plug.commands.names import require_names
-from skipgs_plug.commands.session import Session, SessionOptions
+from skipgs_plug.commands.options.sfm import Args as SfmArgs
+from skipgs_plug.commands.options.train import Args
+from skipgs_plug.commands.session import Session
 from skipgs_plug.install import next_command
 from skipgs_plug.photos.gather import are_photographs
 from skipgs_plug.trainer import InputError, MissingFileError, TrainConfig, Trainer, load_scene
@@ -27,45 +24,6 @@ from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.metrics import require_lpips
 from skipgs_plug.trainer.resume import first_sound, lengths
 from skipgs_plug.trainer.run_folder import SCENE, RunFolder
-
-
-@dataclass
-class Options(TrainConfig):
-    """TrainConfig without the folders, which the command takes as SCENE and --out, and the length of the run."""
-
-    data_dir: tyro.conf.Suppress[str] = ""
-    result_dir: tyro.conf.Suppress[str] = ""
-    max_steps: tyro.conf.Suppress[int] = REFERENCE_STEPS
-    schedule_steps: tyro.conf.Suppress[int | None] = None
-
-
-@dataclass
-class Args:
-    """Train a COLMAP, nerfstudio or Blender folder or a packed .npz: the 3DGS recipe, every iteration of it.
-
-    --refine-share 0.4 (or auto) refines in fewer iterations with larger, shrinking steps.
-    """
-
-    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
-    """Folder with sparse/0, transforms.json or transforms_train.json, packed .npz; with --sfm: photographs, a video."""
-    out: str
-    """Run folder to write."""
-    sfm: bool = False
-    """Find out first where the photographs were taken, as the command sfm does, and keep the scene in OUT/scene."""
-    max_steps: int | None = None
-    """Training iterations; default: 30,000, or with --resume those of the run, which a larger number extends."""
-    train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
-    gate: bool = False
-    """Attach the paper's gate. Any of its settings, --refine-share among them, attaches a gate as well."""
-    gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
-    resume: bool = False
-    """Continue from the last checkpoint in --out, or write what a finished run lacks."""
-    session: Annotated[SessionOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=SessionOptions)
-
-
-def main(argv: list[str]) -> int:
-    args = tyro.cli(Args, args=argv, prog="skipgs-plug train", config=(tyro.conf.FlagCreatePairsOff,))
-    return run(args)
 
 
 def run(args: Args) -> int:
@@ -132,8 +90,10 @@ def scene_of_photographs(args: Args, folder: RunFolder) -> Path:
     """Return the scene of the run's photographs, which is made in its folder unless it is there."""
     scene = folder.root / SCENE
     if not is_scene(scene):
+        from skipgs_plug.commands import sfm  # with pycolmap, which training has no use for
+
         with exclusive(folder.root):
-            sfm.reconstruct(sfm.Args(Path(args.scene), scene, no_progress=args.session.no_progress))
+            sfm.reconstruct(SfmArgs(Path(args.scene), scene, no_progress=args.session.no_progress))
     return scene
 
 

@@ -2,39 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
-
-import tyro
 from torch import Tensor
 
+from skipgs_plug.commands.options.view import Args
 from skipgs_plug.trainer.exposure import fit_colours
 from skipgs_plug.trainer.scene import View
 from skipgs_plug.view.draw import Painter
 from skipgs_plug.view.model import open_model
 from skipgs_plug.view.page import Page, Splats
-
-
-@dataclass
-class Args:
-    """Serve a page with the model, its cameras, and photographs beside renders and errors, until Ctrl-C."""
-
-    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
-    """Run folder or PLY."""
-    scene: str | None = None
-    """Scene with the photographs; default: the one the run folder names. A PLY is shown without, too."""
-    data_factor: int | None = None
-    """Reduction of the photographs; default: as in training."""
-    host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 lets other machines of the network in."""
-    port: int = 8080
-    """Port to listen on; the next free one is taken."""
-    backend: str = "auto"
-    """auto, gsplat (CUDA) or warp (CPU)."""
-
-
-def main(argv: list[str]) -> int:
-    return run(tyro.cli(Args, args=argv, prog="skipgs-plug view", config=(tyro.conf.FlagCreatePairsOff,)))
 
 
 def run(args: Args) -> int:

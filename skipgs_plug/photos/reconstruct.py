@@ -5,9 +5,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from skipgs_plug.photos import global_mapping
+from skipgs_plug.photos.choices import Mapping, Matching
 from skipgs_plug.photos.gather import Gathered
 from skipgs_plug.photos.links import Links, largest_group, read_links
 from skipgs_plug.photos.progress import counted
@@ -21,8 +22,6 @@ ENOUGH = 0.9  # of the photographs that hang together, for a model of all at onc
 FEATURE_SIZE = 1600  # larger sides are reduced for feature detection, which gains little above
 SEED = 0
 
-Matching = Literal["auto", "exhaustive", "sequential"]
-Mapping = Literal["auto", "incremental", "global"]
 Progress = Callable[[int], None]
 
 

@@ -3,12 +3,18 @@
 It knows nothing of the gate, which is attached to it like to any other trainer.
 """
 
-from skipgs_plug.trainer.config import TrainConfig
-from skipgs_plug.trainer.errors import InputError, MissingFileError
-from skipgs_plug.trainer.loaders import load_scene
-from skipgs_plug.trainer.loaders.packed import save_packed
-from skipgs_plug.trainer.loop import Trainer
-from skipgs_plug.trainer.scene import Scene, View
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from skipgs_plug.trainer.config import TrainConfig
+    from skipgs_plug.trainer.errors import InputError, MissingFileError
+    from skipgs_plug.trainer.loaders import load_scene
+    from skipgs_plug.trainer.loaders.packed import save_packed
+    from skipgs_plug.trainer.loop import Trainer
+    from skipgs_plug.trainer.scene import Scene, View
 
 __all__ = [
     "InputError",
@@ -20,3 +26,27 @@ __all__ = [
     "load_scene",
     "save_packed",
 ]
+
+# Loaded on first use: settings and errors need no torch.
+_HOMES = {
+    "InputError": "errors",
+    "MissingFileError": "errors",
+    "Scene": "scene",
+    "TrainConfig": "config",
+    "Trainer": "loop",
+    "View": "scene",
+    "load_scene": "loaders",
+    "save_packed": "loaders.packed",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -15,8 +15,9 @@ from torch import Tensor
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.exposure import fit_colours
 from skipgs_plug.trainer.mask import leave_out
+from skipgs_plug.trainer.ssim import ssim_map
 
-SSIM_FLAVOUR = "torchmetrics: 11x11 Gaussian window, reflect padding, border cropped"
+SSIM_FLAVOUR = "torchmetrics 1.9: 11x11 Gaussian window, borders reflected, mean over all windows"
 LPIPS_WEIGHTS = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 
 
@@ -60,17 +61,12 @@ def psnr(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def ssim(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Return SSIM of images [H, W, 3] in [0, 1], as torchmetrics pads (see SSIM_FLAVOUR).
+    """Return SSIM of images [H, W, 3] in [0, 1], as torchmetrics computes it (see SSIM_FLAVOUR).
 
     With a mask [H, W]: the mean over windows whose centre counts. Both images should be black outside it.
     """
-    from torchmetrics.functional.image import structural_similarity_index_measure
-
-    images = batch(render.clamp(0, 1)), batch(target)
-    if mask is None:
-        return float(structural_similarity_index_measure(*images, data_range=1.0))  # type: ignore[arg-type]
-    _, windows = structural_similarity_index_measure(*images, data_range=1.0, return_full_image=True)
-    return float(windows[0].permute(1, 2, 0)[mask.to(windows.device)].mean())
+    windows = ssim_map(render.clamp(0, 1), target)
+    return float((windows if mask is None else windows[mask.to(windows.device)]).mean())
 
 
 def require_lpips(net: str) -> None:

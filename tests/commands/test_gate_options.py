@@ -10,8 +10,8 @@ import tyro
 from skipgs_plug import SkipConfig, SkipGate, SkipGSError
 from skipgs_plug.cli import main
 from skipgs_plug.commands import run, train
-from skipgs_plug.commands.gate_options import GateOptions
 from skipgs_plug.commands.gate_settings import GateSettings
+from skipgs_plug.commands.options.gate import GateOptions
 from skipgs_plug.trainer import InputError
 
 GIVEN = {

@@ -7,14 +7,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-import tyro
-
+from skipgs_plug.commands.options.parse import shown
 from skipgs_plug.core.errors import SkipGSError
-
-
-def shown(kind: str, default: str) -> Any:
-    """How --help shows an option that may be left out, and what holds then."""
-    return tyro.conf.arg(metavar=kind, help_behavior_hint=f"(default: {default})")
 
 
 @dataclass

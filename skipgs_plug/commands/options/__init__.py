@@ -1,0 +1,1 @@
+"""What each command takes, as dataclasses; nothing here imports torch, so `--help` and typing errors answer at once."""

@@ -1,0 +1,30 @@
+"""What `skipgs-plug export` takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from skipgs_plug.commands.options.parse import parse_as
+
+
+@dataclass
+class Args:
+    """Convert the last model of a run folder, or any 3DGS PLY. The ending of OUT chooses the format.
+
+    .compressed.ply: SuperSplat, PlayCanvas; 61 bytes per Gaussian, invisible ones left out.
+    .splat: antimatter15 and most web viewers; 32 bytes, colours that do not change with direction.
+    .ply: 62 properties, exact.
+    """
+
+    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
+    """Run folder or PLY."""
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """File to write."""
+
+
+def parse(argv: list[str]) -> Args:
+    return parse_as(Args, argv, "export")

@@ -1,0 +1,41 @@
+"""What `skipgs-plug render` takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from skipgs_plug.commands.options.parse import parse_as
+
+
+@dataclass
+class Args:
+    """Render the last model of a run folder, or any 3DGS PLY, along a camera path or from the held-out cameras."""
+
+    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
+    """Run folder or PLY."""
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PATH")]
+    """Film to write (.mp4), or folder for PNG files."""
+    scene: str | None = None
+    """Scene that gives the cameras; default: the one the run folder names."""
+    cameras: Literal["path", "held-out"] = "path"
+    """A path through the training cameras in the order of names, or each held-out camera."""
+    show: Literal["colour", "depth", "both"] = "colour"
+    """Colour, depth (red is near), or both side by side."""
+    frames: int = 240
+    """Length of the path."""
+    fps: int = 30
+    """Frames per second of a film."""
+    data_factor: int | None = None
+    """Size of the frames, as that of the scene's images_{factor}; default: as in training."""
+    backend: str = "auto"
+    """auto, gsplat (CUDA) or warp (CPU)."""
+    no_progress: bool = False
+    """No progress bar."""
+
+
+def parse(argv: list[str]) -> Args:
+    return parse_as(Args, argv, "render")

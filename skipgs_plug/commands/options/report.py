@@ -1,0 +1,24 @@
+"""What `skipgs-plug report` takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from skipgs_plug.commands.options.parse import parse_as
+
+
+@dataclass
+class Args:
+    """Turn run folders into one self-contained HTML page: tables and plots inside, nothing loaded from a network."""
+
+    runs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN ...")]
+    """Folders of `skipgs-plug train`, `run` or `bench`, or their skipgs.json."""
+    out: str = "report.html"
+    """Page to write."""
+
+
+def parse(argv: list[str]) -> Args:
+    return parse_as(Args, argv, "report")

@@ -1,0 +1,47 @@
+"""What `skipgs-plug run` takes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from skipgs_plug.commands.options.gate import GateOptions
+from skipgs_plug.commands.options.parse import parse_as
+
+
+def split(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Separate our options from the script's command line."""
+    if "--" not in argv:
+        return list(argv), []
+    at = list(argv).index("--")
+    return list(argv[:at]), list(argv[at + 1 :])
+
+
+@dataclass
+class Args:
+    """Run a training script of another project, unedited and gated.
+
+    What follows `--` is what would follow `python`, for example: skipgs-plug run fastgs -- train.py -s data/garden.
+    Exit code, output and files are the script's own; skipgs.json is added to its output folder.
+    """
+
+    adapter: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ADAPTER -- SCRIPT ...")]
+    """Name of the trainer: inria, fastgs, taming, ...; or auto, to recognise it by its script."""
+    gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
+    resume_gate: str = "auto"
+    """State the gate goes on from: auto (the one beside the checkpoint the script loads), off (afresh), or a path."""
+    no_gate: bool = False
+    """Change nothing in training; skipgs.json then holds the seconds of the ungated run."""
+    cpu: bool = False
+    """Run on the CPU: CUDA requests are redirected, and CUDA modules are served by the CPU rasterizer."""
+    command: tyro.conf.Suppress[tuple[str, ...]] = ()
+    """What follows `--`."""
+
+
+def parse(argv: list[str]) -> Args:
+    ours, command = split(argv)
+    return dataclasses.replace(parse_as(Args, ours, "run"), command=tuple(command))

@@ -1,0 +1,32 @@
+"""What a session writes and shows, and when."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from skipgs_plug.trainer.errors import InputError
+
+
+@dataclass
+class SessionOptions:
+    """What a session writes and shows, and when; none of it changes what is trained."""
+
+    save_every: int | None = None
+    """Iterations between two checkpoints, of which two are kept; default: five minutes of training; 0: the end only."""
+    eval_every: int = 0
+    """Iterations between two evaluations on the way; 0: the end only."""
+    tensorboard: bool = False
+    """Log gsplat's scalars and the gate's counters to RUN/tb, every tenth iteration."""
+    view: bool = False
+    """Show training in the browser; costs at most 2 % of its time."""
+    lpips_net: Literal["alex", "vgg"] | None = None
+    """Also report LPIPS; its weights must be on this machine."""
+    no_progress: bool = False
+    """No progress bar."""
+
+    def __post_init__(self) -> None:
+        for name in ("save_every", "eval_every"):
+            value = getattr(self, name)
+            if value is not None and value < 0:
+                raise InputError(f"{name}={value} is not a number of iterations; 0 stands for the end only.")

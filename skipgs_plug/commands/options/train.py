@@ -1,0 +1,52 @@
+"""What `skipgs-plug train` takes."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from skipgs_plug.commands.options.gate import GateOptions
+from skipgs_plug.commands.options.parse import parse_as
+from skipgs_plug.commands.options.session import SessionOptions
+from skipgs_plug.trainer.config import REFERENCE_STEPS, TrainConfig
+
+
+@dataclass
+class Options(TrainConfig):
+    """TrainConfig without the folders, which the command takes as SCENE and --out, and the length of the run."""
+
+    data_dir: tyro.conf.Suppress[str] = ""
+    result_dir: tyro.conf.Suppress[str] = ""
+    max_steps: tyro.conf.Suppress[int] = REFERENCE_STEPS
+    schedule_steps: tyro.conf.Suppress[int | None] = None
+
+
+@dataclass
+class Args:
+    """Train a COLMAP, nerfstudio or Blender folder or a packed .npz: the 3DGS recipe, every iteration of it.
+
+    --refine-share 0.4 (or auto) refines in fewer iterations with larger, shrinking steps.
+    """
+
+    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
+    """Folder with sparse/0, transforms.json or transforms_train.json, packed .npz; with --sfm: photographs, a video."""
+    out: str
+    """Run folder to write."""
+    sfm: bool = False
+    """Find out first where the photographs were taken, as the command sfm does, and keep the scene in OUT/scene."""
+    max_steps: int | None = None
+    """Training iterations; default: 30,000, or with --resume those of the run, which a larger number extends."""
+    train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
+    gate: bool = False
+    """Attach the paper's gate. Any of its settings, --refine-share among them, attaches a gate as well."""
+    gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
+    resume: bool = False
+    """Continue from the last checkpoint in --out, or write what a finished run lacks."""
+    session: Annotated[SessionOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=SessionOptions)
+
+
+def parse(argv: list[str]) -> Args:
+    return parse_as(Args, argv, "train")

@@ -1,0 +1,35 @@
+"""SSIM as torchmetrics 1.9 computes it by default: its results, without its import.
+
+Its package brings SciPy's signal processing and matplotlib, which take longer to load than an evaluation does.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+SIGMA = 1.5
+RADIUS = 5  # the window has 11 pixels a side
+C1, C2 = 0.01**2, 0.03**2  # of values in [0, 1]
+
+
+def ssim_map(first: Tensor, second: Tensor) -> Tensor:
+    """Return the SSIM of every window, by its centre: two images [H, W, 3] in [0, 1] -> [H, W, 3].
+
+    Windows are Gaussian, of 11x11 pixels; where they reach beyond the image, its border is reflected.
+    """
+    images = torch.stack([image.permute(2, 0, 1) for image in (first, second)])  # [2, 3, H, W]
+    one, other = functional.pad(images, (RADIUS,) * 4, mode="reflect")
+    planes = torch.stack([one, other, one * one, other * other, one * other]).flatten(0, 1)[:, None]
+    offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=images.dtype, device=images.device)
+    window = torch.exp(-((offsets / SIGMA) ** 2) / 2)
+    window = window / window.sum()
+    # Two passes of 11 products each are four times as fast as one of 121, and equal to rounding.
+    planes = functional.conv2d(planes, window[None, None, None, :])
+    planes = functional.conv2d(planes, window[None, None, :, None])
+    mean1, mean2, square1, square2, product = planes[:, 0].unflatten(0, (5, 3))  # [3, H, W] each
+    variances = (square1 - mean1**2).clamp(min=0.0) + (square2 - mean2**2).clamp(min=0.0)
+    above = (2 * mean1 * mean2 + C1) * (2 * (product - mean1 * mean2) + C2)
+    below = (mean1**2 + mean2**2 + C1) * (variances + C2)
+    return (above / below).permute(1, 2, 0)
