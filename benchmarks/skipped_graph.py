@@ -1,10 +1,10 @@
-"""Memory that the graph of a skipped iteration holds until the trainer lets go of its loss and image.
+"""Memory that the graph of a skipped iteration would hold until the trainer lets go of its loss and image.
 
     python benchmarks/skipped_graph.py
 
 A backward frees what its graph saved; a skipped one does not. Most trainers overwrite `loss` and `image` only when the
-next forward pass is done, so for that long there are two graphs. Nobody but the trainer can free the first: PyTorch
-releases saved tensors only by going backward, or with the last reference. Rendered are random Gaussians at 504x378 with
+next forward pass is done, so for that long there would be two graphs; the gate frees the first at the skip
+(`skipgs_plug.core.saved_graph`). Here no gate is attached. Rendered are random Gaussians at 504x378 with
 SH degree 3, L1 + SSIM, on the CPU rasterizer. Writes `benchmarks/results/skipped_graph.json`.
 """
 

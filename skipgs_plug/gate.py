@@ -172,7 +172,7 @@ class SkipGate:
             )
         if isinstance(view, list):
             return self._backward_batch(loss, view, loss if signal is None else signal)
-        return engine.gate(self._new_in_iteration(view), loss if signal is None else signal, loss.backward)
+        return engine.gate(self._new_in_iteration(view), loss if signal is None else signal, loss.backward, loss)
 
     def step(self, optimizer: Any, *args: Any) -> bool:
         """Call `optimizer.step(*args)` if it has a pending gradient; True when it stepped.
@@ -196,13 +196,17 @@ class SkipGate:
         return step_pending(optimizers, args, always=not self._engine.config.enabled)
 
     def update(self) -> None:
-        """End the iteration. Optional: a new step number ends it too.
+        """End the iteration, and free the graph of a backward that was skipped.
+
+        Optional: a new step number ends it too, but in most loops the next forward has run by then, and two graphs
+        need memory.
 
         Raises:
             GateOrderError: No `backward` came first in this iteration.
         """
         self._require_backward_before("update")
         self._iteration.ended = True
+        self._engine.free_skipped()
 
     def notify_event(self, kind: str, step: int | None = None) -> None:
         """Tell of a structural change: real backwards follow for a while, and means are left alone.

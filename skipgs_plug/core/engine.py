@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
+import weakref
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -16,6 +18,7 @@ from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
 from skipgs_plug.core.facts import TrainerFacts
+from skipgs_plug.core.host_copy import HostCopy, has_events
 from skipgs_plug.core.iteration import Iteration
 from skipgs_plug.core.nonfinite import NonFiniteGuard
 from skipgs_plug.core.pace.base import Pace
@@ -23,6 +26,7 @@ from skipgs_plug.core.pace.compensated import Compensated
 from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.policy import Policy
+from skipgs_plug.core.saved_graph import SavedGraph, drop_gradients
 from skipgs_plug.core.scene_check import SceneCheck
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, require_state
 from skipgs_plug.core.stats import GateStats
@@ -51,6 +55,7 @@ class Engine:
         stats, clock: counts, seconds.
         rates: scales learning rates, for the pace.
         pace: says which iterations run, and scales learning rates.
+        graph: what autograd saves for backwards that may be skipped.
         trace: rows of gated decisions; None when they are not recorded.
     """
 
@@ -75,6 +80,9 @@ class Engine:
         else:
             self.pace = Compensated(config, self.rates) if config.compensates else Pace()
         self.trace: list[TraceRow] | None = [] if record_trace else None
+        self.graph = SavedGraph()
+        self._skipped: list[weakref.ref[Tensor]] = []  # losses of this iteration whose backwards were skipped
+        self._accumulates = False
         self._guard = NonFiniteGuard(config.on_nonfinite)
         self._must_run = must_run
         self._saved_state = saved_state
@@ -113,6 +121,7 @@ class Engine:
             self._view_names = require_unique(facts.view_names)
         if config.enabled and facts.max_steps is not None and self.start > facts.max_steps:
             log.warning("The gate starts at %d, after the last iteration %d.", self.start, facts.max_steps)
+        self._accumulates = facts.accumulates
         self.pace.configure(self.start, facts, self._view_names)
         if self.policy is None:
             self.policy = self.pace.policy(config)
@@ -120,7 +129,8 @@ class Engine:
             self.load_state_dict(self._pending_state)
 
     def release(self) -> None:
-        """Let go of loops and optimizers; counts stay readable."""
+        """Let go of loops, optimizers and graphs; counts stay readable."""
+        self.graph.close()
         self.pace.remove()
         self.rates.remove()
 
@@ -161,23 +171,100 @@ class Engine:
             )
         self.pace.begin(step, None if self.policy is None else self.policy.floor)
         self.iteration.begin(step)
+        self._skipped.clear()
+        self._keep_graph(step)
         self.clock.open(post=step >= self.start)
 
-    def gate(self, view: str, signal: float | Tensor, run: Callable[[], Any]) -> bool:
-        """Call `run`, a real backward, unless the view can do without; True when it was called."""
-        skip = self.decide(view, signal).skip
-        if not skip:
-            run()
-            self.iteration.ran = True
-            if self.active:
-                self.rates.ran()
+    def gate(
+        self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor | None = None, alone: bool = False
+    ) -> bool:
+        """Call `run`, a real backward, unless the view can do without; True when its gradients stay.
+
+        Many answers do not depend on the loss: then, on a device, the backward is launched while the loss is on its way
+        to the host. A loss that turns out not to be finite has its gradients dropped before any optimizer steps.
+
+        Args:
+            view: Key of the view.
+            signal: Value to decide on.
+            run: The backward.
+            loss: What it goes back from, where that is not the signal.
+            alone: Whether no other backward of this iteration needs what this one shares with it: a skipped graph is
+                freed at once.
+        """
+        self.graph.close()
+        back_from = loss if loss is not None else signal if isinstance(signal, Tensor) else None
+        foreseen = self._foreseen(view, signal, back_from)
+        if foreseen is False:
+            skip = self._run_first(view, signal, run, back_from)
+        else:
+            # In iterations that train nothing the loss is not read.
+            skip = self.decide(view, None if foreseen else signal).skip
+            if not skip:
+                run()
+                self.iteration.ran = True
+                if self.active:
+                    self.rates.ran()
+            elif back_from is not None:
+                self._skipped.append(weakref.ref(back_from))
+                if alone:
+                    self.free_skipped()
         self.clock.mark()
+        if self.iteration.step is not None:
+            self._keep_graph(self.iteration.step + 1)
         return not skip
 
-    def decide(self, view: str, signal: float | Tensor) -> Decision:
+    def free_skipped(self) -> None:
+        """Free what was saved for the skipped backwards of this iteration: it has no other backward."""
+        for reference in self._skipped:
+            loss = reference()
+            if loss is not None:
+                self.graph.free(loss)
+        self._skipped.clear()
+
+    def _foreseen(self, view: str, signal: float | Tensor, loss: Tensor | None) -> bool | None:
+        """Whether the backward is skipped, if that is known without the loss, whose reading would cost a wait."""
+        step = self.iteration.step
+        if not (self.active and loss is not None and isinstance(signal, Tensor) and has_events(signal.device)):
+            return None
+        # Others are to be asked; gradients of earlier iterations would be dropped with a loss that is not finite.
+        if self._accumulates or self._scene_check.running or distributed.group_size() > 1:
+            return None
+        assert self.policy is not None and step is not None
+        if self._must_run is not None and self._must_run(step):
+            return False
+        return self.policy.foreseen(view, step)
+
+    def _run_first(self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor | None) -> bool:
+        """Launch the backward, then decide; True when its gradients were dropped after all."""
+        assert isinstance(signal, Tensor) and loss is not None
+        copy = HostCopy(signal)
+        run()
+        self.iteration.ran = True
+        try:
+            skip = self.decide(view, copy).skip
+        except SkipGSError:
+            drop_gradients(loss)
+            raise
+        if skip:
+            drop_gradients(loss)
+            self.iteration.ran = False
+        else:
+            self.rates.ran()
+        return skip
+
+    def _keep_graph(self, step: int) -> None:
+        """Keep what iteration `step` saves within reach, if its backward may be skipped."""
+        if not self.config.enabled or step < self.start or self.policy is None:
+            return
+        if self.policy.foreseen(None, step) is not False:
+            self.graph.open()
+
+    def decide(self, view: str, signal: float | Tensor | HostCopy | None) -> Decision:
         """Decide on one view in the present iteration, with all processes, and record the answer.
 
-        The signal is read on the host only from `start` on.
+        Args:
+            view: Key of the view.
+            signal: Value to decide on, read on the host only from `start` on; None in iterations that train nothing.
         """
         now = self.iteration
         assert now.step is not None
@@ -185,11 +272,15 @@ class Engine:
         if not self.active:
             now.decision = decision.INACTIVE
             return now.decision
-        loss = float(signal.detach() if isinstance(signal, Tensor) else signal)
         mean = None if self.trace is None else self.mean(view)
-        device = signal.device if isinstance(signal, Tensor) else None
-        answer = now.decision = self._agreed(view, loss, now.step, device)
-        if self.stats.record(answer, view, loss) and self._view_names is None:
+        if signal is None:
+            loss, answer = math.nan, decision.OVER
+        else:
+            loss = signal.value() if isinstance(signal, HostCopy) else float(_detached(signal))
+            device = signal.device if isinstance(signal, Tensor) else None
+            answer = self._agreed(view, loss, now.step, device)
+        now.decision = answer
+        if self.stats.record(answer, view, None if signal is None else loss) and self._view_names is None:
             warn_unless_recurring(self.stats.n_views, self.stats.gated)
         if self.trace is not None:
             self.trace.append(TraceRow(now.step, view, loss, mean, answer.reason, answer.skip))
@@ -312,3 +403,7 @@ class Engine:
                 f"The gate state belongs to another scene: it knows view {unknown[0]!r}, which is not among "
                 f"the {len(self._view_names)} training views; start the gate afresh."
             )
+
+
+def _detached(signal: float | Tensor) -> float | Tensor:
+    return signal.detach() if isinstance(signal, Tensor) else signal

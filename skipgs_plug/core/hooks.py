@@ -75,6 +75,8 @@ class Hooks:
         """
         with self._detaching_on_error():
             self._engine.configure(facts, self._given)
+            if self._engine.config.enabled:
+                self.on_detach("torch.autograd (hooks for saved tensors)", self._engine.graph.close)
             if self._engine.config.compensates:
                 self.on_detach("torch.optim.Optimizer.step (hooks)", self._engine.release)
             self._ready = True
@@ -131,7 +133,7 @@ class Hooks:
                 raise self._mismatch("no training view was rendered before the backward")
             if callable(view):
                 view = view() if self._engine.active else "not read"
-            self._engine.gate(view_key(view), loss if now.signal is None else now.signal, run)
+            self._engine.gate(view_key(view), loss if now.signal is None else now.signal, run, loss, alone=True)
             return None
 
     # How to hold on to the trainer.

@@ -49,6 +49,13 @@ class Policy(ABC):
         """Running mean of a view's loss, None for a view or a policy without."""
         return None
 
+    def foreseen(self, view: Hashable | None, step: int) -> bool | None:
+        """Whether `decide` will skip, if that is known without the loss, and for None without the view; None if not.
+
+        Changes nothing. True only in iterations that train nothing, whose loss is then not told.
+        """
+        return None
+
     @abstractmethod
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
         """Decide on one view in one iteration, and record the answer."""
@@ -172,6 +179,15 @@ class SkipPolicy(Policy):
         if budget.calibrating:
             budget.calibrate()
         return answer
+
+    def foreseen(self, view: Hashable | None, step: int) -> bool | None:
+        """False in a pause, in warm-up, for a view without a mean, and while the floor forbids skipping."""
+        if step < self._start_iter or not self.enabled or step < self.pause.until:
+            return False
+        warmup_end = step + self._warmup if self._warmup_end is None else self._warmup_end
+        if step < warmup_end or not self.budget.allows_skip():
+            return False
+        return False if view is not None and self.means.get(view) is None else None
 
     def overrule(self, own: Decision, answer: Decision) -> None:
         """Count what happens instead of what was decided last.

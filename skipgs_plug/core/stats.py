@@ -28,16 +28,17 @@ class GateStats:
         self.events: dict[str, int] = {}
         self._views: dict[str, list[Any]] = {}  # visits, backwards, skips, last loss
 
-    def record(self, decision: Decision, view: str, loss: float) -> bool:
-        """Count one gated decision; True for a view that was not counted before."""
+    def record(self, decision: Decision, view: str, loss: float | None) -> bool:
+        """Count one gated decision; True for a view that was not counted before. None for a loss that was not read."""
         self.reasons[decision.reason] = self.reasons.get(decision.reason, 0) + 1
         row = self._views.get(view)
         new = row is None
         if row is None:
-            row = self._views[view] = [0, 0, 0, loss]
+            row = self._views[view] = [0, 0, 0, 0.0 if loss is None else loss]
             forget_oldest(self._views)
         row[0] += 1
-        row[3] = loss
+        if loss is not None:
+            row[3] = loss
         if decision.skip:
             self.skips += 1
             row[2] += 1

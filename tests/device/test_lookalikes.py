@@ -62,7 +62,7 @@ def reads(request) -> dict[str, dict[str, Any]]:
 NO_SHARE = ("No loop over range", "cannot leave out whole iterations")
 
 
-def complaints(found: dict[str, Any]) -> list[str]:
+def complaints(name: str, found: dict[str, Any]) -> list[str]:
     """What one look-alike's iterations, by settings, do that they should not."""
     wrong = []
     for settings, rows in found.items():
@@ -72,25 +72,35 @@ def complaints(found: dict[str, Any]) -> list[str]:
             continue
         looks = 0
         for row in rows:
-            own = [read for read in row["gate"] if not read[0].startswith("waited for a copy")]
-            look = sum(count for _, file, _, count in own if file == "adapters/drift_check.py")
-            views = sum(count for _, file, _, count in own if file == "core/distributed.py")
-            rest = sum(count for *_, count in own) - look - views
-            waits = sum(count for kind, *_, count in row["gate"] if kind.startswith("waited for a copy"))
-            looks += look
-            allowed = 0 if settings == "off" or row["reason"] == "inactive" else 1
-            # A copy that was begun before the render costs no wait of its own.
-            few = (
-                rest <= allowed
-                and waits <= allowed
-                and look <= 1
-                and (views <= 1 if settings == "share" else not views)
-            )
-            if not few:
+            count = Counts(row["gate"])
+            looks += count.looks
+            idle = settings == "off" or row["reason"] == "inactive"
+            # Waits for copies that were begun before a render, or before the backward, leave the device busy: gsplat's
+            # script has one for the id of the view.
+            id_waits = 0 if idle or name == "gsplat_batch" or not name.startswith("gsplat") else 1
+            loss_reads = count.reads + count.waits - id_waits
+            few = loss_reads <= (0 if idle or row["reason"] == "over" else 1)
+            if not (few and count.looks <= 1 and count.visibility <= (settings == "share" and not idle)):
                 wrong.append(f"{settings}, iteration {row['step']} ({row['reason']}): {row['gate']}")
         if looks > LOOKS:
             wrong.append(f"{settings}: the drift check looked {looks} times")
     return wrong
+
+
+class Counts:
+    """Host reads of the gate in one iteration, by what they are for."""
+
+    def __init__(self, gate: list[tuple[str, str, int, int]]) -> None:
+        self.looks = self.visibility = self.waits = self.reads = 0
+        for kind, file, _, count in gate:
+            if file == "adapters/drift_check.py":
+                self.looks += count
+            elif file == "core/distributed.py":
+                self.visibility += count
+            elif kind == "waited for a copy":
+                self.waits += count
+            else:
+                self.reads += count
 
 
 def test_every_lookalike_has_its_turn():
@@ -101,7 +111,15 @@ def test_every_lookalike_has_its_turn():
 
 
 def test_no_device_is_mixed_and_reads_are_few(reads):
-    assert not {name: wrong for name, found in reads.items() if (wrong := complaints(found))}
+    assert not {name: wrong for name, found in reads.items() if (wrong := complaints(name, found))}
+
+
+def test_most_backwards_do_not_wait_for_the_loss(reads):
+    """Warm-up, views without a mean, every iteration of refine_share: the loss is read behind the backward."""
+    for name, found in reads.items():
+        for row in [row for rows in found.values() if isinstance(rows, list) for row in rows]:
+            if row["reason"] in ("warm-up", "new view", "pause", "full") and name not in ("fastgs", "taming_sh_lower"):
+                assert not Counts(row["gate"]).reads, (name, row)
 
 
 def test_the_gate_decides_there(reads):
@@ -114,5 +132,5 @@ def test_the_gate_decides_there(reads):
 def test_defects_that_only_a_second_device_shows_are_caught():
     args = [part for name in MUTANTS for part in ("--mutant", name)]
     found = on_sim(*args, "--settings", "rule", "share", "--", "inria", "gsplat_default")
-    missed = [(name, case) for name in MUTANTS for case in MUTANTS[name] if not complaints(found[name][case])]
+    missed = [(name, case) for name in MUTANTS for case in MUTANTS[name] if not complaints(case, found[name][case])]
     assert not missed

@@ -1,0 +1,203 @@
+"""What a skipped iteration leaves in memory, and backwards that do not wait for the loss."""
+
+from __future__ import annotations
+
+import math
+import random
+import weakref
+
+import pytest
+import torch
+
+from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.core import engine
+from skipgs_plug.core.decision import AT_OR_BELOW_MEAN, FULL
+from skipgs_plug.core.policy import Policy
+from skipgs_plug.core.saved_graph import SavedGraph
+from tests.always import Always
+
+N = 20_000
+
+
+class Allocated:
+    """Counts live numbers of what a forward allocates and saves."""
+
+    def __init__(self):
+        self.live = self.peak = 0
+
+    def add(self, tensor):
+        numbers = tensor.numel()
+        self.live += numbers
+        self.peak = max(self.peak, self.live)
+        weakref.finalize(tensor.untyped_storage(), self._gone, numbers)
+
+    def _gone(self, numbers):
+        self.live -= numbers
+
+
+ALLOCATED = Allocated()
+
+
+class Stage(torch.autograd.Function):
+    """A stage of a rasterizer, with a buffer for its backward."""
+
+    @staticmethod
+    def forward(ctx, x):
+        buffer = x.detach() * 2.0
+        ALLOCATED.add(buffer)
+        ctx.save_for_backward(buffer)
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx, gradient):
+        (buffer,) = ctx.saved_tensors
+        return gradient + 0.0 * buffer
+
+
+class Every(Policy):
+    """Skips what its list says."""
+
+    def __init__(self, skips):
+        self.skips = skips
+
+    def decide(self, view, loss, step):
+        return AT_OR_BELOW_MEAN if self.skips[step] else FULL
+
+    def notify_event(self, step, n_views): ...
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state): ...
+
+
+def peak(skips, update=True):
+    """Most numbers alive in a loop that holds its loss and image until the next forward is done."""
+    ALLOCATED.__init__()
+    value = torch.nn.Parameter(torch.ones(N))
+    with SkipGate(policy=Every(skips)) as gate:
+        for step in range(len(skips)):
+            image = Stage.apply(Stage.apply(Stage.apply(value)))
+            loss = (image.exp() * value).mean()
+            gate.backward(loss, view="a", step=step)
+            if update:
+                gate.update()
+    del loss, image
+    return ALLOCATED.peak
+
+
+def test_a_skipped_graph_does_not_raise_the_peak():
+    assert peak([False] * 4) == 3 * N
+    assert peak([False, True, False]) == peak([False, True, True, True, False]) == 3 * N
+    assert peak([False, True, False], update=False) > 3 * N  # what shares a graph may come until the next step
+
+
+@pytest.mark.parametrize("skips", [[False, True, False, True]])
+def test_gradients_are_those_without_a_gate(skips):
+    value, plain = torch.nn.Parameter(torch.ones(N)), torch.nn.Parameter(torch.ones(N))
+    with SkipGate(policy=Every(skips)) as gate:
+        for step, skip in enumerate(skips):
+            loss = (Stage.apply(value).exp() * value).mean()
+            assert gate.backward(loss, view="a", step=step) is not skip
+            gate.update()
+    for skip in skips:
+        if not skip:
+            (Stage.apply(plain).exp() * plain).mean().backward()
+    assert torch.equal(value.grad, plain.grad)
+
+
+def test_a_graph_that_is_shared_stays_until_the_iteration_ends():
+    value = torch.nn.Parameter(torch.ones(N))
+
+    class First(Every):
+        def decide(self, view, loss, step):
+            return AT_OR_BELOW_MEAN if view == "a" else FULL
+
+    with SkipGate(policy=First([])) as gate:
+        for step in range(3):
+            shared = value.exp()
+            assert not gate.backward((shared * value).mean(), view="a", step=step)
+            assert gate.backward((shared + value).mean(), view="b", step=step)
+            gate.update()
+
+
+def test_a_backward_through_a_freed_graph_is_an_error_with_a_sentence():
+    value = torch.nn.Parameter(torch.ones(N))
+    with SkipGate(policy=Always()) as gate:
+        for step in range(2):
+            loss = (value.exp() * value).mean()
+            gate.backward(loss, view="a", step=step)
+            gate.update()
+        with pytest.raises(SkipGSError, match="needs the graph of a loss whose backward was skipped"):
+            loss.backward()
+
+
+def test_changes_in_place_are_still_noticed():
+    value = torch.nn.Parameter(torch.ones(N))
+    graph = SavedGraph()
+    graph.open()
+    image = value.exp()
+    loss = image.sin().mean()
+    graph.close()
+    with torch.no_grad():
+        image.add_(1.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+def test_hooks_of_the_trainers_own_are_left_alone():
+    value, seen = torch.nn.Parameter(torch.ones(N)), []
+    graph = SavedGraph()
+    with torch.autograd.graph.saved_tensors_hooks(lambda t: seen.append(1) or t, lambda t: t):
+        graph.open()
+        value.exp()
+        graph.close()
+    assert seen
+    graph.open()
+    with torch.autograd.graph.saved_tensors_hooks(lambda t: seen.append(1) or t, lambda t: t):
+        value.exp().mean().backward()
+    graph.close()
+    assert torch._C._autograd._top_saved_tensors_default_hooks(True) is None and len(seen) == 2
+
+
+def losses(gate, steps, poison=()):
+    """Losses of a random walk; what each iteration left in the parameter's gradient."""
+    draw, left = random.Random(0), []
+    value = torch.nn.Parameter(torch.ones(4))
+    for step in range(steps):
+        scale = math.nan if step in poison else draw.uniform(0.8, 1.2)
+        loss = value.mean() * scale
+        answer = gate.backward(loss, view=f"v{step % 7}", step=step)
+        left.append((answer, None if value.grad is None else value.grad.isfinite().all().item()))
+        value.grad = None
+    return left
+
+
+@pytest.mark.parametrize("settings", [{}, {"min_bwd_ratio": 0.0}, {"min_bwd_ratio": 0.9, "warmup": 10}])
+def test_a_backward_that_does_not_wait_is_decided_on_the_same(settings, monkeypatch):
+    traces = []
+    for device in (False, True):
+        monkeypatch.setattr(engine, "has_events", lambda _, device=device: device)
+        gate = SkipGate(start_iter=50, record_trace=True, **settings)
+        losses(gate, 2000)
+        gate.notify_event("prune", 1999)
+        traces.append((gate.trace, gate.state_dict()["policy"], gate.state_dict()["stats"]))
+    assert traces[0] == traces[1] and any(row.skip for row in traces[0][0])
+
+
+@pytest.mark.parametrize("mode, left", [("skip", (False, None)), ("pass", (True, False))])
+def test_a_loss_that_is_not_finite_is_seen_behind_its_backward_and_before_the_step(mode, left, monkeypatch):
+    monkeypatch.setattr(engine, "has_events", lambda _: True)
+    gate = SkipGate(start_iter=0, warmup=100, on_nonfinite=mode)
+    with pytest.warns(RuntimeWarning, match="Loss is nan in iteration 20"):
+        seen = losses(gate, 30, poison=(20,))
+    assert seen[20] == left and seen[19] == seen[21] == (True, True)
+
+
+def test_a_loss_that_stops_training_leaves_no_gradient(monkeypatch):
+    monkeypatch.setattr(engine, "has_events", lambda _: True)
+    value = torch.nn.Parameter(torch.ones(4))
+    gate = SkipGate(start_iter=0, on_nonfinite="raise")
+    with pytest.raises(SkipGSError, match="Loss is nan"):
+        gate.backward(value.mean() * math.nan, view="a", step=0)
+    assert value.grad is None
