@@ -151,6 +151,16 @@ def released_on_error(hooks: Hooks, adapter: AbstractAdapter) -> Iterator[None]:
         release(hooks, adapter, f"The gate is released, and training goes on without it: {name}{error}")
 
 
+def guarded(hooks: Hooks, adapter: AbstractAdapter, call: Callable[..., Any]) -> Callable[..., None]:
+    """Return `call` as a function that releases the gate when it fails; see `released_on_error`."""
+
+    def safe(*args: Any, **kwargs: Any) -> None:
+        with released_on_error(hooks, adapter):
+            call(*args, **kwargs)
+
+    return safe
+
+
 # Marks a `torch.multiprocessing.spawn` that attaches a gate in each process.
 GATES_SPAWNED = "__skipgs_gates_spawned__"
 

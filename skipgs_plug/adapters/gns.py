@@ -19,7 +19,7 @@ class GNS(InriaFamily):
     """
 
     name = "gns"
-    checked = "XiaoBin2001/GNS 0c8e7dcd (both loops read, and a look-alike)"
+    checked = "XiaoBin2001/GNS 0c8e7dcd (train.py run on the CPU; train-fast.py read)"
     project = "[GNS](https://github.com/XiaoBin2001/GNS)"
     gated = (
         "`train.py`: from `reg_end` + 1 (23,001) on, where selection by opacity has ended; without `prune_reg` from "
