@@ -17,10 +17,10 @@ from skipgs_plug.adapters.gsplat_strategy import (
 )
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
-from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
-from skipgs_plug.core.host_copy import HostCopy
+from skipgs_plug.host_copy import HostCopy
 
 EXPECTED = ("cfg", "parser", "trainset", "rasterize_splats", "world_size")
 BATCH = "batch"  # one key for the joint loss of random batches, which never recur
@@ -78,6 +78,7 @@ class GsplatRunner(AbstractAdapter):
                 f"Adapter {self.name!r} expects a Runner with {', '.join(missing)}, as in {self.checked}."
             )
         strategy = runner.cfg.strategy
+        refuse_frozen(runner.cfg, hooks)
         batched = runner.cfg.batch_size > 1
         names = [BATCH] if batched else view_names(runner)
         # Id of the view rendered last. It lies on the device: it is on its way before the render is launched.
@@ -123,6 +124,27 @@ class GsplatRunner(AbstractAdapter):
 
     def must_run(self, step: int) -> bool:
         return step in self._relocations
+
+
+def refuse_frozen(cfg: Any, hooks: Hooks) -> None:
+    """Refuse to leave out iterations that train something else than the Gaussians.
+
+    With `--post_processing ppisp` the script freezes them near the end and distils a controller: those iterations need
+    all their steps, as long as they are.
+
+    Raises:
+        SkipGSError: Iterations would be left out, or steps be scaled, and the run reaches that part.
+    """
+    distils = getattr(cfg, "post_processing", None) == "ppisp" and cfg.ppisp_use_controller
+    if not (distils and cfg.ppisp_controller_distillation):
+        return
+    begin, gate = cfg.ppisp_controller_activation_num_steps, hooks.state.config
+    if begin < cfg.max_steps and (gate.leaves_out or gate.compensates):
+        raise SkipGSError(
+            f"From iteration {begin} on this run freezes the Gaussians and trains the PPISP controller, which needs "
+            "every iteration at its own learning rate; gate without share, refine_share and compensate, or give the "
+            "script --no-ppisp_controller_distillation."
+        )
 
 
 def view_names(runner: Any) -> list[str]:

@@ -179,7 +179,7 @@ class Bench:
 
     def _trainer(self, seed: int, **changes: Any) -> Trainer:
         trainer = Trainer(dataclasses.replace(self.config, seed=seed, **changes), self.scene, self.backend)
-        trainer.clock = TrainClock(self.backend.device, by_processor=self.clock == "processor")
+        trainer.clock = TrainClock(self.backend.device, by_processor=self.clock == "processor", phases=True)
         return trainer
 
     def _densified(self, trainer: Trainer) -> dict[str, Any]:

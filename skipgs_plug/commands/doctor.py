@@ -47,6 +47,8 @@ def run(args: None) -> int:
         print(IMPORT_ORDER)
     print("\nBackends")
     works = [check_backend(name) for name in ("gsplat", "warp")]
+    if torch.cuda.is_available():
+        print("\nMeasure the gate on this GPU, from a checkout, in eight minutes: python -m benchmarks.gpu SCENE")
     if missing:
         print(f"\nGet all missing packages with: {install_command()}")
     return 0 if any(works) else 1

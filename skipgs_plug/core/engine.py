@@ -18,7 +18,6 @@ from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
 from skipgs_plug.core.facts import TrainerFacts
-from skipgs_plug.core.host_copy import HostCopy, has_events
 from skipgs_plug.core.iteration import Iteration
 from skipgs_plug.core.nonfinite import NonFiniteGuard
 from skipgs_plug.core.pace.base import Pace
@@ -32,6 +31,7 @@ from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, r
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.views import require_unique, warn_unless_recurring
+from skipgs_plug.host_copy import HostCopy, has_events
 
 log = logging.getLogger(__name__)
 

@@ -28,10 +28,13 @@ class Sums:
 class TrainClock:
     """Adds up the seconds of training iterations; whatever runs between iterations is not counted.
 
-    On CUDA every phase border synchronises, so that a phase holds its own kernels.
+    A GPU works on while the host is ahead. Where phases are asked for, every border of one synchronises, so that it
+    holds its own kernels. Otherwise nothing synchronises within iterations: what is still under way is booked by
+    `settle`, before anything else is done with the device.
 
     Args:
         device: of the trainer.
+        phases: measure phases; None for yes on the CPU, where that costs nothing, and no on a GPU, where they stay 0.
         by_processor: `t_total`, `t_post` and `phase_seconds` are processor seconds instead of those on the wall.
 
     Attributes:
@@ -41,8 +44,11 @@ class TrainClock:
         phase_seconds: by phase.
     """
 
-    def __init__(self, device: torch.device, by_processor: bool = False) -> None:
-        self._cuda = device.type == "cuda"
+    def __init__(self, device: torch.device, by_processor: bool = False, phases: bool | None = None) -> None:
+        self._device = None if device.type == "cpu" else device
+        self._phases = self._device is None if phases is None else phases
+        self._after_densification = False
+        self._under_way = False  # work of the last iteration may be: nothing has synchronised since
         self._by_processor = by_processor
         self.wall, self.processor = Sums(), Sums()
         self.phase_seconds = dict.fromkeys(PHASES, 0.0)
@@ -59,17 +65,39 @@ class TrainClock:
         return self._chosen.post
 
     def start(self) -> None:
+        if self._phases:
+            self._synchronize()
         self._started = self._last = self._now()
 
     def mark(self, phase: str) -> None:
         """Book the time since the previous border to `phase`."""
+        if not self._phases:
+            return
+        self._synchronize()
         now = self._now()
         self.phase_seconds[phase] += now[self._by_processor] - self._last[self._by_processor]
         self._last = now
 
     def stop(self, after_densification: bool) -> None:
-        self.wall.add(self._last[0] - self._started[0], after_densification)
-        self.processor.add(self._last[1] - self._started[1], after_densification)
+        if not self._phases:
+            if after_densification != self._after_densification:
+                self._synchronize()  # no kernel of densification counts as refinement
+            self._last = self._now()
+        self._after_densification = after_densification
+        self._under_way = self._device is not None and not self._phases
+        self._book(self._last)
+
+    def settle(self) -> None:
+        """Wait for what is under way and book it: something else follows, such as an evaluation or a checkpoint."""
+        if self._under_way:
+            self._started = self._now()
+            self._synchronize()
+            self._book(self._now())
+            self._under_way = False
+
+    def _book(self, end: tuple[float, float]) -> None:
+        self.wall.add(end[0] - self._started[0], self._after_densification)
+        self.processor.add(end[1] - self._started[1], self._after_densification)
 
     def seconds(self) -> dict[str, float]:
         """Return `t_total`, `t_post` on the wall and, with `_processor` after the name, of the processor."""
@@ -98,8 +126,11 @@ class TrainClock:
     def _chosen(self) -> Sums:
         return self.processor if self._by_processor else self.wall
 
-    def _now(self) -> tuple[float, float]:
+    def _synchronize(self) -> None:
+        if self._device is not None:
+            getattr(torch, self._device.type).synchronize()
+
+    @staticmethod
+    def _now() -> tuple[float, float]:
         """Return the seconds on the wall and of the processor."""
-        if self._cuda:
-            torch.cuda.synchronize()
         return time.perf_counter(), time.process_time()

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from skipgs_plug.fallback_raster.buffers import release_memory
 from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
+from skipgs_plug.host_copy import HostCopy
 from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.clock import TrainClock
@@ -26,6 +27,7 @@ from skipgs_plug.trainer.mcmc import Mcmc
 from skipgs_plug.trainer.model import create_optimizers, create_splats
 from skipgs_plug.trainer.near_plane import near_plane
 from skipgs_plug.trainer.order import ViewOrder, derive_seed
+from skipgs_plug.trainer.photographs import Photographs
 from skipgs_plug.trainer.ply import write_ply
 from skipgs_plug.trainer.row_order import sort_rows, sorts_rows
 from skipgs_plug.trainer.scene import Scene, View
@@ -109,6 +111,11 @@ class Trainer:
         self._recipe = config.recipe
         self._sh_interval = config.scaled(config.sh_degree_interval)
         self._warm = False
+        self._photographs = Photographs(scene.train, self.backend.device)
+        self._value: HostCopy | None = None  # loss of the present iteration
+        self._colour: Tensor | None = None  # behind the scene; None for black  # [3]
+        if any(scene.background):
+            self._colour = torch.tensor(scene.background, dtype=torch.float32, device=self.backend.device)
 
     @property
     def splats(self) -> nn.ParameterDict:
@@ -134,7 +141,7 @@ class Trainer:
 
     @property
     def phase_seconds(self) -> dict[str, float]:
-        """Seconds of training by phase: forward, loss, backward, optimizer, strategy."""
+        """Seconds of training by phase: forward, loss, backward, optimizer, strategy; 0 if not measured."""
         return self.clock.phase_seconds
 
     @property
@@ -166,6 +173,7 @@ class Trainer:
             else:  # those at the end may have been left out
                 self.step = self.step if self.stop_requested else max(self.step, until)
         self.stop_requested = False
+        self.clock.settle()
         self._catch_up()
 
     def iterations(self, until: int) -> range:
@@ -179,7 +187,8 @@ class Trainer:
 
     def _train_step(self) -> float:
         step = self.step
-        view = self.scene.train[self._order.at(self.ran)]
+        view = self._photographs.on_device(self.scene.train[self._order.at(self.ran)])
+        self._photographs.begin(self.scene.train[self._order.at(self.ran + 1)])
         if not self._warm:
             self._warm_up(view)
         densifying = step < self.refine_stop_iter
@@ -193,7 +202,7 @@ class Trainer:
         if strategy is not None:
             strategy.step_pre_backward(self._splats, self._optimizers, self.strategy_state, step, info)
         loss = self._loss(image, target)
-        value = float(loss.detach())
+        self._value = HostCopy(loss)
         self.clock.mark("loss")
         self.backward(loss, view.name, step)
         self.clock.mark("backward")
@@ -206,6 +215,8 @@ class Trainer:
             self._densify(strategy, step, info)
         self.clock.mark("strategy")
         self.clock.stop(after_densification=not densifying)
+        value = self._value.value()
+        self._value = None
 
         self.step += 1
         self.ran += 1
@@ -220,14 +231,21 @@ class Trainer:
         Raises:
             InputError: the loss is not finite; names view and step.
         """
-        value = float(loss.detach())
-        if not math.isfinite(value):
+        value = self._value if self._value is not None else HostCopy(loss)
+        if value.is_under_way:  # a device need not wait for the answer
+            loss.backward()
+            self._require_finite(value, view, step)
+        else:
+            self._require_finite(value, view, step)
+            loss.backward()
+
+    @staticmethod
+    def _require_finite(value: HostCopy, view: str, step: int) -> None:
+        if not math.isfinite(value.value()):
             raise InputError(
-                f"Loss is {value} at iteration {step} on view {view!r}; "
-                "check that image and camera, or lower the "
-                "learning rates."
+                f"Loss is {value.value()} at iteration {step} on view {view!r}; check that image and camera, or lower "
+                "the learning rates."
             )
-        loss.backward()
 
     def set_learning_rate(self, step: float) -> None:
         """Set the learning rates of positions and exposure to those of iteration `step`; the others are constant."""
@@ -257,6 +275,7 @@ class Trainer:
         views = {"test": self.scene.test, "train": self.scene.train}[split]
         if not views:
             raise InputError(f"Scene {self.scene.name} has no {split} views; lower test_every to hold some out.")
+        self.clock.settle()
         wanted = metrics.chosen(lpips_net, fitted=self.exposure is not None and split == "test")
         with self.backend.exclusive_cores():
             rows = [self._measure(wanted, view) for view in views]
@@ -285,6 +304,7 @@ class Trainer:
 
     def snapshot(self) -> dict[str, Any]:
         """Return an exact copy of the training state, in memory."""
+        self.clock.settle()
         return state.capture(self)
 
     def restore(self, snapshot: dict[str, Any]) -> None:
@@ -293,6 +313,7 @@ class Trainer:
 
     def save_checkpoint(self, path: str | Path) -> None:
         """Write a checkpoint from which `load_checkpoint` continues exactly."""
+        self.clock.settle()
         state.save_checkpoint(self, path)
 
     def load_checkpoint(self, path: str | Path) -> None:
@@ -332,9 +353,7 @@ class Trainer:
 
     def _background(self) -> Tensor | None:
         """Return the scene's background [3]; None for black, which needs no compositing."""
-        if not any(self.scene.background):
-            return None
-        return torch.tensor(self.scene.background, dtype=torch.float32, device=self.backend.device)
+        return self._colour
 
     def _target(self, view: View) -> Tensor:
         return view.image.to(self.backend.device)
@@ -403,9 +422,14 @@ class Trainer:
 
         So resuming is exact, and the caller's random state is left alone.
         """
-        with DRAWING, torch.random.fork_rng():
+        with DRAWING, torch.random.fork_rng(devices=self._random_devices):
             torch.manual_seed(derive_seed(self.config.seed, step))
             yield
+
+    @property
+    def _random_devices(self) -> list[torch.device]:
+        """Devices whose random state is kept: without a list PyTorch would initialise every GPU."""
+        return [] if self.backend.device.type == "cpu" else [self.backend.device]
 
     def _warm_up(self, view: View) -> None:
         """Compile kernels before the clock runs: a forward and backward of each kind, whose gradients are dropped.

@@ -88,7 +88,7 @@ def create_optimizers(
         group = [{"params": [splats[name]], "lr": rate, "name": name}]
         if config.visible_adam:
             optimizers[name] = SelectiveAdam(group, eps=ADAM_EPS)
-        elif splats[name].is_cuda:
+        elif splats[name].device.type != "cpu":
             optimizers[name] = torch.optim.Adam(group, eps=ADAM_EPS, fused=True)
         elif name == "shN" and splats[name].numel():
             optimizers[name] = LazyAdam(group, eps=ADAM_EPS)

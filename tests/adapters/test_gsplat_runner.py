@@ -118,3 +118,19 @@ def test_script_that_spawns_processes_is_refused(gsplat_module):
     with pytest.raises(SkipGSError, match=sentence), SkipGate(adapter="gsplat"):
         script()
     assert not hasattr(torch.multiprocessing.spawn, "__skipgs_plug__")
+
+
+PPISP = {
+    "post_processing": "ppisp",
+    "ppisp_use_controller": True,
+    "ppisp_controller_distillation": True,
+    "ppisp_controller_activation_num_steps": 40,
+}
+
+
+@pytest.mark.parametrize("settings", [{"refine_share": 0.4}, {"compensate": True}, {"share": 0.5}])
+def test_iterations_that_train_a_controller_alone_are_not_left_out(settings):
+    with pytest.raises(SkipGSError, match="From iteration 40 on this run freezes the Gaussians"):
+        SkipGate(HeadRunner(DefaultStrategy(), **PPISP), **settings)
+    SkipGate(HeadRunner(DefaultStrategy(), **PPISP)).detach()
+    SkipGate(HeadRunner(DefaultStrategy(), **{**PPISP, "ppisp_use_controller": False}), **settings).detach()

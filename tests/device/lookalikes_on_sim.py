@@ -66,13 +66,15 @@ def rasterization_on_sim(rasterization: Any) -> Any:
 
     def on_sim(*args: Any, **kwargs: Any) -> Any:
         with host.paused():
-            image, alpha, info = rasterization(*map(to_host, args), **kwargs)
+            own = {name: to_host(value) for name, value in kwargs.items()}
+            image, alpha, info = rasterization(*map(to_host, args), **own)
             image = to_sim(image)
             wants_grad = info["means2d"].requires_grad
             means2d = torch.zeros(info["means2d"].shape, device=SIM, requires_grad=wants_grad)
             if wants_grad:
                 image = image + 0.0 * means2d.sum()
-            return image, to_sim(alpha), {**info, "means2d": means2d}
+            there = {name: to_sim(value) for name, value in info.items()}
+            return image, to_sim(alpha), {**there, "means2d": means2d}
 
     return on_sim
 

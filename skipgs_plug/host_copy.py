@@ -18,10 +18,11 @@ class HostCopy:
         tensor: One value, of any shape.
     """
 
-    __slots__ = ("_copy", "_event")
+    __slots__ = ("_copy", "_event", "_value")
 
     def __init__(self, tensor: Tensor) -> None:
         self._event: Any = None
+        self._value: float | None = None
         self._copy = tensor.detach()
         if has_events(tensor.device):
             # PyTorch makes a copy that does not block in pinned memory.
@@ -29,12 +30,19 @@ class HostCopy:
             self._event = getattr(torch, tensor.device.type).Event()
             self._event.record()
 
+    @property
+    def is_under_way(self) -> bool:
+        """Whether asking for the value would wait for a copy."""
+        return self._event is not None
+
     def value(self) -> float:
         """The value, as soon as it is here."""
-        if self._event is not None:
-            self._event.synchronize()
-            self._event = None
-        return self._copy.item()
+        if self._value is None:
+            if self._event is not None:
+                self._event.synchronize()
+                self._event = None
+            self._value = self._copy.item()
+        return self._value
 
 
 def has_events(device: torch.device) -> bool:
