@@ -19,6 +19,7 @@ from skipgs_plug.photos.gather import are_photographs
 from skipgs_plug.trainer import InputError, MissingFileError, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.config import REFERENCE_STEPS
 from skipgs_plug.trainer.curve import LossCurve
+from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders import is_scene
 from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.metrics import require_lpips
@@ -38,7 +39,10 @@ def run(args: Args) -> int:
     if args.sfm:
         args = dataclasses.replace(args, scene=str(scene_of_photographs(args, folder)))
     checkpoints, config = configure(args, found)
-    scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
+    memory = args.session.image_memory
+    images = ImageStore(None if memory is None else round(memory * 1e9), progress=not args.session.no_progress)
+    loading = (config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
+    scene = load_scene(args.scene, *loading, images)
     trainer = Trainer(config, scene)
     settings = args.gate_options.given()
     gate = SkipGate(trainer, **settings) if args.gate or settings else None

@@ -22,6 +22,7 @@ from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.densification import densify
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.exposure import Exposure
+from skipgs_plug.trainer.image_store import ReadAhead, one_by_one
 from skipgs_plug.trainer.mask import leave_out
 from skipgs_plug.trainer.mcmc import Mcmc
 from skipgs_plug.trainer.model import create_optimizers, create_splats
@@ -108,6 +109,7 @@ class Trainer:
         self.on_step: Callable[[Iteration], None] | None = None
         self.stop_requested = False
         self._order = ViewOrder(len(scene.train), config.seed)
+        self._read_ahead = ReadAhead(scene.train, config.seed)
         self._recipe = config.recipe
         self._sh_interval = config.scaled(config.sh_degree_interval)
         self._warm = False
@@ -174,6 +176,7 @@ class Trainer:
                 self.step = self.step if self.stop_requested else max(self.step, until)
         self.stop_requested = False
         self.clock.settle()
+        self._read_ahead.end()
         self._catch_up()
 
     def iterations(self, until: int) -> range:
@@ -187,6 +190,7 @@ class Trainer:
 
     def _train_step(self) -> float:
         step = self.step
+        self._read_ahead.expect(self.ran)
         view = self._photographs.on_device(self.scene.train[self._order.at(self.ran)])
         self._photographs.begin(self.scene.train[self._order.at(self.ran + 1)])
         if not self._warm:
@@ -278,7 +282,7 @@ class Trainer:
         self.clock.settle()
         wanted = metrics.chosen(lpips_net, fitted=self.exposure is not None and split == "test")
         with self.backend.exclusive_cores():
-            rows = [self._measure(wanted, view) for view in views]
+            rows = [self._measure(wanted, view) for view in one_by_one(views)]
         means = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
         return {
             **means,

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from skipgs_plug.trainer.image_store import StreamedView
 from skipgs_plug.trainer.scene import View
 
 log = logging.getLogger(__name__)
@@ -42,7 +43,7 @@ class Photographs:
         self.resident = True
         if device.type == "cpu":
             return
-        size = sum(view.image.nbytes for view in views)
+        size = sum(3 * view.width * view.height for view in views)
         bound = int(SHARE * (_free_bytes(self._backend) if free_bytes is None else free_bytes))
         self.resident = size <= bound
         if not self.resident:
@@ -59,6 +60,8 @@ class Photographs:
         """Return a view with all its tensors on the device; the host does not wait for it."""
         if self._device.type == "cpu":
             return view
+        if self._streams(view):
+            return self._kept(view)
         kept = self._views.get(view.name)
         if kept is None:
             kept = self._views[view.name] = self._kept(view)
@@ -75,7 +78,7 @@ class Photographs:
 
     def begin(self, view: View) -> None:
         """Begin to copy a view's photograph, which is the next."""
-        if self._device.type == "cpu" or self.resident or view.name in self._ahead:
+        if self._device.type == "cpu" or self.resident or view.name in self._ahead or self._streams(view):
             return
         self._ahead.clear()
         kept = self._views.get(view.name)
@@ -92,13 +95,17 @@ class Photographs:
             event.record(self._stream)
         self._ahead[view.name] = (image, event)
 
+    def _streams(self, view: View) -> bool:
+        """Whether neither the device nor the host has room to keep the photograph; see `ImageStore`."""
+        return isinstance(view, StreamedView) and not self.resident
+
     def _kept(self, view: View) -> View:
         def there(tensor: Tensor) -> Tensor:
             return tensor.to(self._device)
 
         return View(
             view.name,
-            there(view.image) if self.resident else _pinned(view.image),
+            there(view.image) if self.resident or self._streams(view) else _pinned(view.image),
             there(view.K),
             there(view.viewmat),
             None if view.mask is None else there(view.mask),

@@ -13,6 +13,7 @@ import numpy as np
 from skipgs_plug.files import remove_leftovers, write_aside
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.files import write_json
+from skipgs_plug.trainer.image_store import one_by_one
 from skipgs_plug.trainer.loop import Trainer
 
 CHECKPOINT = re.compile(r"ckpt_(\d+)_rank0\.pt")
@@ -71,7 +72,7 @@ class RunFolder:
         from PIL import Image
 
         views = trainer.scene.test if split == "val" else trainer.scene.train
-        for i, view in enumerate(views):
+        for i, view in enumerate(one_by_one(views)):
             render = (trainer.render(view).clamp(0, 1) * 255).round().byte().cpu().numpy()
             both = np.concatenate([view.image.numpy(), render], axis=1)
             with write_aside(self.root / "renders" / f"{split}_step{trainer.step - 1}_{i:04d}.png") as temporary:

@@ -40,6 +40,11 @@ class View:
     def height(self) -> int:
         return self.image.shape[0]
 
+    @property
+    def blank(self) -> bool:
+        """Whether its mask leaves no pixel."""
+        return self.mask is not None and not bool(self.mask.any())
+
 
 @dataclass
 class Scene:
@@ -113,7 +118,7 @@ def check_view(view: View, source: Path) -> None:
             f"{source}: {view.name!r} is {view.width}x{view.height}, SSIM needs {MIN_SIDE} pixels on each side; "
             "use larger images or a smaller data_factor."
         )
-    if view.mask is not None and not view.mask.any():
+    if view.blank:
         raise InputError(f"{source}: the mask of {view.name!r} leaves no pixel; white is what counts.")
 
 

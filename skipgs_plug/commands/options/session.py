@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
+from skipgs_plug.commands.options.parse import shown
 from skipgs_plug.trainer.errors import InputError
 
 
@@ -20,6 +21,8 @@ class SessionOptions:
     """Log gsplat's scalars and the gate's counters to RUN/tb, every tenth iteration."""
     view: bool = False
     """Show training in the browser; costs at most 2 % of its time."""
+    image_memory: Annotated[float | None, shown("GB", "a quarter of what is free")] = None
+    """Memory for decoded photographs; those of larger captures are decoded again ahead of their turn."""
     lpips_net: Literal["alex", "vgg"] | None = None
     """Also report LPIPS; its weights must be on this machine."""
     no_progress: bool = False
@@ -30,3 +33,5 @@ class SessionOptions:
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise InputError(f"{name}={value} is not a number of iterations; 0 stands for the end only.")
+        if self.image_memory is not None and not 0 < self.image_memory < 1e6:
+            raise InputError(f"image_memory={self.image_memory} is no amount of memory; give gigabytes, such as 4.")

@@ -10,6 +10,7 @@ import torch
 
 from skipgs_plug.install import next_command
 from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.blender import load_blender
 from skipgs_plug.trainer.loaders.colmap import load_colmap
 from skipgs_plug.trainer.loaders.nerfstudio import load_nerfstudio
@@ -31,6 +32,7 @@ def load_scene(
     test_every: int = 8,
     init_num_pts: int = 100_000,
     init_ply: str | Path | None = None,
+    images: ImageStore | None = None,
 ) -> Scene:
     """Load a COLMAP, nerfstudio or Blender folder or a packed .npz.
 
@@ -43,12 +45,14 @@ def load_scene(
             with `transforms_test.json`, nerfstudio files with `train_filenames` and packed files bring their own split.
         init_num_pts: random points for a Blender scene, which has no point cloud.
         init_ply: point cloud, or 3DGS model, to start from instead of the scene's points; in its coordinates.
+        images: bounds the memory of decoded photographs; None: to a quarter of what is free.
 
     Raises:
         MissingFileError: a folder or image is not there.
         InputError: the content cannot be used (camera model, empty or non-finite points, damaged image...).
     """
     path = Path(path).expanduser()
+    images = images or ImageStore()
     cloud, gaussians = read_start(init_ply) if init_ply else (None, None)
     if not path.exists():
         raise MissingFileError(
@@ -59,11 +63,11 @@ def load_scene(
             raise InputError(f"Scene {path} is a file but not a packed .npz; give the folder that holds it.")
         scene = load_packed(path)
     elif (path / "sparse").is_dir():
-        scene = load_colmap(path, data_factor, test_every)
+        scene = load_colmap(path, data_factor, test_every, images)
     elif (path / "transforms_train.json").is_file():
-        scene = load_blender(path, data_factor, test_every, init_num_pts)
+        scene = load_blender(path, data_factor, test_every, init_num_pts, images)
     elif (path / "transforms.json").is_file():
-        scene = load_nerfstudio(path, data_factor, test_every, cloud)
+        scene = load_nerfstudio(path, data_factor, test_every, images, cloud)
     else:
         raise MissingFileError(
             f"Scene {path} holds neither {path / 'sparse' / '0'} (COLMAP) nor {path / 'transforms_train.json'} "

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
+from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.colmap_files import check_lengths
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.paths import find_image
@@ -19,7 +20,7 @@ from skipgs_plug.trainer.scene import Scene, View, assemble_scene, split_views
 log = logging.getLogger(__name__)
 
 
-def load_colmap(path: Path, data_factor: int, test_every: int) -> Scene:
+def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStore) -> Scene:
     """Load a COLMAP reconstruction; see `load_scene`."""
     model = find_model(path)
     reconstruction = read_model(model)
@@ -27,7 +28,7 @@ def load_colmap(path: Path, data_factor: int, test_every: int) -> Scene:
     masks = path / "masks"
     cache = UndistortedCache(path)
     views, bare, distorted = [], 0, set()
-    for image in reconstruction.images.values():
+    for image in images.reading(list(reconstruction.images.values())):
         if not image.has_pose:
             continue
         name = image_name(image, model)
@@ -37,7 +38,7 @@ def load_colmap(path: Path, data_factor: int, test_every: int) -> Scene:
         if model_name(camera) not in PINHOLE_MODELS:
             distorted.add(model_name(camera))
         pose, image_path = pose_of(image, name, model), find_image(folder, name)
-        views.append(load_photograph(name, image_path, camera, pose, cache, factor, mask))
+        views.append(load_photograph(name, image_path, camera, pose, cache, factor, mask, images))
     if not views:
         raise InputError(f"{model} registers no image; run COLMAP again with more overlap between photographs.")
     if distorted:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.blender import opencv_viewmat
 from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.loaders.json_file import read_number, read_object, read_pose, read_string
@@ -31,7 +32,11 @@ SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
 
 def load_nerfstudio(
-    path: Path, data_factor: int, test_every: int, cloud: tuple[np.ndarray, np.ndarray] | None = None
+    path: Path,
+    data_factor: int,
+    test_every: int,
+    images: ImageStore,
+    cloud: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Scene:
     """Load transforms.json; `cloud` (points, colours) takes the place of its point cloud. See `load_scene`."""
     source = path / FILE
@@ -41,7 +46,7 @@ def load_nerfstudio(
         raise InputError(f"{source} lists no frames; run ns-process-data again.")
     cache = UndistortedCache(path)
     views, distorted = [], set()
-    for frame in frames:
+    for frame in images.reading(frames):
         file_path = read_string(frame.get("file_path"), "file_path of a frame", source)
         name = PurePosixPath(file_path).as_posix()  # without a leading ./
         viewmat = opencv_viewmat(read_pose(frame.get("transform_matrix"), file_path, source))
@@ -51,7 +56,7 @@ def load_nerfstudio(
         if mask is not None:
             mask = inside(path, read_string(mask, f"mask_path of {name!r}", source))
         image_path, factor = reduced_image(path, name, full, data_factor)
-        views.append(load_photograph(name, image_path, camera, viewmat, cache, factor, mask))
+        views.append(load_photograph(name, image_path, camera, viewmat, cache, factor, mask, images))
         if model_name(camera) not in PINHOLE_MODELS:
             distorted.add(model_name(camera))
     if distorted:

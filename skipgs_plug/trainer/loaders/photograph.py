@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.trainer.errors import InputError, reason
+from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.images import read_image, read_mask
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.paths import inside
@@ -29,6 +30,7 @@ def load_photograph(
     cache: UndistortedCache,
     factor: int = 1,
     mask_path: Path | None = None,
+    images: ImageStore | None = None,
 ) -> View:
     """Read a photograph; alpha below one half and black pixels of the mask do not count in the loss.
 
@@ -40,8 +42,22 @@ def load_photograph(
         cache: keeps what is undistorted.
         factor: shrink by this in memory.
         mask_path: picture of the same shape, black where pixels are left out.
+        images: keeps the photograph; None: it stays in memory.
     """
     check_camera(camera, image_path)
+
+    def read() -> Straight:
+        return read_straight(image_path, camera, cache, factor, mask_path)
+
+    pixels, mask, K = read()
+    view = View(name, pixels, torch.from_numpy(K).float(), torch.from_numpy(viewmat).float(), mask)
+    return view if images is None else images.keep(view, lambda: read()[:2])
+
+
+def read_straight(
+    image_path: Path, camera: Any, cache: UndistortedCache, factor: int, mask_path: Path | None
+) -> Straight:
+    """Return a photograph as a pinhole camera sees it; see `load_photograph`."""
     if model_name(camera) in PINHOLE_MODELS:
         pixels, mask = read_photograph(image_path, camera, factor, mask_path)
         K = np.array(camera.calibration_matrix(), dtype=np.float64)
@@ -54,8 +70,8 @@ def load_photograph(
         if kept is None:
             kept = undistort(*read_photograph(image_path, camera, factor, mask_path), camera, image_path)
             cache.write(key, kept)
-        pixels, mask, K = kept
-    return View(name, pixels, torch.from_numpy(K).float(), torch.from_numpy(viewmat).float(), mask)
+        return kept
+    return Straight(pixels, mask, K)
 
 
 def read_photograph(image_path: Path, camera: Any, factor: int, mask_path: Path | None) -> tuple[Tensor, Tensor | None]:
