@@ -33,9 +33,9 @@ from common import (
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import rasterization
-from skipgs_plug.fallback_raster.cores import usable_cores
-from skipgs_plug.fallback_raster.torch_reference import near_cutoff, rasterization_reference
-from skipgs_plug.fallback_raster.torch_reference_projection import rotation_matrices, spherical_harmonics
+from skipgs_plug.fallback_raster.oracle.torch_reference import near_cutoff, rasterization_reference
+from skipgs_plug.fallback_raster.oracle.torch_reference_projection import rotation_matrices, spherical_harmonics
+from skipgs_plug.fallback_raster.runtime.cores import usable_cores
 
 FILE = RESULTS / "accuracy.json"
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "backgrounds", "viewmats")

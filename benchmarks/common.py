@@ -18,8 +18,8 @@ from torch import Tensor
 
 from skipgs_plug.bench.provenance import commit, cpu_name, versions
 from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
-from skipgs_plug.fallback_raster.cores import usable_cores
-from skipgs_plug.fallback_raster.launch import FloatArray, Worker, worker
+from skipgs_plug.fallback_raster.runtime.cores import usable_cores
+from skipgs_plug.fallback_raster.runtime.launch import FloatArray, Worker, worker
 from skipgs_plug.trainer.files import write_aside
 
 RESULTS = Path(__file__).parent / "results"

@@ -31,8 +31,10 @@ from common import (
     write_part,
 )
 
-from skipgs_plug.fallback_raster import blend, launch, rasterization
-from skipgs_plug.fallback_raster.cores import usable_cores
+from skipgs_plug.fallback_raster import rasterization
+from skipgs_plug.fallback_raster.runtime import launch
+from skipgs_plug.fallback_raster.runtime.cores import usable_cores
+from skipgs_plug.fallback_raster.stages import blend
 from skipgs_plug.trainer import TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.loss import l1_ssim_loss as convolved_loss

@@ -17,7 +17,7 @@ import torch
 import tyro
 from common import RESULTS, SCENES, exponents, median_ms, provenance, threads, write_part
 
-from skipgs_plug.fallback_raster.cores import usable_cores
+from skipgs_plug.fallback_raster.runtime.cores import usable_cores
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer, load_scene
 
 FILE = RESULTS / "iteration.json"

@@ -19,8 +19,8 @@ from common import RESULTS, clock, median_ms, provenance, relative_difference, t
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import l1_ssim_loss
-from skipgs_plug.fallback_raster.cores import usable_cores
-from skipgs_plug.fallback_raster.optimizer import Adam
+from skipgs_plug.fallback_raster.runtime.cores import usable_cores
+from skipgs_plug.fallback_raster.training.optimizer import Adam
 from skipgs_plug.trainer.loss import l1_ssim_loss as plain_loss
 
 FILE = RESULTS / "optimizer_and_loss.json"

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 from skipgs_plug.fallback_raster import rasterization
-from skipgs_plug.fallback_raster.launch import FloatArray, worker
+from skipgs_plug.fallback_raster.runtime.launch import FloatArray, worker
 
 
 # Every tile looks at every Gaussian, nearest first; a box around its ellipse at alpha 1/255 decides only whether

@@ -46,8 +46,8 @@ from pairs import blended_pairs
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
-from skipgs_plug.fallback_raster.cores import usable_cores
-from skipgs_plug.fallback_raster.shortcuts import SHORTCUTS, without_shortcuts
+from skipgs_plug.fallback_raster.runtime.cores import usable_cores
+from skipgs_plug.fallback_raster.runtime.optimizations import OPTIMIZATIONS, without_optimizations
 from skipgs_plug.fallback_raster.splats import rasterize_splats
 from skipgs_plug.trainer.loss import l1_ssim_loss as convolved_loss
 from skipgs_plug.trainer.row_order import morton_order
@@ -316,7 +316,7 @@ def part_shortcuts(quick: bool, repeats: int, only: str | None) -> list[dict[str
     """Time with and without each shortcut, in turns, and by how much it changes the result."""
     scene = garden_scene(GARDEN_DOWNSCALE["324x210" if quick else "648x420"], 0, sh_degree=3)
     left = slice(0, scene["width"] // 2)  # half of the image has no gradient
-    names: list[tuple[str, ...]] = [(name,) for name in SHORTCUTS] + [tuple(SHORTCUTS)]
+    names: list[tuple[str, ...]] = [(name,) for name in OPTIMIZATIONS] + [tuple(OPTIMIZATIONS)]
     rows = []
     print(f"{'left out':>18} {'ms':>7} {'ms with':>7} {'saves':>14} {'image':>8} {'gradient':>8}")
     for left_out in names:
@@ -325,7 +325,7 @@ def part_shortcuts(quick: bool, repeats: int, only: str | None) -> list[dict[str
         inputs = {}
         for seed in range(4 * repeats + 2):
             for shortened in (True, False) if seed % 2 else (False, True):
-                with contextlib.nullcontext() if shortened else without_shortcuts(*left_out):
+                with contextlib.nullcontext() if shortened else without_optimizations(*left_out):
                     there, back, inputs[shortened] = one_pass(scene, seed, left)
                 if seed >= 2:
                     seconds[shortened].append(there + back)

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import torch
 
-from skipgs_plug.fallback_raster.buffers import release_memory
+from skipgs_plug.fallback_raster import release_memory
 
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 RESET_PEAK = "5"  # as proc(5) has it

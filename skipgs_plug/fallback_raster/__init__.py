@@ -5,8 +5,70 @@ cores; none is written in Warp's Python dialect, and no compiler has to be insta
 compiled (seconds, cached on disk), when something is first rendered.
 """
 
-from .install import install_as_gsplat as install_as_gsplat
-from .loss import l1_ssim_loss as l1_ssim_loss
-from .rasterization import rasterization as rasterization
-from .threads import get_num_threads as get_num_threads
-from .threads import set_num_threads as set_num_threads
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .install import install_as_gsplat
+    from .rasterize import rasterization
+    from .runtime.buffers import release_memory
+    from .runtime.cores import usable_cores
+    from .runtime.threads import get_num_threads, set_num_threads
+    from .splats import rasterize_splats
+    from .stages.rows import take_rows
+    from .training.adam import adam_rows
+    from .training.gradient_norms import sum_norms
+    from .training.lazy_adam import LazyAdam
+    from .training.loss import l1_ssim_loss
+    from .training.optimizer import Adam, instead_of_torchs_adam, moments
+
+__all__ = [
+    "Adam",
+    "LazyAdam",
+    "adam_rows",
+    "get_num_threads",
+    "install_as_gsplat",
+    "instead_of_torchs_adam",
+    "l1_ssim_loss",
+    "moments",
+    "rasterization",
+    "rasterize_splats",
+    "release_memory",
+    "set_num_threads",
+    "sum_norms",
+    "take_rows",
+    "usable_cores",
+]
+
+# Loaded on first use: a program that only asks for the number of threads should not load optimizers.
+_HOMES = {
+    "Adam": "training.optimizer",
+    "LazyAdam": "training.lazy_adam",
+    "adam_rows": "training.adam",
+    "get_num_threads": "runtime.threads",
+    "install_as_gsplat": "install",
+    "instead_of_torchs_adam": "training.optimizer",
+    "l1_ssim_loss": "training.loss",
+    "moments": "training.optimizer",
+    "rasterization": "rasterize",
+    "rasterize_splats": "splats",
+    "release_memory": "runtime.buffers",
+    "set_num_threads": "runtime.threads",
+    "sum_norms": "training.gradient_norms",
+    "take_rows": "stages.rows",
+    "usable_cores": "runtime.cores",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .buffers import floats, ints, zeros
-from .constants import blocks
-from .project import project_backward, project_forward
-from .rendering import blend, blend_adjoint
-from .rows import all_rows, put_rows, take_rows, visible_rows
-from .sh import sh_backward, sh_forward
-from .shortcuts import SHORTCUTS, active_shortcuts
+from .runtime.buffers import floats, ints, zeros
+from .runtime.constants import blocks
+from .runtime.optimizations import OPTIMIZATIONS, active_optimizations
+from .stages.project import project_backward, project_forward
+from .stages.rendering import blend, blend_adjoint
+from .stages.rows import all_rows, put_rows, take_rows, visible_rows
+from .stages.sh import sh_backward, sh_forward
 
 
 def check_shapes(tensors: tuple[Tensor, ...], **shapes: torch.Size) -> tuple[Tensor, ...]:
@@ -69,7 +69,7 @@ class Project(torch.autograd.Function):
         project_forward(
             means, quats, scales, opacities, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
             floats(0), seen, block_count, n, float(width), float(height), near_plane, far_plane, eps2d, radius_clip,
-            int(antialiased), 0, 1, 1, active_shortcuts(),
+            int(antialiased), 0, 1, 1, active_optimizations(),
         )  # fmt: skip
         visible, block_start = visible_rows(seen, block_count)
         ctx.save_for_backward(means, quats, scales, viewmat, K, visible, block_start)
@@ -103,7 +103,7 @@ class Project(torch.autograd.Function):
         project_backward(
             means, quats, scales, viewmat, K, visible, block_start, v_means2d, v_depths, v_conics, v_compensations,
             v_means, v_quats, v_scales, v_poses, n, float(width), float(height), eps2d,
-            int(v_depths.numel() > 0), int(v_compensations.numel() > 0), int(with_pose), active_shortcuts(),
+            int(v_depths.numel() > 0), int(v_compensations.numel() > 0), int(with_pose), active_optimizations(),
         )  # fmt: skip
         v_viewmat = None
         if with_pose:
@@ -131,7 +131,7 @@ class SphericalHarmonics(torch.autograd.Function):
     ) -> Tensor:
         n = len(means)
         colors = floats(n, 3)
-        if not active_shortcuts() & SHORTCUTS["visible_only"]:
+        if not active_optimizations() & OPTIMIZATIONS["visible_only"]:
             visible, block_start = all_rows(n)
         ctx.layout = (3 * base.shape[1], 3 * base.shape[1], 3) if rest is None else (3, 3 * rest.shape[1], 0)
         ctx.degree = degree
@@ -151,7 +151,7 @@ class SphericalHarmonics(torch.autograd.Function):
         v_cameras = zeros(blocks(len(means)), 3)
         sh_backward(
             means, camera, base, rest, visible, block_start, colors, v_colors.contiguous(), v_means, v_base, v_rest,
-            v_cameras, len(means), *ctx.layout, ctx.degree, active_shortcuts(),
+            v_cameras, len(means), *ctx.layout, ctx.degree, active_optimizations(),
         )  # fmt: skip
         v_camera = v_cameras.sum(0) if ctx.needs_input_grad[1] else None
         return v_means, v_camera, v_base, None if ctx.joined else v_rest, None, None, None

@@ -26,7 +26,7 @@ class Installation:
         _open.remove(self)
         if _open:
             return
-        from skipgs_plug.fallback_raster import rasterization
+        from .rasterize import rasterization
 
         for module in _gsplat_modules():
             original = _originals.pop(module.__name__)
@@ -60,7 +60,7 @@ def install_as_gsplat() -> Installation:
     Raises:
         ImportError: gsplat is not installed.
     """
-    from skipgs_plug.fallback_raster import rasterization
+    from .rasterize import rasterization
 
     modules = _gsplat_modules()
     installation = Installation()

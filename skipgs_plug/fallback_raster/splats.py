@@ -12,18 +12,18 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .arguments import as_kernels_read, camera_centre, check_tensors, planes
 from .autograd import check_shapes
-from .buffers import floats, ints, zeros
-from .constants import FACTOR, TILE, blocks, tiles
-from .lazy_adam import LazyAdam
-from .outer_gradient import Factors
-from .project import project_forward
-from .rendering import blend, pair_sums
-from .rows import take_rows, visible_rows
-from .sh import sh_forward
-from .shortcuts import active_shortcuts
-from .splat_backward import splat_backward
+from .runtime.arguments import as_kernels_read, camera_centre, check_tensors, planes
+from .runtime.buffers import floats, ints, zeros
+from .runtime.constants import FACTOR, TILE, blocks, tiles
+from .runtime.optimizations import active_optimizations
+from .stages.project import project_forward
+from .stages.rendering import blend, pair_sums
+from .stages.rows import take_rows, visible_rows
+from .stages.sh import sh_forward
+from .stages.splat_backward import splat_backward
+from .training.factored_gradient import Factors
+from .training.lazy_adam import LazyAdam
 
 EPS2D = 0.3  # added to the 2D covariance's diagonal, square pixels
 
@@ -212,7 +212,7 @@ class _Render(torch.autograd.Function):
             *sums, means, quats, log_scales, logits, sh0, shN, viewmat, K, camera, ctx.colors, p.conics, p.opacities,
             *gradients, v_shN, factors.directions, factors.colors, v_centres, absolute,
             n, *map(float, size), EPS2D, layout[1], degree, int(lazy is not None), int(antialiased),
-            int(ctx.with_centres), int(with_absolute), ctx.blended.parts, active_shortcuts(),
+            int(ctx.with_centres), int(with_absolute), ctx.blended.parts, active_optimizations(),
         )  # fmt: skip
         if lazy is not None:
             lazy.receive(factors)
@@ -239,7 +239,7 @@ def _project(
     project_forward(
         means, quats, log_scales, logits, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
         opacities, seen, block_count, n, *map(float, size), near_plane, far_plane, EPS2D, 0.0, int(antialiased),
-        1, 0, int(with_radii), active_shortcuts(),
+        1, 0, int(with_radii), active_optimizations(),
     )  # fmt: skip
     lists = visible_rows(seen, block_count)
     return _Projected(means2d, depths, conics, sigmas, compensations, radii, opacities, *lists)

@@ -1,6 +1,6 @@
 """Run code written for CUDA on the CPU: every request for a CUDA tensor gives a CPU tensor.
 
-The counterpart of `fallback_raster.compat`: together they let an unmodified training script run where
+The counterpart of `compat`: together they let an unmodified training script run where
 there is no GPU. Nothing is emulated beyond placement and clocks, and whatever is not listed here (streams,
 graphs, CUDA generators) fails as it does in any PyTorch without CUDA.
 """
@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch.overrides import TorchFunctionMode
 
-from skipgs_plug.fallback_raster.compat.stand_ins import stand_ins
+from skipgs_plug.compat.stand_ins import stand_ins
 
 
 class HostEvent:

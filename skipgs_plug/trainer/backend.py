@@ -53,7 +53,7 @@ class Backend:
         """
         viewmat, K = viewmat.to(self.device), K.to(self.device)
         if self.name == "warp":
-            from skipgs_plug.fallback_raster.splats import rasterize_splats
+            from skipgs_plug.fallback_raster import rasterize_splats
 
             image, _, info = rasterize_splats(
                 splats["means"],

@@ -7,13 +7,12 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from skipgs_plug.fallback_raster.buffers import release_memory
-from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
+from skipgs_plug.fallback_raster import LazyAdam, release_memory
 from skipgs_plug.host_copy import HostCopy
 from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend
@@ -32,18 +31,11 @@ from skipgs_plug.trainer.photographs import Photographs
 from skipgs_plug.trainer.ply import write_ply
 from skipgs_plug.trainer.row_order import sort_rows, sorts_rows
 from skipgs_plug.trainer.scene import Scene, View
+from skipgs_plug.trainer.state import Stateful
 from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
 
 MEANS_LR_END = 0.01  # share of the positions' learning rate that is left at the end of the schedule
 DRAWING = threading.Lock()  # held by the trainer that draws: all threads share the generator that gsplat draws from
-
-
-class Stateful(Protocol):
-    """Anything whose state should travel in snapshots and checkpoints."""
-
-    def state_dict(self) -> dict[str, Any]: ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
 class Iteration(NamedTuple):

@@ -53,6 +53,6 @@ class Mcmc:
 
 
 def _strategy_on_cpu() -> contextlib.AbstractContextManager[None]:
-    from skipgs_plug.fallback_raster.compat.strategy_operations import strategy_on_cpu
+    from skipgs_plug.compat.strategy_operations import strategy_on_cpu
 
     return strategy_on_cpu()

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
-from skipgs_plug.fallback_raster.optimizer import Adam
+from skipgs_plug.fallback_raster import Adam, LazyAdam
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.near_plane import before_a_lens

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from skipgs_plug.fallback_raster.rows import take_rows
+from skipgs_plug.fallback_raster import take_rows
 
 EVERY = 4  # refinements between two sorts; those in between add few rows at the end
 BITS = 10  # of a coordinate

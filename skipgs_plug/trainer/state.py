@@ -9,19 +9,18 @@ import pickle
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any, Protocol, TypedDict
 
 import torch
 from torch import Tensor, nn
 
 from skipgs_plug import schema
 from skipgs_plug.files import write_aside
+from skipgs_plug.trainer.backend import Backend
 from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import DamagedCheckpointError, InputError, MissingFileError
-
-if TYPE_CHECKING:
-    from skipgs_plug.trainer.loop import Trainer
+from skipgs_plug.trainer.scene import Scene
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +33,35 @@ DAMAGE = (
     *(pickle.UnpicklingError, zipfile.BadZipFile, EOFError, OSError, MemoryError, OverflowError),
     *(RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError),
 )
+
+
+class Stateful(Protocol):
+    """Anything whose state should travel in snapshots and checkpoints."""
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+
+
+class Capturable(Protocol):
+    """The part of a `Trainer` that a snapshot holds and a checkpoint is compared with."""
+
+    step: int
+    ran: int
+    max_steps: int
+    config: TrainConfig
+    scene: Scene
+    backend: Backend
+    clock: TrainClock
+    view_names: list[str]
+    strategy_state: dict[str, Any]
+    registered: dict[str, Stateful]
+
+    @property
+    def splats(self) -> nn.ParameterDict: ...
+
+    @property
+    def optimizers(self) -> dict[str, torch.optim.Optimizer]: ...
 
 
 class ConfigEntry(TypedDict):
@@ -65,7 +93,7 @@ class Checkpoint(TypedDict):
     scene: SceneEntry
 
 
-def capture(trainer: Trainer) -> dict[str, Any]:
+def capture(trainer: Capturable) -> dict[str, Any]:
     """Return an independent copy of everything that the next iteration depends on.
 
     Keys: `version`, `step` (next iteration), `ran` (iterations that ran), `splats`, `optimizers` (moments by
@@ -75,7 +103,7 @@ def capture(trainer: Trainer) -> dict[str, Any]:
     return copy.deepcopy(_view(trainer))
 
 
-def apply(trainer: Trainer, state: dict[str, Any]) -> None:
+def apply(trainer: Capturable, state: dict[str, Any]) -> None:
     """Put a captured state back, keeping the optimizer objects so that attached tools stay attached.
 
     Registered objects without an entry (a gate attached later) are left as they are.
@@ -99,7 +127,7 @@ def apply(trainer: Trainer, state: dict[str, Any]) -> None:
             owner.load_state_dict(state["registered"][name])
 
 
-def save_checkpoint(trainer: Trainer, path: str | Path) -> None:
+def save_checkpoint(trainer: Capturable, path: str | Path) -> None:
     """Write the captured state with config and view names; loads with `weights_only=True`.
 
     Raises:
@@ -143,7 +171,7 @@ def read_checkpoint(path: str | Path, device: torch.device) -> dict[str, Any]:
     return content
 
 
-def load_checkpoint(trainer: Trainer, path: str | Path) -> None:
+def load_checkpoint(trainer: Capturable, path: str | Path) -> None:
     """Continue where a checkpoint of the same scene and settings stopped.
 
     Raises:
@@ -165,7 +193,7 @@ def load_checkpoint(trainer: Trainer, path: str | Path) -> None:
             log.warning("Checkpoint %s holds no state for %s: it starts fresh.", path, name)
 
 
-def _view(trainer: Trainer) -> dict[str, Any]:
+def _view(trainer: Capturable) -> dict[str, Any]:
     """Return what `capture` copies, with the tensors of the trainer themselves."""
     moments = {}
     for name, optimizer in trainer.optimizers.items():
@@ -214,7 +242,7 @@ def _check_tensors(content: dict[str, Any]) -> None:
             raise schema.SchemaError(f"{name} of the strategy has shape {list(value.shape)}")
 
 
-def _require_same_run(trainer: Trainer, content: dict[str, Any], path: str | Path) -> None:
+def _require_same_run(trainer: Capturable, content: dict[str, Any], path: str | Path) -> None:
     if content["scene"]["view_names"] != list(trainer.view_names):
         raise InputError(f"Checkpoint {path} was made with other training views; resume with its own scene and split.")
     # A checkpoint that is older than a setting was made with what is its default now.
@@ -237,7 +265,7 @@ def _require_same_run(trainer: Trainer, content: dict[str, Any], path: str | Pat
         )
 
 
-def _require_same_shape(trainer: Trainer, content: dict[str, Any], path: str | Path) -> None:
+def _require_same_shape(trainer: Capturable, content: dict[str, Any], path: str | Path) -> None:
     """Raise DamagedCheckpointError unless the trainer can hold these tensors, and knows all other entries."""
     wrong = _difference(trainer, content)
     if wrong is not None:
@@ -246,7 +274,7 @@ def _require_same_shape(trainer: Trainer, content: dict[str, Any], path: str | P
         )
 
 
-def _difference(trainer: Trainer, content: dict[str, Any]) -> str | None:
+def _difference(trainer: Capturable, content: dict[str, Any]) -> str | None:
     own = {name: (list(param.shape[1:]), param.dtype) for name, param in trainer.splats.items()}
     read = {name: (list(tensor.shape[1:]), tensor.dtype) for name, tensor in content["splats"].items()}
     if own != read:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from skipgs_plug.fallback_raster.gradient_norms import sum_norms
+from skipgs_plug.fallback_raster import sum_norms
 from skipgs_plug.install import install_command
 from skipgs_plug.trainer.config import MIN_REFINE_EVERY, MIN_RESET_EVERY, TrainConfig
 from skipgs_plug.trainer.errors import InputError

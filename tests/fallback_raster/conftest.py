@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from skipgs_plug.fallback_raster import guard
+from skipgs_plug.fallback_raster.runtime import guard
 
 
 @pytest.fixture(autouse=True)

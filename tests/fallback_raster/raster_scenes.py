@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from skipgs_plug.fallback_raster.torch_reference import near_cutoff, rasterization_reference
+from skipgs_plug.fallback_raster.oracle.torch_reference import near_cutoff, rasterization_reference
 
 DIFFERENTIABLE = ("means", "quats", "scales", "opacities", "colors", "backgrounds")
 

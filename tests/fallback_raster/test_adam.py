@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from skipgs_plug.fallback_raster.adam import adam_rows
+from skipgs_plug.fallback_raster.training.adam import adam_rows
 
 
 @pytest.mark.parametrize("shape", [(1,), (700, 1), (700, 3), (1300, 15, 3), (0, 3)])

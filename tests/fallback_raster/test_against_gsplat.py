@@ -8,8 +8,8 @@ import pytest
 import torch
 from raster_scenes import leaves, random_scene
 
-from skipgs_plug.fallback_raster import torch_reference
-from skipgs_plug.fallback_raster import torch_reference_projection as projection
+from skipgs_plug.fallback_raster.oracle import torch_reference
+from skipgs_plug.fallback_raster.oracle import torch_reference_projection as projection
 
 gsplat_torch: Any = pytest.importorskip("gsplat.cuda._torch_impl")
 

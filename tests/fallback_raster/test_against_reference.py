@@ -9,8 +9,8 @@ import torch
 from raster_scenes import errors_against_reference, leaves, random_scene, relative_error
 
 from skipgs_plug.fallback_raster import rasterization
-from skipgs_plug.fallback_raster.shortcuts import SHORTCUTS, without_shortcuts
-from skipgs_plug.fallback_raster.torch_reference import rasterization_reference
+from skipgs_plug.fallback_raster.oracle.torch_reference import rasterization_reference
+from skipgs_plug.fallback_raster.runtime.optimizations import OPTIMIZATIONS, without_optimizations
 
 IMAGE_ERROR = 1e-5
 GRADIENT_ERROR = 1e-4
@@ -60,9 +60,9 @@ def test_shortcuts_change_nothing(case: str) -> None:
     """Without any of them the rasterizer is a second oracle: nothing is left out but by the definition of alpha."""
     scene, options = CASES[case]
     results = []
-    for left_out in ((), tuple(SHORTCUTS)):
+    for left_out in ((), tuple(OPTIMIZATIONS)):
         inputs = leaves(random_scene(**scene), torch.float32)
-        with without_shortcuts(*left_out):
+        with without_optimizations(*left_out):
             image, alpha, info = rasterization(**inputs, **{"packed": False, **options})
             generator = torch.Generator().manual_seed(1)
             upstream = torch.randn(image.shape, generator=generator)
@@ -84,7 +84,7 @@ def test_blocks_without_gradient_change_no_bit() -> None:
     gradients = []
     for left_out in ((), ("zero_gradient",)):
         inputs = leaves(scene, torch.float32)
-        with without_shortcuts(*left_out):
+        with without_optimizations(*left_out):
             image, _, _ = rasterization(**inputs, packed=False)
             upstream = torch.randn(image.shape, generator=torch.Generator().manual_seed(1))
             upstream[:, : image.shape[1] // 2] = 0.0

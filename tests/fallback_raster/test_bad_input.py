@@ -10,7 +10,7 @@ import torch
 from raster_scenes import random_scene
 
 from skipgs_plug.fallback_raster import rasterization
-from skipgs_plug.fallback_raster.arguments import camera_centre
+from skipgs_plug.fallback_raster.runtime.arguments import camera_centre
 
 # A type of its own per case is not worth having; NotImplementedError marks what gsplat can and we cannot.
 REFUSALS = (ValueError, TypeError, NotImplementedError)

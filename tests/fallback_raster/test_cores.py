@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from skipgs_plug.fallback_raster.cores import CGROUP_V1, CGROUP_V2, usable_cores
+from skipgs_plug.fallback_raster.runtime.cores import CGROUP_V1, CGROUP_V2, usable_cores
 
 
 def written(root: Path, files: dict[str, str]) -> Path:

@@ -8,8 +8,8 @@ import pytest
 import torch
 from raster_scenes import leaves, random_scene
 
-from skipgs_plug.fallback_raster import torch_reference
-from skipgs_plug.fallback_raster.torch_reference import near_cutoff, rasterization_reference
+from skipgs_plug.fallback_raster.oracle import torch_reference
+from skipgs_plug.fallback_raster.oracle.torch_reference import near_cutoff, rasterization_reference
 
 STEP = 1e-6
 

@@ -9,34 +9,22 @@ import torch
 from compat_scenes import camera, gaussians
 from raster_scenes import deep_scene, leaves, random_scene
 
-from skipgs_plug.fallback_raster import (
-    adam,
-    binning,
-    blend,
-    gradient_norms,
-    guard,
-    l1_ssim_loss,
-    lazy_adam,
-    loss,
-    near_first,
-    project,
-    rasterization,
-    rows,
-    sh,
-    splat_backward,
-)
-from skipgs_plug.fallback_raster.compat import statistics
-from skipgs_plug.fallback_raster.compat.inria import GaussianRasterizationSettings
-from skipgs_plug.fallback_raster.compat.rendering import render, splats
-from skipgs_plug.fallback_raster.launch import ByteArray, FloatArray, IntArray, LongArray, Worker, worker
-from skipgs_plug.fallback_raster.outer_gradient import Factors, OuterGradient
-from skipgs_plug.fallback_raster.source import KERNELS, PRELUDE, read_kernel
+from skipgs_plug.compat import statistics
+from skipgs_plug.compat.compose import render, splats
+from skipgs_plug.compat.inria import GaussianRasterizationSettings
+from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
+from skipgs_plug.fallback_raster.runtime import guard
+from skipgs_plug.fallback_raster.runtime.launch import ByteArray, FloatArray, IntArray, LongArray, Worker, worker
+from skipgs_plug.fallback_raster.runtime.source import KERNELS, PRELUDE, read_kernel
 from skipgs_plug.fallback_raster.splats import rasterize_splats
+from skipgs_plug.fallback_raster.stages import binning, blend, project, rows, sh, splat_backward, two_pass
+from skipgs_plug.fallback_raster.training import adam, gradient_norms, lazy_adam, loss
+from skipgs_plug.fallback_raster.training.factored_gradient import FactoredGradient, Factors
 
 WORKERS = {
     found._name: found
     for module in (
-        *(adam, binning, blend, gradient_norms, lazy_adam, loss, near_first),
+        *(adam, binning, blend, gradient_norms, lazy_adam, loss, two_pass),
         *(project, rows, sh, splat_backward, statistics),
     )
     for value in vars(module).values()
@@ -48,9 +36,10 @@ EXAMPLES: dict[type, Any] = {kind: torch.zeros(0, dtype=dtype) for kind, dtype i
 
 
 def test_every_kernel_file_is_used_and_tested() -> None:
-    texts = [PRELUDE, read_kernel("crew_serve.h"), read_kernel("crew_run.h")]
+    texts = [PRELUDE, read_kernel("pool_serve.h"), read_kernel("pool_run.h")]
     texts += [found._code for found in WORKERS.values()]
-    unused = [path.name for path in KERNELS.glob("*.h") if not any(f'kernels/{path.name}"' in text for text in texts)]
+    files = [path.relative_to(KERNELS).as_posix() for path in KERNELS.rglob("*.h")]
+    unused = [file for file in files if not any(f'kernels/{file}"' in text for text in texts)]
     assert not unused
     assert len(WORKERS) == 32
 
@@ -128,7 +117,7 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker, list[A
         adam.adam_rows(torch.ones(5) > 0, param, torch.zeros(5, 3), torch.zeros(5, 3), 0.1, (0.9, 0.999), 1e-15)
         bands = torch.nn.Parameter(torch.ones(5, 15, 3))
         factors = Factors(torch.tensor([1, 3], dtype=torch.int32), torch.ones(2, 4), torch.ones(2, 4), 3)
-        bands.grad = OuterGradient(bands.shape, [factors])
+        bands.grad = FactoredGradient(bands.shape, [factors])
         bands.grad.dense()
         lazy_adam.LazyAdam([bands]).step()
         sums = torch.zeros(5), torch.zeros(5)

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
-from skipgs_plug.fallback_raster.constants import FACTOR
-from skipgs_plug.fallback_raster.lazy_adam import STEPS, LazyAdam
-from skipgs_plug.fallback_raster.optimizer import Adam
-from skipgs_plug.fallback_raster.outer_gradient import Factors, OuterGradient
+from skipgs_plug.fallback_raster.runtime.constants import FACTOR
+from skipgs_plug.fallback_raster.training.factored_gradient import FactoredGradient, Factors
+from skipgs_plug.fallback_raster.training.lazy_adam import STEPS, LazyAdam
+from skipgs_plug.fallback_raster.training.optimizer import Adam
 
 EPS = 1e-15
 SHAPES = [(60, 15, 3), (60, 8, 3), (60, 3, 3), (60, 1, 3), (1, 15, 3), (60, 6, 3)]
@@ -37,7 +37,7 @@ def parameter(shape: tuple[int, ...], generator: torch.Generator) -> torch.nn.Pa
     return torch.nn.Parameter(values)
 
 
-def gradient(shape: tuple[int, ...], share: float, generator: torch.Generator) -> OuterGradient:
+def gradient(shape: tuple[int, ...], share: float, generator: torch.Generator) -> FactoredGradient:
     """For a share of the rows, of all sizes from row to row, zero in some numbers and in some rows."""
     rows = torch.nonzero(torch.rand(shape[0], generator=generator) < share)[:, 0].to(torch.int32)
     directions = torch.randn(len(rows), FACTOR, generator=generator)
@@ -49,7 +49,7 @@ def gradient(shape: tuple[int, ...], share: float, generator: torch.Generator) -
     colors[nothing | directions.isnan().any(1), :3] = 0.0
     directions[nothing] = torch.nan  # undefined
     degree = int(torch.randint(1, 4, (), generator=generator))
-    return OuterGradient(torch.Size(shape), [Factors(rows, directions, colors, degree)])
+    return FactoredGradient(torch.Size(shape), [Factors(rows, directions, colors, degree)])
 
 
 def assert_equal(lazy: LazyAdam, dense: Adam) -> None:
@@ -185,7 +185,7 @@ def test_gradients_may_be_added_up_or_dense_or_missing() -> None:
         if step % 5 == 4:
             parts.append(torch.randn(shape, generator=generator))
         for part in parts:
-            plain = part.dense() if isinstance(part, OuterGradient) else part
+            plain = part.dense() if isinstance(part, FactoredGradient) else part
             one.grad = part if one.grad is None else part + one.grad
             other.grad = plain if other.grad is None else other.grad + plain
         if step % 4 == 3:

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import torch
 
-from skipgs_plug.fallback_raster import buffers, memory
-from skipgs_plug.fallback_raster.memory import Pool
+from skipgs_plug.fallback_raster.runtime import buffers, memory
+from skipgs_plug.fallback_raster.runtime.memory import Pool
 
 pytestmark = pytest.mark.skipif(not memory.SUPPORTED, reason="no private pages without a file here")
 PAGE = 4096

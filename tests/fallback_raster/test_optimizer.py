@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
 
 from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
-from skipgs_plug.fallback_raster.optimizer import Adam, instead_of_torchs_adam
+from skipgs_plug.fallback_raster.training.optimizer import Adam, instead_of_torchs_adam
 
 SHAPES = [(1,), (16,), (33, 3), (700, 15, 3), (0, 3), (40_001,)]
 # Torch's own, which are an ulp of a step apart from each other.
@@ -313,7 +313,7 @@ def test_the_block_ends_with_an_error_too() -> None:
 def test_it_leaves_torchs_compiler_alone() -> None:
     code = (
         "import sys, torch\n"
-        "from skipgs_plug.fallback_raster.optimizer import Adam\n"
+        "from skipgs_plug.fallback_raster.training.optimizer import Adam\n"
         "param = torch.nn.Parameter(torch.ones(3))\n"
         "optimizer = Adam([param])\n"
         "param.grad = torch.ones(3)\n"

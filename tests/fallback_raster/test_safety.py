@@ -13,10 +13,11 @@ import pytest
 import torch
 from raster_scenes import leaves, random_scene
 
-from skipgs_plug.fallback_raster import binning, l1_ssim_loss, rasterization
-from skipgs_plug.fallback_raster.adam import adam_rows
-from skipgs_plug.fallback_raster.cache import load_or_rebuild, say_unwritable
-from skipgs_plug.fallback_raster.constants import SPARE_COUNTS
+from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
+from skipgs_plug.fallback_raster.runtime.cache import load_or_rebuild, say_unwritable
+from skipgs_plug.fallback_raster.runtime.constants import SPARE_COUNTS
+from skipgs_plug.fallback_raster.stages import binning
+from skipgs_plug.fallback_raster.training.adam import adam_rows
 from skipgs_plug.files import WriteError
 
 HERE = Path(__file__).parent
@@ -216,7 +217,7 @@ def test_a_fork_while_another_thread_renders_can_render() -> None:
 
 LISTED = """
 import torch
-from skipgs_plug.fallback_raster.project import list_visible
+from skipgs_plug.fallback_raster.stages.project import list_visible
 
 seen, block_count = torch.tensor([0, 2, 7], dtype=torch.int32), torch.tensor([2], dtype=torch.int32)
 visible, block_start = torch.empty(3, dtype=torch.int32), torch.empty(2, dtype=torch.int32)

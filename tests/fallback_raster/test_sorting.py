@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from skipgs_plug.fallback_raster.binning import bin_gaussians
-from skipgs_plug.fallback_raster.rows import all_rows
+from skipgs_plug.fallback_raster.stages.binning import bin_gaussians
+from skipgs_plug.fallback_raster.stages.rows import all_rows
 
 DEPTHS = {
     "spread": lambda n, g: 1.0 + 9.0 * torch.rand(n, generator=g),

@@ -13,7 +13,7 @@ from raster_scenes import leaves, random_scene
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import rasterization
-from skipgs_plug.fallback_raster.shortcuts import without_shortcuts
+from skipgs_plug.fallback_raster.runtime.optimizations import without_optimizations
 
 
 def rendered(scene: dict[str, Any], **options: Any) -> list[Tensor]:
@@ -29,7 +29,7 @@ def rendered(scene: dict[str, Any], **options: Any) -> list[Tensor]:
 def assert_equal_without(scene: dict[str, Any], **options: Any) -> Tensor:
     """The radii, after the comparison of everything with and without."""
     with_spheres = rendered(scene, **options)
-    with without_shortcuts("spheres"):
+    with without_optimizations("spheres"):
         without = rendered(scene, **options)
     for value, other in zip(with_spheres, without, strict=True):
         assert torch.equal(value.nan_to_num(nan=7e30), other.nan_to_num(nan=7e30))

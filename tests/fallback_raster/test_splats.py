@@ -10,8 +10,8 @@ from raster_scenes import random_scene, relative_error
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import get_num_threads, rasterization, set_num_threads
-from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
 from skipgs_plug.fallback_raster.splats import rasterize_splats
+from skipgs_plug.fallback_raster.training.lazy_adam import LazyAdam
 
 NAMES = ("means", "quats", "log_scales", "logits", "sh0", "shN")
 OPTIONS: dict[str, dict[str, Any]] = {

@@ -16,7 +16,7 @@ from raster_scenes import DIFFERENTIABLE, random_scene, relative_error
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import rasterization
-from skipgs_plug.fallback_raster.torch_reference import near_cutoff, rasterization_reference
+from skipgs_plug.fallback_raster.oracle.torch_reference import near_cutoff, rasterization_reference
 
 SCALES = ("usual", "1e-12", "1e6", "zero", "any magnitude", "needles", "disks")
 QUATS = ("usual", "zero", "1e18", "1e-18", "one axis")

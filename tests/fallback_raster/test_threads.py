@@ -10,7 +10,7 @@ import torch
 from raster_scenes import leaves, random_scene
 
 from skipgs_plug.fallback_raster import rasterization, set_num_threads
-from skipgs_plug.fallback_raster.threads import get_num_threads
+from skipgs_plug.fallback_raster.runtime.threads import get_num_threads
 
 
 @pytest.fixture

@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from skipgs_plug.fallback_raster.binning import Bins, bin_gaussians
-from skipgs_plug.fallback_raster.constants import ALPHA_MIN, TILE, tiles
-from skipgs_plug.fallback_raster.shortcuts import without_shortcuts
-from skipgs_plug.fallback_raster.threads import get_num_threads, set_num_threads
+from skipgs_plug.fallback_raster.runtime.constants import ALPHA_MIN, TILE, tiles
+from skipgs_plug.fallback_raster.runtime.optimizations import without_optimizations
+from skipgs_plug.fallback_raster.runtime.threads import get_num_threads, set_num_threads
+from skipgs_plug.fallback_raster.stages.binning import Bins, bin_gaussians
 
 SIZE = 330, 300  # 21 x 19 tiles: more rows than a vector has lanes, cut off on the right and below
 
@@ -96,7 +96,7 @@ def test_without_the_test_of_ellipses_whole_boxes_are_listed() -> None:
     centres, depths, conics, opacities, sigmas = ellipses(n, 9)
     rows = (torch.arange(n, dtype=torch.int32), centres, depths, conics, opacities, sigmas, torch.rand(n, 3))
     exact = listed_tiles(bin_gaussians(*rows, width, height), n)
-    with without_shortcuts("exact_tiles"):
+    with without_optimizations("exact_tiles"):
         boxes = listed_tiles(bin_gaussians(*rows, width, height), n)
     assert (boxes >= exact).all() and boxes.sum() > 1.2 * exact.sum()
     grid = boxes.view(n, -1, tiles(width, height)[0]) > 0

@@ -12,7 +12,7 @@ import torch
 from test_resume import assert_same
 from torch import nn
 
-from skipgs_plug.fallback_raster.gradient_norms import sum_norms
+from skipgs_plug.fallback_raster.training.gradient_norms import sum_norms
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.densification import densify
 from skipgs_plug.trainer.loop import Iteration

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from skipgs_plug import SkipGate
-from skipgs_plug.fallback_raster.lazy_adam import LazyAdam
-from skipgs_plug.fallback_raster.optimizer import Adam
+from skipgs_plug.fallback_raster.training.lazy_adam import LazyAdam
+from skipgs_plug.fallback_raster.training.optimizer import Adam
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.loop import Iteration
 from skipgs_plug.trainer.row_order import sort_rows

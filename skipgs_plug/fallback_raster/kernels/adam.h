@@ -1,5 +1,5 @@
 // One step for all rows, or for those that are seen.
-#include "adam_step.h"
+#include "lib/adam_step.h"
 for (int row = first; row < last;) {
     if (only_seen && !seen[row]) {
         ++row;

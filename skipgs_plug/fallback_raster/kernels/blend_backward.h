@@ -1,6 +1,6 @@
 // Adjoint of blend_forward, back to front, one tile at a time.
-#include "blend_tile.h"
-#include "pixels.h"
+#include "lib/blend_tile.h"
+#include "lib/pixels.h"
 struct Seen : Falloff {
     vblock full;  // alpha before it is clamped
     Seen(const Tile& tile, int block, const float* r) : Falloff(tile, block, r), full(exp2(log2_alpha)) {}
@@ -26,7 +26,7 @@ for (int t = first; t < last; ++t) {
         iblock wanted = behind[b] != 0.0f;
         for (int c = 0; c < D; ++c) wanted |= v[b][c] != 0.0f;
         // A block without incoming gradient adds exact zeros.
-        if (any(wanted) || !(shortcuts & ZERO_GRADIENT)) open |= 1u << b;
+        if (any(wanted) || !(optimizations & ZERO_GRADIENT)) open |= 1u << b;
     }
     // The part of the list that was blended last comes first.
     for (int part = parts - 1; part >= 0; --part) {

@@ -1,8 +1,8 @@
 // Front-to-back compositing, one tile at a time.
-#include "blend_tile.h"
-#include "pixels.h"
-#include "reached_blocks.h"
-#include "sorted_tile.h"
+#include "lib/blend_tile.h"
+#include "lib/pixels.h"
+#include "lib/reached_blocks.h"
+#include "lib/sorted_tile.h"
 static constexpr int GROUP = 64;        // Gaussians at a time, one bit each
 static constexpr int SIDE_BY_SIDE = 4;  // of these in the chains of one block
 typedef unsigned char bytes __attribute__((ext_vector_type(32)));
@@ -77,7 +77,7 @@ for (int t = first; t < last; ++t) {
                 send_for(smaller(k + GROUP, listed - 1));
                 blocks[g] = ~0u;
             }
-            if (shortcuts & BLOCK_BOUNDS) reached_blocks(r, tile.x0, tile.y0, blocks);
+            if (optimizations & BLOCK_BOUNDS) reached_blocks(r, tile.x0, tile.y0, blocks);
             for (int i = 0; i < BLOCKS / 8; ++i)
                 *(some_bytes*)(reached[i] + j) = __builtin_convertvector(*(const some_masks*)blocks >> 8 * i, some_bytes);
         }
@@ -125,7 +125,7 @@ for (int t = first; t < last; ++t) {
                     stopped = hit ? (iblock)(base + place[i] + 1) : stopped;
                     blended |= (unsigned long long)any(hit) << (place[i] & (GROUP - 1));
                 }
-                if ((shortcuts & SATURATION) && !any(product > TRANSMITTANCE_MIN)) {
+                if ((optimizations & SATURATION) && !any(product > TRANSMITTANCE_MIN)) {
                     open &= ~(1u << b);
                     break;
                 }

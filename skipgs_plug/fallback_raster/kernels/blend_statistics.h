@@ -1,6 +1,6 @@
 // What the forks of Inria's rasterizer count inside their blend, one tile at a time, without the colours.
-#include "blend_tile.h"
-#include "pixels.h"
+#include "lib/blend_tile.h"
+#include "lib/pixels.h"
 for (int t = first; t < last; ++t) {
     const Tile tile(t, tile_start, tiles_x, width, height);
     vblock T[BLOCKS], value[BLOCKS], most[BLOCKS];

@@ -3,8 +3,8 @@
 // To the bit what `adam.h` makes of the same steps. Its two divisions and its square root take 35 cycles for 16 floats.
 // Where nothing comes near underflow, multiply-adds give the same correctly rounded results (Markstein, IBM J. Res. Dev.
 // 34, 1990) in 15.
-#include "adam_step.h"
-#include "harmonics.h"
+#include "lib/adam_step.h"
+#include "lib/harmonics.h"
 #if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
 constexpr bool fused = true;
 #else

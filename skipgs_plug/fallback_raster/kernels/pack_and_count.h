@@ -1,9 +1,9 @@
 // Records of the visible rows that have pairs, one after the other, their places among the tiles, and the number of pairs
 // of each tile, by slice of the rows. Where `limited`, only pairs whose depths lie in the range of their tile count.
-#include "box_tiles.h"
-#include "ellipse.h"
-#include "slice_begin.h"
-#include "tile_ranges.h"
+#include "lib/box_tiles.h"
+#include "lib/ellipse.h"
+#include "lib/slice_begin.h"
+#include "lib/tile_ranges.h"
 const int tiles = tiles_x * tiles_y;
 const auto add_two = [](int* to, const int* numbers) INLINE {
     typedef int two __attribute__((ext_vector_type(2), aligned(4)));
@@ -61,7 +61,7 @@ for (int s = first; s < last; ++s) {
         const int deepest = __builtin_reduce_max(small ? lines : (i16)0);
         for (int r = 0; r <= deepest; ++r) {
             i16 left = first_column, right = last_column;
-            if (shortcuts & EXACT_TILES) ellipses.columns(first_row + r, width, left, right);
+            if (optimizations & EXACT_TILES) ellipses.columns(first_row + r, width, left, right);
             left = vmax(left - first_column, (i16)0);
             right = vmin(right - first_column, vmin(columns, (i16)(BOX_COLUMNS - 1)));
             const i16 hit = small & (r <= lines) & (left <= right);
@@ -126,7 +126,7 @@ for (int s = first; s < last; ++s) {
                 int met = 0;
                 int* own = boxes + (long long)BOX * (begin + found);
                 for (int j = 0; j < BOX; ++j) own[j] = box[j][l];
-                each_tile(own_record, own, width, tiles_x, !(shortcuts & EXACT_TILES), [&](int tile) INLINE {
+                each_tile(own_record, own, width, tiles_x, !(optimizations & EXACT_TILES), [&](int tile) INLINE {
                     ++met;
                     if (!limited || in_range(ranges, tile, key[l])) ++count[tile], ++pairs;
                 });

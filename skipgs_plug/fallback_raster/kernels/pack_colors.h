@@ -1,5 +1,5 @@
 // Puts further channels of colour into the records.
-#include "slice_begin.h"
+#include "lib/slice_begin.h"
 for (int s = first; s < last; ++s) {
     const int begin = slice_begin(s, n, slices);
     for (int k = begin; k < begin + listed_count[s]; ++k)

@@ -2,4 +2,4 @@
 constexpr int RAW = 0;
 const float *const opacities = nullptr, *const v_activated = nullptr;
 float* const v_opacities = nullptr;
-#include "project_adjoint.h"
+#include "lib/project_adjoint.h"

@@ -1,5 +1,5 @@
 // Centre, depth, inverse covariance and extent on the image plane of one block of rows, and which of them are visible.
-#include "geometry.h"
+#include "lib/geometry.h"
 const int block = first, row_begin = BLOCK * block, row_end = smaller(row_begin + BLOCK, n);
 int found = row_begin;
 for (int base = row_begin; base < row_end; base += 16) {
@@ -18,7 +18,7 @@ for (int base = row_begin; base < row_end; base += 16) {
     v16 longest = vmax(vmax(vabs(S[0]), vabs(S[1])), vabs(S[2]));
     if (raw) longest = vexp(vmax(vmax(S[0], S[1]), S[2]));
     i16 outside = (z < near_plane) | (z > far_plane);
-    if (shortcuts & SPHERES) outside |= beyond(K, width, height, eps2d, x, y, iz, longest);
+    if (optimizations & SPHERES) outside |= beyond(K, width, height, eps2d, x, y, iz, longest);
     if (!any(~outside)) {
         if (dense) {
             if (with_radii) clear((float*)radii + 2ll * base, 2 * lanes);

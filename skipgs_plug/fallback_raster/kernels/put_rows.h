@@ -1,5 +1,5 @@
 // Packed rows back to their places, zeros between them, one block of rows at a time.
-#include "copy_row.h"
+#include "lib/copy_row.h"
 for (int block = first; block < last; ++block) {
     const int row_begin = BLOCK * block;
     clear(put + (long long)width * row_begin, (long long)width * smaller(BLOCK, n - row_begin));

@@ -1,6 +1,6 @@
 // Adds up the pairs of each row of a block in a fixed order and turns their moments into gradients, of all rows where
 // DENSE, else of visible ones.
-#include "copy_row.h"
+#include "lib/copy_row.h"
 const int row_begin = BLOCK * first, rows_here = smaller(BLOCK, rows - row_begin);
 const bool more = channel > 0;
 if (!more && DENSE) {

@@ -1,5 +1,5 @@
 // Bands beside the constant one, in each direction.
-#include "harmonics.h"
+#include "lib/harmonics.h"
 for (int i = first; i < last; i += 16) {
     const int lanes = smaller(16, last - i);
     int row[16];

@@ -1,5 +1,5 @@
 // Colours of the visible rows of one block, 16 at a time; zero for the others where `dense`.
-#include "sh_basis.h"
+#include "lib/sh_basis.h"
 const int block = first, terms = (degree + 1) * (degree + 1), end = block_start[block + 1];
 const int all = block_start[(n + BLOCK - 1) / BLOCK];
 if (dense) clear(colors + 3ll * BLOCK * block, 3 * smaller(BLOCK, n - BLOCK * block));

@@ -26,11 +26,11 @@ for (int i = block_start[first]; i < block_start[first + 1]; ++i)
     constexpr int base_stride = 3, rest_offset = 0;
     float v_camera[3];
     float* const v_cameras = (float*)((unsigned long long)v_camera - sizeof(float) * 3 * first);
-#include "sh_adjoint.h"
+#include "lib/sh_adjoint.h"
 }
 {
     constexpr int with_depth = 0, with_pose = 0;
     const float *const v_depths = nullptr, *const v_compensations = nullptr;
     float* const v_poses = nullptr;
-#include "project_adjoint.h"
+#include "lib/project_adjoint.h"
 }

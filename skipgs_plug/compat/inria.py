@@ -1,0 +1,58 @@
+"""Stand-in for `diff_gaussian_rasterization` of Inria's 3D Gaussian Splatting, classic and current.
+
+The two versions differ by one setting: the current one (branch `dr_aa`) passes `antialiasing` and gets
+the inverse depth as a third result, the classic one does neither.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .compose import NEAR_PLANE, render, splats
+
+
+class GaussianRasterizationSettings(NamedTuple):
+    """Fields as in the CUDA module; `antialiasing` is None where the caller does not know it."""
+
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool
+    debug: bool
+    antialiasing: bool | None = None
+
+
+class RasterizerModule(torch.nn.Module):
+    """What the rasterizer class of every family has in common."""
+
+    def __init__(self, raster_settings: Any) -> None:
+        super().__init__()
+        self.raster_settings = raster_settings
+
+    @torch.no_grad()
+    def markVisible(self, positions: Tensor) -> Tensor:
+        """Which points lie in front of the near plane. [N, 3] -> [N] bool"""
+        view = self.raster_settings.viewmatrix
+        return positions @ view[:3, 2] + view[3, 2] > NEAR_PLANE
+
+
+class GaussianRasterizer(RasterizerModule):
+    """Returns (color [3, H, W], radii [N]), and inverse depth [1, H, W] when `antialiasing` is set."""
+
+    def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
+        settings = self.raster_settings
+        scene = splats(means3D, means2D, opacities, **gaussians)
+        if settings.antialiasing is None:
+            return render(settings, scene)[:2]
+        result = render(settings, scene, antialiased=settings.antialiasing, inverse_depth=True)
+        return result.color, result.radii, result.inverse_depth

@@ -1,0 +1,45 @@
+"""Stand-in for the rasterizer of Mip-Splatting: a 2D filter of a given size that conserves opacity."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from .compose import render, splats
+from .inria import RasterizerModule
+
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
+
+
+class GaussianRasterizationSettings(NamedTuple):
+    """Fields as in the CUDA module."""
+
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    kernel_size: float
+    subpixel_offset: Tensor  # [H, W, 2] pixels
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool
+    debug: bool
+
+
+class GaussianRasterizer(RasterizerModule):
+    """Returns (color [3, H, W], radii [N]). The third column of `means2D`'s gradient is the sum of absolute ones.
+
+    Opacities are compensated by the root of the ratio of the covariances' determinants, without the CUDA code's 1e-6.
+    """
+
+    def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
+        settings = self.raster_settings
+        if settings.subpixel_offset.any():
+            raise NotImplementedError("The CPU stand-in has its pixels on a grid: run without --ray_jitter.")
+        scene = splats(means3D, means2D, opacities, **gaussians)
+        return render(settings, scene, antialiased=True, eps2d=settings.kernel_size, absgrad=True)[:2]

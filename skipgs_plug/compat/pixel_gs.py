@@ -1,0 +1,48 @@
+"""Stand-in for the rasterizer of Pixel-GS: pixel counts, and screen gradients that fade near the camera."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from .compose import render, splats
+from .inria import RasterizerModule
+from .statistics import gather
+
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
+
+
+class GaussianRasterizationSettings(NamedTuple):
+    """Fields as in the CUDA module."""
+
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
+    depth_threshold: float | None  # world units; None where no gradient is asked for
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool
+    debug: bool
+
+
+class GaussianRasterizer(RasterizerModule):
+    """Returns (color [3, H, W], radii [N], pixels [N, 1] that each Gaussian contributes to, float).
+
+    The gradient that reaches `means2D` is scaled by (depth / depth_threshold)^2, at most 1.
+    """
+
+    def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
+        settings = self.raster_settings
+        if means2D.requires_grad and settings.depth_threshold is not None:
+            depth = means3D.detach() @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]
+            fading = (depth / settings.depth_threshold).square().clamp_max(1.0)[:, None]
+            means2D = means2D.clone()
+            means2D.register_hook(lambda gradient: gradient * fading)
+        result = render(settings, splats(means3D, means2D, opacities, **gaussians))
+        return result.color, result.radii, gather(result.footprint).pixels.float()[:, None]

@@ -1,0 +1,34 @@
+"""Adam that leaves invisible Gaussians alone, as the accelerated rasterizers ship it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from skipgs_plug.fallback_raster.training.adam import adam_rows
+from skipgs_plug.fallback_raster.training.optimizer import moments
+
+
+class SparseGaussianAdam(torch.optim.Adam):
+    """One parameter per group, first dimension N; no bias correction, as in the CUDA kernel."""
+
+    def __init__(self, params: Any, lr: float, eps: float) -> None:
+        super().__init__(params=params, lr=lr, eps=eps)
+
+    @torch.no_grad()
+    def step(self, visibility: Tensor, N: int) -> None:  # type: ignore[override]
+        """Update the rows that `visibility` marks, of every parameter with a gradient.
+
+        Args:
+            visibility: [N] bool
+            N: Number of Gaussians.
+        """
+        for group in self.param_groups:
+            (param,) = group["params"]
+            if param.grad is None:
+                continue
+            state = moments(self, param)
+            means = state["exp_avg"], state["exp_avg_sq"]
+            adam_rows(visibility.reshape(N), param, *means, group["lr"], (0.9, 0.999), group["eps"])

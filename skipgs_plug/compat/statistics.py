@@ -1,0 +1,92 @@
+"""Sums over the pixels of each Gaussian that the CUDA forks gather inside their blend kernels."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import torch
+from torch import Tensor
+
+from skipgs_plug.fallback_raster.runtime.buffers import floats, ints, zeros
+from skipgs_plug.fallback_raster.runtime.constants import tiles
+from skipgs_plug.fallback_raster.runtime.launch import FloatArray, IntArray, worker
+from skipgs_plug.fallback_raster.runtime.source import read_kernel
+from skipgs_plug.fallback_raster.stages.binning import bin_gaussians
+
+SUMS = 8  # of a (tile, Gaussian) pair, six of them used
+
+
+class Footprint(NamedTuple):
+    """Gaussians on one image plane, without gradients."""
+
+    means2d: Tensor  # [N, 2] pixels, the first pixel centre at 0.5
+    conics: Tensor  # [N, 3] inverse 2D covariance: xx, xy, yy
+    opacities: Tensor  # [N]
+    depths: Tensor  # [N]
+    drawn: Tensor  # [N] bool
+    width: int
+    height: int
+
+    def __len__(self) -> int:
+        return len(self.depths)
+
+
+class Statistics(NamedTuple):
+    """Sums over the pixels that a Gaussian contributes to, and two maps."""
+
+    pixels: Tensor  # [N] int32, their number
+    weight: Tensor  # [N] sum of its shares of their colour
+    light: Tensor  # [N] sum of the light that reaches it
+    value: Tensor  # [N] sum of the values given for the pixels
+    weighted_value: Tensor  # [N] sum of value times share
+    distance: Tensor  # [N] sum of the distances of the pixels' centres from its own
+    contributions: Tensor  # [H, W] int32, Gaussians that contribute to a pixel
+    strongest: Tensor  # [H, W] int32, the one with the largest share, the front one of equals; -1 where there is none
+
+
+@worker(read_kernel("blend_statistics.h"), items="tiles_x * tiles_y", grain="2", constants={"SUMS": SUMS})
+def blend_statistics(
+    records: Annotated[FloatArray, "M, RECORD"],
+    tile_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],
+    tile_list: Annotated[IntArray, "P"],
+    tile_rows: Annotated[IntArray, "P"],
+    values: Annotated[FloatArray, "height, width"],
+    pair_sums: Annotated[FloatArray, "P, 8"],  # out
+    contributions: Annotated[IntArray, "height, width"],  # out
+    strongest: Annotated[IntArray, "height, width"],  # out
+    width: int,
+    height: int,
+    tiles_x: int,
+    tiles_y: int,
+) -> None: ...
+
+
+@torch.no_grad()
+def gather(f: Footprint, values: Tensor | None = None) -> Statistics:
+    """Walk through the blend of an image once more, and sum what is asked of it.
+
+    Args:
+        f: The projected scene.
+        values: One number for each pixel, H * W of them in any shape; zeros when left out.
+    """
+    a, b, c = f.conics.unbind(-1)
+    determinant = torch.where(f.drawn, a * c - b * b, 1.0)
+    sigmas = (torch.stack([c, a], dim=-1) / determinant[:, None]).clamp_min(0.0).sqrt()
+    visible = f.drawn.nonzero()[:, 0].to(torch.int32)
+    means2d, depths, conics, opacities = (t.contiguous() for t in (f.means2d, f.depths, f.conics, f.opacities))
+    bins = bin_gaussians(
+        visible, means2d, depths, conics, opacities, sigmas, zeros(len(f), 1), f.width, f.height
+    )  # fmt: skip
+    bins.sort()
+    rows = visible[bins.listed[bins.tile_list]]
+    tiles_x, tiles_y = tiles(f.width, f.height)
+    size = (f.height, f.width)
+    picture = zeros(*size) if values is None else values.detach().to(torch.float32).reshape(size).contiguous()
+    pair_sums, contributions, strongest = floats(len(bins.tile_list), SUMS), ints(*size), ints(*size)
+    blend_statistics(
+        bins.records, bins.tile_start, bins.tile_list, rows, picture, pair_sums, contributions, strongest,
+        f.width, f.height, tiles_x, tiles_y,
+    )  # fmt: skip
+    total = zeros(len(f), SUMS).index_add_(0, rows, pair_sums)
+    count, weight, light, value, weighted, distance = (column.contiguous() for column in total[:, :6].unbind(dim=1))
+    return Statistics(count.to(torch.int32), weight, light, value, weighted, distance, contributions, strongest)

@@ -1,0 +1,54 @@
+"""Stand-in for the rasterizer of Taming 3DGS: thirteen results, four of them sums over weighted pixels."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .compose import render, splats
+from .inria import RasterizerModule
+from .sparse_adam import SparseGaussianAdam
+from .statistics import gather
+
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam"]
+
+
+class GaussianRasterizationSettings(NamedTuple):
+    """Fields as in the CUDA module."""
+
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool
+    debug: bool
+    pixel_weights: Tensor | None  # [H, W]; None leaves the sums empty
+
+
+class GaussianRasterizer(RasterizerModule):
+    """Returns the CUDA module's 13-tuple.
+
+    (color, radii, counts [H, W], three lists, centers [N, 2], depths [N], radii [N], accum_weights [N],
+    accum_count [N], accum_blend [N], accum_dist [N]). The lists are empty, as the CUDA code leaves them;
+    counts and sums are empty without `pixel_weights`.
+    """
+
+    def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
+        result = render(self.raster_settings, splats(means3D, means2D, opacities, **gaussians))
+        f, weights = result.footprint, self.raster_settings.pixel_weights
+        whole, fraction = torch.empty(0, dtype=torch.int32), torch.empty(0)
+        counts, sums = whole, (fraction, whole, fraction, fraction)
+        if weights is not None and len(weights):
+            found = gather(f, weights)
+            counts, sums = found.contributions, (found.value, found.pixels, found.weight, found.distance)
+        centers = f.means2d - 0.5  # the CUDA code has the first pixel centre at 0
+        lists = (whole, fraction, fraction)
+        return result.color, result.radii, counts, *lists, centers, f.depths, result.radii, *sums

@@ -1,0 +1,286 @@
+"""`rasterization` with gsplat's signature, on the CPU."""
+
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor
+
+from .autograd import Blend, Pack, Project, SphericalHarmonics
+from .runtime.arguments import (
+    as_float,
+    as_int,
+    as_kernels_read,
+    camera_centre,
+    check_tensors,
+    planes,
+    refuse_unsupported,
+)
+from .runtime.constants import MAX_CHANNELS, TILE, tiles
+from .stages.rows import all_rows
+
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+RasterizeMode = Literal["classic", "antialiased"]
+
+
+def rasterization(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor | tuple[Tensor, Tensor],  # [(C,) N, D], [(C,) N, K, 3] or ([N, 1, 3], [N, K - 1, 3])
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,  # [C, D]
+    render_mode: RenderMode = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: RasterizeMode = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: Any = None,
+    rolling_shutter: Any = None,
+    viewmats_rs: Tensor | None = None,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Renders N Gaussians (Kerbl et al. 2023) into C pinhole cameras; arguments and results as in gsplat 1.5.
+
+    Computes in float32 on all cores (see `set_num_threads`) and returns the dtype of `means`. The result, images
+    and gradients, is bit-equal for any number of threads. Differentiable in means, quats, scales, opacities,
+    colors, backgrounds and viewmats.
+
+    Args:
+        means: Centres in world space.
+        quats: Rotations w, x, y, z of any length; zero stands for no rotation.
+        scales: Standard deviations along the axes, world units.
+        opacities: In [0, 1].
+        colors: D channels per Gaussian (per camera if C is given), or K >= (sh_degree + 1)^2 SH coefficients. Not in
+            gsplat: the constant band and the others as a pair of tensors, which spares joining them in every
+            iteration.
+        viewmats: World to camera, x right, y down, z forward.
+        Ks: Intrinsics in pixels; pixel centres lie at +0.5.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        near_plane: Gaussians nearer than this are left out, world units; those behind the camera always are.
+        far_plane: Gaussians farther than this are left out, world units.
+        radius_clip: Gaussians whose radii are all at or below this are left out, pixels.
+        eps2d: Added to the 2D covariance's diagonal, square pixels.
+        sh_degree: 0 to 3 to read `colors` as SH coefficients, None to read them as colours.
+        packed: True: `info` holds one row per visible (camera, Gaussian) pair, as gsplat's packed mode.
+        tile_size: Kept for gsplat's callers; tiles are 16 pixels wide whatever it says.
+        backgrounds: Colour behind everything; black if None.
+        render_mode: Colour, accumulated depth (D), expected depth (ED), or colour and depth.
+        sparse_grad: Not supported.
+        absgrad: Also add up |gradient| of the 2D means over pixels (AbsGS), in `info["means2d"].absgrad`;
+            with at most four channels, depth included.
+        rasterize_mode: "antialiased" scales opacities by the area lost to `eps2d` (Mip-Splatting).
+        channel_chunk: Kept for gsplat's callers; any number of channels works.
+        distributed: Not supported, as every argument below; each raises when it is used.
+        camera_model: Only "pinhole".
+        segmented: Kept for gsplat's callers; has no effect.
+        covars: Not supported.
+        with_ut: Not supported.
+        with_eval3d: Not supported.
+        radial_coeffs: Not supported.
+        tangential_coeffs: Not supported.
+        thin_prism_coeffs: Not supported.
+        ftheta_coeffs: Not supported.
+        rolling_shutter: Not supported.
+        viewmats_rs: Not supported.
+
+    Returns:
+        Colours [C, H, W, X], alphas [C, H, W, 1] and gsplat's dictionary: means2d (with a gradient after
+        backward), radii, depths, conics, opacities, tiles_per_gauss, width, height, n_cameras, ...; not in it are
+        isect_ids, flatten_ids and isect_offsets.
+
+    Raises:
+        ValueError: A shape, dtype, device or mode does not fit, or a camera is not finite or cannot be inverted.
+        NotImplementedError: An option is not supported on the CPU.
+    """
+    refuse_unsupported(
+        sparse_grad=sparse_grad,
+        distributed=distributed,
+        covars=covars is not None,
+        with_ut=with_ut,
+        with_eval3d=with_eval3d,
+        radial_coeffs=radial_coeffs is not None,
+        tangential_coeffs=tangential_coeffs is not None,
+        thin_prism_coeffs=thin_prism_coeffs is not None,
+        ftheta_coeffs=ftheta_coeffs is not None,
+        viewmats_rs=viewmats_rs is not None,
+        rolling_shutter=rolling_shutter is not None and getattr(rolling_shutter, "name", "GLOBAL") != "GLOBAL",
+    )
+    if camera_model != "pinhole":
+        raise NotImplementedError(f"The CPU rasterizer only knows camera_model='pinhole', not {camera_model!r}.")
+    if render_mode not in get_args(RenderMode):
+        raise ValueError(f"render_mode must be RGB, D, ED, RGB+D or RGB+ED, not {render_mode!r}.")
+    if rasterize_mode not in get_args(RasterizeMode):
+        raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', not {rasterize_mode!r}.")
+    sh_rest = None
+    if isinstance(colors, tuple):
+        if sh_degree is None or len(colors) != 2:
+            raise ValueError("colors as a tuple must be a pair (sh0 [N, 1, 3], shN [N, K - 1, 3]) with sh_degree set.")
+        colors, sh_rest = colors
+    near_plane, far_plane = planes(near_plane, far_plane)
+    radius_clip, eps2d = as_float("radius_clip", radius_clip), as_float("eps2d", eps2d)
+    width, height = as_int(width), as_int(height)
+    check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, sh_rest, backgrounds, width, height)
+    blended = (render_mode != "RGB") + ("RGB" in render_mode) * colors.shape[-1]
+    # A pass over some of the channels knows a part of each pixel's gradient, whose absolute value is none of the whole.
+    if absgrad and blended > MAX_CHANNELS:
+        raise NotImplementedError(
+            f"The CPU rasterizer supports absgrad with at most {MAX_CHANNELS} channels, depth included, got {blended}; "
+            "render the others without."
+        )
+
+    dtype, n_cameras, n = means.dtype, len(viewmats), len(means)
+    given = means, quats, scales, opacities, colors, viewmats, Ks
+    means, quats, scales, opacities, colors, viewmats, Ks = as_kernels_read(*given)
+    if sh_rest is not None:
+        (sh_rest,) = as_kernels_read(sh_rest)
+    antialiased = rasterize_mode == "antialiased"
+    shared_colors = colors.dim() == (2 if sh_degree is None else 3)
+
+    projected = [
+        Project.apply(
+            means, quats, scales, opacities, viewmat, K, width, height, near_plane, far_plane, eps2d, radius_clip,
+            antialiased,
+        )
+        for viewmat, K in zip(_split(viewmats, None), _split(Ks, None), strict=True)
+    ]  # fmt: skip
+    *stacked, visible, block_starts = map(list, zip(*projected, strict=True))
+    means2d, depths, conics, compensations, radii, sigmas = (_join(parts) for parts in stacked)
+    # The adjoint of `expand` adds up, of one camera too.
+    opacities = opacities[None] if n_cameras == 1 else opacities.expand(n_cameras, n)
+    if antialiased:
+        opacities = opacities * compensations
+
+    features = []
+    if "RGB" in render_mode:
+        for camera in range(n_cameras):
+            of_camera = colors if shared_colors else colors[camera]
+            if sh_degree is not None:
+                centre = camera_centre(viewmats[camera])
+                of_camera = SphericalHarmonics.apply(
+                    means, centre, of_camera, sh_rest, visible[camera], block_starts[camera], sh_degree
+                )
+            features.append(of_camera)
+
+    camera_ids = gaussian_ids = counts = None
+    if packed:
+        counts = [len(rows) for rows in visible]
+        camera_ids = torch.cat([torch.full((count,), camera, device="cpu") for camera, count in enumerate(counts)])
+        gaussian_ids = torch.cat(visible).long()
+
+        def pack(of_cameras: Sequence[Tensor]) -> list[Tensor]:
+            return [Pack.apply(*rows) for rows in zip(of_cameras, visible, block_starts, strict=True)]
+
+        features = pack(features) if features else []
+        means2d, depths, conics, opacities, radii, sigmas = (
+            # The adjoint of `unbind` copies.
+            _join(pack([t.squeeze(0)] if n_cameras == 1 else t.unbind()))
+            for t in (means2d, depths, conics, opacities, radii, sigmas)
+        )
+        visible, block_starts = map(list, zip(*map(all_rows, counts), strict=True))
+    absolute = None
+    if absgrad:
+        absolute = torch.zeros_like(means2d)
+        means2d.absgrad = absolute  # type: ignore[attr-defined]
+
+    absolutes = None if absolute is None else _split(absolute, counts)
+    projections = zip(*(_split(t, counts) for t in (means2d, conics, opacities, depths, sigmas)), strict=True)
+    rendered = [
+        _render_camera(
+            projection,
+            visible[camera],
+            block_starts[camera],
+            features[camera] if features else None,
+            None if absolutes is None else absolutes[camera],
+            None if backgrounds is None else backgrounds[camera],
+            width,
+            height,
+            render_mode,
+        )
+        for camera, projection in enumerate(projections)
+    ]
+    images, alphas, tiles_per_gauss = zip(*rendered, strict=True)
+    tile_width, tile_height = tiles(width, height)
+    info = {
+        "batch_ids": None if camera_ids is None else torch.zeros_like(camera_ids),
+        "camera_ids": camera_ids,
+        "gaussian_ids": gaussian_ids,
+        "radii": radii,
+        "means2d": means2d,
+        "depths": depths,
+        "conics": conics,
+        "opacities": opacities,
+        "tile_width": tile_width,
+        "tile_height": tile_height,
+        "tiles_per_gauss": _join(tiles_per_gauss if packed else [t.unsqueeze(0) for t in tiles_per_gauss]),
+        "width": width,
+        "height": height,
+        "tile_size": TILE,
+        "n_batches": 1,
+        "n_cameras": n_cameras,
+    }
+    return _join(images).to(dtype), _join(alphas).to(dtype), info
+
+
+def _render_camera(
+    projection: tuple[Tensor, ...],  # means2d, conics, opacities, depths and sigmas of R rows
+    visible: Tensor,  # [M]
+    block_start: Tensor,  # [ceil(R / BLOCK) + 1]
+    features: Tensor | None,  # [R, D], None where only depth is wanted
+    absolute: Tensor | None,  # [R, 2]
+    background: Tensor | None,  # [D]
+    width: int,
+    height: int,
+    render_mode: RenderMode,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Image [1, H, W, X], alpha [1, H, W, 1] and tiles_per_gauss [R] of projected Gaussians."""
+    means2d, conics, opacities, depths, sigmas = projection
+    with_depth = render_mode != "RGB"
+    channels = [] if features is None else [features]
+    if with_depth:
+        channels.append(depths.reshape(-1, 1))
+    image, alpha, tiles_per_gauss = Blend.apply(
+        means2d, conics, opacities, torch.cat(channels, 1) if len(channels) > 1 else channels[0],
+        depths, sigmas, visible, block_start, width, height, absolute,
+    )  # fmt: skip
+    if background is not None and features is not None:
+        behind = background.to(torch.float32)
+        if with_depth:
+            behind = torch.cat([behind, behind.new_zeros(1)])
+        image = image + (1.0 - alpha) * behind
+    if render_mode.endswith("ED"):
+        expected = image[..., -1:] / alpha.clamp(min=1e-10)
+        image = expected if features is None else torch.cat([image[..., :-1], expected], -1)
+    return image, alpha, tiles_per_gauss
+
+
+# One camera is the rule in training: it needs neither copies nor views, whose gradients are views too.
+def _join(tensors: Sequence[Tensor]) -> Tensor:
+    return tensors[0] if len(tensors) == 1 else torch.cat(list(tensors))
+
+
+def _split(tensor: Tensor, counts: list[int] | None) -> Sequence[Tensor]:
+    """One tensor per camera, of rows [C, N, ...], whose first dimension stays, or packed with `counts` per camera."""
+    if len(tensor if counts is None else counts) == 1:
+        return [tensor]
+    return tensor.split(1 if counts is None else counts)

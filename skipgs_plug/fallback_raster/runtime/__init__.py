@@ -1,0 +1,1 @@
+"""Whatever compiles, checks and runs kernels: launch, threads, cache, guard zones, memory."""

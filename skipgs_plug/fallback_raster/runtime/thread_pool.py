@@ -1,0 +1,85 @@
+"""Threads that run kernels beside the one that calls, without the interpreter.
+
+A helper spends its life in one call of native code (`kernels/pool_serve.h`). Between two kernels it looks for the next
+one for some microseconds, and then sleeps until it is called. As threads of Python, helpers and caller wanted the
+interpreter at the same moments, and every launch waited several times for the system to wake somebody.
+"""
+
+import _thread
+import ctypes
+import time
+
+from .cores import usable_cores
+from .native import Kernel, load_kernel
+from .source import read_kernel
+
+# How often a thread looks for what it waits for before it sleeps: for 100 to 200 microseconds on x86. Looking longer
+# takes processor time from others, looking less makes launches late.
+_PATIENCE = 5000
+
+_LINE = 64  # bytes of the lines in memory that `kernels/lib/thread_pool.h` consists of
+_CALLER, _HELPERS = 2, 3  # which of them are the caller's and the first helper's
+_LOCK = 8  # bytes of a line before its lock
+
+# Locks of Python work on every system, and without the interpreter.
+_allocate = ctypes.PYFUNCTYPE(ctypes.c_void_p)(("PyThread_allocate_lock", ctypes.pythonapi))
+_acquire = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int)(("PyThread_acquire_lock", ctypes.pythonapi))
+_release = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)(("PyThread_release_lock", ctypes.pythonapi))
+_free = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)(("PyThread_free_lock", ctypes.pythonapi))
+
+
+class ThreadPool:
+    """Helpers that run kernels along with the thread that calls `run`, of which there is one at a time.
+
+    Args:
+        count: Number of helpers.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        # With more threads than cores, one that looks keeps another from its work.
+        self._patience = _PATIENCE if count < usable_cores() else 0
+        self._server = _load("pool_serve", ["pool_address"], ["number", "patience"])
+        launch = ["pool_address", "function_address", "bounds_address", "block_address"]
+        self._launcher = _load("pool_run", launch, ["helpers", "patience"])
+        self._memory = (ctypes.c_char * (_LINE * (_HELPERS + count + 1)))()
+        self._address = -(-ctypes.addressof(self._memory) // _LINE) * _LINE
+        self._locks = [self._put_lock(line) for line in range(_CALLER, _HELPERS + count)]
+        self._alive = list(range(count))
+        for number in range(count):
+            _thread.start_new_thread(self._serve, (number,))
+
+    def run(self, kernel: Kernel, block: ctypes.Structure) -> None:
+        """Run it on all of them and here; none of them is at it any more when this returns."""
+        self._launch(*kernel.addresses, ctypes.addressof(block))
+
+    def dismiss(self) -> None:
+        """Wait until all are gone; may be called again when an exception ended it."""
+        self._launch(0, 0, 0)
+        while self._alive:
+            time.sleep(0.0005)
+        while self._locks:
+            _free(self._locks.pop())
+
+    def _put_lock(self, line: int) -> int:
+        """A lock that is held, and the functions to use it, at its place in a line."""
+        lock: int = _allocate()
+        _acquire(lock, 1)
+        functions = (ctypes.cast(function, ctypes.c_void_p).value for function in (_acquire, _release))
+        place = (ctypes.c_void_p * 3).from_address(self._address + _LINE * line + _LOCK)
+        place[:] = [lock, *functions]
+        return lock
+
+    def _launch(self, *addresses: int) -> None:
+        self._launcher(self._launcher.block(self._address, *addresses, self._count, self._patience))
+
+    def _serve(self, number: int) -> None:
+        try:
+            self._server(self._server.block(self._address, number, self._patience))
+        finally:
+            self._alive.remove(number)
+
+
+def _load(name: str, addresses: list[str], numbers: list[str]) -> Kernel:
+    parameters = dict.fromkeys(addresses, "wp.uint64") | dict.fromkeys(numbers, "wp.int32")
+    return load_kernel(name, parameters, read_kernel(f"{name}.h"))

@@ -1,0 +1,91 @@
+"""How many threads kernels run on, and whose turn it is.
+
+One launch takes place at a time, under `LOCK`. KeyboardInterrupt and what signal handlers raise may come between any
+two steps of the main thread, but not while a kernel runs, which is one call of native code on all threads.
+"""
+
+import atexit
+import ctypes
+import os
+import threading
+import warnings
+
+import torch
+
+from .cores import usable_cores
+from .native import Kernel
+from .thread_pool import ThreadPool
+
+LOCK = threading.RLock()
+_num_threads = usable_cores()
+_pool: ThreadPool | None = None
+_forked = False  # this process inherited torch's OpenMP without its threads, and has not been told so
+
+
+def get_num_threads() -> int:
+    """Number of threads that the CPU rasterizer runs on; all cores this process may use unless set."""
+    return _num_threads
+
+
+def set_num_threads(n: int) -> None:
+    """Sets the number of threads of the CPU rasterizer. Images and gradients are bit-equal for any number.
+
+    Args:
+        n: At least 1.
+
+    Raises:
+        ValueError: `n` is not a whole number of at least 1.
+    """
+    global _num_threads
+    if not isinstance(n, int) or n < 1:
+        raise ValueError(f"set_num_threads expects a whole number of at least 1, got {n!r}.")
+    with LOCK:
+        _num_threads = n
+        _dismiss()
+
+
+def on_threads(count: int, kernel: Kernel, block: ctypes.Structure) -> None:
+    """Runs a kernel on one thread, this one, or on all, and returns when it is done. The caller holds `LOCK`."""
+    global _pool
+    if _forked:
+        _warn_after_fork()
+    if count == 1:
+        kernel(block)
+        return
+    if _pool is None:
+        _pool = ThreadPool(_num_threads - 1)
+    _pool.run(kernel, block)
+
+
+@atexit.register
+def _dismiss() -> None:
+    """No thread runs a kernel when this returns."""
+    global _pool
+    with LOCK:
+        if _pool is not None:
+            _pool.dismiss()
+        _pool = None
+
+
+def _warn_after_fork() -> None:
+    global _forked
+    _forked = False
+    warnings.warn(
+        "This process was forked from one in which torch had several threads, which do not survive a fork: torch "
+        'may hang here. Start processes with multiprocessing\'s "spawn", or call torch.set_num_threads(1) first.',
+        RuntimeWarning,
+        stacklevel=5,
+    )
+
+
+def _after_fork_in_child() -> None:
+    """Threads do not survive a fork: a child starts its own."""
+    global _pool, _forked
+    _pool = None
+    _forked = torch.get_num_threads() > 1
+    LOCK.release()
+
+
+# A child must not inherit the lock from a thread that renders; so a fork waits until it has finished.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=_after_fork_in_child)

@@ -1,0 +1,1 @@
+"""Optimizers and the loss of training, as kernels."""

@@ -1,0 +1,31 @@
+"""What densification knows of a Gaussian: how far the views that show it would move it on their images."""
+
+from typing import Annotated
+
+from torch import Tensor
+
+from ..runtime.launch import FloatArray, IntArray, worker
+from ..runtime.source import read_kernel
+
+
+@worker(read_kernel("sum_norms.h"), items="n", grain="4096")
+def _sum_norms(
+    rows: Annotated[IntArray, "n"],  # none of them twice
+    gradient: Annotated[FloatArray, "n, 2"],
+    norms: Annotated[FloatArray, "R"],  # added to, as the next
+    counts: Annotated[FloatArray, "R"],
+    n: int,
+    scale_x: float,
+    scale_y: float,
+) -> None: ...
+
+
+def sum_norms(
+    rows: Tensor,  # [M] int32, none of them twice
+    gradient: Tensor,  # [M, 2] float32, of the 2D means
+    scale: tuple[float, float],  # by which both columns are multiplied first
+    norms: Tensor,  # [N] float32, changed in place as the next
+    counts: Tensor,  # [N] float32
+) -> None:
+    """Add the norms of gradients to `norms` and 1 to `counts`, for the rows that an image shows."""
+    _sum_norms(rows, gradient.contiguous(), norms, counts, len(rows), *map(float, scale))

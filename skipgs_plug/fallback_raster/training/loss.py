@@ -1,0 +1,148 @@
+"""The 3DGS loss, (1 - w) L1 + w (1 - SSIM), value and gradient in one go.
+
+SSIM (Wang et al. 2004) with an 11x11 Gaussian window of sigma 1.5 and the constants 0.01^2 and 0.03^2. In terms of
+the difference d = x - y of the images, with means m, variances v and covariance c inside a window,
+
+    luminance  1 - (2 m_x m_y + C1) / (m_x^2 + m_y^2 + C1) = m_d^2 / (m_x^2 + m_y^2 + C1)
+    structure  1 - (2 c + C2) / (v_x + v_y + C2)           = v_d   / (v_x + v_y + C2)
+
+so that 1 - SSIM and its gradient come out of small numbers instead of differences of large ones. Every tile also
+subtracts its mean before it squares, because E[x^2] - E[x]^2 loses digits in float32 where an image is bright and flat.
+For the same reason the parts of the gradient count x and d from there: where both images are flat they are thousands of
+times larger than their sum.
+
+Images stay channels-last, as the rasterizer returns them: a blur along a row is a blur with stride C over a flat
+row. A tile is at most 256 floats wide and 128 rows high, and is gone through once for value and gradient: what the
+windows need of rows above stays in two rings in the first two caches, of which four rows at a time read most numbers
+once. Tiles compute what they need beyond their borders themselves, a fifth more, which costs less than writing it down
+for another pass: no core reads what another one wrote.
+"""
+
+import math
+from typing import Annotated, Any, Literal
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ..runtime.arguments import as_kernels_read
+from ..runtime.buffers import floats
+from ..runtime.constants import BAND, CHUNK, LOSS_CHANNELS, WINDOW
+from ..runtime.launch import ByteArray, FloatArray, Worker, worker
+from ..runtime.source import read_kernel
+
+# Columns of float32 count no further exactly, and kernels find them in it.
+MAX_ROW = 2**24
+
+
+def _loss_tiles(name: str, pixels: type) -> Worker:
+    @worker(read_kernel("loss_tiles.h"), items="tiles", grain="1", name=name)
+    def loss_tiles(
+        image: Annotated[FloatArray, "images, height, width, channels"],
+        target: Annotated[pixels, "images, height, width, channels"],  # type: ignore[valid-type]
+        gradient: Annotated[FloatArray, "images if with_gradient else 0, height, width, channels"],  # out
+        sums: Annotated[FloatArray, "tiles, 2"],  # out, |image - target| and 1 - SSIM summed over each tile
+        tiles: int,
+        images: int,
+        height: int,
+        width: int,
+        channels: int,
+        valid: int,
+        with_gradient: int,
+        l1_weight: float,
+        ssim_weight: float,
+    ) -> None: ...
+
+    return loss_tiles
+
+
+_LOSS_TILES = {
+    torch.float32: _loss_tiles("loss_tiles", FloatArray),
+    torch.uint8: _loss_tiles("loss_tiles_bytes", ByteArray),
+}
+
+
+class _L1Ssim(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, ssim_lambda: float, valid: bool) -> Tensor:  # type: ignore[override]
+        height, width, channels = image.shape[-3:]
+        images = image.numel() // (height * width * channels)
+        size = (images, height, width, channels)
+        with_gradient = ctx.needs_input_grad[0]
+        tiles = images * -(-height // BAND) * -(-width * channels // (16 * CHUNK))
+        border = WINDOW - 1 if valid else 0
+        windows = images * (height - border) * (width - border) * channels
+        weights = ((1.0 - ssim_lambda) / image.numel(), ssim_lambda / windows)
+        gradient, sums = floats(*image.shape) if with_gradient else floats(0), floats(tiles, 2)
+        loss_tiles = _LOSS_TILES[target.dtype]
+        loss_tiles(image, target, gradient, sums, tiles, *size, int(valid), int(with_gradient), *weights)
+        ctx.save_for_backward(gradient)
+        # Tiles were summed in float32; adding them in float64, in a fixed order, keeps the last digits of the mean.
+        l1, unlike = map(math.fsum, zip(*sums.tolist(), strict=True))
+        return torch.tensor(weights[0] * l1 + weights[1] * unlike, dtype=torch.float32, device="cpu")
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_loss: Tensor) -> Any:  # type: ignore[override]
+        (gradient,) = ctx.saved_tensors
+        return gradient if v_loss.item() == 1.0 else v_loss * gradient, None, None, None
+
+
+def l1_ssim_loss(
+    image: Tensor,  # [..., H, W, C]
+    target: Tensor,  # [..., H, W, C]
+    ssim_lambda: float = 0.2,
+    padding: Literal["same", "valid"] = "same",
+) -> Tensor:
+    """The 3DGS training loss (Kerbl et al. 2023, eq. 7), fused, in float32 on all cores.
+
+    (1 - ssim_lambda) mean |image - target| + ssim_lambda (1 - mean SSIM), bit-equal for any number of threads.
+    Differentiable in `image`; the gradient is computed along with the value, so going back costs nothing more.
+
+    Args:
+        image: Rendered image, usually in [0, 1].
+        target: Photograph of the same shape; as uint8 it counts in 255ths, to the bit what `target / 255` gives.
+        ssim_lambda: Weight of the SSIM term.
+        padding: "same" continues the images with black (Inria, fused_ssim's default); "valid" averages SSIM over
+            windows inside the image only (gsplat).
+
+    Returns:
+        Scalar.
+
+    Raises:
+        ValueError: Shapes differ, there are more than 32 channels, a row has more than 2^24 numbers, an image is too
+            small for "valid", a tensor is of another kind or not on the CPU, or a gradient with respect to `target` is
+            asked for.
+    """
+    in_bytes = target.dtype is torch.uint8
+    for name, tensor, kinds, fits in (
+        ("image", image, "float", image.is_floating_point()),
+        ("target", target, "float or uint8", target.is_floating_point() or in_bytes),
+    ):
+        if not fits or tensor.device.type != "cpu":
+            raise ValueError(f"{name} must be a {kinds} tensor on the CPU, got {tensor.dtype} on {tensor.device}.")
+    if image.shape != target.shape or image.dim() < 3 or image.numel() == 0:
+        raise ValueError(
+            f"image and target must have one shape [..., H, W, C], got {list(image.shape)} and {list(target.shape)}."
+        )
+    if image.shape[-1] > LOSS_CHANNELS:
+        raise ValueError(
+            f"images may have at most {LOSS_CHANNELS} channels, got {image.shape[-1]}; are they [H, W, C]?"
+        )
+    if image.shape[-2] * image.shape[-1] > MAX_ROW:
+        raise ValueError(
+            f"a row of an image may have at most {MAX_ROW} numbers, got {image.shape[-2]} pixels of "
+            f"{image.shape[-1]} channels."
+        )
+    if padding not in ("same", "valid"):
+        raise ValueError(f"padding must be 'same' or 'valid', got {padding!r}.")
+    if padding == "valid" and min(image.shape[-3:-1]) < WINDOW:
+        raise ValueError(
+            f"padding='valid' needs images of at least {WINDOW}x{WINDOW} pixels, got "
+            f"{image.shape[-2]}x{image.shape[-3]}; use padding='same'."
+        )
+    if target.requires_grad:
+        raise ValueError("l1_ssim_loss is differentiable in image only: pass target.detach().")
+    (rendered,) = as_kernels_read(image)
+    (photograph,) = [target.contiguous()] if in_bytes else as_kernels_read(target)
+    return _L1Ssim.apply(rendered, photograph, ssim_lambda, padding == "valid").to(image.dtype)

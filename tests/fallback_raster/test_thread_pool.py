@@ -1,0 +1,105 @@
+"""Helpers run a kernel along with its caller, which comes back when the last of them is done."""
+
+from __future__ import annotations
+
+import ctypes
+import random
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from skipgs_plug import fallback_raster
+from skipgs_plug.fallback_raster.runtime.native import Kernel
+from skipgs_plug.fallback_raster.runtime.thread_pool import ThreadPool
+
+PATIENCE = 2e-4  # seconds after which threads sleep, about
+
+
+class Block(ctypes.Structure):
+    _fields_ = (("number", ctypes.c_int32),)
+
+
+def kernel(work: Callable[[int], None]) -> Kernel:
+    """One that calls Python, with the number in its block."""
+
+    def body(bounds: int, block: int) -> None:
+        assert bounds == 7
+        work(Block.from_address(block).number)
+
+    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(body)
+    address = ctypes.cast(function, ctypes.c_void_p).value
+    assert address is not None
+    return Kernel(function, None, Block, (address, 7), function)
+
+
+@pytest.fixture(params=[1, 3])
+def pool(request: pytest.FixtureRequest) -> Iterator[ThreadPool]:
+    pool = ThreadPool(request.param)
+    yield pool
+    pool.dismiss()
+
+
+def test_all_that_began_are_done_when_a_launch_returns(pool: ThreadPool) -> None:
+    lengths = random.Random(0)
+    begun: list[tuple[int, int]] = []
+    ended: list[tuple[int, int]] = []
+
+    def work(number: int) -> None:
+        me = number, threading.get_ident()
+        begun.append(me)
+        time.sleep(lengths.choice([0, 0, PATIENCE / 10, PATIENCE, 4 * PATIENCE]))
+        ended.append(me)
+
+    working = kernel(work)
+    for number in range(400):
+        pool.run(working, Block(number))
+        assert sorted(begun) == sorted(ended)
+        mine = [thread for launch, thread in ended if launch == number]
+        assert threading.get_ident() in mine
+        assert len(set(mine)) == len(mine) <= 1 + pool._count
+        if number % 3 == 0:  # let helpers fall asleep, or not
+            time.sleep(lengths.choice([PATIENCE / 10, 3 * PATIENCE]))
+    assert len({thread for _, thread in ended}) == 1 + pool._count
+
+
+def test_helpers_that_sleep_are_woken(pool: ThreadPool) -> None:
+    together = threading.Barrier(1 + pool._count)
+    meeting = kernel(lambda _: together.wait(10) and None)
+    for _ in range(3):
+        time.sleep(20 * PATIENCE)
+        pool.run(meeting, Block(0))
+    assert not together.broken
+
+
+def test_a_caller_waits_for_helpers_that_take_long(pool: ThreadPool) -> None:
+    caller, ended = threading.get_ident(), []
+    started = threading.Event()
+
+    def work(_: int) -> None:
+        if threading.get_ident() == caller:
+            assert started.wait(10)
+        else:
+            started.set()
+            time.sleep(0.05)
+            ended.append(True)
+
+    pool.run(kernel(work), Block(0))
+    assert ended
+
+
+def test_who_is_dismissed_is_gone_and_may_be_dismissed_again() -> None:
+    pool = ThreadPool(4)
+    pool.run(kernel(lambda _: None), Block(0))
+    pool.dismiss()
+    assert not pool._alive and not pool._locks
+    pool.dismiss()
+
+
+def test_no_kernel_holds_inline_assembly():
+    """The compiler inside Warp has no assembler for aarch64: one such line ends the process natively."""
+    for file in Path(fallback_raster.__file__).parent.rglob("*.h"):
+        assert not re.search(r"\b(asm|__asm__)\b", re.sub(r"//.*", "", file.read_text())), file.name
