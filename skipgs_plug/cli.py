@@ -53,6 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     replace_closed_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
     own = arguments[: arguments.index("--")] if "--" in arguments else arguments
+    own = [expand_home(argument) for argument in own]
+    arguments[: len(own)] = own
     debug = "--debug" in own
     if debug:
         arguments.remove("--debug")
@@ -74,6 +76,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exc()
             return BAD_INPUT if sentence else 1
         return fail(sentence)
+
+
+def expand_home(argument: str) -> str:
+    """Return an argument with `~` as the home folder: shells leave it in `--out=~/runs`, quotes and lists."""
+    option, equals, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
+    return f"{option}{equals}{os.path.expanduser(value)}" if value.startswith("~") else argument
 
 
 def replace_closed_streams() -> None:

@@ -195,3 +195,12 @@ def test_training_loads_nothing_that_it_does_not_use(tmp_path: Path, packed: str
     code = f"from skipgs_plug.cli import main\nassert main({arguments!r}) == 0"
     assert loaded_by(code, UNUSED_IN_TRAINING) == set()
     assert loaded_by(code.replace("== 0", "== 2"), {"torch"}) == {"torch"}  # the probe sees what is there
+
+
+def test_the_home_folder_is_known_everywhere(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/somebody")
+    from skipgs_plug.cli import expand_home
+
+    given = ["~/scene", "--out=~/runs", "--out", "~", "a~b", "--name=a~"]
+    expected = ["/home/somebody/scene", "--out=/home/somebody/runs", "--out", "/home/somebody", "a~b", "--name=a~"]
+    assert [expand_home(argument) for argument in given] == expected

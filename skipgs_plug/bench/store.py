@@ -15,7 +15,7 @@ class BenchFolder:
     """Names and writes `settings.json`, `snapshots/`, `runs/`, `tb/` and `bench.json`."""
 
     def __init__(self, root: str | Path) -> None:
-        self.root = Path(root)
+        self.root = Path(root).expanduser()
 
     def require_settings(self, settings: dict[str, Any]) -> None:
         """Store the settings of a new folder; those of an old one must be the same.
@@ -57,7 +57,9 @@ class BenchFolder:
 
     def store(self, record: RunRecord) -> None:
         with write_aside(self._run(record.seed, record.policy)) as temporary:
-            temporary.write_text(json.dumps(record.as_dict(), separators=(",", ":"), allow_nan=False) + "\n")
+            temporary.write_text(
+                json.dumps(record.as_dict(), separators=(",", ":"), allow_nan=False) + "\n", encoding="utf-8"
+            )
 
     def _run(self, seed: int, policy: str) -> Path:
         return self.root / "runs" / f"seed{seed}_{policy}.json"
@@ -65,7 +67,7 @@ class BenchFolder:
 
 def read_json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text())
+        return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:
         raise InputError(f"{path} cannot be read as JSON ({error}); restore it or remove it.") from error
 

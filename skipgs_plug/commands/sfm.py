@@ -75,6 +75,8 @@ def reconstruct(args: Args) -> Path:
         f"mean reprojection error {error:.2f} px."
     )
     print_unplaced(unplaced, matching)
+    if gathered.masks is not None:
+        print("Transparent pixels of the photographs are left out of training: masks/ says which.")
     return scene
 
 

@@ -125,7 +125,7 @@ def write_report(gate: Reporting, path: str | Path) -> None:
     """Write `gate.report()` as JSON."""
     text = json.dumps(_finite(gate.report()), indent=2, allow_nan=False) + "\n"
     with write_aside(path) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _finite(value: Any) -> Any:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image, ImageOps
 
 from skipgs_plug.photos.video import VIDEO_SUFFIXES, sharpest_frames
@@ -21,6 +22,7 @@ CONVERTED = (".webp", ".bmp", ".tif", ".tiff")
 UNREADABLE = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
 MODEL, FOCAL_LENGTH, EXIF_BLOCK = 0x0110, 0x920A, 0x8769  # EXIF tags
 QUALITY: dict[str, Any] = {"quality": 97, "subsampling": 0}
+OPAQUE = 128  # alpha from which a pixel counts, as in the loaders
 LEAST = 3  # photographs, below which nothing can be reconstructed
 
 
@@ -30,12 +32,15 @@ class Gathered:
 
     Attributes:
         names: paths relative to the folder, sorted.
+        masks: folder with a mask for each photograph that is transparent somewhere, `photo.png.png` for
+            `photo.png`, black where alpha is below one half; None where none is.
         one_camera: whether all have one size, camera model and focal length, so that they share intrinsics.
     """
 
     folder: Path
     names: list[str]
     one_camera: bool
+    masks: Path | None = None
 
 
 def are_photographs(source: Path) -> bool:
@@ -45,7 +50,20 @@ def are_photographs(source: Path) -> bool:
     if not source.is_dir() or is_scene(source):
         return False
     known = AS_THEY_ARE + CONVERTED + UNREADABLE
-    return any(path.suffix.lower() in known and not path.name.startswith(".") for path in source.rglob("*"))
+    return any(path.suffix.lower() in known and not path.name.startswith(".") for path in walk(source))
+
+
+def walk(folder: Path) -> Iterator[Path]:
+    """Yield the files in a folder and in those below it, also behind links, each real folder once."""
+    seen: set[str] = set()
+    for root, folders, files in os.walk(folder, followlinks=True):
+        folders.sort()
+        real = os.path.realpath(root)
+        if real in seen:  # a link to a folder that holds it, or a second one
+            folders.clear()
+            continue
+        seen.add(real)
+        yield from (Path(root, name) for name in files)
 
 
 def check_source(source: Path) -> None:
@@ -98,7 +116,7 @@ def gather_video(source: Path, folder: Path, frames: int, progress: Callable[[in
 
 def gather_folder(source: Path, folder: Path, progress: Callable[[int], None]) -> Gathered:
     known = AS_THEY_ARE + CONVERTED + UNREADABLE
-    found = [path for path in sorted(source.rglob("*")) if path.suffix.lower() in known]
+    found = [path for path in sorted(walk(source)) if path.suffix.lower() in known]
     files = [path for path in found if not path.is_dir() and not path.name.startswith(".")]
     unreadable = [path for path in files if path.suffix.lower() in UNREADABLE]
     if unreadable:
@@ -108,16 +126,24 @@ def gather_folder(source: Path, folder: Path, progress: Callable[[int], None]) -
         if not path.exists():
             raise MissingFileError(f"{path} links to a file that does not exist; restore that or remove the link.")
     names, cameras = [], set()
+    masks = folder.with_name("masks")
     for path in files:
-        name, camera = place(path, source, folder)
+        name, camera = place(path, source, folder, masks)
         names.append(name)
         cameras.add(camera)
         progress(1)
-    return Gathered(folder, sorted(names), one_camera=len(cameras) == 1)
+    doubled = {name for name in names if names.count(name) > 1}
+    if doubled:
+        raise InputError(f"{source}: two photographs would be called {min(doubled)}; rename one.")
+    return Gathered(folder, sorted(names), len(cameras) == 1, masks if masks.is_dir() else None)
 
 
-def place(path: Path, source: Path, folder: Path) -> tuple[str, tuple[object, ...]]:
-    """Link or convert one photograph; return its name and what tells its camera from others."""
+def place(path: Path, source: Path, folder: Path, masks: Path) -> tuple[str, tuple[object, ...]]:
+    """Link or convert one photograph, with its transparency in `masks`.
+
+    Returns:
+        Its name, and what tells its camera from others.
+    """
     picture = decode(path, path)  # also so that a damaged file is named here, not by C++ code later
     exif = picture.getexif()
     target = folder / path.relative_to(source)
@@ -130,6 +156,12 @@ def place(path: Path, source: Path, folder: Path) -> tuple[str, tuple[object, ..
         picture.convert("RGB").save(target, exif=picture.getexif(), **options)
     else:
         link(path, target)
+    if picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info:
+        alpha = picture.convert("RGBA").getchannel("A")
+        if np.asarray(alpha).min() < OPAQUE:
+            mask = masks / target.relative_to(folder).with_name(f"{target.name}.png")
+            mask.parent.mkdir(parents=True, exist_ok=True)
+            alpha.point(lambda value: 255 if value >= OPAQUE else 0).save(mask)
     camera = (picture.size, exif.get(MODEL), exif.get_ifd(EXIF_BLOCK).get(FOCAL_LENGTH))
     return target.relative_to(folder).as_posix(), camera
 

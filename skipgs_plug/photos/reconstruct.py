@@ -7,12 +7,17 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from PIL import Image
+
 from skipgs_plug.photos import global_mapping
 from skipgs_plug.photos.choices import Mapping, Matching
 from skipgs_plug.photos.gather import Gathered
 from skipgs_plug.photos.links import Links, largest_group, read_links
 from skipgs_plug.photos.progress import counted
 from skipgs_plug.trainer.loaders.native import import_pycolmap
+from skipgs_plug.trainer.loaders.photograph import undistort
 
 EXHAUSTIVE_UP_TO = 100  # photographs; beyond, all pairs take longer than neighbours in order
 OVERLAP = 10  # neighbours on either side, then those 16, 32, ... away
@@ -42,10 +47,18 @@ class Reconstruction:
         """Detect features."""
         options = self._colmap.FeatureExtractionOptions()
         options.max_image_size = FEATURE_SIZE
+        reader = self._colmap.ImageReaderOptions()
+        if self._photos.masks is not None:
+            reader.mask_path = self._photos.masks
         mode = self._colmap.CameraMode.SINGLE if self._photos.one_camera else self._colmap.CameraMode.AUTO
         with counted(self.database, "descriptors", progress):
             self._colmap.extract_features(
-                self.database, self._photos.folder, self._photos.names, camera_mode=mode, extraction_options=options
+                self.database,
+                self._photos.folder,
+                self._photos.names,
+                camera_mode=mode,
+                reader_options=reader,
+                extraction_options=options,
             )
 
     def match(self, matching: Matching, progress: Progress) -> str:
@@ -63,7 +76,9 @@ class Reconstruction:
                 self._colmap.match_sequential(self.database, pairing_options=options, verification_options=verification)
                 pairs = self._colmap.ImportedPairingOptions()
                 pairs.match_list_path = self._work / "pairs.txt"
-                pairs.match_list_path.write_text("\n".join(f"{a} {b}" for a, b in key_pairs(self._photos.names)))
+                pairs.match_list_path.write_text(
+                    "\n".join(f"{a} {b}" for a, b in key_pairs(self._photos.names)), encoding="utf-8"
+                )
                 self._colmap.match_image_pairs(self.database, pairing_options=pairs, verification_options=verification)
         return matching
 
@@ -113,7 +128,22 @@ class Reconstruction:
         chosen.mkdir()
         model.write(chosen)
         self._colmap.undistort_images(output, chosen, self._photos.folder, jpeg_quality=97)
+        if self._photos.masks is not None:
+            self._undistort_masks(model, self._photos.masks, output / "masks")
         return output
+
+    def _undistort_masks(self, model: Any, masks: Path, output: Path) -> None:
+        """Write the masks of a model's photographs as `undistort` writes these."""
+        for image in model.images.values():
+            source = masks / f"{image.name}.png"
+            if not source.is_file():
+                continue
+            mask = torch.from_numpy(np.array(Image.open(source))) > 0
+            straight = undistort(mask[..., None].byte().repeat(1, 1, 3), mask, model.cameras[image.camera_id], source)
+            assert straight.mask is not None
+            target = output / f"{image.name}.png"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(straight.mask.byte().numpy() * 255).save(target)
 
 
 def key_pairs(names: Sequence[str]) -> Iterator[tuple[str, str]]:

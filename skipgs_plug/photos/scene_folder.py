@@ -41,6 +41,8 @@ def write_scene(undistorted: Path, scene: Path, progress: Callable[[int], None])
     (content / "sparse").mkdir(parents=True)
     (undistorted / "sparse").rename(content / "sparse" / "0")
     (undistorted / "images").rename(content / "images")
+    if (undistorted / "masks").is_dir():
+        (undistorted / "masks").rename(content / "masks")
     shutil.rmtree(undistorted)
     images = [path for path in sorted((content / "images").rglob("*")) if path.is_file()]
     for path in images:

@@ -140,7 +140,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
 
     file = folder / "cfg.yml"
     try:
-        content = yaml.safe_load(file.read_text()) if file.is_file() else {}
+        content = yaml.safe_load(file.read_text(encoding="utf-8")) if file.is_file() else {}
     except (yaml.YAMLError, UnicodeDecodeError):
         return {}
     return content if isinstance(content, dict) else {}
@@ -148,7 +148,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
 
 def read_object(file: Path) -> dict[str, Any]:
     try:
-        data = json.loads(file.read_text())
+        data = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:
         raise SkipGSError(f"{file} is damaged ({error}); run it again, or leave it out.") from error
     if not isinstance(data, dict):

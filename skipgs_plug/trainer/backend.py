@@ -101,6 +101,20 @@ class Backend:
             torch.set_num_threads(before)
 
 
+@contextmanager
+def single_precision() -> Iterator[None]:
+    """Let new tensors be float32 inside the block, whatever type the process has chosen as default.
+
+    Parameters and kernels are of float32; gsplat's strategies make tensors of the default type beside them.
+    """
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
 def resolve_backend(name: str = "auto") -> Backend:
     """Return the backend called "gsplat" or "warp"; "auto" takes gsplat where CUDA works, else warp.
 

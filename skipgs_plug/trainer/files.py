@@ -11,4 +11,4 @@ from skipgs_plug.files import write_aside
 
 def write_json(path: str | Path, content: Any) -> None:
     with write_aside(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n")
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from skipgs_plug.fallback_raster import LazyAdam, release_memory
 from skipgs_plug.host_copy import HostCopy
 from skipgs_plug.trainer import metrics, state
-from skipgs_plug.trainer.backend import Backend, resolve_backend
+from skipgs_plug.trainer.backend import Backend, resolve_backend, single_precision
 from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.densification import densify
@@ -72,6 +72,7 @@ class Trainer:
             the next `train` at once.
     """
 
+    @single_precision()
     def __init__(self, config: TrainConfig, scene: Scene, backend: Backend | None = None) -> None:
         self.config = config
         self.scene = scene
@@ -175,6 +176,7 @@ class Trainer:
         """Numbers of the iterations up to `until` (exclusive): the seam where a gate leaves some out."""
         return range(self.step, until)
 
+    @single_precision()
     def train_step(self) -> float:
         """Run one iteration and return its loss."""
         with self.backend.exclusive_cores():
@@ -256,12 +258,14 @@ class Trainer:
         return min(step // self._sh_interval, self.config.sh_degree)
 
     @torch.no_grad()
+    @single_precision()
     def render(self, view: View) -> Tensor:
         """Return the image [H, W, 3] of a view, in [0, 1] up to overshoot; of a training view with its exposure."""
         degree = self.active_sh_degree(max(self.step - 1, 0))
         image, _ = self._rasterize(view, degree, self._background())
         return self._exposed(image, view)
 
+    @single_precision()
     def evaluate(self, split: str = "test", lpips_net: str | None = None) -> dict[str, Any]:
         """Return the means of the chosen metrics over the views of "test" or "train", and what belongs to them.
 
@@ -320,7 +324,7 @@ class Trainer:
         background = self._background()
         if self.config.random_bkgd:
             generator = torch.Generator().manual_seed(derive_seed(self.config.seed, step))
-            background = torch.rand(3, generator=generator).to(self.backend.device)
+            background = torch.rand(3, generator=generator, dtype=torch.float32).to(self.backend.device)
         image, info = self._rasterize(view, degree, background, with_rows)
         return (*leave_out(self._exposed(image, view), self._target(view), view.mask), info)
 

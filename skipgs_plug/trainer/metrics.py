@@ -18,6 +18,7 @@ from skipgs_plug.trainer.mask import leave_out
 from skipgs_plug.trainer.ssim import ssim_map
 
 SSIM_FLAVOUR = "torchmetrics 1.9: 11x11 Gaussian window, borders reflected, mean over all windows"
+LEAST_ERROR = 1e-10  # mean square, of 100 dB
 LPIPS_WEIGHTS = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 
 
@@ -54,10 +55,13 @@ class Metric:
 
 
 def psnr(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Return PSNR in dB of images [H, W, 3] clamped to [0, 1], over the pixels of `mask`; infinite for equal images."""
+    """Return PSNR in dB of images [H, W, 3] clamped to [0, 1], over the pixels of `mask`; at most 100.
+
+    Equal images have no error; 100 dB are one of 0.00001, and a number that means and files can hold.
+    """
     squares = (render.clamp(0, 1) - target) ** 2
     error = float((squares if mask is None else squares[mask.to(squares.device)]).mean())
-    return -10.0 * math.log10(error) if error > 0.0 else math.inf
+    return -10.0 * math.log10(max(error, LEAST_ERROR))
 
 
 def ssim(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:

@@ -28,7 +28,7 @@ def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near:
     """
     if scene.gaussians is not None:
         tensors = {name: tensor.clone() for name, tensor in scene.gaussians.items()}
-        higher = torch.zeros(len(tensors["means"]), (config.sh_degree + 1) ** 2 - 1, 3)
+        higher = torch.zeros(len(tensors["means"]), (config.sh_degree + 1) ** 2 - 1, 3, dtype=torch.float32)
         known = min(higher.shape[1], tensors["shN"].shape[1])
         higher[:, :known] = tensors["shN"][:, :known]
         tensors["shN"] = higher
@@ -51,10 +51,10 @@ def one_per_point(scene: Scene, config: TrainConfig) -> dict[str, Tensor]:
     return {
         "means": scene.points.clone(),
         "scales": torch.log(neighbour_distance(scene.points) * config.recipe.init_scale)[:, None].repeat(1, 3),
-        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        "opacities": torch.logit(torch.full((n,), config.recipe.init_opa)),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float32).repeat(n, 1),
+        "opacities": torch.logit(torch.full((n,), config.recipe.init_opa, dtype=torch.float32)),
         "sh0": ((rgb - 0.5) / SH_C0)[:, None, :],
-        "shN": torch.zeros(n, (config.sh_degree + 1) ** 2 - 1, 3),
+        "shN": torch.zeros(n, (config.sh_degree + 1) ** 2 - 1, 3, dtype=torch.float32),
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,14 +11,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skipgs_plug.trainer.compressed_ply import SH_C0, decompress, is_compressed
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.scene import check_points
 
+log = logging.getLogger(__name__)
+
 REST = 15  # coefficients of SH degrees 1 to 3
+SATURATING = ("opacity", "scale_0", "scale_1", "scale_2")  # infinite where a model is saturated
 REST_COUNTS = (0, 9, 24, 45)  # f_rest properties of SH degrees 0 to 3
 MAX_LOG_SCALE = 80.0  # float32 overflows at e^88
+MAX_LOGIT = 20.0  # of an opacity that is 1 in float32, where a file has infinity
+MIN_LOG_SCALE = -40.0  # squares of e^-40 are still numbers in float32
 MAX_HEADER = 1 << 16
+COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+PACKED_COLOURS = ("rgb", "rgba")  # of the Point Cloud Library: one number, bytes 0xAARRGGBB
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
     *(f"f_rest_{i}" for i in range(3 * REST)),
@@ -32,13 +41,13 @@ def write_ply(splats: Mapping[str, Tensor], path: str | Path) -> None:
     """
     from plyfile import PlyData, PlyElement
 
-    values = {name: tensor.detach().cpu().float() for name, tensor in splats.items()}
+    values = saturated({name: tensor.detach().cpu().float() for name, tensor in splats.items()}, path)
     n = len(values["means"])
-    rest = torch.zeros(n, REST, 3)
+    rest = torch.zeros(n, REST, 3, dtype=torch.float32)
     rest[:, : values["shN"].shape[1]] = values["shN"]
     columns = [
         values["means"],
-        torch.zeros(n, 3),
+        torch.zeros(n, 3, dtype=torch.float32),
         values["sh0"].reshape(n, 3),
         rest.transpose(1, 2).reshape(n, 3 * REST),
         values["opacities"].reshape(n, 1),
@@ -100,22 +109,43 @@ def model_of(path: Path, vertices: Mapping[str, np.ndarray]) -> dict[str, Tensor
     lacking = [name for name in names if name not in vertices]
     if lacking:
         raise InputError(f"PLY {path} is not a 3DGS model: it lacks {', '.join(lacking[:4])}; export it again.")
-    table = columns(path, vertices, names)
+    table = columns(path, vertices, names, infinite=SATURATING)
     if not len(table):
         raise InputError(f"PLY {path} holds no Gaussians; export it again from a sound checkpoint.")
     means, sh0, rest, opacity, scales, quats = torch.from_numpy(table).split([3, 3, count, 1, 3, 4], dim=1)
     if (quats == 0).all(dim=1).any():
         raise InputError(f"PLY {path} holds rotations of length 0; export it again from a sound checkpoint.")
-    if float(scales.max()) > MAX_LOG_SCALE:
-        raise InputError(f"PLY {path} holds scales above e^{MAX_LOG_SCALE:g}: they must be logarithms.")
-    return {
+    splats = {
         "means": means.contiguous(),
         "scales": scales.contiguous(),
         "quats": quats.contiguous(),
         "opacities": opacity[:, 0].contiguous(),
         "sh0": sh0[:, None, :].contiguous(),
-        "shN": rest.reshape(-1, 3, count // 3).transpose(1, 2).contiguous(),
+        "shN": rest.reshape(len(rest), 3, count // 3).transpose(1, 2).contiguous(),
     }
+    return saturated(splats, path)
+
+
+def saturated(splats: Mapping[str, Tensor], path: str | Path) -> dict[str, Tensor]:
+    """Return raw parameters with finite numbers in place of infinite opacities and scales of zero, which is said.
+
+    A saturated model has them: an opacity of 1 is infinite as a logit, a flat Gaussian has a scale of e^-inf.
+
+    Raises:
+        InputError: other values are not finite, or scales too large; names `path`.
+    """
+    result = dict(splats)
+    for name, low, high in (("opacities", -MAX_LOGIT, MAX_LOGIT), ("scales", MIN_LOG_SCALE, np.inf)):
+        values = result[name]
+        infinite = torch.isinf(values) & ((values < 0) | (high < np.inf))
+        if bool(infinite.any()):
+            log.warning("%s: %d %s of infinite value are taken as finite.", path, int(infinite.sum()), name)
+            result[name] = torch.where(infinite, values.clamp(low, high), values)
+    if not all(bool(torch.isfinite(values).all()) for values in result.values()):
+        raise InputError(f"{path}: the model holds NaN or infinite values; export it again from a sound checkpoint.")
+    if len(result["scales"]) and float(result["scales"].max()) > MAX_LOG_SCALE:
+        raise InputError(f"{path} holds scales above e^{MAX_LOG_SCALE:g}: they must be logarithms.")
+    return result
 
 
 def points_of(path: Path, vertices: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -123,13 +153,36 @@ def points_of(path: Path, vertices: Mapping[str, np.ndarray]) -> tuple[np.ndarra
     if not {"x", "y", "z"} <= set(vertices):
         raise InputError(f"PLY {path} has no vertices with x, y and z; give a point cloud.")
     positions = columns(path, vertices, ["x", "y", "z"])
-    names = ["red", "green", "blue"]
-    if not set(names) <= set(vertices):
-        return positions, np.full(positions.shape, 128, dtype=np.uint8)
-    colours = columns(path, vertices, names)
-    if vertices["red"].dtype.kind == "f":  # in [0, 1] by convention
-        colours = colours * 255
-    return positions, np.rint(colours.clip(0, 255)).astype(np.uint8)
+    return positions, colours_of(path, vertices)
+
+
+def colours_of(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return colours [M, 3] uint8 whatever their columns are called and their type; grey where there are none.
+
+    Bytes are taken as they are. The range of other types is told by the largest value: up to 1 for floats, else up to
+    255, else up to 65,535.
+    """
+    by_name = {name.lower(): values for name, values in vertices.items()}
+    for name in PACKED_COLOURS:
+        if name in by_name and by_name[name].dtype.itemsize == 4:
+            bits = np.ascontiguousarray(by_name[name])
+            bits = bits.view(bits.dtype.str[0] + "u4")
+            return np.stack([bits >> shift & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
+    names = next((names for names in COLOURS if set(names) <= set(by_name)), None)
+    if names is not None:
+        colours = columns(path, by_name, list(names))
+        largest = float(colours.max(initial=0.0))
+        kinds = {by_name[name].dtype for name in names}
+        if any(kind.kind == "f" for kind in kinds) and largest <= 1.0:
+            colours = colours * 255
+        elif any(kind.itemsize > 1 for kind in kinds) and largest > 255.5:
+            colours = colours / 257
+        return np.rint(colours.clip(0, 255)).astype(np.uint8)
+    if {"f_dc_0", "f_dc_1", "f_dc_2"} <= set(vertices):
+        colours = 0.5 + SH_C0 * columns(path, vertices, ["f_dc_0", "f_dc_1", "f_dc_2"])
+        return np.rint(colours.clip(0, 1) * 255).astype(np.uint8)
+    log.warning("%s has no colours (red, green and blue): its points are grey.", path)
+    return np.full((len(vertices["x"]), 3), 128, dtype=np.uint8)
 
 
 def read_vertices(path: Path) -> dict[str, np.ndarray]:
@@ -138,8 +191,16 @@ def read_vertices(path: Path) -> dict[str, np.ndarray]:
 
     check_header(path)
     try:
-        vertices = PlyData.read(str(path), mmap=False)["vertex"]
-        return {prop.name: np.asarray(vertices[prop.name]) for prop in vertices.properties}
+        content = PlyData.read(str(path), mmap=False)
+        elements = {
+            element.name: {prop.name: np.asarray(element[prop.name]) for prop in element.properties}
+            for element in content.elements
+            if element.name in ("vertex", "chunk", "sh")
+        }
+        vertices = elements["vertex"]
+        if is_compressed(vertices):
+            return decompress(vertices, elements["chunk"], elements.get("sh", {}))
+        return vertices
     except (PlyParseError, KeyError, ValueError, TypeError, EOFError, MemoryError, OSError) as error:
         raise InputError(f"PLY {path} is damaged or not a PLY ({reason(error)}); export it again.") from error
 
@@ -171,10 +232,13 @@ def check_header(path: Path) -> None:
         raise InputError(f"PLY {path} is damaged: it claims {needed:,} bytes at least, has {size:,}; export it again.")
 
 
-def columns(path: Path, vertices: Mapping[str, np.ndarray], names: list[str]) -> np.ndarray:
-    """Return the named properties as a finite table [N, len(names)] float32."""
+def columns(
+    path: Path, vertices: Mapping[str, np.ndarray], names: list[str], infinite: tuple[str, ...] = ()
+) -> np.ndarray:
+    """Return the named properties as a table [N, len(names)] float32, finite but for those in `infinite`."""
     with np.errstate(over="ignore"):
         table = np.stack([vertices[name].astype(np.float32) for name in names], axis=1)
-    if not np.isfinite(table).all():
+    may_be = np.array([name in infinite for name in names])
+    if not np.isfinite(table[:, ~may_be]).all() or np.isnan(table).any():
         raise InputError(f"PLY {path} holds NaN or infinite values; export it again from a sound checkpoint.")
     return table

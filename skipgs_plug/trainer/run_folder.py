@@ -26,14 +26,15 @@ class RunFolder:
     """Names and writes what a run leaves behind; file names carry the last finished iteration, from 0."""
 
     def __init__(self, root: str | Path) -> None:
-        self.root = Path(root)
+        self.root = Path(root).expanduser()
 
     def write_config(self, config: TrainConfig, **extra: Any) -> None:
         """Write cfg.yml."""
         import yaml
 
         with write_aside(self.root / "cfg.yml") as temporary:
-            temporary.write_text(yaml.safe_dump({**dataclasses.asdict(config), **extra}, sort_keys=False))
+            content = yaml.safe_dump({**dataclasses.asdict(config), **extra}, sort_keys=False)
+            temporary.write_text(content, encoding="utf-8")
 
     def write_checkpoint(self, trainer: Trainer) -> Path:
         """Write a checkpoint, then remove all but the last two."""

@@ -84,7 +84,11 @@ def assemble_scene(
 ) -> Scene:
     """Check what every format must fulfil and build the Scene; `source` is named in errors."""
     if not train:
-        raise InputError(f"{source} leaves no training view; it holds {len(test)} views, raise test_every or add some.")
+        held_out = "view is" if len(test) == 1 else f"{len(test)} views are"
+        raise InputError(
+            f"{source} leaves no training view: its {held_out} held out. Give --test-every 0 (test_every=0) to train "
+            "on all of them."
+        )
     seen: set[str] = set()
     for view in train + test:
         if view.name in seen:
@@ -125,7 +129,10 @@ def check_view(view: View, source: Path) -> None:
 def check_points(points: np.ndarray, source: Path) -> None:
     """Refuse point clouds that training cannot start from."""
     if len(points) < MIN_POINTS:
-        raise InputError(f"{source} has {len(points)} points, at least {MIN_POINTS} are needed; get a larger cloud.")
+        raise InputError(
+            f"{source} has {len(points)} points, at least {MIN_POINTS} are needed; get a larger cloud, or give "
+            "one by --init-ply."
+        )
     bad = int((~(np.abs(points) < MAX_COORDINATE).all(axis=1)).sum())
     if bad:
         raise InputError(f"{source} has {bad} points with NaN, infinite or huge coordinates; remove them.")

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.backend import Backend, resolve_backend
+from skipgs_plug.trainer.backend import Backend, resolve_backend, single_precision
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.view.model import Model
 
@@ -45,6 +45,7 @@ class Painter:
         return cls(resolve_backend(backend), *settings)
 
     @torch.no_grad()
+    @single_precision()
     def draw(
         self,
         splats: Mapping[str, Tensor],

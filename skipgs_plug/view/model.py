@@ -16,7 +16,7 @@ from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.loaders import load_scene
 from skipgs_plug.trainer.near_plane import near_plane
-from skipgs_plug.trainer.ply import read_ply
+from skipgs_plug.trainer.ply import read_ply, saturated
 from skipgs_plug.trainer.run_folder import SCENE
 from skipgs_plug.trainer.scene import BLACK, Scene
 
@@ -45,9 +45,10 @@ class Snapshot:
             return read_ply(self.path)
         try:
             splats = torch.load(self.path, map_location="cpu", weights_only=True)["splats"]
-            return {name: splats[name] for name in ("means", "scales", "quats", "opacities", "sh0", "shN")}
+            splats = {name: splats[name] for name in ("means", "scales", "quats", "opacities", "sh0", "shN")}
         except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, OSError, ValueError) as error:
             raise InputError(f"Checkpoint {self.path} is damaged or not one of this trainer; remove it.") from error
+        return saturated(splats, self.path)
 
 
 @dataclass
@@ -151,7 +152,7 @@ def read_config(folder: Path) -> Mapping[str, Any]:
     if not file.is_file():
         return {}
     try:
-        content = yaml.safe_load(file.read_text())
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError):
         return {}  # gsplat's holds Python objects
     return content if isinstance(content, dict) else {}

@@ -120,3 +120,21 @@ def test_a_damaged_video_is_named(tmp_path):
 def test_sharpness_falls_with_blur(pattern):
     levels = [sharpness(image) for image in (pattern, blur(pattern, 3), blur(pattern, 7))]
     assert levels[0] > 2 * levels[1] > 2 * levels[2] > 0
+
+
+def test_linked_folders_and_transparency(pattern, tmp_path):
+    source, store = tmp_path / "source", tmp_path / "store"
+    (source / "day1").mkdir(parents=True)
+    store.mkdir()
+    for name in ("day1/a.png", "day1/b.png"):
+        Image.fromarray(pattern).save(source / name)
+    alpha = np.full(pattern.shape[:2], 255, dtype=np.uint8)
+    alpha[:, :40] = 0
+    Image.fromarray(np.dstack([pattern, alpha])).save(store / "c.png")
+    (source / "day2").symlink_to(store)
+    (store / "round").symlink_to(source)  # a circle ends
+    gathered = gather(source, tmp_path / "work" / "photos", 0, lambda _: None)
+    assert gathered.names == ["day1/a.png", "day1/b.png", "day2/c.png"]
+    assert [path.name for path in gathered.masks.rglob("*.png")] == ["c.png.png"]
+    mask = np.array(Image.open(gathered.masks / "day2" / "c.png.png"))
+    np.testing.assert_array_equal(mask, alpha)

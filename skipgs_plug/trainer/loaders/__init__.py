@@ -5,14 +5,11 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-import numpy as np
-import torch
-
 from skipgs_plug.install import next_command
 from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.blender import load_blender
-from skipgs_plug.trainer.loaders.colmap import load_colmap
+from skipgs_plug.trainer.loaders.colmap import MODEL_FOLDERS, is_model, load_colmap
 from skipgs_plug.trainer.loaders.nerfstudio import load_nerfstudio
 from skipgs_plug.trainer.loaders.packed import load_packed
 from skipgs_plug.trainer.ply import read_start
@@ -23,7 +20,12 @@ TRANSFORMS = ("transforms_train.json", "transforms.json")
 
 def is_scene(folder: Path) -> bool:
     """Whether `load_scene` recognises what a folder holds."""
-    return (folder / "sparse").is_dir() or any((folder / name).is_file() for name in TRANSFORMS)
+    places = (folder / place for place in MODEL_FOLDERS)
+    return (
+        is_model(folder)
+        or any(place.is_dir() for place in places)
+        or any((folder / name).is_file() for name in TRANSFORMS)
+    )
 
 
 def load_scene(
@@ -39,7 +41,8 @@ def load_scene(
     Writes nothing but `undistorted_cache` in a scene whose cameras are distorted, if it can.
 
     Args:
-        path: folder with `sparse/0` or `sparse`, with `transforms_train.json`, with `transforms.json`, or .npz file.
+        path: folder with `sparse/0` or `sparse`, one model of such a folder (SCENE/sparse/1), folder with
+            `transforms_train.json`, with `transforms.json`, or .npz file.
         data_factor: use `images_{data_factor}`; resized in memory when that folder is missing.
         test_every: views sorted by name, index % test_every == 0 held out; 0 holds out none. Blender scenes
             with `transforms_test.json`, nerfstudio files with `train_filenames` and packed files bring their own split.
@@ -61,13 +64,15 @@ def load_scene(
     if path.is_file():
         if path.suffix != ".npz":
             raise InputError(f"Scene {path} is a file but not a packed .npz; give the folder that holds it.")
-        scene = load_packed(path)
-    elif (path / "sparse").is_dir():
-        scene = load_colmap(path, data_factor, test_every, images)
+        scene = load_packed(path, cloud)
+    elif is_model(path) or (path / "sparse").is_dir():
+        scene = load_colmap(path, data_factor, test_every, images, cloud)
     elif (path / "transforms_train.json").is_file():
-        scene = load_blender(path, data_factor, test_every, init_num_pts, images)
+        scene = load_blender(path, data_factor, test_every, init_num_pts, images, cloud)
     elif (path / "transforms.json").is_file():
         scene = load_nerfstudio(path, data_factor, test_every, images, cloud)
+    elif (path / "colmap" / "sparse").is_dir():
+        scene = load_colmap(path, data_factor, test_every, images, cloud)
     else:
         raise MissingFileError(
             f"Scene {path} holds neither {path / 'sparse' / '0'} (COLMAP) nor {path / 'transforms_train.json'} "
@@ -75,5 +80,4 @@ def load_scene(
         )
     if cloud is None:
         return scene
-    points, colours = (torch.from_numpy(np.ascontiguousarray(part)) for part in cloud)
-    return dataclasses.replace(scene, points=points, points_rgb=colours, gaussians=gaussians)
+    return dataclasses.replace(scene, gaussians=gaussians)

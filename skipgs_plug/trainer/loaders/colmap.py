@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import logging
+import re
+import struct
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +14,9 @@ import numpy as np
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.colmap_files import check_lengths
+from skipgs_plug.trainer.loaders.colmap_text import content_lines, image_records, simplify
 from skipgs_plug.trainer.loaders.native import import_pycolmap
-from skipgs_plug.trainer.loaders.paths import find_image
+from skipgs_plug.trainer.loaders.paths import find_image, relative_name
 from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, find_mask, load_photograph, model_name
 from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene, split_views
@@ -20,18 +24,30 @@ from skipgs_plug.trainer.scene import Scene, View, assemble_scene, split_views
 log = logging.getLogger(__name__)
 
 
-def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStore) -> Scene:
-    """Load a COLMAP reconstruction; see `load_scene`."""
-    model = find_model(path)
-    reconstruction = read_model(model)
+STEMS = ("cameras", "images", "points3D")
+MODEL_FOLDERS = ("sparse", "colmap/sparse")  # the second: nerfstudio's
+Cloud = tuple[np.ndarray, np.ndarray]
+
+
+def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStore, cloud: Cloud | None = None) -> Scene:
+    """Load a COLMAP reconstruction, of which `path` is the scene or the very model; see `load_scene`.
+
+    `cloud` (points, colours) takes the place of its points.
+    """
+    if is_model(path):
+        model, path = path, scene_of(path)
+    else:
+        model = find_model(path)
+    reconstruction, names = read_model(model)
     folder, factor = image_folder(path, data_factor)
     masks = path / "masks"
     cache = UndistortedCache(path)
-    views, bare, distorted = [], 0, set()
+    views, bare, unplaced, distorted = [], 0, 0, set()
     for image in images.reading(list(reconstruction.images.values())):
         if not image.has_pose:
+            unplaced += 1
             continue
-        name = image_name(image, model)
+        name = relative_name(folder, names.get(image.image_id) or image_name(image, model))
         mask = find_mask(masks, name) if masks.is_dir() else None
         bare += mask is None
         camera = reconstruction.cameras[image.camera_id]
@@ -43,37 +59,97 @@ def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStor
         raise InputError(f"{model} registers no image; run COLMAP again with more overlap between photographs.")
     if distorted:
         log.warning("%s: lens distortion (%s) is removed, and the result kept.", path, ", ".join(sorted(distorted)))
+    if unplaced:
+        log.warning("%s: %d of %d images have no pose and are left out.", model, unplaced, unplaced + len(views))
     if masks.is_dir() and bare:
         log.warning("%s: %d of %d views have no mask there and count whole.", masks, bare, len(views))
-    return assemble(path, model, views, reconstruction, test_every)
+    return assemble(path, model, views, reconstruction, test_every, cloud)
 
 
-def assemble(path: Path, model: Path, views: list[View], reconstruction: Any, test_every: int) -> Scene:
+def assemble(
+    path: Path, model: Path, views: list[View], reconstruction: Any, test_every: int, cloud: Cloud | None
+) -> Scene:
     train, test = split_views(views, test_every)
+    if cloud is not None:
+        return assemble_scene(model, path.resolve().name, train, test, *cloud)
     points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
     return assemble_scene(model, path.resolve().name, train, test, xyz, rgb)
 
 
+def is_model(folder: Path) -> bool:
+    """Whether a folder holds cameras, images and points3D (.bin or .txt)."""
+    return any(all((folder / (stem + suffix)).is_file() for stem in STEMS) for suffix in (".bin", ".txt"))
+
+
+def scene_of(model: Path) -> Path:
+    """Return the scene that a model belongs to: the next folder above it with images, else its own."""
+    parents = [model, *model.resolve().parents[:3]]
+    return next((folder for folder in parents if (folder / "images").is_dir()), model)
+
+
 def find_model(path: Path) -> Path:
-    """Return the folder with cameras, images and points3D (.bin or .txt)."""
-    tried = (path / "sparse" / "0", path / "sparse")
-    for folder in tried:
-        for suffix in (".bin", ".txt"):
-            if all((folder / (stem + suffix)).is_file() for stem in ("cameras", "images", "points3D")):
-                return folder
-    raise MissingFileError(
-        f"Neither {tried[0]} nor {tried[1]} holds cameras, images and points3D (.bin or .txt); run COLMAP's mapper."
-    )
+    """Return the model of a scene: the first of sparse/0, sparse, sparse/1 and so on; names a larger one.
+
+    Raises:
+        MissingFileError: there is none.
+    """
+    found: list[Path] = []
+    for place in MODEL_FOLDERS:
+        root = path / place
+        numbered = sorted(root.glob("*"), key=lambda folder: [int(n) for n in re.findall(r"\d+", folder.name)] or [-1])
+        found += [folder for folder in (root / "0", root, *numbered) if is_model(folder) and folder not in found]
+        if found:
+            break
+    if not found:
+        raise MissingFileError(
+            f"Neither {path / 'sparse' / '0'} nor {path / 'sparse'} holds cameras, images and points3D "
+            "(.bin or .txt); run COLMAP's mapper."
+        )
+    counts = [listed_images(folder) for folder in found]
+    largest = counts.index(max(counts))
+    if counts[largest] > counts[0]:
+        log.warning(
+            "%s has %d images, %s has %d; to take the larger model, give %s as SCENE.",
+            *(found[0], counts[0], found[largest], counts[largest], found[largest]),
+        )
+    return found[0]
 
 
-def read_model(model: Path) -> Any:
-    """Read the reconstruction, turning pycolmap's failures into one sentence."""
+def listed_images(model: Path) -> int:
+    """Return how many images a model lists; 0 where that cannot be told."""
+    try:
+        if (model / "images.bin").is_file():
+            with open(model / "images.bin", "rb") as stream:
+                return int(struct.unpack("<Q", stream.read(8))[0])
+        cameras = {line.split()[0] for line in content_lines(model / "cameras.txt") if line.strip()}
+        return len(image_records(model / "images.txt", cameras))
+    except (struct.error, OSError, InputError):
+        return 0
+
+
+def read_model(model: Path) -> tuple[Any, dict[int, str]]:
+    """Read the reconstruction, turning pycolmap's failures into one sentence.
+
+    Returns:
+        The reconstruction, and the names of a text model's images by id, in place of those in it.
+    """
     pycolmap = import_pycolmap()
     check_lengths(model, camera_models(pycolmap))
     try:
-        return pycolmap.Reconstruction(str(model))
+        if all((model / f"{stem}.bin").is_file() for stem in STEMS):
+            return pycolmap.Reconstruction(str(model)), {}
+        with tempfile.TemporaryDirectory() as folder:
+            names = simplify(model, Path(folder))
+            reconstruction = pycolmap.Reconstruction(folder)
+        if len(reconstruction.images) != len(names):
+            raise InputError(
+                f"{model} lists {len(names)} images, and {len(reconstruction.images)} can be read; export it again."
+            )
+        return reconstruction, names
+    except InputError:
+        raise
     except Exception as error:  # pycolmap raises bare RuntimeError, ValueError or IndexError by kind of damage
         raise InputError(f"COLMAP model {model} cannot be read ({reason(error)}); export it again.") from error
 

@@ -58,6 +58,11 @@ def read_pose(value: Any, name: str, source: Path) -> np.ndarray:
     return pose
 
 
+def opencv_viewmat(camera_to_world: np.ndarray) -> np.ndarray:
+    """Return world to camera [4, 4] of an OpenGL pose, which looks along -z with y up."""
+    return np.linalg.inv(camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0]))
+
+
 def short(value: Any) -> str:
     """Return what is wrong in at most 60 characters; numbers of thousands of digits have no text."""
     try:

@@ -56,8 +56,8 @@ def save_packed(scene: Scene, path: str | Path) -> None:
         np.savez_compressed(stream, **content)
 
 
-def load_packed(path: Path) -> Scene:
-    """Read what `save_packed` wrote."""
+def load_packed(path: Path, cloud: tuple[np.ndarray, np.ndarray] | None = None) -> Scene:
+    """Read what `save_packed` wrote; `cloud` (points, colours) takes the place of its points."""
     content = read_archive(path)
     if int(content["version"]) != VERSION:
         raise InputError(f"Packed scene {path} has version {content['version']}, expected {VERSION}; pack it again.")
@@ -78,7 +78,7 @@ def load_packed(path: Path) -> Scene:
     background = tuple(float(channel) for channel in content["background"])
     if not all(0.0 <= channel <= 1.0 for channel in background):
         raise InputError(f"Packed scene {path} has background {background}, outside 0..1; pack it again.")
-    points, colours = content["points"], content["points_rgb"]
+    points, colours = cloud or (content["points"], content["points_rgb"])
     return assemble_scene(path, str(content["name"]), views[:n_train], views[n_train:], points, colours, background)  # type: ignore[arg-type]
 
 

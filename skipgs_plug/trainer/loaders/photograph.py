@@ -60,10 +60,7 @@ def read_straight(
     """Return a photograph as a pinhole camera sees it; see `load_photograph`."""
     if model_name(camera) in PINHOLE_MODELS:
         pixels, mask = read_photograph(image_path, camera, factor, mask_path)
-        K = np.array(camera.calibration_matrix(), dtype=np.float64)
-        # The downscaled image has a rounded size: scale by what was really loaded, not by the factor.
-        K[0] *= pixels.shape[1] / camera.width
-        K[1] *= pixels.shape[0] / camera.height
+        K = scaled_matrix(camera, pixels)
     else:
         key = cache.key(image_path, mask_path, camera, factor)
         kept = cache.read(key)
@@ -72,6 +69,15 @@ def read_straight(
             cache.write(key, kept)
         return kept
     return Straight(pixels, mask, K)
+
+
+def scaled_matrix(camera: Any, pixels: Tensor) -> np.ndarray:
+    """Return the calibration matrix [3, 3] float64 of a pinhole camera for the size of `pixels` [H, W, 3]."""
+    K = np.array(camera.calibration_matrix(), dtype=np.float64)
+    # The downscaled image has a rounded size: scale by what was really loaded, not by the factor.
+    K[0] *= pixels.shape[1] / camera.width
+    K[1] *= pixels.shape[0] / camera.height
+    return K
 
 
 def read_photograph(image_path: Path, camera: Any, factor: int, mask_path: Path | None) -> tuple[Tensor, Tensor | None]:

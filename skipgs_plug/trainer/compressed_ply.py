@@ -1,0 +1,80 @@
+"""The compressed PLY of SuperSplat and PlayCanvas, as columns of a plain 3DGS PLY."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+CHUNK = 256  # Gaussians that share one set of bounds
+SH_C0 = 0.28209479177387814
+Columns = dict[str, np.ndarray]
+XYZ, RGB = ("x", "y", "z"), ("r", "g", "b")
+
+
+def is_compressed(vertices: Mapping[str, np.ndarray]) -> bool:
+    """Whether the columns of `vertex` are those of a compressed PLY."""
+    return {"packed_position", "packed_rotation", "packed_scale", "packed_color"} <= set(vertices)
+
+
+def decompress(
+    vertices: Mapping[str, np.ndarray], chunks: Mapping[str, np.ndarray], sh: Mapping[str, np.ndarray]
+) -> Columns:
+    """Return `x` to `rot_3` [N] float32 of the elements `vertex` [N], `chunk` [ceil(N / 256)] and `sh` [N] or none.
+
+    Opacity is infinite where alpha is 0 or 1: a byte says no more.
+
+    Raises:
+        KeyError: a column is missing.
+        ValueError: there are fewer chunks than Gaussians need.
+    """
+    packed = {
+        name: np.asarray(vertices[f"packed_{name}"], dtype=np.uint32)
+        for name in ("position", "rotation", "scale", "color")
+    }
+    n = len(packed["position"])
+    chunk = np.arange(n) // CHUNK
+    if n and len(chunks["min_x"]) <= chunk[-1]:
+        raise ValueError(f"{len(chunks['min_x'])} chunks for {n} Gaussians")
+
+    def between(values: np.ndarray, name: str) -> np.ndarray:
+        low, high = (np.asarray(chunks[f"{end}_{name}"], dtype=np.float64)[chunk] for end in ("min", "max"))
+        return low + values * (high - low)
+
+    result: Columns = {}
+    for axis, values in zip(XYZ, unpack_111011(packed["position"]), strict=True):
+        result[axis] = between(values, axis)
+    for i, values in enumerate(unpack_111011(packed["scale"])):
+        result[f"scale_{i}"] = between(values, f"scale_{XYZ[i]}")
+    for i, values in enumerate(unpack_rotation(packed["rotation"])):
+        result[f"rot_{i}"] = values
+    for i, name in enumerate(RGB):
+        values = (packed["color"] >> np.uint32(24 - 8 * i) & np.uint32(255)) / 255.0
+        colour = between(values, name) if f"min_{name}" in chunks else values
+        result[f"f_dc_{i}"] = (colour - 0.5) / SH_C0
+    alpha = (packed["color"] & np.uint32(255)) / 255.0
+    with np.errstate(divide="ignore"):
+        result["opacity"] = np.log(alpha) - np.log1p(-alpha)
+    for name, values in sh.items():
+        result[name] = (np.asarray(values, dtype=np.float64) + 0.5) / 256 * 8 - 4
+    return {name: values.astype(np.float32) for name, values in result.items()}
+
+
+def unpack_111011(packed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return three numbers in [0, 1] of 11, 10 and 11 bits."""
+    x, y, z = packed >> np.uint32(21), packed >> np.uint32(11) & np.uint32(1023), packed & np.uint32(2047)
+    return x / 2047.0, y / 1023.0, z / 2047.0
+
+
+def unpack_rotation(packed: np.ndarray) -> list[np.ndarray]:
+    """Return the four parts of unit quaternions, of which the largest was left out and its place is told by 2 bits."""
+    bits = [packed >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
+    others = np.stack([(value / 1023.0 - 0.5) * np.sqrt(2.0) for value in bits])  # [3, N]
+    largest = np.sqrt(np.maximum(1.0 - (others**2).sum(axis=0), 0.0))
+    place = packed >> np.uint32(30)
+    parts = []
+    for i in range(4):
+        before = others[min(i, 2)]  # where the largest comes later
+        after = others[max(i - 1, 0)]  # where it came earlier
+        parts.append(np.where(place == i, largest, np.where(place > i, before, after)))
+    return parts

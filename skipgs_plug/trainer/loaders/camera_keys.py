@@ -1,0 +1,105 @@
+"""Cameras as transforms.json writes them: the keys of instant-ngp, nerfstudio and exporters for Blender."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.loaders.images import read_image
+from skipgs_plug.trainer.loaders.json_file import read_number, short
+from skipgs_plug.trainer.loaders.native import import_pycolmap
+from skipgs_plug.trainer.loaders.photograph import MAX_SIDE
+
+PERSPECTIVE = ("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", *DISTORTION)
+# What changes a picture and is not modelled here: refused unless it is zero, false or empty.
+UNSUPPORTED = {
+    **dict.fromkeys(("k5", "k6", "p3", "p4", "b1", "b2", "s1", "s2", "s3", "s4", "skew", "shear"), "this distortion"),
+    **dict.fromkeys(("ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4"), "the f-theta lens"),
+    "latlong": "a panorama",
+    "is_equirectangular": "a panorama",
+    "is_latlong": "a panorama",
+    "is_orthographic": "a parallel projection",
+    "ortho_scale": "a parallel projection",
+    "distortion_params": "this distortion",
+    "rolling_shutter": "a rolling shutter",
+}
+
+
+def read_camera(values: dict[str, Any], image_path: Path, source: Path) -> Any:
+    """Return the pycolmap.Camera that a frame (its own values over those of the file) describes.
+
+    Focal lengths come from `x_fov` and `y_fov` (degrees), `fl_x` and `fl_y` (pixels) or `camera_angle_x` and
+    `camera_angle_y` (radians), in this order as instant-ngp takes them; one axis alone stands for both.
+
+    Raises:
+        InputError: a model that is neither a pinhole nor OpenCV's (fisheye) lens, without a focal length, or with a
+            key that changes the picture in a way that is not modelled.
+    """
+    refuse_unsupported(values, source)
+    numbers = {name: read_number(values[name], name, source) for name in NUMBERS if values.get(name) is not None}
+    if not {"w", "h"} <= numbers.keys():
+        pixels, _ = read_image(image_path, image_path)
+        numbers["h"], numbers["w"] = pixels.shape[:2]
+    width, height = numbers["w"], numbers["h"]
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width == int(width) and height == int(height)):
+        raise InputError(f"{source}: w and h are {width:g} and {height:g}, no size of an image; restore the file.")
+    focal_x, focal_y = focal_length(numbers, "x", width, source), focal_length(numbers, "y", height, source)
+    if focal_x is None and focal_y is None:
+        raise InputError(
+            f"{source}: {image_path.name} has neither fl_x nor camera_angle_x nor x_fov, nor these of y; "
+            "run ns-process-data again."
+        )
+    pinhole = [focal_x or focal_y, focal_y or focal_x, numbers.get("cx", width / 2), numbers.get("cy", height / 2)]
+    k1, k2, k3, k4, p1, p2 = (numbers.get(name, 0.0) for name in DISTORTION)
+    kind = values.get("camera_model", "PERSPECTIVE")
+    if values.get("is_fisheye") and kind in PERSPECTIVE:
+        kind = FISHEYE[0]
+    if kind in FISHEYE:
+        if p1 or p2:
+            raise InputError(f"{source}: a fisheye lens with p1 or p2 is not supported; undistort the images.")
+        model, parameters = "OPENCV_FISHEYE", [*pinhole, k1, k2, k3, k4]
+    elif kind not in PERSPECTIVE or k4:
+        raise InputError(
+            f"{source}: camera_model {kind!r}{' with k4' if k4 else ''} is not supported, only "
+            f"{', '.join(PERSPECTIVE + FISHEYE)} (fourth radial coefficient for fisheye alone); undistort the images."
+        )
+    elif k3:
+        model, parameters = "FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
+    elif k1 or k2 or p1 or p2:
+        model, parameters = "OPENCV", [*pinhole, k1, k2, p1, p2]
+    else:
+        model, parameters = "PINHOLE", pinhole
+    camera = {"model": model, "width": int(width), "height": int(height), "params": parameters}
+    return import_pycolmap().Camera(camera)
+
+
+def focal_length(numbers: dict[str, float], axis: str, side: float, source: Path) -> float | None:
+    """Return the focal length in pixels along an axis whose picture has `side` pixels, or None."""
+    for key, half in ((f"{axis}_fov", math.pi / 360), (f"fl_{axis}", None), (f"camera_angle_{axis}", 0.5)):
+        if key not in numbers:
+            continue
+        value = numbers[key]
+        if half is None:
+            return value
+        if not 0.0 < value * half < math.pi / 2:
+            limit = "pi" if half == 0.5 else "180"
+            raise InputError(f"{source}: {key} is {value:g}, not between 0 and {limit}; restore the file.")
+        return 0.5 * side / math.tan(value * half)
+    return None
+
+
+def refuse_unsupported(values: dict[str, Any], source: Path) -> None:
+    """Raise InputError for a key that changes the picture and is not modelled."""
+    for key, what in UNSUPPORTED.items():
+        value = values.get(key)
+        parts = value if isinstance(value, list) else [value]
+        if any(parts):
+            raise InputError(f"{source}: {key} is {short(value)}, and {what} is not supported; undistort the images.")
+    start, end = values.get("transform_matrix_start"), values.get("transform_matrix_end")
+    if start != end:
+        raise InputError(f"{source}: a frame moves while it is taken (transform_matrix_start, _end): not supported.")

@@ -1,0 +1,84 @@
+"""COLMAP's text models, as other programs write them.
+
+pycolmap ends a name at its first space, and takes every second line of images.txt for observations, also where a
+program left these lines out. Here both are read for what they are, and the model is handed to pycolmap without
+observations, which nothing here uses.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from skipgs_plug.trainer.errors import InputError, reason
+
+IMAGE_FIELDS = 9  # id, quaternion, translation, camera; then the name
+
+
+def simplify(model: Path, target: Path) -> dict[int, str]:
+    """Write a text model into `target` without observations, its images named by their numbers.
+
+    Returns:
+        The names of the images, by their ids.
+
+    Raises:
+        InputError: a file cannot be read, or a line of it is none of its kind.
+    """
+    cameras = content_lines(model / "cameras.txt")
+    (target / "cameras.txt").write_text("\n".join(cameras) + "\n", encoding="utf-8")
+    known = {line.split()[0] for line in cameras if line.strip()}
+    names, lines = {}, []
+    for number, fields in image_records(model / "images.txt", known):
+        if number in names:
+            raise InputError(f"{model / 'images.txt'} gives the id {number} to two images; export the model again.")
+        names[number] = fields[IMAGE_FIELDS]
+        lines += [" ".join([*fields[:IMAGE_FIELDS], str(number)]), ""]
+    (target / "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    points = (" ".join(line.split()[:8]) for line in content_lines(model / "points3D.txt") if line.strip())
+    (target / "points3D.txt").write_text("\n".join(points) + "\n", encoding="utf-8")
+    return names
+
+
+def image_records(path: Path, cameras: set[str]) -> list[tuple[int, list[str]]]:
+    """Return id and fields of each image; the name is the last field, with its spaces.
+
+    Args:
+        cameras: ids of the model's cameras, by which an image is told from observations.
+    """
+    records: list[tuple[int, list[str]]] = []
+    observations = False  # whether the line may hold those of the image before it
+    for line in content_lines(path):
+        fields = line.strip().split(maxsplit=IMAGE_FIELDS)
+        if observations and not is_image(fields, line.split(), cameras):
+            observations = False
+            continue
+        if not fields:
+            continue
+        if len(fields) <= IMAGE_FIELDS or not fields[0].isdigit():
+            raise InputError(f"{path}: {line[:80]!r} describes no image; export the model again.")
+        records.append((int(fields[0]), fields))
+        observations = True
+    return records
+
+
+def is_image(fields: list[str], words: list[str], cameras: set[str]) -> bool:
+    """Whether a line that may hold observations (x, y, id; x, y, id; ...) describes an image."""
+    if len(fields) <= IMAGE_FIELDS or not fields[0].isdigit() or fields[8] not in cameras:
+        return False
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        return True  # a name
+    return len(numbers) % 3 != 0 or math.isclose(math.hypot(*numbers[1:5]), 1.0, abs_tol=1e-3)
+
+
+def content_lines(path: Path) -> list[str]:
+    """Return the lines of a text file without comments, whatever ends them."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({reason(error)}).") from error
+    encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    text = data.decode(encoding, errors="surrogateescape" if encoding != "utf-16" else "replace")
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    return [line for line in lines if not line.lstrip().startswith("#")]
