@@ -123,16 +123,13 @@ def model_of(path: Path, vertices: Mapping[str, np.ndarray]) -> dict[str, Tensor
         "sh0": sh0[:, None, :].contiguous(),
         "shN": rest.reshape(len(rest), 3, count // 3).transpose(1, 2).contiguous(),
     }
-    return saturated(splats, path)
+    return renderable(splats, path)
 
 
 def saturated(splats: Mapping[str, Tensor], path: str | Path) -> dict[str, Tensor]:
     """Return raw parameters with finite numbers in place of infinite opacities and scales of zero, which is said.
 
     A saturated model has them: an opacity of 1 is infinite as a logit, a flat Gaussian has a scale of e^-inf.
-
-    Raises:
-        InputError: other values are not finite, or scales too large; names `path`.
     """
     result = dict(splats)
     for name, low, high in (("opacities", -MAX_LOGIT, MAX_LOGIT), ("scales", MIN_LOG_SCALE, np.inf)):
@@ -141,8 +138,18 @@ def saturated(splats: Mapping[str, Tensor], path: str | Path) -> dict[str, Tenso
         if bool(infinite.any()):
             log.warning("%s: %d %s of infinite value are taken as finite.", path, int(infinite.sum()), name)
             result[name] = torch.where(infinite, values.clamp(low, high), values)
+    return result
+
+
+def renderable(splats: Mapping[str, Tensor], path: str | Path) -> dict[str, Tensor]:
+    """Return raw parameters as `saturated`.
+
+    Raises:
+        InputError: other values are not finite, or scales too large; names `path`.
+    """
+    result = saturated(splats, path)
     if not all(bool(torch.isfinite(values).all()) for values in result.values()):
-        raise InputError(f"{path}: the model holds NaN or infinite values; export it again from a sound checkpoint.")
+        raise InputError(f"{path} holds NaN or infinite values; export it again from a sound checkpoint.")
     if len(result["scales"]) and float(result["scales"].max()) > MAX_LOG_SCALE:
         raise InputError(f"{path} holds scales above e^{MAX_LOG_SCALE:g}: they must be logarithms.")
     return result

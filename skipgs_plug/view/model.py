@@ -16,7 +16,7 @@ from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.loaders import load_scene
 from skipgs_plug.trainer.near_plane import near_plane
-from skipgs_plug.trainer.ply import read_ply, saturated
+from skipgs_plug.trainer.ply import read_ply, renderable
 from skipgs_plug.trainer.run_folder import SCENE
 from skipgs_plug.trainer.scene import BLACK, Scene
 
@@ -48,7 +48,7 @@ class Snapshot:
             splats = {name: splats[name] for name in ("means", "scales", "quats", "opacities", "sh0", "shN")}
         except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, OSError, ValueError) as error:
             raise InputError(f"Checkpoint {self.path} is damaged or not one of this trainer; remove it.") from error
-        return saturated(splats, self.path)
+        return renderable(splats, self.path)
 
 
 @dataclass

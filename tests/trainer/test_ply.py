@@ -113,7 +113,6 @@ def test_count_in_the_header_is_checked_before_memory_is_taken(tmp_path: Path, c
     ("name", "value", "sentence"),
     [
         ("scales", torch.nan, "holds NaN"),
-        ("opacities", torch.inf, "holds NaN or infinite"),
         ("scales", 100.0, "they must be logarithms"),
         ("quats", 0.0, "rotations of length 0"),
     ],
