@@ -12,7 +12,7 @@ import torch
 from plyfile import PlyData, PlyElement
 from scene_folders import write_blender, write_colmap
 
-from skipgs_plug.commands import export
+from skipgs_plug.cli import main
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.loaders.camera_keys import read_camera
 from skipgs_plug.trainer.metrics import psnr
@@ -238,7 +238,7 @@ def test_models_of_any_degree_order_and_type(tmp_path: Path, degree: int, kinds:
     for name, values in read_ply(tmp_path / "model.ply").items():
         assert torch.equal(values, splats[name]), name
     for ending in (".splat", ".compressed.ply", ".ply"):
-        assert export.main([str(tmp_path / "model.ply"), str(tmp_path / f"out{ending}")]) == 0
+        assert main(["export", str(tmp_path / "model.ply"), str(tmp_path / f"out{ending}")]) == 0
     assert torch.equal(read_ply(tmp_path / "out.ply")["means"], splats["means"])
 
 
@@ -246,7 +246,7 @@ def test_a_compressed_model_is_read(tmp_path: Path) -> None:
     splats = gaussians(3)
     splats["opacities"] = splats["opacities"].clamp(-3, 3)
     write_model(tmp_path / "model.ply", splats)
-    assert export.main([str(tmp_path / "model.ply"), str(tmp_path / "x.compressed.ply")]) == 0
+    assert main(["export", str(tmp_path / "model.ply"), str(tmp_path / "x.compressed.ply")]) == 0
     read = read_ply(tmp_path / "x.compressed.ply")
     distance = torch.cdist(read["means"], splats["means"])
     assert float(distance.min(dim=1).values.max()) < 0.01
@@ -258,7 +258,7 @@ def test_a_compressed_model_is_read(tmp_path: Path) -> None:
         assert float((read[name] - splats[name][same]).abs().max()) < error, name
     alpha = torch.sigmoid(read["opacities"]) - torch.sigmoid(splats["opacities"][same])
     assert float(alpha.abs().max()) < 0.003
-    assert export.main([str(tmp_path / "x.compressed.ply"), str(tmp_path / "y.ply")]) == 0
+    assert main(["export", str(tmp_path / "x.compressed.ply"), str(tmp_path / "y.ply")]) == 0
 
 
 def test_saturated_values_are_clamped_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
