@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from torch import Tensor
+
 from skipgs_plug.commands.options.export import Args
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.ply import write_ply
 from skipgs_plug.view.model import open_snapshots
+from skipgs_plug.view.spz import to_spz
 
 FORMATS = {".compressed.ply": "ply_compressed", ".splat": "splat"}  # as gsplat.export_splats calls them
 
@@ -14,17 +19,22 @@ FORMATS = {".compressed.ply": "ply_compressed", ".splat": "splat"}  # as gsplat.
 def run(args: Args) -> int:
     """Convert; see `Args`."""
     out = args.out.expanduser()
-    ending = next((ending for ending in (*FORMATS, ".ply") if out.name.lower().endswith(ending)), None)
+    ending = next((ending for ending in (*FORMATS, ".spz", ".ply") if out.name.lower().endswith(ending)), None)
     if ending is None:
-        raise InputError(f"{out.name} has an ending that is not written here; use {', '.join(FORMATS)} or .ply.")
+        raise InputError(f"{out.name} has an ending that is not written here; use {', '.join(FORMATS)}, .spz or .ply.")
     splats = open_snapshots(args.model)[-1].load()
     if ending == ".ply":
         write_ply(splats, out)
     else:
-        from gsplat import export_splats
-
-        data = export_splats(**splats, format=FORMATS[ending])
+        data = to_spz(splats) if ending == ".spz" else exported(splats, FORMATS[ending])
         with write_aside(out) as temporary:
             temporary.write_bytes(data)
     print(f"{len(splats['means']):,} Gaussians, {out.stat().st_size / 2**20:.1f} MiB: {out}")
     return 0
+
+
+def exported(splats: Mapping[str, Tensor], name: str) -> bytes:
+    """Return a model in a format of gsplat's."""
+    from gsplat import export_splats
+
+    return export_splats(**splats, format=name)
