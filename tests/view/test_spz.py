@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from skipgs_plug.cli import main
-from skipgs_plug.fallback_raster.torch_reference_projection import spherical_harmonics
+from skipgs_plug.fallback_raster.oracle.torch_reference_projection import spherical_harmonics
 from skipgs_plug.trainer.ply import read_ply
 from skipgs_plug.view.spz import to_spz
 
