@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 from skipgs_plug.commands.options.export import Args
@@ -12,6 +14,8 @@ from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.ply import write_ply
 from skipgs_plug.view.model import open_snapshots
 from skipgs_plug.view.spz import to_spz
+
+log = logging.getLogger(__name__)
 
 FORMATS = {".compressed.ply": "ply_compressed", ".splat": "splat"}  # as gsplat.export_splats calls them
 
@@ -26,6 +30,9 @@ def run(args: Args) -> int:
     if ending == ".ply":
         write_ply(splats, out)
     else:
+        if splats["means"].dtype == torch.float64:
+            log.warning("%s holds positions of single precision: they are rounded. A .ply keeps them.", out)
+            splats["means"] = splats["means"].float()
         data = to_spz(splats) if ending == ".spz" else exported(splats, FORMATS[ending])
         with write_aside(out) as temporary:
             temporary.write_bytes(data)

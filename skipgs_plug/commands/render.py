@@ -32,7 +32,7 @@ def run(args: Args) -> int:
     train = sorted(model.scene.train, key=lambda view: view.name)
     if args.cameras == "held-out" and not held_out:
         raise InputError(f"Scene {model.scene.name} holds out no view; use --cameras path.")
-    splats = model.snapshots[-1].load()
+    splats = model.load(model.snapshots[-1])
     painter = Painter.of(model, args.backend)
 
     if args.cameras == "path":
@@ -66,6 +66,7 @@ def run(args: Args) -> int:
         raise InputError(f"{out} ends neither in .mp4 nor is it a folder's name; give one of the two.")
     else:
         write_pictures(out, frames(), names)
-    depths = "" if args.show == "colour" else f", depth from {limits[0]:.3g} to {limits[1]:.3g} scene units"
+    near, far = (limit * model.scene.frame.unit for limit in limits)
+    depths = "" if args.show == "colour" else f", depth from {near:.3g} to {far:.3g} scene units"
     print(f"{len(cameras)} frames, {len(splats['means']):,} Gaussians{depths}: {out}")
     return 0

@@ -123,7 +123,7 @@ class Session:
             ply = folder.write_ply(trainer)
         if self._gate is not None:
             with keep_going(self._failed):
-                write_report(self._gate, folder.root / "skipgs.json")
+                write_report(self._gate, folder.root / "skipgs.json", frame=trainer.scene.frame.as_dict())
             print(self._gate.summary())
         print(f"{self._described(stats)}; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s")
         if ply is not None:

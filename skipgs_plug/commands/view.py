@@ -31,7 +31,7 @@ def run(args: Args) -> int:
         while True:
             step = page.chosen_step if page.chosen_step is not None else model.snapshots[-1].step
             if step != shown:
-                page.show(by_step[step].load(), model.name if step is None else f"Iteration {step:,}")
+                page.show(model.load(by_step[step]), model.name if step is None else f"Iteration {step:,}")
                 page.measure()
                 shown = step
             else:

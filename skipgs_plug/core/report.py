@@ -121,9 +121,9 @@ def _summarise_growing(growing: dict[str, Any]) -> str:
     )
 
 
-def write_report(gate: Reporting, path: str | Path) -> None:
-    """Write `gate.report()` as JSON."""
-    text = json.dumps(_finite(gate.report()), indent=2, allow_nan=False) + "\n"
+def write_report(gate: Reporting, path: str | Path, **more: Any) -> None:
+    """Write `gate.report()` as JSON, with entries of the trainer (`more`)."""
+    text = json.dumps(_finite({**gate.report(), **more}), indent=2, allow_nan=False) + "\n"
     with write_aside(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

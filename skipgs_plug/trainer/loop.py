@@ -25,7 +25,7 @@ from skipgs_plug.trainer.image_store import ReadAhead, one_by_one
 from skipgs_plug.trainer.mask import leave_out
 from skipgs_plug.trainer.mcmc import Mcmc
 from skipgs_plug.trainer.model import create_optimizers, create_splats
-from skipgs_plug.trainer.near_plane import near_plane
+from skipgs_plug.trainer.near_plane import far_plane, near_plane
 from skipgs_plug.trainer.order import ViewOrder, derive_seed
 from skipgs_plug.trainer.photographs import Photographs
 from skipgs_plug.trainer.ply import write_ply
@@ -66,7 +66,7 @@ class Trainer:
         strategy: gsplat's DefaultStrategy, or None where `mcmc` densifies.
         exposure: colour correction of each photograph, with an optimizer of its own; None unless asked for.
         refine_stop_iter: end of densification in iterations of this run.
-        near_plane: near clipping plane, world units.
+        near_plane: near clipping plane, in the units of `scene.frame`, as are the Gaussians.
         on_step: called after every iteration, outside the clock.
         stop_requested: set it (from a signal handler, say) to end `train` after the current iteration, or, before it,
             the next `train` at once.
@@ -79,6 +79,7 @@ class Trainer:
         self.backend = backend or resolve_backend(config.backend)
         self.max_steps = config.max_steps
         self.near_plane = near_plane(config, scene)
+        self.far_plane = far_plane(config, scene)
         self.step = self.ran = 0
         self._since: int | None = None  # number after the previous iteration, set by `train`
         self._splats = create_splats(scene, config, self.backend.device, self.near_plane)
@@ -296,7 +297,7 @@ class Trainer:
 
     def export_ply(self, path: str | Path) -> None:
         """Write the 62-property INRIA PLY, in the coordinates of the dataset."""
-        write_ply(dict(self.splats.items()), path)
+        write_ply(self.scene.frame.dataset_splats(dict(self.splats.items())), path)
 
     def register_state(self, name: str, owner: Stateful) -> None:
         """Let the state of `owner` travel in snapshots and checkpoints under `name`."""
@@ -346,7 +347,7 @@ class Trainer:
             height=view.height,
             sh_degree=degree,
             near_plane=self.near_plane,
-            far_plane=self.config.far_plane,
+            far_plane=self.far_plane,
             absgrad=self.config.absgrad,
             **lazy,
         )

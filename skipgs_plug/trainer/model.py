@@ -37,8 +37,8 @@ def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near:
         wrong = before_a_lens(scene.train, scene.points, near)
         if bool(wrong.all()):
             raise InputError(
-                f"All {len(wrong):,} points of {scene.name} are nearer than the near plane {near:g}; "
-                "lower --near-plane or leave it out."
+                f"All {len(wrong):,} points of {scene.name} are nearer than the near plane "
+                f"{near * scene.frame.unit:g}; lower --near-plane or leave it out."
             )
         tensors = {name: tensor[~wrong] for name, tensor in tensors.items()}
     order = morton_order(tensors["means"])
@@ -48,9 +48,10 @@ def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near:
 def one_per_point(scene: Scene, config: TrainConfig) -> dict[str, Tensor]:
     n = len(scene.points)
     rgb = scene.points_rgb.float() / 255.0
+    distance = neighbour_distance(scene.points, scene.scene_scale)
     return {
         "means": scene.points.clone(),
-        "scales": torch.log(neighbour_distance(scene.points) * config.recipe.init_scale)[:, None].repeat(1, 3),
+        "scales": torch.log(distance * config.recipe.init_scale)[:, None].repeat(1, 3),
         "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float32).repeat(n, 1),
         "opacities": torch.logit(torch.full((n,), config.recipe.init_opa, dtype=torch.float32)),
         "sh0": ((rgb - 0.5) / SH_C0)[:, None, :],
@@ -58,13 +59,14 @@ def one_per_point(scene: Scene, config: TrainConfig) -> dict[str, Tensor]:
     }
 
 
-def neighbour_distance(points: Tensor) -> Tensor:
-    """Return the root mean square distance to the three nearest other points [M]."""
+def neighbour_distance(points: Tensor, scale: float = 1.0) -> Tensor:
+    """Return the root mean square distance to the three nearest other points [M], of duplicates 0.0003 of `scale`."""
     from scipy.spatial import cKDTree
 
     distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=4)  # column 0 is the point itself
     mean_square = np.mean(distances[:, 1:] ** 2, axis=1)
-    return torch.from_numpy(np.sqrt(np.maximum(mean_square, 1e-7))).float()  # duplicates have distance 0
+    least = 1e-7 * scale**2  # duplicates have distance 0
+    return torch.from_numpy(np.sqrt(np.maximum(mean_square, least))).float()
 
 
 def create_optimizers(

@@ -17,7 +17,7 @@ SHARE_OF_EXTENT = 0.04  # where points tell nothing: 3DGS cuts at 0.2 in scenes 
 
 
 def near_plane(config: TrainConfig, scene: Scene) -> float:
-    """Return the near clipping plane in world units: that of the settings, or a tenth of the nearest points' depth.
+    """Return the near clipping plane in local units: that of the settings, or a tenth of the nearest points' depth.
 
     A Gaussian close to a camera covers its whole picture, and no other view tells that it is wrong. Nothing that was
     photographed lies so near. A fixed distance cannot be right: a COLMAP scene has no unit.
@@ -25,16 +25,22 @@ def near_plane(config: TrainConfig, scene: Scene) -> float:
     Raises:
         InputError: not below the far plane.
     """
-    chosen = config.near_plane
+    chosen = None if config.near_plane is None else config.near_plane / scene.frame.unit
     if chosen is None:
         nearest = nearest_depth(scene.train, scene.points)
         chosen = SHARE_OF_EXTENT * scene.scene_scale if nearest is None else SHARE * nearest
         chosen = max(chosen, TINY)
-    if chosen >= config.far_plane:
+    if chosen >= far_plane(config, scene):
         raise InputError(
-            f"The near plane {chosen:g} is not below far_plane={config.far_plane:g}; raise --far-plane or leave it out."
+            f"The near plane {chosen * scene.frame.unit:g} is not below far_plane={config.far_plane:g}; "
+            "raise --far-plane or leave it out."
         )
     return chosen
+
+
+def far_plane(config: TrainConfig, scene: Scene) -> float:
+    """Return the far clipping plane in local units; the default cuts nothing, whatever the unit."""
+    return config.far_plane if config.far_plane == TrainConfig.far_plane else config.far_plane / scene.frame.unit
 
 
 def nearest_depth(views: list[View], points: torch.Tensor) -> float | None:

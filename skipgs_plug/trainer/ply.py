@@ -14,6 +14,7 @@ from torch import Tensor
 from skipgs_plug.trainer.compressed_ply import SH_C0, decompress, is_compressed
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.files import write_aside
+from skipgs_plug.trainer.frame import FAR
 from skipgs_plug.trainer.scene import check_points
 
 log = logging.getLogger(__name__)
@@ -42,6 +43,7 @@ def write_ply(splats: Mapping[str, Tensor], path: str | Path) -> None:
     from plyfile import PlyData, PlyElement
 
     values = saturated({name: tensor.detach().cpu().float() for name, tensor in splats.items()}, path)
+    positions = splats["means"].detach().cpu()  # float64 where float32 would lose some
     n = len(values["means"])
     rest = torch.zeros(n, REST, 3, dtype=torch.float32)
     rest[:, : values["shN"].shape[1]] = values["shN"]
@@ -55,9 +57,10 @@ def write_ply(splats: Mapping[str, Tensor], path: str | Path) -> None:
         values["quats"],
     ]
     table = torch.cat(columns, dim=1).numpy()
-    vertices = np.empty(n, dtype=[(name, "<f4") for name in PROPERTIES])
+    kind = "<f8" if positions.dtype == torch.float64 else "<f4"
+    vertices = np.empty(n, dtype=[(name, kind if name in ("x", "y", "z") else "<f4") for name in PROPERTIES])
     for i, name in enumerate(PROPERTIES):
-        vertices[name] = table[:, i]
+        vertices[name] = positions[:, i].numpy() if i < 3 else table[:, i]
     with write_aside(path) as temporary:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
 
@@ -77,7 +80,9 @@ def read_ply(path: str | Path) -> dict[str, Tensor]:
 
 
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a point cloud: positions [M, 3] float32 and colours [M, 3] uint8, grey where the file has none.
+    """Read a point cloud: positions [M, 3] and colours [M, 3] uint8, grey where the file has none.
+
+    Positions are float32, or float64 where that would lose some.
 
     Raises:
         MissingFileError: no such file.
@@ -115,8 +120,9 @@ def model_of(path: Path, vertices: Mapping[str, np.ndarray]) -> dict[str, Tensor
     means, sh0, rest, opacity, scales, quats = torch.from_numpy(table).split([3, 3, count, 1, 3, 4], dim=1)
     if (quats == 0).all(dim=1).any():
         raise InputError(f"PLY {path} holds rotations of length 0; export it again from a sound checkpoint.")
+    exact = positions_of(vertices)
     splats = {
-        "means": means.contiguous(),
+        "means": means.contiguous() if exact.dtype == np.float32 else torch.from_numpy(exact),
         "scales": scales.contiguous(),
         "quats": quats.contiguous(),
         "opacities": opacity[:, 0].contiguous(),
@@ -159,8 +165,17 @@ def points_of(path: Path, vertices: Mapping[str, np.ndarray]) -> tuple[np.ndarra
     """Return positions and colours of `read_points`."""
     if not {"x", "y", "z"} <= set(vertices):
         raise InputError(f"PLY {path} has no vertices with x, y and z; give a point cloud.")
-    positions = columns(path, vertices, ["x", "y", "z"])
+    columns(path, vertices, ["x", "y", "z"])  # finite
+    positions = positions_of(vertices)
     return positions, colours_of(path, vertices)
+
+
+def positions_of(vertices: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return positions [N, 3]: float64 where the file has them so and float32 would lose some, else float32."""
+    table = np.stack([vertices[name].astype(np.float64) for name in ("x", "y", "z")], axis=1)
+    short = table.astype(np.float32)
+    far = len(table) and np.abs(table).max() > FAR * max(float(np.ptp(table, axis=0).max()), 1e-300)
+    return table if far and (short != table).any() else short
 
 
 def colours_of(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.frame import Frame
 
 BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
@@ -50,8 +51,9 @@ class View:
 class Scene:
     """Training views, held-out views and the points that training starts from.
 
-    Positions stay in the coordinates of the dataset, so an exported PLY lies where its cameras do; everything
-    in the recipe that has a length is multiplied by `scene_scale` instead.
+    Cameras and points are in local coordinates, which are those of the dataset unless `frame` says otherwise; files
+    are written in those of the dataset, so an exported PLY lies where its cameras do. Everything in the recipe that
+    has a length is multiplied by `scene_scale`.
     """
 
     name: str
@@ -61,7 +63,8 @@ class Scene:
     points_rgb: Tensor  # [M, 3] uint8
     scene_scale: float  # 1.1 x largest distance of a training camera from their centre
     background: tuple[float, float, float] = BLACK  # colour in [0, 1] behind the scene
-    gaussians: dict[str, Tensor] | None = None  # as of `read_ply`, to start from instead of one per point
+    gaussians: dict[str, Tensor] | None = None  # as of `read_ply`, to start from instead of one per point; local
+    frame: Frame = field(default_factory=Frame)  # from local coordinates to those of the dataset
 
 
 def split_views(views: list[View], test_every: int) -> tuple[list[View], list[View]]:
@@ -96,6 +99,10 @@ def assemble_scene(
         seen.add(view.name)
         check_view(view, source)
     check_points(points, source)
+    frame = Frame.of(torch.stack([view.viewmat for view in train]).double().numpy(), np.asarray(points, np.float64))
+    for view in train + test:
+        view.viewmat = (frame.local_pose(view.viewmat) if frame.moves else view.viewmat).float()
+    points = frame.to_local(points) if frame.moves else points
     return Scene(
         name=name,
         train=train,
@@ -104,6 +111,7 @@ def assemble_scene(
         points_rgb=torch.from_numpy(np.ascontiguousarray(points_rgb, dtype=np.uint8)),
         scene_scale=camera_extent(train),
         background=background,
+        frame=frame,
     )
 
 

@@ -136,7 +136,7 @@ def save_checkpoint(trainer: Capturable, path: str | Path) -> None:
     content = {
         **_view(trainer),
         "config": {**dataclasses.asdict(trainer.config), "schedule_steps": trainer.config.schedule},
-        "scene": {"name": trainer.scene.name, "view_names": list(trainer.view_names)},
+        "scene": {"name": trainer.scene.name, "view_names": list(trainer.view_names), **trainer.scene.frame.as_dict()},
     }
     size = sum(tensor.nbytes for tensor in _tensors(content))
     # Through a file of ours: given a path, torch forgets why it could not write.

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError, MissingFileError
+from skipgs_plug.trainer.frame import Frame, frame_of
 from skipgs_plug.trainer.loaders import load_scene
-from skipgs_plug.trainer.near_plane import near_plane
+from skipgs_plug.trainer.near_plane import far_plane, near_plane
 from skipgs_plug.trainer.ply import read_ply, renderable
 from skipgs_plug.trainer.run_folder import SCENE
 from skipgs_plug.trainer.scene import BLACK, Scene
@@ -36,7 +37,9 @@ class Snapshot:
     path: Path
 
     def load(self) -> dict[str, Tensor]:
-        """Return the raw parameters `means scales quats opacities sh0 shN`.
+        """Return the raw parameters `means scales quats opacities sh0 shN` in coordinates of the dataset.
+
+        Positions are float64 where float32 would lose some.
 
         Raises:
             InputError: the file is damaged or no model.
@@ -44,11 +47,13 @@ class Snapshot:
         if self.path.suffix == ".ply":
             return read_ply(self.path)
         try:
-            splats = torch.load(self.path, map_location="cpu", weights_only=True)["splats"]
+            content = torch.load(self.path, map_location="cpu", weights_only=True)
+            splats = content["splats"]
+            frame = frame_of(content.get("scene", {}))
             splats = {name: splats[name] for name in ("means", "scales", "quats", "opacities", "sh0", "shN")}
         except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, OSError, ValueError) as error:
             raise InputError(f"Checkpoint {self.path} is damaged or not one of this trainer; remove it.") from error
-        return renderable(splats, self.path)
+        return renderable(frame.dataset_splats(splats), self.path)
 
 
 @dataclass
@@ -68,6 +73,10 @@ class Model:
     antialiased: bool = False
     exposure: bool = False
     far_plane: float = TrainConfig.far_plane
+
+    def load(self, snapshot: Snapshot) -> dict[str, Tensor]:
+        """Return the raw parameters of a snapshot in the coordinates of the scene's cameras, float32."""
+        return (self.scene.frame if self.scene else Frame()).local_splats(snapshot.load())
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -98,14 +107,17 @@ def open_model(path: str | Path, scene: str | None = None, data_factor: int | No
         if not scene and not Path(source).exists():
             raise MissingFileError(f"{path} was trained on {source}, which does not exist here; add --scene.")
         loaded = load_scene(source, factor, **{name: config[name] for name in LOADING if name in config})
+    planes = TrainConfig(
+        near_plane=config.get("near_plane"), far_plane=float(config.get("far_plane", TrainConfig.far_plane))
+    )
     return Model(
         path.stem,
         snapshots,
         loaded,
-        near_plane(TrainConfig(near_plane=config.get("near_plane")), loaded) if loaded else NEAR_PLANE,
+        near_plane(planes, loaded) if loaded else NEAR_PLANE,
         bool(config.get("antialiased", False)),
         bool(config.get("exposure", False)),
-        float(config.get("far_plane", TrainConfig.far_plane)),
+        far_plane(planes, loaded) if loaded else planes.far_plane,
     )
 
 

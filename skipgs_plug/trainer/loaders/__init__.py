@@ -80,4 +80,4 @@ def load_scene(
         )
     if cloud is None:
         return scene
-    return dataclasses.replace(scene, gaussians=gaussians)
+    return dataclasses.replace(scene, gaussians=gaussians and scene.frame.local_splats(gaussians))

@@ -93,7 +93,7 @@ def read_frame(
     size = (camera.width, camera.height)
     pixels, alpha = read_image(image_path, image_path, WHITE, data_factor, size)
     K = torch.from_numpy(scaled_matrix(camera, pixels)).float()
-    view = View(name, pixels, K, torch.from_numpy(viewmat).float())
+    view = View(name, pixels, K, torch.from_numpy(viewmat))
     return images.keep(view, partial(read_opaque, image_path, data_factor, size)), alpha is not None
 
 

@@ -45,15 +45,26 @@ def save_packed(scene: Scene, path: str | Path) -> None:
         "n_train": np.int64(len(scene.train)),
         "view_names": np.array([view.name for view in views]),
         "Ks": torch.stack([view.K for view in views]).numpy(),
-        "viewmats": torch.stack([view.viewmat for view in views]).numpy(),
+        "viewmats": torch.stack([placed(scene, view) for view in views]).numpy(),
         "image_bytes": np.frombuffer(b"".join(encoded), dtype=np.uint8),
         "image_sizes": np.array([len(data) for data in encoded], dtype=np.int64),
-        "points": scene.points.numpy(),
+        "points": points_of(scene),
         "points_rgb": scene.points_rgb.numpy(),
         "background": np.array(scene.background, dtype=np.float64),
     }
     with write_aside(path) as temporary, open(temporary, "wb") as stream:
         np.savez_compressed(stream, **content)
+
+
+def placed(scene: Scene, view: View) -> torch.Tensor:
+    """Return the pose [4, 4] in coordinates of the dataset; in float64 where they are not those of the scene."""
+    return scene.frame.dataset_pose(view.viewmat) if scene.frame.moves else view.viewmat
+
+
+def points_of(scene: Scene) -> np.ndarray:
+    """Return the points [M, 3] likewise."""
+    points = scene.points.numpy()
+    return points.astype(np.float64) * scene.frame.unit + scene.frame.centre if scene.frame.moves else points
 
 
 def load_packed(path: Path, cloud: tuple[np.ndarray, np.ndarray] | None = None) -> Scene:
@@ -73,7 +84,8 @@ def load_packed(path: Path, cloud: tuple[np.ndarray, np.ndarray] | None = None) 
         label = f"{names[i]} in {path}"
         pixels, alpha = read_image(io.BytesIO(data[start : start + size]), label)
         start += size
-        K, viewmat = (torch.from_numpy(content[key][i].astype(np.float32)) for key in ("Ks", "viewmats"))
+        K = torch.from_numpy(content["Ks"][i].astype(np.float32))
+        viewmat = torch.from_numpy(content["viewmats"][i].astype(np.float64))
         views.append(View(str(names[i]), pixels, K, viewmat, None if alpha is None else alpha >= 128))
     background = tuple(float(channel) for channel in content["background"])
     if not all(0.0 <= channel <= 1.0 for channel in background):

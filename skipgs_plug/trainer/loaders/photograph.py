@@ -50,7 +50,7 @@ def load_photograph(
         return read_straight(image_path, camera, cache, factor, mask_path)
 
     pixels, mask, K = read()
-    view = View(name, pixels, torch.from_numpy(K).float(), torch.from_numpy(viewmat).float(), mask)
+    view = View(name, pixels, torch.from_numpy(K).float(), torch.from_numpy(viewmat), mask)
     return view if images is None else images.keep(view, lambda: read()[:2])
 
 

@@ -1,0 +1,111 @@
+"""Coordinates that training runs in: those of the dataset, moved to the origin and scaled, where float32 needs it.
+
+float32 tells 500,000.0 from 500,000.03 and nothing between, so a scene in coordinates of a map is a blur of half a
+metre; and recipes hold absolute constants, so a scene in an odd unit trains otherwise. Both are undone in float64.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+FAR = 100.0  # distance from the origin, in extents, from which float32 loses what a picture shows
+SMALL, LARGE = 2.0**-6, 2.0**10  # extents between which a scene keeps its unit
+SHARE_OF_DEPTH = 0.01  # of the distance to points, below which cameras that turn on the spot have no extent
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Local coordinates: (position in the dataset - `centre`) / `unit`.
+
+    Attributes:
+        centre: what is subtracted, in units of the dataset.
+        unit: a power of two, so that scaling rounds nothing.
+    """
+
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    unit: float = 1.0
+
+    @classmethod
+    def of(cls, viewmats: np.ndarray, points: np.ndarray) -> Frame:
+        """Return the frame of cameras [C, 4, 4] (world to camera) and points [M, 3], float64."""
+        centres = -np.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[..., 0]
+        centre = centres.mean(axis=0)
+        extent = float(np.linalg.norm(centres - centre, axis=1).max())
+        if len(points):
+            depth = float(np.median(np.linalg.norm(points - centre, axis=1)))
+            extent = max(extent, SHARE_OF_DEPTH * depth)
+        if not (extent > 0.0 and math.isfinite(extent)):
+            return cls()
+        kept = SMALL <= extent < LARGE
+        if kept and float(np.abs(centre).max()) < FAR * extent:
+            return cls()
+        unit = 1.0 if kept else 2.0 ** math.floor(math.log2(extent))
+        return cls((float(centre[0]), float(centre[1]), float(centre[2])), unit)
+
+    @property
+    def moves(self) -> bool:
+        """Whether local coordinates differ from those of the dataset."""
+        return self != Frame()
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the entries of skipgs.json and cfg.yml: what was subtracted from positions, then divided by."""
+        return {"centre": list(self.centre), "unit": self.unit}
+
+    def to_local(self, positions: np.ndarray) -> np.ndarray:
+        """Return positions [M, 3] of the dataset in local coordinates, float64."""
+        return (np.asarray(positions, dtype=np.float64) - self.centre) / self.unit
+
+    def local_pose(self, viewmat: Tensor) -> Tensor:
+        """Return a pose [4, 4], dataset to camera, as local coordinates to camera, float64; depths are local too."""
+        local = viewmat.double().clone()
+        local[:3, 3] = (local[:3, :3] @ torch.tensor(self.centre, dtype=torch.float64) + local[:3, 3]) / self.unit
+        return local
+
+    def dataset_pose(self, viewmat: Tensor) -> Tensor:
+        """Return the inverse of `local_pose`."""
+        pose = viewmat.double().clone()
+        pose[:3, 3] = pose[:3, 3] * self.unit - pose[:3, :3] @ torch.tensor(self.centre, dtype=torch.float64)
+        return pose
+
+    def local_splats(self, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return raw parameters in coordinates of the dataset as local ones, float32."""
+        result = dict(splats)
+        if self.moves:
+            result["means"] = torch.from_numpy(self.to_local(splats["means"].detach().cpu().numpy()))
+            result["scales"] = splats["scales"] - math.log(self.unit)
+        result["means"] = result["means"].float()
+        return result
+
+    def dataset_splats(self, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return local raw parameters in coordinates of the dataset; positions in float64 where float32 loses some."""
+        result = dict(splats)
+        if not self.moves:
+            return result
+        means = splats["means"].detach().cpu().double() * self.unit
+        means = means + torch.tensor(self.centre, dtype=torch.float64)
+        far = max(map(abs, self.centre)) >= FAR * self.unit
+        result["means"] = means if far else means.float()
+        result["scales"] = splats["scales"].detach().cpu() + math.log(self.unit)
+        return result
+
+
+def frame_of(content: Mapping[str, object]) -> Frame:
+    """Return the frame that `as_dict` described; that of the dataset where nothing is said of one.
+
+    Raises:
+        ValueError, TypeError: it is none.
+    """
+    if "centre" not in content:
+        return Frame()
+    x, y, z = (float(value) for value in content["centre"])  # type: ignore[attr-defined]
+    frame = Frame((x, y, z), float(content["unit"]))  # type: ignore[arg-type]
+    if not all(math.isfinite(value) for value in (*dataclasses.astuple(frame)[0], frame.unit)) or frame.unit <= 0:
+        raise ValueError(f"no frame: {content}")
+    return frame

@@ -1,0 +1,134 @@
+"""Scenes far from the origin and in odd units train as they would at the origin, and files are where they were."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+from scene_folders import write_colmap
+
+from skipgs_plug.cli import main
+from skipgs_plug.trainer import Scene, TrainConfig, Trainer, load_scene
+from skipgs_plug.trainer.frame import Frame
+from skipgs_plug.trainer.loaders.packed import save_packed
+from skipgs_plug.trainer.ply import read_ply
+from skipgs_plug.trainer.scene import View, assemble_scene
+from skipgs_plug.view.model import open_model
+
+UTM = (500_000.0, 4_500_000.0, 120.0)
+NOWHERE = (0.0, 0.0, 0.0)
+
+
+def placed(scene: Scene, unit: float, shift: tuple[float, float, float]) -> Scene:
+    """Return the scene with positions unit * x + shift."""
+
+    def move(view: View) -> View:
+        pose = view.viewmat.double().clone()
+        pose[:3, 3] = unit * pose[:3, 3] - pose[:3, :3] @ torch.tensor(shift, dtype=torch.float64)
+        return dataclasses.replace(view, viewmat=pose)
+
+    train, test = ([move(view) for view in views] for views in (scene.train, scene.test))
+    points = scene.points.double().numpy() * unit + np.array(shift)
+    return assemble_scene(Path("x"), "x", train, test, points, scene.points_rgb.numpy(), scene.background)
+
+
+def trained(scene: Scene, **settings) -> Trainer:
+    # Without densification, whose thresholds make much of a rounded bit in a scene so small.
+    trainer = Trainer(TrainConfig(max_steps=60, refine_start_iter=30_000, sh_degree_interval=5000, **settings), scene)
+    trainer.train(progress=False)
+    return trainer
+
+
+@pytest.mark.parametrize("settings", [{}, {"strategy": "mcmc", "cap_max": 160}])
+def test_the_unit_changes_nothing(tiny_scene: Scene, settings: dict) -> None:
+    expected = trained(tiny_scene, **settings).evaluate()["psnr"]
+    for exponent in (-6, -4, -2, 0, 4, 7):
+        found = trained(placed(tiny_scene, 10.0**exponent, NOWHERE), **settings).evaluate()["psnr"]
+        assert found == pytest.approx(expected, abs=0.05), exponent
+
+
+@pytest.mark.parametrize("shift", [UTM, (1e7, 0, 0), (0, -3e3, 0)])
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e5])
+def test_the_place_changes_nothing(tiny_scene: Scene, shift, unit: float) -> None:
+    moved = tuple(unit * value for value in shift)
+    expected = trained(tiny_scene).evaluate()["psnr"]
+    assert trained(placed(tiny_scene, unit, moved)).evaluate()["psnr"] == pytest.approx(expected, abs=0.05)
+
+
+def test_ordinary_scenes_stay_where_they_are(tiny_scene: Scene) -> None:
+    assert not tiny_scene.frame.moves
+    assert not placed(tiny_scene, 1.0, (100.0, 0.0, 0.0)).frame.moves
+    assert placed(tiny_scene, 1.0, UTM).frame.moves
+
+
+def test_splats_and_poses_go_there_and_back() -> None:
+    frame = Frame(UTM, 2.0**-12)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor([-499_999.0, -4_500_003.0, -118.0])
+    torch.testing.assert_close(frame.dataset_pose(frame.local_pose(pose)), pose, rtol=0, atol=1e-8)
+    splats = {"means": torch.randn(5, 3), "scales": torch.randn(5, 3)}
+    there = frame.dataset_splats(splats)
+    assert there["means"].dtype == torch.float64
+    back = frame.local_splats(there)
+    torch.testing.assert_close(back, splats, rtol=0, atol=1e-5)
+
+
+def test_a_run_at_utm_coordinates_is_written_there(tmp_path: Path, tiny_scene: Scene, caplog) -> None:
+    root = write_colmap(tiny_scene, tmp_path / "scene")
+    move_text_model(root, UTM)
+    run = tmp_path / "run"
+    length = ["--max-steps", "30", "--no-progress", "--refine-every", "4"]
+    assert main(["train", str(root), "--out", str(run), "--gate", *length]) == 0
+    said = json.loads((run / "skipgs.json").read_text())["frame"]
+    assert np.abs(np.array(said["centre"]) - UTM).max() < 10
+    (ply,) = (run / "ply").glob("*.ply")
+    vertices = PlyData.read(ply)["vertex"]
+    assert vertices["x"].dtype == np.float64
+    assert vertices["opacity"].dtype == np.float32
+    middle = np.median([vertices["x"], vertices["y"], vertices["z"]], axis=1)
+    assert np.abs(middle - UTM).max() < 5
+    # The checkpoint, the PLY beside its scene and the exported PLY look alike.
+    assert main(["export", str(run), str(tmp_path / "out.ply")]) == 0
+    torch.testing.assert_close(read_ply(tmp_path / "out.ply")["means"], read_ply(ply)["means"], rtol=0, atol=1e-6)
+    of_run, of_ply = open_model(run), open_model(ply, scene=str(root))
+    own, other = of_run.load(of_run.snapshots[-1]), of_ply.load(of_ply.snapshots[-1])
+    for name in ("means", "scales"):
+        torch.testing.assert_close(own[name], other[name], rtol=0, atol=1e-5)
+    assert float(own["means"].abs().median()) < 5
+    # --init-ply begins at the same Gaussians, and a run goes on.
+    again = load_scene(root, init_ply=ply)
+    torch.testing.assert_close(again.gaussians["means"], own["means"], rtol=0, atol=1e-5)
+    assert main(["train", str(root), "--out", str(run), "--resume", "--gate", *length[:1], "40", *length[2:]]) == 0
+    assert main(["export", str(run), str(tmp_path / "out.splat")]) == 0
+    assert "single precision" in caplog.text
+    # So does a packed scene.
+    save_packed(load_scene(root), tmp_path / "packed.npz")
+    packed, loaded = load_scene(tmp_path / "packed.npz"), load_scene(root)
+    for first, second in zip(packed.train, loaded.train, strict=True):
+        torch.testing.assert_close(first.viewmat, second.viewmat, rtol=0, atol=1e-5)
+    torch.testing.assert_close(packed.points, loaded.points, rtol=0, atol=1e-5)
+
+
+def move_text_model(root: Path, shift: tuple[float, float, float]) -> None:
+    from scipy.spatial.transform import Rotation
+
+    images = root / "sparse/0/images.txt"
+    lines = []
+    for line in images.read_text().splitlines():
+        if line:
+            fields = line.split(maxsplit=9)
+            w, x, y, z, *t = (float(value) for value in fields[1:8])
+            moved = np.array(t) - Rotation.from_quat([x, y, z, w]).as_matrix() @ np.array(shift)
+            line = " ".join([*fields[:5], *(repr(float(value)) for value in moved), *fields[8:]])
+        lines.append(line)
+    images.write_text("\n".join(lines) + "\n")
+    points = root / "sparse/0/points3D.txt"
+    rows = [line.split() for line in points.read_text().splitlines()]
+    for row in rows:
+        row[1:4] = [repr(float(value) + by) for value, by in zip(row[1:4], shift, strict=True)]
+    points.write_text("\n".join(" ".join(row) for row in rows) + "\n")
