@@ -14,6 +14,7 @@ from skipgs_plug.commands.names import require_names
 from skipgs_plug.commands.options.sfm import Args as SfmArgs
 from skipgs_plug.commands.options.train import Args
 from skipgs_plug.commands.session import Session
+from skipgs_plug.files import write_aside
 from skipgs_plug.install import next_command
 from skipgs_plug.photos.gather import are_photographs
 from skipgs_plug.trainer import InputError, MissingFileError, TrainConfig, Trainer, load_scene
@@ -25,6 +26,7 @@ from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.metrics import require_lpips
 from skipgs_plug.trainer.resume import first_sound, lengths
 from skipgs_plug.trainer.run_folder import SCENE, RunFolder
+from skipgs_plug.view.spz import to_spz
 
 
 def run(args: Args) -> int:
@@ -67,7 +69,19 @@ def run(args: Args) -> int:
             f"iterations {trainer.step:,} to {trainer.max_steps:,}"
             + (f", gate active from {gate.config.start_iter:,}" if gate is not None else "")
         )
-        return Session(args.session, folder, trainer, gate, curve).run()
+        code = Session(args.session, folder, trainer, gate, curve).run()
+    if args.sfm and not code:
+        share(folder, trainer)
+    return code
+
+
+def share(folder: RunFolder, trainer: Trainer) -> None:
+    """Write the model small enough to be sent, and say what to open and what to share."""
+    path = folder.root / f"{folder.root.resolve().name}.spz"
+    data = to_spz({name: parameter.detach().cpu() for name, parameter in trainer.splats.items()})
+    with write_aside(path, len(data)) as temporary:
+        temporary.write_bytes(data)
+    print(f"Open it: {next_command('view', folder.root)}; share it: {path} ({len(data) / 1e6:.1f} MB)")
 
 
 def check(args: Args, checkpoints: list[Path]) -> None:

@@ -93,6 +93,8 @@ def test_a_video_is_trained_on_with_one_command(fern, tmp_path, capsys):
     assert main([*train, "--max-steps", "6", "--sfm"]) == 0
     shown = capsys.readouterr().out
     assert "photographs placed" in shown and f"Next: {program()} view {run}" in shown
+    last = shown.splitlines()[-1]
+    assert f"{program()} view {run}; share it: {run / 'walk.spz'} (" in last and (run / "walk.spz").is_file()
     assert (run / "scene/sparse/0").is_dir() and (run / "ply/point_cloud_5.ply").is_file()
     assert main([*train, "--max-steps", "8", "--sfm", "--resume"]) == 0
     assert "placed" not in capsys.readouterr().out  # the scene is there
