@@ -42,9 +42,16 @@ class SavedGraph:
 
     def open(self) -> None:
         """Begin to keep what is saved in this thread, unless it is begun already or hooks of others are at work."""
-        if not self._open and _top() is None:
-            torch._C._autograd._push_saved_tensors_default_hooks(self._pack, self._unpack)
-            self._open = True
+        if self._open:
+            return
+        top = _top()
+        if top is not None:
+            other = getattr(top[0], "__self__", None)
+            if not isinstance(other, SavedGraph):
+                return
+            other.close()  # of another gate: one that was never detached, or whose turn comes again
+        torch._C._autograd._push_saved_tensors_default_hooks(self._pack, self._unpack)
+        self._open = True
 
     def close(self) -> None:
         """Keep nothing of what is saved from now on."""

@@ -92,6 +92,16 @@ def test_a_skipped_graph_does_not_raise_the_peak():
     assert peak([False, True, False], update=False) > 3 * N  # what shares a graph may come until the next step
 
 
+def test_a_gate_that_was_never_detached_does_not_keep_the_next_from_freeing():
+    value = torch.nn.Parameter(torch.ones(N))
+    left = SkipGate(policy=Every([True, True]))
+    for step in range(2):
+        left.backward((value.exp() * value).mean(), view="a", step=step)
+    assert peak([False, True, False]) == 3 * N
+    left.detach()
+    assert torch._C._autograd._top_saved_tensors_default_hooks(True) is None
+
+
 @pytest.mark.parametrize("skips", [[False, True, False, True]])
 def test_gradients_are_those_without_a_gate(skips):
     value, plain = torch.nn.Parameter(torch.ones(N)), torch.nn.Parameter(torch.ones(N))
