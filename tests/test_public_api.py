@@ -54,7 +54,8 @@ ADAPTER = {
     "must_run": "(self, step: 'int') -> 'bool'",
     "optimizers": "(self) -> 'Iterable[torch.optim.Optimizer]'",
     "recognises_script": "(code: 'LoopCode') -> 'bool'",
-    "timing": "(self) -> 'tuple[float, float] | None'",
+    "stand_ins_for": "(command: 'Sequence[str]') -> 'str'",
+    "timing": "(self) -> 'Times | None'",
 }
 HOOKS = {
     "always": "(self, always: 'Always') -> 'None'",
@@ -89,6 +90,7 @@ FACTS = (
 )
 POLICY = {
     "decide": "(self, view: 'Hashable', loss: 'float', step: 'int') -> 'Decision'",
+    "foreseen": "(self, view: 'Hashable | None', step: 'int') -> 'bool | None'",
     "load_state_dict": "(self, state: 'dict[str, Any]') -> 'None'",
     "mean": "(self, view: 'Hashable') -> 'float | None'",
     "notify_event": "(self, step: 'int', n_views: 'int') -> 'None'",

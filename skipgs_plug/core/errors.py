@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 
 class SkipGSError(RuntimeError):
     """Base of all errors of the gate and the adapters: one sentence that names the thing and the fix."""
@@ -15,5 +17,19 @@ class AdapterMismatchError(SkipGSError):
     """The trainer does not have, or does not do, what its adapter expects."""
 
 
+class BrokenTrainingError(SkipGSError):
+    """The training itself is broken, such as by losses that stay non-finite: it is raised at any time."""
+
+
 class GateOrderError(SkipGSError):
     """A verb of the gate was called out of order."""
+
+
+def warn_of_release(error: Exception, step: int | None) -> None:
+    """Warn that the gate let go of a training that goes on: no run is lost to the gate."""
+    reason = str(error) if isinstance(error, SkipGSError) else f"{type(error).__name__}: {error}"
+    warnings.warn(
+        f"The gate is released in iteration {step}, and training goes on without it, in all its iterations ({reason})",
+        RuntimeWarning,
+        stacklevel=3,
+    )

@@ -9,9 +9,16 @@ from typing import Any, ClassVar, Protocol
 
 import torch
 
+from skipgs_plug.core import distributed
 from skipgs_plug.core.clock import Times
 from skipgs_plug.core.engine import Engine
-from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
+from skipgs_plug.core.errors import (
+    AdapterMismatchError,
+    BrokenTrainingError,
+    GateOrderError,
+    SkipGSError,
+    warn_of_release,
+)
 from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.intercept import Around, Patches, intercept_tensor_backward
 from skipgs_plug.core.pace.base import Always, nothing_always
@@ -58,7 +65,7 @@ class Hooks:
         self._given = given
         self._expectation = f"Adapter {adapter.name!r} was checked with {adapter.checked}."
         self._patches = Patches(self._expectation)
-        self._ready = False
+        self._ready = self._released = False
         self.script_globals: dict[str, Any] = {}
         self._iteration = engine.iteration
         self._iterations = 0
@@ -73,7 +80,7 @@ class Hooks:
         Raises:
             SkipGSError: As `Engine.configure`.
         """
-        with self._detaching_on_error():
+        with self._releasing_on_error(None):
             self._engine.configure(facts, self._given)
             if self._engine.config.enabled:
                 self.on_detach("torch.autograd (hooks for saved tensors)", self._engine.graph.close)
@@ -85,8 +92,10 @@ class Hooks:
 
     def iteration(self, step: int) -> None:
         """Iteration `step` begins: its first training backward will be gated."""
+        if self._released:
+            return
         step = int(step)  # a NumPy number would get into saved states
-        with self._detaching_on_error():
+        with self._releasing_on_error(step):
             if not self._ready:
                 raise self._mismatch("the trainer iterates before it said when densification ends")
             if self._iterations == CHECKED_ITERATIONS:
@@ -116,25 +125,39 @@ class Hooks:
 
     def backward(self, loss: torch.Tensor, run: Callable[[], Any], view: Any = None) -> Any:
         """Gate a training backward: `run()` is the real one, and is called unless it is skipped."""
-        with self._detaching_on_error():
-            self._backwards += 1
-            if self._iterations == 0:
-                if self._backwards >= CHECKED_ITERATIONS:
-                    raise self._mismatch(f"{self._backwards} training backwards ran in no iteration")
-                return run()
-            now = self._iteration
-            now.backwards += 1
-            if now.backwards > 1:
-                self._odd_iterations += now.backwards == 2
-                return run()
-            self._odd_iterations -= 1
-            view = now.view if view is None else view
-            if view is None:
-                raise self._mismatch("no training view was rendered before the backward")
-            if callable(view):
-                view = view() if self._engine.active else "not read"
-            self._engine.gate(view_key(view), loss if now.signal is None else now.signal, run, loss, alone=True)
-            return None
+        call = _Call(run)
+        with self._releasing_on_error(self._iteration.step, call):
+            if not self._released:
+                if self._is_training_backward():
+                    self._gate(loss, view, call)
+                else:
+                    return call()
+        # A gate that gave up before it decided owes the trainer its backward.
+        return call() if self._released and not (call.made or self._iteration.skipped) else None
+
+    def _is_training_backward(self) -> bool:
+        """Whether this backward is the first of an iteration."""
+        self._backwards += 1
+        if self._iterations == 0:
+            if self._backwards >= CHECKED_ITERATIONS:
+                raise self._mismatch(f"{self._backwards} training backwards ran in no iteration")
+            return False
+        now = self._iteration
+        now.backwards += 1
+        if now.backwards > 1:
+            self._odd_iterations += now.backwards == 2
+            return False
+        self._odd_iterations -= 1
+        return True
+
+    def _gate(self, loss: torch.Tensor, view: Any, call: Callable[[], Any]) -> None:
+        now = self._iteration
+        view = now.view if view is None else view
+        if view is None:
+            raise self._mismatch("no training view was rendered before the backward")
+        if callable(view):
+            view = view() if self._engine.active else "not read"
+        self._engine.gate(view_key(view), loss if now.signal is None else now.signal, call, loss, alone=True)
 
     # How to hold on to the trainer.
 
@@ -300,10 +323,43 @@ class Hooks:
         )
 
     @contextmanager
-    def _detaching_on_error(self) -> Iterator[None]:
-        """Leave nothing patched behind when the gate itself gives up."""
+    def _releasing_on_error(self, step: int | None, call: _Call | None = None) -> Iterator[None]:
+        """Leave nothing patched behind when the gate gives up, and let a training that is under way go on.
+
+        Refusals come in the first iterations, when nothing is lost yet. An error of the training itself is raised at
+        any time, and so is every error where other processes would wait for this one.
+        """
         try:
             yield
-        except SkipGSError:
+        except Exception as error:
+            if call is not None and call.failed:
+                raise  # the trainer's own
             self.restore()
+            refusal = isinstance(error, SkipGSError) and self._iterations <= CHECKED_ITERATIONS
+            broken = isinstance(error, (BrokenTrainingError, GateOrderError))
+            if refusal or broken or distributed.group_size() > 1:
+                raise
+            self._released = True
+            self._engine.release()
+            warn_of_release(error, step)
+
+
+class _Call:
+    """A call of the trainer's own.
+
+    Attributes:
+        made: it was called.
+        failed: it raised.
+    """
+
+    def __init__(self, function: Callable[[], Any]) -> None:
+        self._function = function
+        self.made = self.failed = False
+
+    def __call__(self) -> Any:
+        self.made = True
+        try:
+            return self._function()
+        except BaseException:
+            self.failed = True
             raise

@@ -6,7 +6,7 @@ import warnings
 
 from skipgs_plug.core import decision
 from skipgs_plug.core.decision import Decision
-from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.errors import BrokenTrainingError
 
 MIN_IN_A_ROW = 10
 
@@ -27,16 +27,16 @@ class NonFiniteGuard:
         """Decide on a loss that is not finite.
 
         Raises:
-            SkipGSError: mode is "raise", or every view of an epoch (at least 10 losses) in a row was
+            BrokenTrainingError: mode is "raise", or every view of an epoch (at least 10 losses) in a row was
                 non-finite.
         """
         known = "no finite loss before" if mean is None else f"mean of its finite losses {mean:.4g}"
         what = f"Loss is {loss} in iteration {step} on view {view!r} ({known})"
         self.in_a_row += 1
         if self._mode == "raise":
-            raise SkipGSError(f"{what}: it came out of the trainer so; check that image and camera.")
+            raise BrokenTrainingError(f"{what}: it came out of the trainer so; check that image and camera.")
         if self.in_a_row >= max(MIN_IN_A_ROW, n_views):
-            raise SkipGSError(
+            raise BrokenTrainingError(
                 f"{what}, like {self.in_a_row - 1} losses before it: the model is lost; "
                 "go back to a checkpoint and lower the learning rates."
             )

@@ -13,6 +13,8 @@ from torch.optim import lr_scheduler as schedulers
 from skipgs_plug import AdapterMismatchError, GateOrderError, SkipGate, SkipGSError, UnknownTrainerError
 from skipgs_plug.adapters import AbstractAdapter, TrainerFacts
 from skipgs_plug.adapters.schedulers import catch_up_schedulers
+from skipgs_plug.core.pace.refining import Refining
+from skipgs_plug.core.policy import SkipPolicy
 
 
 class ToyTrainer:
@@ -428,3 +430,40 @@ def test_unknown_trainers_get_the_list_and_the_manual_form() -> None:
         SkipGate(object())
     with pytest.raises(UnknownTrainerError, match="no adapter 'fastestgs'"):
         SkipGate(object(), adapter="fastestgs")
+
+
+def test_a_training_under_way_is_not_lost_when_the_gate_fails(monkeypatch) -> None:
+    """An error of the gate's own code releases it: the rest of the run trains as without a gate."""
+
+    def fails(self, view, loss, step):
+        if step == 50:
+            raise ZeroDivisionError("of the policy")
+        return original(self, view, loss, step)
+
+    original = SkipPolicy.decide
+    monkeypatch.setattr(SkipPolicy, "decide", fails)
+    trainer = ToyTrainer()
+    gate = attach(trainer)
+    with pytest.warns(RuntimeWarning, match=r"released in iteration 50, .*ZeroDivisionError: of the policy"):
+        trainer.train()
+    assert plain(trainer) and gate.patched == []
+    assert gate.stats()["gated_iterations"] < 50
+
+
+def test_an_error_of_the_trainers_own_backward_stays_its_own() -> None:
+    trainer = ToyTrainer()
+    with attach(trainer) as gate:
+        with pytest.raises(MemoryError):
+            gate._hooks.iteration(0)  # type: ignore[union-attr]
+            gate._hooks.backward(torch.ones((), requires_grad=True), lambda: (_ for _ in ()).throw(MemoryError()), "v0")  # type: ignore[union-attr]
+        assert gate.patched
+
+
+def test_a_loop_goes_on_in_all_its_iterations_when_a_phase_fails(monkeypatch) -> None:
+    def fails(self, number):
+        raise ZeroDivisionError("of the phase")
+
+    monkeypatch.setattr(Refining, "runs", fails)
+    gate = SkipGate(start_iter=40, refine_share=0.25)
+    with pytest.warns(RuntimeWarning, match="released in iteration 40, .* of the phase"):
+        assert list(gate.iterations(range(60), always=())) == list(range(60))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from skipgs_plug.core import distributed
@@ -60,16 +60,16 @@ class Growing:
         self,
         numbers: range,
         found: Mapping[str, set[int]],
-        hidden: Iterable[int],
+        hidden: set[int],
         densification: Densification,
         n_views: int | None,
-    ) -> None:
-        """Take what is known when the loop begins.
+    ) -> bool:
+        """Take the facts that are known when the loop begins; False if the loop shows no densification event.
 
         Args:
             numbers: Iterations from the first that can be left out to the end of densification.
             found: Iterations on which something depends, by the condition of the loop.
-            hidden: Further iterations that must run.
+            hidden: Further iterations of these that must run.
             densification: The trainer's events.
             n_views: Number of training views; None if unknown.
 
@@ -86,9 +86,10 @@ class Growing:
         for reason, hits in found.items():
             if any(mark in reason for mark in marks):
                 events |= hits
+        if not events and marks:
+            return False
         others = {reason: hits for reason, hits in found.items() if not any(mark in reason for mark in marks)}
         self.always = dict(others)
-        hidden = {n for n in hidden if n in numbers}
         if hidden:
             self.always["named for this trainer"] = hidden
         self.events = Events(events, densification)
@@ -103,6 +104,7 @@ class Growing:
             self._first_number = numbers.start
         self._length = numbers.stop - self._first_number
         self._n_views = n_views or self._n_views
+        return True
 
     def runs(self, number: int) -> bool:
         """Whether iteration `number` runs; asked once for each, in order."""

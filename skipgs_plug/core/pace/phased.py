@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.errors import SkipGSError, warn_of_release
 from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.pace.base import Always, Pace, Source, nothing_always
 from skipgs_plug.core.pace.growing import Growing
@@ -53,6 +53,7 @@ class Phased(Pace):
         self._conditions: tuple[dict[str, set[int]], dict[str, set[int]]] | None = None  # of both phases
         self._left_out = 0
         self._configured = self._removed = False
+        self._planned = False  # the loop's conditions were read: nothing is refused any more
 
     # Facts about the trainer.
 
@@ -127,19 +128,35 @@ class Phased(Pace):
         return self._finder.found is None
 
     def runs(self, loop: LoopRange, number: int) -> bool:
-        """Whether the loop runs with this number; asked once for each, in order."""
+        """Whether the loop runs with this number; asked once for each, in order.
+
+        Raises:
+            SkipGSError: The loop's conditions cannot be foreseen; raised with the first number that could be left out,
+                never later.
+        """
         if self._removed:
             return True
+        try:
+            return self._runs(loop, number)
+        except Exception as error:
+            if isinstance(error, SkipGSError) and not self._planned:
+                raise
+            self.remove()
+            self._rates.remove()
+            warn_of_release(error, number)
+            return True
+
+    def _runs(self, loop: LoopRange, number: int) -> bool:
         if self.wants_loop and number == loop.numbers.start > 0:
             self._go_on(number)
         if not self._finder.asks(loop, number) or not self._configured:
             return True
         if self._conditions is None or loop.source is not None:
+            self._planned = False
             self._read(loop, number)
-        if number >= self._start:
-            runs = self._refine(loop, number)
-        else:
-            runs = self.growing is None or self.growing.runs(number)
+            self._planned = True
+        grows = number < self._start
+        runs = (self.growing is None or self.growing.runs(number)) if grows else self._refine(number)
         if runs:
             self.gap, self._left_out = self._left_out, 0
         else:
@@ -185,10 +202,13 @@ class Phased(Pace):
         if hidden:
             found[1][NAMED] = hidden
         self._conditions = found[0], found[1]
+        self.refining.begin(self._last, found[1], self._views, self._keeps_rates)
         if self.growing is not None and grown:
             n_views = None if self._views is None else len(self._views)
             assert self._densification is not None
-            self.growing.begin(grown, found[0], [*self._hidden(grown), *self._chosen], self._densification, n_views)
+            hidden = {n for n in (*self._hidden(grown), *self._chosen) if n in grown}
+            if not self.growing.begin(grown, found[0], hidden, self._densification, n_views):
+                self._grow_whole(f"No condition of the loop names {', '.join(self._densification.marks)}")
 
     def _require_events(self) -> None:
         """Let growth run whole where its densification events are not known."""
@@ -199,20 +219,20 @@ class Phased(Pace):
                 "grow_share leaves out iterations of densification, whose events are not known in this trainer; leave "
                 "it out, or give events= to gate.iterations()."
             )
+        self._grow_whole("In a loop of your own give events= to gate.iterations()")
+
+    def _grow_whole(self, reason: str) -> None:
         warnings.warn(
             "The densification events of this trainer are not known, so its densification runs whole, and iterations "
-            "are left out after it; in a loop of your own give events= to gate.iterations().",
+            f"are left out after it. {reason}.",
             RuntimeWarning,
             stacklevel=2,
         )
         self.growing = None
 
-    def _refine(self, loop: LoopRange, number: int) -> bool:
-        if not self.refining.begun:
-            assert self._conditions is not None and self._last is not None
-            if self.growing is not None and self.refining.sampling.run == 0:
-                self._rates.shown.restart()  # what views show of the grown scene decides how long steps are
-            self.refining.begin(self._last, self._conditions[1], self._views, self._keeps_rates)
+    def _refine(self, number: int) -> bool:
+        if self.growing is not None and self.refining.sampling.asked == 0:
+            self._rates.shown.restart()  # what views show of the grown scene decides how long steps are
         return self.refining.runs(number)
 
     # State and report.

@@ -25,6 +25,11 @@ class Sampling:
         self.left_out = 0
         self._due = 0  # how many should have run by now
 
+    @property
+    def asked(self) -> int:
+        """Iterations counted so far."""
+        return self.run + self.left_out
+
     def runs(self, must: bool, barred: bool = False) -> bool:
         """Whether the next iteration runs.
 
