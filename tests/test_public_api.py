@@ -156,7 +156,9 @@ def test_what_adapters_are_written_with() -> None:
         "left_alone",
         "saved_state",
         "output_folder",
+        "released",
         "replaced",
+        "stand_ins",
     }
     assert signatures(Hooks) == HOOKS
     assert properties(Hooks) == {"gap", "patched", "state", "trained"}
