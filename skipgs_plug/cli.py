@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import errno
 import importlib
+import io
 import os
 import sys
 import traceback
@@ -51,6 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         `--debug` shows the traceback.
     """
     replace_closed_streams()
+    print_any_name()
     arguments = list(sys.argv[1:] if argv is None else argv)
     own = arguments[: arguments.index("--")] if "--" in arguments else arguments
     own = [expand_home(argument) for argument in own]
@@ -92,6 +94,13 @@ def replace_closed_streams() -> None:
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - as long as the process lives
+
+
+def print_any_name() -> None:
+    """Let names that the locale has no letters for be printed with escapes, instead of ending the program."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def run(arguments: list[str]) -> int:

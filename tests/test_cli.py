@@ -204,3 +204,14 @@ def test_the_home_folder_is_known_everywhere(monkeypatch):
     given = ["~/scene", "--out=~/runs", "--out", "~", "a~b", "--name=a~"]
     expected = ["/home/somebody/scene", "--out=/home/somebody/runs", "--out", "/home/somebody", "a~b", "--name=a~"]
     assert [expand_home(argument) for argument in given] == expected
+
+
+def test_names_that_the_locale_cannot_print(tmp_path: Path, packed: str) -> None:
+    scene = tmp_path / "Lübeck \u732b.npz"
+    scene.write_bytes(Path(packed).read_bytes())
+    arguments = ["train", str(scene), "--out", str(tmp_path / "l\u00e4uft"), "--max-steps", "1", "--no-progress"]
+    code = f"from skipgs_plug.cli import main; raise SystemExit(main({arguments!r}))"
+    narrow = {**os.environ, "PYTHONIOENCODING": "ascii:strict"}
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, env=narrow)
+    assert ended.returncode == 0, ended.stderr
+    assert b"l\\xe4uft" in ended.stdout

@@ -93,7 +93,7 @@ def test_metrics_count_what_is_seen() -> None:
     mask[:, 20:] = False
     wrong = target.clone()
     wrong[:, 20:] = 0
-    assert metrics.psnr(wrong, target, mask) == math.inf
+    assert metrics.psnr(wrong, target, mask) == 100.0
     assert metrics.ssim(target, target, mask) == pytest.approx(1.0)
     # A window around a pixel far from the hidden columns sees none of them.
     mask[:] = False

@@ -308,3 +308,10 @@ def test_one_photograph_names_the_option(colmap: Path) -> None:
 def test_equal_images_have_a_finite_psnr() -> None:
     image = torch.rand(8, 8, 3)
     assert psnr(image, image) == 100.0
+
+
+def test_what_a_fisheye_loses_is_said(tmp_path: Path, tiny_scene: Scene, caplog: pytest.LogCaptureFixture) -> None:
+    """A lens of 180 degrees cannot be a pinhole whole."""
+    fisheye = {"camera_model": "OPENCV_FISHEYE", "w": 32, "h": 24, "fl_x": 32 / math.pi, "fl_y": 32 / math.pi}
+    load_scene(write_nerf(tiny_scene, tmp_path / "scene", **fisheye))
+    assert "of about 180 degrees" in caplog.text

@@ -17,7 +17,7 @@ from skipgs_plug.trainer.loaders.colmap_files import check_lengths
 from skipgs_plug.trainer.loaders.colmap_text import content_lines, image_records, simplify
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.paths import find_image, relative_name
-from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, find_mask, load_photograph, model_name
+from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, find_mask, load_photograph, lost_angle, model_name
 from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene, split_views
 
@@ -51,10 +51,10 @@ def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStor
         mask = find_mask(masks, name) if masks.is_dir() else None
         bare += mask is None
         camera = reconstruction.cameras[image.camera_id]
-        if model_name(camera) not in PINHOLE_MODELS:
-            distorted.add(model_name(camera))
         pose, image_path = pose_of(image, name, model), find_image(folder, name)
         views.append(load_photograph(name, image_path, camera, pose, cache, factor, mask, images))
+        if model_name(camera) not in PINHOLE_MODELS:
+            distorted.add(model_name(camera) + lost_angle(camera, views[-1]))
     if not views:
         raise InputError(f"{model} registers no image; run COLMAP again with more overlap between photographs.")
     if distorted:

@@ -14,7 +14,7 @@ from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.camera_keys import read_camera
 from skipgs_plug.trainer.loaders.json_file import opencv_viewmat, read_object, read_pose, read_string
 from skipgs_plug.trainer.loaders.paths import find_image, inside, relative_name
-from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, load_photograph, model_name
+from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, load_photograph, lost_angle, model_name
 from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
 from skipgs_plug.trainer.ply import read_points
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene, split_views
@@ -52,7 +52,7 @@ def load_nerfstudio(
         image_path, factor = reduced_image(path, name, full, data_factor)
         views.append(load_photograph(name, image_path, camera, viewmat, cache, factor, mask, images))
         if model_name(camera) not in PINHOLE_MODELS:
-            distorted.add(model_name(camera))
+            distorted.add(model_name(camera) + lost_angle(camera, views[-1]))
     if distorted:
         log.warning("%s: lens distortion (%s) is removed, and the result kept.", source, ", ".join(sorted(distorted)))
     train, test = own_split(content, views, path, source) or split_views(views, test_every)

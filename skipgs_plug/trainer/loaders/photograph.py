@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,18 @@ def read_photograph(image_path: Path, camera: Any, factor: int, mask_path: Path 
         drawn = read_mask(mask_path, pixels, size)
         mask = drawn if mask is None else mask & drawn
     return pixels, mask
+
+
+def lost_angle(camera: Any, view: View) -> str:
+    """Return a clause on how much of a wide lens is cut away in `view`, empty for less than a tenth.
+
+    The angle of the lens is that of an equidistant fisheye, which its distortion changes little.
+    """
+    if "FISHEYE" not in model_name(camera):
+        return ""
+    whole = math.degrees(camera.width / float(np.array(camera.params)[list(camera.focal_length_idxs())][0]))
+    kept = math.degrees(2 * math.atan(view.width / 2 / float(view.K[0, 0])))
+    return f", of about {whole:.0f} degrees {kept:.0f} are kept" if kept < 0.9 * whole else ""
 
 
 def undistort(pixels: Tensor, mask: Tensor | None, camera: Any, image_path: Path) -> Straight:
