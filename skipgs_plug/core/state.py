@@ -215,6 +215,9 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
             )
         # States from before iterations could be left out, and before steps depended on what a view shows.
         state = {"pace": None, "shown": [0.0, 0], **state}
+        shown = state["shown"]
+        if isinstance(shown, (list, tuple)) and len(shown) == 2:  # from before sums could wait on a device
+            state["shown"] = [*shown, shown[1], 0.0, 0.0]
         if isinstance(state.get("clock"), Mapping):  # and from before processor seconds were counted
             state["clock"] = {"t_total_processor": math.nan, "t_post_processor": math.nan, **state["clock"]}
         _require(state, GateState, "state")
