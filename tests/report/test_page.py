@@ -173,7 +173,7 @@ def test_folders_without_a_run_are_named(tmp_path, capsys):
         ("[1]", "no JSON object"),
         ('{"schema_version": 99}', "schema version 99"),
         ('{"schema_version": 1, "settings": {}}', "no 'iterations' in it"),
-        ('{"kind": "skipgs-bench", "schema_version": 1}', "no 'command' in it"),
+        ('{"kind": "skipgs-bench", "schema_version": 2}', "no 'command' in it"),
     ],
 )
 def test_unusable_input_is_one_sentence(tmp_path, capsys, content, sentence):
