@@ -101,7 +101,7 @@ def test_a_signal_while_torch_is_being_imported(name: str, code: int, said: str)
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name == 'torch.nn': signal.raise_signal(signal.Signals[sys.argv[1]])\n"
         "sys.meta_path.insert(0, Interrupt())\n"
-        "sys.exit(main(['train', '--help']))\n"
+        "sys.exit(main(['train', 'scene', '--out', 'folder']))\n"
     )
     command = [sys.executable, "-c", script, name]
     tried = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
@@ -138,7 +138,11 @@ def test_file_systems_in_trouble(
 ) -> None:
     class Command:
         @staticmethod
-        def main(argv: list[str]) -> int:
+        def parse(arguments: list[str]) -> None:
+            return None
+
+        @staticmethod
+        def run(args: None) -> int:
             raise OSError(number, os.strerror(number), "/some/where")
 
     monkeypatch.setattr(cli.importlib, "import_module", lambda name: Command)
@@ -235,7 +239,11 @@ def test_a_copy_that_does_not_fit_names_the_copy(
 ) -> None:
     class Command:
         @staticmethod
-        def main(argv: list[str]) -> int:
+        def parse(arguments: list[str]) -> None:
+            return None
+
+        @staticmethod
+        def run(args: None) -> int:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/photographs/a.jpg", None, "/scene/a.jpg")
 
     monkeypatch.setattr(cli.importlib, "import_module", lambda name: Command)
