@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skipgs_plug.install import next_command
 from skipgs_plug.trainer.compressed_ply import SH_C0, decompress, is_compressed
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.files import write_aside
@@ -96,10 +97,10 @@ def read_start(path: str | Path) -> tuple[tuple[np.ndarray, np.ndarray], dict[st
 
     Raises:
         MissingFileError: no such file.
-        InputError: neither a point cloud nor a model, or of fewer than four points.
+        InputError: neither a point cloud nor a model, of fewer than four points, or compressed, which rounds.
     """
     path = Path(path).expanduser()
-    vertices = read_vertices(path)
+    vertices = read_vertices(path, rounded=False)
     cloud = points_of(path, vertices)
     check_points(cloud[0], path)
     return cloud, model_of(path, vertices) if "f_dc_0" in vertices else None
@@ -207,7 +208,7 @@ def colours_of(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.full((len(vertices["x"]), 3), 128, dtype=np.uint8)
 
 
-def read_vertices(path: Path) -> dict[str, np.ndarray]:
+def read_vertices(path: Path, rounded: bool = True) -> dict[str, np.ndarray]:
     """Return the vertices' properties [N] by name; what the header claims is checked before anything is allocated."""
     from plyfile import PlyData, PlyParseError
 
@@ -221,8 +222,15 @@ def read_vertices(path: Path) -> dict[str, np.ndarray]:
         }
         vertices = elements["vertex"]
         if is_compressed(vertices):
+            if not rounded:
+                raise InputError(
+                    f"PLY {path} is compressed: its numbers are rounded to 8 to 11 bits. Start from the model it was "
+                    f"made of, or run: {next_command('export', path, path.with_suffix('').with_suffix('.ply'))}."
+                )
             return decompress(vertices, elements["chunk"], elements.get("sh", {}))
         return vertices
+    except InputError:
+        raise
     except (PlyParseError, KeyError, ValueError, TypeError, EOFError, MemoryError, OSError) as error:
         raise InputError(f"PLY {path} is damaged or not a PLY ({reason(error)}); export it again.") from error
 

@@ -16,7 +16,7 @@ from skipgs_plug.cli import main
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.loaders.camera_keys import read_camera
 from skipgs_plug.trainer.metrics import psnr
-from skipgs_plug.trainer.ply import PROPERTIES, read_ply, read_points, write_ply
+from skipgs_plug.trainer.ply import PROPERTIES, read_ply, read_points, read_start, write_ply
 
 
 @pytest.fixture
@@ -259,6 +259,8 @@ def test_a_compressed_model_is_read(tmp_path: Path) -> None:
     alpha = torch.sigmoid(read["opacities"]) - torch.sigmoid(splats["opacities"][same])
     assert float(alpha.abs().max()) < 0.003
     assert main(["export", str(tmp_path / "x.compressed.ply"), str(tmp_path / "y.ply")]) == 0
+    with pytest.raises(InputError, match=r"is compressed: .*export .*x\.ply"):
+        read_start(tmp_path / "x.compressed.ply")
 
 
 def test_saturated_values_are_clamped_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
