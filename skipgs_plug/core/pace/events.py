@@ -7,11 +7,16 @@ from collections.abc import Iterable
 from typing import Any
 
 from skipgs_plug.core.facts import Densification
+from skipgs_plug.core.pace.needs import NEARLY_ALL
 
 # Visits of each Gaussian behind an event. Densification grows what has a large mean gradient over its visits: over
 # fewer, the means are noisier, and more of them lie above the threshold (bonsai with 10 visits: 17 to 90 % more
-# Gaussians). Over more, events are fewer, and a scene that must grow far does not get there (Lego).
-VISITS_BEHIND = 15.0
+# Gaussians). Over more, events are fewer, and a scene that must grow far does not get there (Lego). What a view shows
+# is measured in the first steps and falls as the scene grows: 20 visits by that measure are 14 in the end.
+VISITS_BEHIND = 20.0
+# Where a view shows nearly all, growth is limited by the number of events instead: every second one ends with half of
+# Lego's Gaussians.
+VISITS_BEHIND_FULL_VIEWS = 8.0
 SHOWN = 1 / 3  # share of the Gaussians that a view shows, before it is measured
 
 
@@ -68,7 +73,8 @@ class Events:
         if self._needs == "iterations":
             return behind >= distance
         shown = shown or SHOWN
-        return behind * shown >= min(VISITS_BEHIND, distance * shown)
+        visits = VISITS_BEHIND_FULL_VIEWS if shown >= NEARLY_ALL else VISITS_BEHIND
+        return behind * shown >= min(visits, distance * shown)
 
     def _distance(self, number: int) -> int:
         """Iterations from the event before to this one in the trainer's own schedule."""

@@ -81,7 +81,7 @@ def test_a_saved_state_goes_on():
 
 
 def test_the_share_follows_from_the_visits():
-    assert refining_share(15_000, 100) == refining_share(1500, 17) == 0.2
+    assert refining_share(15_000, 100) == refining_share(2000, 17) == 0.2
     assert refining_share(3000, 255) == pytest.approx(0.2484, abs=1e-4)
     assert refining_share(1500, 255) == pytest.approx(0.2954, abs=1e-4)
     assert refining_share(2000, 2000) == 0.46
@@ -89,9 +89,9 @@ def test_the_share_follows_from_the_visits():
 
 
 def test_a_short_refinement_needs_more_of_its_iterations():
-    assert refining_share(1000, 17) == 0.3
-    assert refining_share(400, 17) == 0.75
-    assert refining_share(300, 17) == refining_share(20, 17) == 1.0
+    assert refining_share(1000, 17) == 0.4
+    assert refining_share(500, 17) == 0.8
+    assert refining_share(400, 17) == refining_share(20, 17) == 1.0
 
 
 def test_watched_views_are_few_and_always_the_same():
