@@ -24,6 +24,7 @@ class MiniSplatting(InriaFamily):
     left_alone = "Scores and depths for pruning are rendered without gradients and always run."
     stand_ins = "gaussianspa"
     mark = "num_depth"
+    densification = None  # its loop gathers more between events than means over visits
     renders = ("render_imp",)
     structural = (*InriaFamily.structural, "reinitial_pts")
     calls = ("densify_and_prune_split",)

@@ -23,6 +23,7 @@ class MiniSplatting2(InriaFamily):
     )
     left_alone = "Its sparse Adam has no gradients in skipped iterations. Needs CUDA: its culling has no stand-in."
     mark = "depth_reinit"
+    densification = None  # its loop gathers more between events than means over visits
     renders = ("render_imp",)
     structural = (*InriaFamily.structural, "reinitial_pts", "init_culling")
     calls = (

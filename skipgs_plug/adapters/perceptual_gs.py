@@ -24,6 +24,7 @@ class PerceptualGS(InriaFamily):
     left_alone = "Renders of sensitivity and alpha are of the same view, and belong to its loss."
     stand_ins = "gaussianspa"
     mark = "get_sensitivity"
+    densification = None  # its loop gathers more between events than means over visits
     structural = (*InriaFamily.structural, "reinitial_pts")
     calls = ("get_alpha", "get_sensitivity")
 
