@@ -147,7 +147,7 @@ def refine(rank: int, folder: str, share: float | str, nothing_on_the_cpu: bool)
     goal = torch.randn(40, 3)
     gate = SkipGate(start_iter=20, refine_share=share)
     ran = []
-    for step in gate.iterations(range(400), views=[f"{view}.png" for view in range(40)]):
+    for step in gate.iterations(range(600), views=[f"{view}.png" for view in range(40)]):
         ran.append(step)
         seen = torch.zeros(40, 1)
         seen[: 10 + 25 * rank] = 1.0
@@ -169,5 +169,5 @@ def refine(rank: int, folder: str, share: float | str, nothing_on_the_cpu: bool)
 def test_ranks_agree_on_what_views_show(tmp_path: Path, share: float | str, nothing_on_the_cpu: bool) -> None:
     mp.spawn(refine, args=(str(tmp_path), share, nothing_on_the_cpu), nprocs=2)
     one, two = (json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2))
-    assert one == two and 20 < len(one["ran"]) < 400
+    assert one == two and 20 < len(one["ran"]) < 600
     assert one["shown"] == pytest.approx((0.25 + 0.875) / 2)

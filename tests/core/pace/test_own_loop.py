@@ -289,7 +289,7 @@ def test_views_named_twice_are_known_once():
     reports = []
     for views in (VIEWS, VIEWS * 40):
         with SkipGate(start_iter=40, refine_share="auto", warmup=0) as gate:
-            Loop(end=400).train(gate, views=views)
+            Loop(end=600).train(gate, views=views)
         reports.append(gate.report()["refine_share"])
     assert reports[0] == reports[1] < 1
 
