@@ -25,11 +25,12 @@ class GateOrderError(SkipGSError):
     """A verb of the gate was called out of order."""
 
 
-def warn_of_release(error: Exception, step: int | None) -> None:
-    """Warn that the gate let go of a training that goes on: no run is lost to the gate."""
+def warn_of_release(error: Exception, step: int | None) -> str:
+    """Warn that the gate let go of a training that goes on, and return the sentence: no run is lost to the gate."""
     reason = str(error) if isinstance(error, SkipGSError) else f"{type(error).__name__}: {error}"
-    warnings.warn(
-        f"The gate is released in iteration {step}, and training goes on without it, in all its iterations ({reason})",
-        RuntimeWarning,
-        stacklevel=3,
+    said = (
+        f"The gate is released in iteration {step}, and training goes on without it, in all its iterations ({reason})"
     )
+    said += f" ({reason})"
+    warnings.warn(said, RuntimeWarning, stacklevel=3)
+    return said

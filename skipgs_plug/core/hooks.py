@@ -125,13 +125,13 @@ class Hooks:
 
     def backward(self, loss: torch.Tensor, run: Callable[[], Any], view: Any = None) -> Any:
         """Gate a training backward: `run()` is the real one, and is called unless it is skipped."""
+        if self._released:
+            return run()
         call = _Call(run)
         with self._releasing_on_error(self._iteration.step, call):
-            if not self._released:
-                if self._is_training_backward():
-                    self._gate(loss, view, call)
-                else:
-                    return call()
+            if not self._is_training_backward():
+                return call()
+            self._gate(loss, view, call)
         # A gate that gave up before it decided owes the trainer its backward.
         return call() if self._released and not (call.made or self._iteration.skipped) else None
 
@@ -341,7 +341,7 @@ class Hooks:
                 raise
             self._released = True
             self._engine.release()
-            warn_of_release(error, step)
+            self._adapter.released = warn_of_release(error, step)
 
 
 class _Call:

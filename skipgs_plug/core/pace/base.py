@@ -13,6 +13,7 @@ from skipgs_plug.core.policy import Policy, SkipPolicy
 
 Source = tuple[CodeType, Mapping[str, Any]]  # code of the function that holds a loop, and the names that it knew
 Always = Callable[[range], Iterable[int]]
+NAMED = "named for this trainer"  # reason of iterations that must run and that no condition of the loop names
 
 
 def nothing_always(numbers: range) -> Iterable[int]:

@@ -9,6 +9,7 @@ from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.facts import Densification
+from skipgs_plug.core.pace.base import NAMED
 from skipgs_plug.core.pace.events import Events
 from skipgs_plug.core.pace.needs import growing_factor, growing_share
 from skipgs_plug.core.pace.rates import ScaledRates
@@ -83,15 +84,15 @@ class Growing:
             )
         marks = densification.marks
         events = set() if densification.numbers is None else set(densification.numbers(numbers))
+        others: dict[str, set[int]] = {}
         for reason, hits in found.items():
             if any(mark in reason for mark in marks):
                 events |= hits
+            else:
+                others[reason] = hits
         if not events and marks:
             return False
-        others = {reason: hits for reason, hits in found.items() if not any(mark in reason for mark in marks)}
-        self.always = dict(others)
-        if hidden:
-            self.always["named for this trainer"] = hidden
+        self.always = {**others, NAMED: hidden} if hidden else others
         self.events = Events(events, densification)
         if self._saved_events is not None:
             self.events.load_state_dict(self._saved_events)
@@ -121,7 +122,7 @@ class Growing:
             self.events.ran(number)
         else:
             self.events.skipped(number)
-        factor = growing_factor(self._length, self.share, self._shown) if self._config.compensates else 1.0
+        factor = self._factor
         if factor > 1.0 or not self._settled or self._config.max_gaussians is not None:
             self._rates.scale(factor, evenly=True)
         else:
@@ -137,6 +138,13 @@ class Growing:
             self._settled = True
         if self._config.growing == "auto":
             self.share = growing_share(self._length, self._n_views, self._shown)
+
+    @property
+    def _factor(self) -> float:
+        """Factor on learning rates in force."""
+        if self.share is None or not self._config.compensates:
+            return 1.0
+        return growing_factor(self._length, self.share, self._shown)
 
     def _full(self) -> bool:
         """Whether one more event could grow the scene beyond the number of Gaussians that the user set."""
@@ -158,9 +166,7 @@ class Growing:
             "iterations_skipped": self.sampling.left_out,
             "events_run": 0 if events is None else events.kept,
             "events_skipped": 0 if events is None else events.left_out,
-            "rate_factor": None
-            if self.share is None or not self._config.compensates
-            else growing_factor(self._length, self.share, self._shown),
+            "rate_factor": None if self.share is None or not self._config.compensates else self._factor,
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
         }
 

@@ -9,7 +9,7 @@ from typing import Any
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError, warn_of_release
 from skipgs_plug.core.facts import Densification, TrainerFacts
-from skipgs_plug.core.pace.base import Always, Pace, Source, nothing_always
+from skipgs_plug.core.pace.base import NAMED, Always, Pace, Source, nothing_always
 from skipgs_plug.core.pace.growing import Growing
 from skipgs_plug.core.pace.loop_finder import LoopFinder
 from skipgs_plug.core.pace.loop_range import LoopRange, line_of, require_planned
@@ -18,8 +18,6 @@ from skipgs_plug.core.pace.policy import RefinementPolicy
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refining import Refining
 from skipgs_plug.core.policy import Policy
-
-NAMED = "named for this trainer"
 
 
 class Phased(Pace):

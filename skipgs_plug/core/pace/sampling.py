@@ -41,8 +41,7 @@ class Sampling:
             self.left_out += 1
             return False
         if 0.0 < self.share < 1.0:
-            asked = self.run + self.left_out
-            while (self._due + _place(self._due)) / self.share < asked + 1:
+            while (self._due + _place(self._due)) / self.share < self.asked + 1:
                 self._due += 1
             must = must or self.run < self._due
         else:
