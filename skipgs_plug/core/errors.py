@@ -31,6 +31,5 @@ def warn_of_release(error: Exception, step: int | None) -> str:
     said = (
         f"The gate is released in iteration {step}, and training goes on without it, in all its iterations ({reason})"
     )
-    said += f" ({reason})"
     warnings.warn(said, RuntimeWarning, stacklevel=3)
     return said
