@@ -336,9 +336,8 @@ class Engine:
             self._guard.in_a_row = state["non_finite_in_a_row"]
             self.clock.load_state_dict(state["clock"])
             step = state["step"]
-        if (
-            not self.pace.leaves_out or not self.stats.events
-        ):  # where nothing pauses, means lag behind a change for long
+        # Where nothing pauses, means lag behind a change for long.
+        if not self.pace.leaves_out or not self.stats.events:
             self._scene_check.start()
         self.iteration.begin(step)
 
