@@ -50,6 +50,7 @@ class Phased(Pace):
         self._pure: tuple[str, ...] = ()
         self._conditions: tuple[dict[str, set[int]], dict[str, set[int]]] | None = None  # of both phases
         self._left_out = 0
+        self._attached = False  # by an adapter
         self._configured = self._removed = False
         self._planned = False  # the loop's conditions were read: nothing is refused any more
 
@@ -71,6 +72,7 @@ class Phased(Pace):
         densification: Densification | None = None,
     ) -> None:
         self._hidden, self._pure, self._densification = always, tuple(pure), densification
+        self._attached = True
 
     def follow(
         self,
@@ -114,7 +116,9 @@ class Phased(Pace):
         return None if loop is None else loop.current
 
     def begin(self, step: int, floor: float | None) -> None:
-        if self._finder.begins(step, self.needs_loop(step)) and step >= self._start and self.refining.first is None:
+        # An adapter's loop is looked for from the first iteration on: a refusal comes before anything is trained.
+        needed = self._attached or self.needs_loop(step)
+        if self._finder.begins(step, needed) and step >= self._start and self.refining.first is None:
             self.refining.first = step  # it began before its loop was known
             self.refining.counts()
 
