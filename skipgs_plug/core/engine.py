@@ -81,6 +81,7 @@ class Engine:
             self.pace = Compensated(config, self.rates) if config.compensates else Pace()
         self.trace: list[TraceRow] | None = [] if record_trace else None
         self.graph = SavedGraph()
+        weakref.finalize(self, self.graph.close)  # a gate that was never detached leaves no hooks behind
         self._skipped: list[weakref.ref[Tensor]] = []  # losses of this iteration whose backwards were skipped
         self._accumulates = False
         self._guard = NonFiniteGuard(config.on_nonfinite)

@@ -17,8 +17,6 @@ from torch import Tensor
 
 from skipgs_plug.core.errors import SkipGSError
 
-SMALLEST = 4096  # numbers in a tensor that is worth it: 16 KiB of float32
-
 
 class _Saved:
     """One saved tensor; None once it is freed."""
@@ -70,12 +68,10 @@ class SavedGraph:
         finally:
             self._freeing = False
 
-    def _pack(self, tensor: Tensor) -> Any:
-        return _Saved(tensor) if tensor.numel() >= SMALLEST else tensor
+    def _pack(self, tensor: Tensor) -> _Saved:
+        return _Saved(tensor)  # small ones too: PyTorch leaves the check of versions to hooks
 
-    def _unpack(self, saved: Any) -> Tensor:
-        if not isinstance(saved, _Saved):
-            return saved  # type: ignore[no-any-return]
+    def _unpack(self, saved: _Saved) -> Tensor:
         tensor = saved.tensor
         if tensor is None:
             if self._freeing:
@@ -86,7 +82,7 @@ class SavedGraph:
             )
         if self._freeing:
             saved.tensor = None
-        elif tensor._version != saved.version:  # PyTorch leaves this check to hooks
+        elif tensor._version != saved.version:
             raise RuntimeError(
                 "one of the variables needed for gradient computation has been modified by an inplace operation: "
                 f"{tuple(tensor.shape)} is at version {tensor._version}; expected version {saved.version} instead."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import random
 import weakref
@@ -211,3 +212,30 @@ def test_a_loss_that_stops_training_leaves_no_gradient(monkeypatch):
     with pytest.raises(SkipGSError, match="Loss is nan"):
         gate.backward(value.mean() * math.nan, view="a", step=0)
     assert value.grad is None
+
+
+def test_a_small_tensor_changed_in_place_is_refused_as_without_a_gate():
+    graph = SavedGraph()
+    graph.open()
+    try:
+        value = torch.ones(6, requires_grad=True)
+        loss = value.square().sum()
+        with torch.no_grad():
+            value.add_(1.0)
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            loss.backward()
+    finally:
+        graph.close()
+
+
+@pytest.mark.skipif(
+    not hasattr(torch._C._autograd, "_top_saved_tensors_default_hooks"), reason="this torch does not show its hooks"
+)
+def test_a_gate_that_is_dropped_leaves_no_hooks_behind():
+    gate = SkipGate(start_iter=0, warmup=0)
+    for step in range(3):
+        gate.backward(torch.ones((), requires_grad=True) * 1.0, view="a", step=step)
+    assert torch._C._autograd._top_saved_tensors_default_hooks(True) is not None
+    del gate
+    gc.collect()
+    assert torch._C._autograd._top_saved_tensors_default_hooks(True) is None
