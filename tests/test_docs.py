@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("examples/*.md")])
+FOLDERS = ("", "docs/", "docs/how_it_works/", "benchmarks/notes/", "examples/", "tests/")
+PAGES = sorted(page for folder in FOLDERS for page in ROOT.glob(f"{folder}*.md"))
+# What a user reads, from the first line to the last option.
+USER_PATH = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
 
 
 def anchors(page: Path) -> set[str]:
@@ -29,8 +32,22 @@ def test_links_between_files_lead_somewhere(page: Path) -> None:
 
 def test_readme_stays_short_and_links_every_page() -> None:
     readme = (ROOT / "README.md").read_text()
-    assert len(readme.splitlines()) <= 150
+    assert len(readme.splitlines()) <= 110
     assert {page.name for page in ROOT.glob("docs/*.md")} <= set(re.findall(r"\(docs/([\w.]+)", readme))
+
+
+def test_user_path_stays_below_8000_words() -> None:
+    words = {page.name: sum(any(map(str.isalnum, word)) for word in page.read_text().split()) for page in USER_PATH}
+    assert sum(words.values()) < 8_000, words
+
+
+def test_notes_and_inner_pages_are_listed_and_out_of_the_reading_path() -> None:
+    for folder in ("docs/how_it_works", "benchmarks/notes"):
+        index = (ROOT / folder / "README.md").read_text()
+        for page in ROOT.glob(f"{folder}/*.md"):
+            assert page.name == "README.md" or f"]({page.name})" in index, page
+    links = [link for page in USER_PATH for link in re.findall(r"\]\(([^)]*benchmarks/notes/[^)]*)\)", page.read_text())]
+    assert links == ["../benchmarks/notes/README.md"]
 
 
 @pytest.mark.parametrize(("mark", "command"), [("demo", "skipgs-plug demo"), ("tests", "pytest")])
