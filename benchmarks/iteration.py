@@ -25,7 +25,7 @@ PHASES = ("forward", "loss", "backward", "optimizer")
 WARM_UP = 6  # the SH degree has reached its maximum and every buffer its size
 
 # Milliseconds of OpenSplat bd0400d, the fastest CPU trainer found, for one iteration at SH degree 0 on two cores of an
-# AMD EPYC (Zen 5); medians of 24 iterations, three rounds. How it was built and timed stands in docs/how_it_works/rasterizer.md.
+# AMD EPYC (Zen 5); medians of 24 iterations, three rounds. See docs/how_it_works/rasterizer.md.
 PEER = {1_000: 175, 3_000: 202, 10_000: 317, 30_000: 449, 100_000: 821}
 PEER_THREADS, PEER_SH_DEGREE = 2, 0
 LARGE = (1_000_000, 3_000_000)  # of which no peer was timed

@@ -57,7 +57,7 @@ FILE = RESULTS / "raster.json"
 Part = Literal["scenes", "threads", "gaussians", "pixels", "sh_terms", "order", "shortcuts", "loss"]
 
 # Milliseconds of OpenSplat bd0400d's CPU rasterizer on one and on two cores of an AMD EPYC (Zen 5) for these scenes,
-# projection, forward, mean-L1 and backward; medians of 18 passes, three rounds. How it was built: docs/how_it_works/rasterizer.md.
+# projection, forward, mean-L1 and backward; medians of 18 passes, three rounds. See docs/how_it_works/rasterizer.md.
 PEER = {
     ("random", 1_000, "128x128"): (24, 21),
     ("random", 1_000, "256x256"): (94, 60),
