@@ -151,14 +151,13 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     size = ["--max-steps", "120", "--views", "10", "--width", "32", "--points", "200"]
     assert main(["demo", "--out", str(out), "--no-progress", *size]) == 0
     shown = capsys.readouterr().out
-    names = ("own", "gate", "refine_share=0.4")
-    rows = {
-        line.split()[0]: line.split() for line in shown.splitlines() if line.split()[:1] and line.split()[0] in names
-    }
-    assert [int(cell) for cell in rows["own"][4:6]] == [60, 0]
-    run, skipped = (int(cell) for cell in rows["gate"][4:6])
-    assert run + skipped == 60 and skipped > 0
-    assert [int(cell) for cell in rows["refine_share=0.4"][4:6]] == [24, 1]  # 40 %, and the last, which trains nothing
+    names = ("own", "gate", "share=auto")
+    rows = {line.split()[0]: line.split() for line in shown.splitlines() if len(line.split()) == 8}
+    assert [int(cell) for cell in rows["own"][3:5]] == [120, 120]
+    iterations, backwards = (int(cell) for cell in rows["gate"][3:5])
+    assert iterations == 120 and 60 < backwards < 120
+    report = json.loads((out / "share=auto" / "skipgs.json").read_text())
+    assert report["settings"]["share"] == "auto" and int(rows["share=auto"][3]) == report["iterations"]
     with Image.open(out / "comparison.png") as comparison:
         assert comparison.size == (2 * 32 * 7, 2 * 24 * 2 + 20)  # 7 columns, 2 views, doubled, below a title line
     with Image.open(out / "refinement.png") as plot:
