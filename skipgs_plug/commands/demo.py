@@ -119,10 +119,10 @@ def table(results: list[Result], trainer: Trainer) -> str:
             *(f"{name:>12}" + "".join(f"{cell:>11}" for cell in row) for name, *row in rows),
             "",
             f"{'; '.join(changes)}.",
-            f"{len(trainer.scene.test)} held-out views; densification ends at iteration {trainer.refine_stop_iter:,} of "
-            f"{trainer.max_steps:,}; backend {trainer.backend.name}.",
-            "T_total is the time of training, T_post of its part after densification. Evaluation and compilation are in "
-            "neither.",
+            f"{len(trainer.scene.test)} held-out views; iteration {trainer.refine_stop_iter:,} of {trainer.max_steps:,}"
+            f" ends densification; backend {trainer.backend.name}.",
+            "T_total is the time of training, T_post of its part after densification, both without evaluation and "
+            "compilation.",
             "This is one seed of one small scene: `skipgs-plug bench` compares with controls over several seeds.",
         ]
     )

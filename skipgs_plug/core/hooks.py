@@ -259,7 +259,8 @@ class Hooks:
         For what advances per call instead of by the iteration's number.
 
         Args:
-            owner, name: As for `wrap`.
+            owner: The object or class that holds the function, as for `wrap`.
+            name: Attribute of the function.
             caller: Name of the function whose calls count.
         """
         if not self._engine.pace.leaves_out:

@@ -9,7 +9,7 @@ from skipgs_plug.commands.options.parse import parse_as
 
 @dataclass
 class Args:
-    """Train a small ray-traced scene three times: as it is, with the paper's gate, and with share="auto". No download."""
+    """Train a small ray-traced scene as it is, with the paper's gate and with share="auto". No download."""
 
     out: str = "skipgs_demo"
     """Folder for models, pictures and numbers."""
