@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -168,7 +169,19 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_doctor_renders(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor"]) == 0
-    assert re.search(r"ok  warp +renders and differentiates on cpu", capsys.readouterr().out)
+    shown = capsys.readouterr().out
+    assert re.search(r"ok  warp +renders and differentiates on cpu", shown)
+    assert ("python -m benchmarks.gpu" in shown) == torch.cuda.is_available()
+
+
+def test_doctor_names_the_measurement_where_a_gpu_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "Imagined GPU")
+    assert main(["doctor"]) == 0  # warp renders; what gsplat does without a driver is a finding of its own
+    named = re.search(r"python -m (benchmarks\.gpu) SCENE", capsys.readouterr().out)
+    assert named and importlib.util.find_spec(named[1]) is not None
 
 
 HEAVY = {"torch", "numpy", "warp", "gsplat", "pycolmap", "scipy", "matplotlib", "torchmetrics", "PIL", "viser", "tqdm"}

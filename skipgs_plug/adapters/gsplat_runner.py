@@ -39,9 +39,11 @@ class GsplatRunner(AbstractAdapter):
     gated = "From `strategy.refine_stop_iter` on (15,000, for MCMC 25,000)."
     left_alone = (
         "MCMC's position noise is left out where the gradient step is: alone it is a random walk. Batches of several "
-        "images have one joint loss and so one mean. Where the script spawns a process for each GPU, `skipgs-plug run` "
-        "attaches a gate in each: a backward is left out when all of them would (checked with gloo on the CPU, not on "
-        "GPUs)."
+        "images have one joint loss and so one mean. Once `--post_processing ppisp` freezes the Gaussians, every "
+        "iteration runs as it is; `share`, `refine_share` and `compensate` are refused with it. gsplat's other example "
+        "scripts (2DGS, driving, surgery) have loops of their own, which no adapter knows. Where the script spawns a "
+        "process for each GPU, `skipgs-plug run` attaches a gate in each: a backward is left out when all of them "
+        "would (checked with gloo on the CPU, not on GPUs)."
     )
     stand_ins = "gsplat"
 
@@ -56,7 +58,7 @@ class GsplatRunner(AbstractAdapter):
 
     @classmethod
     def recognises_script(cls, code: LoopCode) -> bool:
-        return "Runner" in code.names and any(name.startswith("gsplat.") for name in code.names)
+        return {"Runner", "gsplat.distributed"} <= code.names  # without the second it is simple_trainer_2dgs.py
 
     def attach_script(self, hooks: Hooks) -> None:
         def started(
@@ -115,6 +117,7 @@ class GsplatRunner(AbstractAdapter):
             TrainerFacts(
                 strategy.refine_stop_iter,
                 view_names=names,
+                epoch=-(-len(runner.trainset) // runner.cfg.batch_size),
                 max_steps=runner.cfg.max_steps - 1,
                 world_size=runner.world_size,
                 gradients_read_until=gradients_read_until(strategy),

@@ -35,6 +35,7 @@ class TrainerFacts:
         start_iter: First iteration after densification, in the trainer's counting; None when it has no
             densification to end. Used when the settings give none.
         view_names: Keys of all training views, checked for uniqueness.
+        epoch: Number of iterations in which every view comes up once; None if an iteration shows one of `view_names`.
         max_steps: Last iteration; a gate that starts after it is worth a warning.
         world_size: Number of processes, when the trainer knows better than WORLD_SIZE.
         gradients_read_until: Before this iteration more than the optimizers reads gradients, densification
@@ -48,6 +49,7 @@ class TrainerFacts:
     start_iter: int | None
     _: KW_ONLY
     view_names: Iterable[str] | None = None
+    epoch: int | None = None
     max_steps: int | None = None
     world_size: int | None = None
     gradients_read_until: int | None = None

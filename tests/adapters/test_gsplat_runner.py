@@ -10,6 +10,8 @@ from lookalikes.gsplat_runner import DefaultStrategy, HeadRunner, MCMCStrategy, 
 from lookalikes.splats import NAMES, log, new_log
 
 from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError
+from skipgs_plug.adapters.registry import find_script_adapter
+from skipgs_plug.core.errors import UnknownTrainerError
 
 MCMC = gsplat("mcmc", Runner, MCMCStrategy)
 
@@ -134,3 +136,57 @@ def test_iterations_that_train_a_controller_alone_are_not_left_out(settings):
         SkipGate(HeadRunner(DefaultStrategy(), **PPISP), **settings)
     SkipGate(HeadRunner(DefaultStrategy(), **PPISP)).detach()
     SkipGate(HeadRunner(DefaultStrategy(), **{**PPISP, "ppisp_use_controller": False}), **settings).detach()
+
+
+def test_the_papers_gate_skips_no_backward_of_the_controller(monkeypatch):
+    plain, gated = (HeadRunner(DefaultStrategy(), **PPISP) for _ in range(2))
+    stepped = []
+    step = torch.optim.Adam.step
+
+    def noted(optimizer, *args, **kwargs):
+        if optimizer is gated.controller_optimizer:
+            stepped.append(gated.controller.grad is not None)
+        return step(optimizer, *args, **kwargs)
+
+    monkeypatch.setattr(torch.optim.Adam, "step", noted)
+    new_log()
+    plain.train()
+    new_log()
+    with SkipGate(gated, start_iter=20, policy=SkipAlways()) as gate:
+        gated.train()
+    assert gate.report()["backwards_skipped"] == 20 and stepped == [True] * 20
+    assert gated.controller.item() != plain.controller.item() != 1.0  # trained on other Gaussians
+
+
+@pytest.mark.parametrize("batch_size, share", [(1, 0.353), (2, 0.297)])
+def test_batches_count_towards_the_visits_of_each_view(batch_size, share, monkeypatch):
+    """Of 1,040 views each is seen once in 520 iterations of two: "auto" needs fewer than of one at a time."""
+    runner = HeadRunner(DefaultStrategy(), batch_size=batch_size)
+    runner.cfg.max_steps = 3020
+    names = runner.parser.image_names
+    names += [f"more/{i}.png" for i in range(1040 - len(runner.trainset))]
+    runner.trainset.indices += range(6, len(names))
+    gate = SkipGate(runner, refine_share="auto")
+    original = log.begins
+
+    def begins(iteration, parameters):
+        original(iteration, parameters)
+        if iteration == 21:
+            gate.detach()
+            raise KeyboardInterrupt
+
+    new_log()
+    monkeypatch.setattr(log, "begins", begins)
+    with pytest.raises(KeyboardInterrupt):
+        runner.train(last=3019)
+    assert gate.report()["refine_share"] == pytest.approx(share, abs=5e-4)
+
+
+def test_gsplats_other_scripts_are_not_taken_for_it(tmp_path):
+    """simple_trainer_2dgs.py has a Runner too, which its own main() builds without gsplat.distributed."""
+    script = tmp_path / "simple_trainer_2dgs.py"
+    script.write_text("from gsplat.strategy import DefaultStrategy\nclass Runner:\n    pass\ndef main():\n    pass\n")
+    with pytest.raises(UnknownTrainerError, match="no function training\\(\\), but Runner, main"):
+        find_script_adapter(script)
+    script.write_text("from gsplat.distributed import cli\nclass Runner:\n    pass\n")
+    assert find_script_adapter(script).name == "gsplat"

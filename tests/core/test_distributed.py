@@ -171,3 +171,31 @@ def test_ranks_agree_on_what_views_show(tmp_path: Path, share: float | str, noth
     one, two = (json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2))
     assert one == two and 20 < len(one["ran"]) < 600
     assert one["shown"] == pytest.approx((0.25 + 0.875) / 2)
+
+
+def grow(rank: int, folder: str, bound: int | None) -> None:
+    """Ranks that hold different numbers of Gaussians, as gsplat's do, which deals them out."""
+    start(rank, folder)
+    held = 40 + 30 * rank
+    torch.manual_seed(rank)
+    means = torch.nn.Parameter(torch.randn(held, 3))
+    optimizer = torch.optim.Adam([{"params": [means], "lr": 0.01, "name": "means"}])
+    gate = SkipGate(start_iter=400, share=0.5, max_gaussians=bound)
+    ran = []
+    for step in gate.iterations(range(500), views=[f"{view}.png" for view in range(8)], events=range(20, 400, 20)):
+        ran.append(step)
+        if gate.backward(means.square().mean(), view=f"{(step * 2 + rank) % 8}.png", step=step):
+            optimizer.step()
+            optimizer.zero_grad()
+    grown = gate.report()["growing"]
+    Path(folder, f"{rank}.json").write_text(json.dumps({"ran": ran, "events": grown["events_run"]}))
+    dist.destroy_process_group()
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("bound, events", [(60, False), (None, True)])  # the second rank alone is above 60
+def test_ranks_agree_on_the_bound_on_gaussians(tmp_path: Path, bound: int | None, events: bool) -> None:
+    mp.spawn(grow, args=(str(tmp_path), bound), nprocs=2)
+    one, two = (json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2))
+    # The first event is asked about before any step showed how many there are.
+    assert one == two and (one["events"] > 1) == events

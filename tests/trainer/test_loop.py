@@ -154,6 +154,22 @@ def test_callers_random_state_is_left_alone(trainer: Trainer) -> None:
     assert torch.equal(torch.rand(3), expected)
 
 
+def test_densification_initialises_no_gpu(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a machine with GPUs, a training on the CPU asks none of them for its random state."""
+    asked: list[object] = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "get_rng_state", lambda device=None: asked.append(device) or torch.get_rng_state())
+    monkeypatch.setattr(torch.cuda, "set_rng_state", lambda state, device=None: asked.append(device))
+    with pytest.warns(UserWarning, match="CUDA reports"), torch.random.fork_rng():
+        pass
+    assert len(asked) == 4  # the probe sees a fork without a list of devices
+    asked.clear()
+    start = trainer.num_gaussians
+    trainer.train(until=trainer.refine_stop_iter, progress=False)
+    assert trainer.num_gaussians != start and not asked
+
+
 def test_trainers_in_other_threads_wait_while_one_draws(trainer: Trainer) -> None:
     def draw(step: int) -> torch.Tensor:
         with trainer._seeded(step):

@@ -46,7 +46,7 @@ class Growing:
         self._must: frozenset[int] = frozenset()
         self._first_number: int | None = None
         self._length = 0
-        self._n_views = 0
+        self._epoch = 0
         self._shown: float | None = None
         self._settled = False
         self._saved_events: dict[str, Any] | None = None
@@ -63,7 +63,7 @@ class Growing:
         found: Mapping[str, set[int]],
         hidden: set[int],
         densification: Densification,
-        n_views: int | None,
+        epoch: int | None,
     ) -> bool:
         """Take the facts that are known when the loop begins; False if the loop shows no densification event.
 
@@ -72,12 +72,12 @@ class Growing:
             found: Iterations on which something depends, by the condition of the loop.
             hidden: Further iterations of these that must run.
             densification: The trainer's events.
-            n_views: Number of training views; None if unknown.
+            epoch: Number of iterations in which every view comes up once; None if unknown.
 
         Raises:
             SkipGSError: "auto" must know the number of views, and it is unknown.
         """
-        if self.share is None and n_views is None:
+        if self.share is None and epoch is None:
             raise SkipGSError(
                 'share="auto" must know the training views; give their names to gate.iterations() as views=, '
                 "or a share."
@@ -104,7 +104,7 @@ class Growing:
         if self._first_number is None:
             self._first_number = numbers.start
         self._length = numbers.stop - self._first_number
-        self._n_views = n_views or self._n_views
+        self._epoch = epoch or self._epoch
         return True
 
     def runs(self, number: int) -> bool:
@@ -137,7 +137,7 @@ class Growing:
             self._shown = self._rates.shown.share
             self._settled = True
         if self._config.growing == "auto":
-            self.share = growing_share(self._length, self._n_views, self._shown)
+            self.share = growing_share(self._length, self._epoch, self._shown)
 
     @property
     def _factor(self) -> float:
@@ -175,7 +175,7 @@ class Growing:
             "asked": self._config.growing,
             "share": self.share,
             "first": self._first_number,
-            "views": self._n_views,
+            "views": self._epoch,
             "settled": self._settled,
             "gaussians_shown": self._shown,
             "sampling": self.sampling.state_dict(),
@@ -185,7 +185,7 @@ class Growing:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict()`; `begin` follows."""
         self.share, self._first_number = state["share"], state["first"]
-        self._n_views = state["views"]
+        self._epoch = state["views"]
         self._settled, self._shown = state["settled"], state["gaussians_shown"]
         self.sampling.load_state_dict(state["sampling"])
         self._saved_events, self.events = state["events"], None

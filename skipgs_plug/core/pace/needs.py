@@ -22,7 +22,7 @@ LEAST_STEPS = 400  # fewer have no room to shrink in: 300 after a thinned growth
 RARE_SHARE = 0.46
 
 
-def refining_share(iterations: int, n_views: int) -> float:
+def refining_share(iterations: int, epoch: int) -> float:
     """Share of the refinement iterations that may be needed, known beforehand.
 
     A fifth, or more where views are many for so few iterations or these are few by themselves; all where not every view
@@ -30,26 +30,26 @@ def refining_share(iterations: int, n_views: int) -> float:
 
     Args:
         iterations: Refinement iterations of the schedule.
-        n_views: Training views.
+        epoch: Number of iterations in which every view comes up once.
     """
-    if iterations < n_views:
+    if iterations < epoch:
         return 1.0
-    return min(1.0, max(LEAST_SHARE, LEAST_STEPS / iterations, RARE_SHARE * (n_views / iterations) ** 0.25))
+    return min(1.0, max(LEAST_SHARE, LEAST_STEPS / iterations, RARE_SHARE * (epoch / iterations) ** 0.25))
 
 
-def growing_share(iterations: int, n_views: int, shown: float | None) -> float:
+def growing_share(iterations: int, epoch: int, shown: float | None) -> float:
     """Share of the iterations before the end of densification that are needed.
 
     Args:
         iterations: Iterations of the schedule until densification ends.
-        n_views: Training views.
+        epoch: Number of iterations in which every view comes up once.
         shown: Share of the Gaussians that a view shows; None before it is measured.
     """
     if iterations < 1:
         return 1.0
     full_views = shown is not None and shown >= NEARLY_ALL
     steps = LEAST_GROWING_STEPS_FULL_VIEWS if full_views else LEAST_GROWING_STEPS
-    return min(1.0, max(LEAST_GROWING_SHARE, steps / iterations, GROWING_VISITS * n_views / iterations))
+    return min(1.0, max(LEAST_GROWING_SHARE, steps / iterations, GROWING_VISITS * epoch / iterations))
 
 
 def growing_factor(iterations: int, share: float, shown: float | None) -> float:

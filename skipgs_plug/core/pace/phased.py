@@ -43,6 +43,7 @@ class Phased(Pace):
         self._densification: Densification | None = None
         self._keeps_rates = False
         self._views: list[str] | None = None
+        self._epoch: int | None = None  # iterations in which every view comes up once; None: as many as there are views
         self._start = 0
         self._last: int | None = None
         self._hidden: Always = nothing_always
@@ -58,7 +59,7 @@ class Phased(Pace):
 
     def configure(self, start: int, facts: TrainerFacts, views: list[str] | None) -> None:
         self._start, self._last, self._views = start, facts.max_steps, views
-        self._keeps_rates = facts.accumulates
+        self._keeps_rates, self._epoch = facts.accumulates, facts.epoch
         self._densification = facts.densification or self._densification
         self._configured = True
 
@@ -204,12 +205,12 @@ class Phased(Pace):
         if hidden:
             found[1][NAMED] = hidden
         self._conditions = found[0], found[1]
-        self.refining.begin(self._last, found[1], self._views, self._keeps_rates)
+        epoch = self._epoch or (None if self._views is None else len(self._views))
+        self.refining.begin(self._last, found[1], self._views, epoch, self._keeps_rates)
         if self.growing is not None and grown:
-            n_views = None if self._views is None else len(self._views)
             assert self._densification is not None
             hidden = {n for n in (*self._hidden(grown), *self._chosen) if n in grown}
-            if not self.growing.begin(grown, found[0], hidden, self._densification, n_views):
+            if not self.growing.begin(grown, found[0], hidden, self._densification, epoch):
                 self._grow_whole(f"No condition of the loop names {', '.join(self._densification.marks)}")
 
     def _require_events(self) -> None:

@@ -57,13 +57,21 @@ class Refining:
         """Whether an iteration of the phase was asked about."""
         return self._begun
 
-    def begin(self, last: int, always: dict[str, set[int]], views: list[str] | None, keeps_rates: bool) -> None:
+    def begin(
+        self,
+        last: int,
+        always: dict[str, set[int]],
+        views: list[str] | None,
+        epoch: int | None,
+        keeps_rates: bool,
+    ) -> None:
         """Refinement begins with iteration `first`.
 
         Args:
             last: Last iteration of the run.
             always: Iterations that must run, by the reason.
             views: Keys of all training views; None if unknown.
+            epoch: Number of iterations in which every view comes up once; None if unknown.
             keeps_rates: Leave learning rates alone: the trainer takes as many steps as before.
 
         Raises:
@@ -74,12 +82,12 @@ class Refining:
         self._must = frozenset().union(*always.values()) if always else frozenset()
         total = last + 1 - self.first
         if self._auto and self.share is None:
-            if views is None:
+            if epoch is None:
                 raise SkipGSError(
                     'refine_share="auto" must know the training views; give their names to gate.iterations() as views='
                     ", or a share."
                 )
-            self.share = refining_share(total, len(views))
+            self.share = refining_share(total, epoch)
         assert self.share is not None
         # Several processes train on different views at a time, so none can be kept out of training and watched.
         if self._auto and views is not None and self.stopping is None and distributed.group_size() == 1:

@@ -119,11 +119,32 @@ class Stage:
 
 
 class HeadRunner(Runner):
-    """At HEAD the training view is rendered through a stage."""
+    """At HEAD the training view is rendered through a stage, and a PPISP controller is distilled at the end.
+
+    From that iteration on the Gaussians are frozen, the strategy is not called, and the controller alone trains.
+    """
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         self.stage = Stage(self.rasterize_splats)
+        self.controller = torch.nn.Parameter(torch.ones(()))
+        self.controller_optimizer = torch.optim.Adam([self.controller], lr=0.01)
+
+    def train(self, last=LAST):
+        cfg = self.cfg
+        distils = getattr(cfg, "post_processing", None) == "ppisp" and cfg.ppisp_controller_distillation
+        first = cfg.ppisp_controller_activation_num_steps if distils else last + 1
+        super().train(min(last, first - 1))
+        for value in self.splats.values():
+            value.requires_grad_(False)
+        for step in range(first, last + 1):
+            camera = pick(list(self.images.values()), step)
+            image_ids = torch.tensor([self.trainset.indices.index(self.number_of(camera))])
+            renders, _, _ = self.render_training_view(camtoworlds=[camera], image_ids=image_ids, sh_degree=3)
+            loss = photo_loss(renders[0] * self.controller, camera)
+            loss.backward()
+            self.controller_optimizer.step()
+            self.controller_optimizer.zero_grad(set_to_none=True)
 
     def render_training_view(self, **kwargs):
         return self.stage.render("scene", **kwargs)
