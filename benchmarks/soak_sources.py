@@ -72,7 +72,7 @@ def load(path: Path) -> None:
         check_view(view, path)
         assert view.image.dtype == torch.uint8 and view.image.shape == (view.height, view.width, 3)
         assert view.mask is None or view.mask.shape == (view.height, view.width)
-        assert view.K.dtype == view.viewmat.dtype == torch.float32
+        assert view.K.dtype == view.viewmat.dtype == torch.float64
 
 
 def write_colmap(scene: Scene, root: Path) -> Path:

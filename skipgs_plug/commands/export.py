@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -12,8 +13,8 @@ from skipgs_plug.commands.options.export import Args
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.ply import write_ply
-from skipgs_plug.view.model import open_snapshots
-from skipgs_plug.view.spz import to_spz
+from skipgs_plug.view.model import is_antialiased, open_snapshots
+from skipgs_plug.view.spz import POSITION_BITS, to_spz
 
 log = logging.getLogger(__name__)
 
@@ -26,18 +27,28 @@ def run(args: Args) -> int:
     ending = next((ending for ending in (*FORMATS, ".spz", ".ply") if out.name.lower().endswith(ending)), None)
     if ending is None:
         raise InputError(f"{out.name} has an ending that is not written here; use {', '.join(FORMATS)}, .spz or .ply.")
-    splats = open_snapshots(args.model)[-1].load()
+    source = Path(args.model).expanduser()
+    splats = open_snapshots(source)[-1].load()
     if ending == ".ply":
         write_ply(splats, out)
     else:
         if splats["means"].dtype == torch.float64:
-            log.warning("%s holds positions of single precision: they are rounded. A .ply keeps them.", out)
+            log.warning(
+                "%s holds positions of single precision: they are rounded by up to %.2g units. A .ply keeps them.",
+                *(out, rounding(splats["means"], ending)),
+            )
             splats["means"] = splats["means"].float()
-        data = to_spz(splats) if ending == ".spz" else exported(splats, FORMATS[ending])
+        data = to_spz(splats, is_antialiased(source)) if ending == ".spz" else exported(splats, FORMATS[ending])
         with write_aside(out) as temporary:
             temporary.write_bytes(data)
     print(f"{len(splats['means']):,} Gaussians, {out.stat().st_size / 2**20:.1f} MiB: {out}")
     return 0
+
+
+def rounding(means: Tensor, ending: str) -> float:
+    """Return by how much a format moves positions [N, 3] at most."""
+    largest = float(means.abs().max())
+    return largest * 2.0 ** -(POSITION_BITS if ending == ".spz" else 24)
 
 
 def exported(splats: Mapping[str, Tensor], name: str) -> bytes:

@@ -78,7 +78,8 @@ def run(args: Args) -> int:
 def share(folder: RunFolder, trainer: Trainer) -> None:
     """Write the model small enough to be sent, and say what to open and what to share."""
     path = folder.root / f"{folder.root.resolve().name}.spz"
-    data = to_spz({name: parameter.detach().cpu() for name, parameter in trainer.splats.items()})
+    local = {name: parameter.detach().cpu() for name, parameter in trainer.splats.items()}
+    data = to_spz(trainer.scene.frame.dataset_splats(local), trainer.config.antialiased)
     with write_aside(path, len(data)) as temporary:
         temporary.write_bytes(data)
     print(f"Open it: {next_command('view', folder.root)}; share it: {path} ({len(data) / 1e6:.1f} MB)")

@@ -57,7 +57,8 @@ def walk(folder: Path) -> Iterator[Path]:
     """Yield the files in a folder and in those below it, also behind links, each real folder once."""
     seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True):
-        folders.sort()
+        # What starts with a dot was put there by programs: .ipynb_checkpoints, .thumbnails, .Trash.
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
         real = os.path.realpath(root)
         if real in seen:  # a link to a folder that holds it, or a second one
             folders.clear()

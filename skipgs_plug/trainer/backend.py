@@ -40,8 +40,8 @@ class Backend:
 
         Args:
             splats: logarithms of scales, logits of opacities, SH coefficients in two parts.
-            viewmat: world to camera.
-            K: intrinsics in pixels.
+            viewmat: world to camera, of any float type.
+            K: intrinsics in pixels, likewise.
             background: colour behind everything; None for black, which needs no compositing.
             antialiased: compensate opacities for the blur.
             with_rows: whether the dictionary has to hold rows of Gaussians.
@@ -51,7 +51,7 @@ class Backend:
         Returns:
             Image [H, W, 3] and the dictionary of `rasterization`.
         """
-        viewmat, K = viewmat.to(self.device), K.to(self.device)
+        viewmat, K = (matrix.to(self.device, torch.float32) for matrix in (viewmat, K))
         if self.name == "warp":
             from skipgs_plug.fallback_raster import rasterize_splats
 

@@ -17,6 +17,8 @@ from torch import Tensor
 
 FAR = 100.0  # distance from the origin, in extents, from which float32 loses what a picture shows
 SMALL, LARGE = 2.0**-6, 2.0**10  # extents between which a scene keeps its unit
+MOST = 0.9  # of the Gaussians of a model alone, whose distance from its middle counts as its extent
+SAME = 1e-5  # of the size of a scene, by which the frames of two sessions may differ
 SHARE_OF_DEPTH = 0.01  # of the distance to points, below which cameras that turn on the spot have no extent
 
 
@@ -41,6 +43,19 @@ class Frame:
         if len(points):
             depth = float(np.median(np.linalg.norm(points - centre, axis=1)))
             extent = max(extent, SHARE_OF_DEPTH * depth)
+        return cls.at(centre, extent)
+
+    @classmethod
+    def around(cls, positions: np.ndarray) -> Frame:
+        """Return the frame of a model alone, by its positions [N, 3], of which some may be far off."""
+        positions = np.asarray(positions, dtype=np.float64)
+        centre = np.median(positions, axis=0)
+        extent = float(np.quantile(np.linalg.norm(positions - centre, axis=1), MOST))
+        return cls.at(centre, extent)
+
+    @classmethod
+    def at(cls, centre: np.ndarray, extent: float) -> Frame:
+        """Return the frame of what lies within `extent` of `centre` [3]; that of the dataset where float32 will do."""
         if not (extent > 0.0 and math.isfinite(extent)):
             return cls()
         kept = SMALL <= extent < LARGE
@@ -53,6 +68,11 @@ class Frame:
     def moves(self) -> bool:
         """Whether local coordinates differ from those of the dataset."""
         return self != Frame()
+
+    def is_like(self, other: Frame, size: float) -> bool:
+        """Whether both are the same for a scene of this size in local units, but for rounding."""
+        apart = max(abs(own - their) for own, their in zip(self.centre, other.centre, strict=True))
+        return self.unit == other.unit and apart <= SAME * size * self.unit
 
     def as_dict(self) -> dict[str, object]:
         """Return the entries of skipgs.json and cfg.yml: what was subtracted from positions, then divided by."""

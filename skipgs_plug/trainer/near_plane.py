@@ -67,7 +67,7 @@ def before_a_lens(views: list[View], points: torch.Tensor, near: float) -> torch
     """
     hidden = torch.zeros(len(points), dtype=torch.bool)
     for view in views:
-        depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]
+        depth = points.double() @ view.viewmat[2, :3].double() + view.viewmat[2, 3].double()
         close = ((depth > 0) & (depth < near)).nonzero()[:, 0]  # few: only these are projected
         hidden[close] |= depths_in_picture(view, points[close]) > 0
     candidates = hidden.nonzero()[:, 0]

@@ -106,8 +106,8 @@ class Photographs:
         return View(
             view.name,
             there(view.image) if self.resident or self._streams(view) else _pinned(view.image),
-            there(view.K),
-            there(view.viewmat),
+            there(view.K.float()),
+            there(view.viewmat.float()),
             None if view.mask is None else there(view.mask),
         )
 

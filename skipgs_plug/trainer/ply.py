@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 from collections.abc import Mapping
@@ -16,6 +17,7 @@ from skipgs_plug.trainer.compressed_ply import SH_C0, decompress, is_compressed
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.frame import FAR
+from skipgs_plug.trainer.lfs import HINT, is_pointer
 from skipgs_plug.trainer.scene import check_points
 
 log = logging.getLogger(__name__)
@@ -110,7 +112,10 @@ def model_of(path: Path, vertices: Mapping[str, np.ndarray]) -> dict[str, Tensor
     """Return the Gaussians of `read_ply`."""
     count = sum(name.startswith("f_rest_") for name in vertices)
     if count not in REST_COUNTS:
-        raise InputError(f"PLY {path} has {count} f_rest properties, expected one of {REST_COUNTS}; export it again.")
+        raise InputError(
+            f"PLY {path} has {count} f_rest properties, expected one of {REST_COUNTS}; export it with "
+            "spherical harmonics of degree 3 or less."
+        )
     names = [n for n in PROPERTIES if n[0] != "n" and (not n.startswith("f_rest") or int(n[7:]) < count)]
     lacking = [name for name in names if name not in vertices]
     if lacking:
@@ -214,7 +219,7 @@ def read_vertices(path: Path, rounded: bool = True) -> dict[str, np.ndarray]:
 
     check_header(path)
     try:
-        content = PlyData.read(str(path), mmap=False)
+        content = PlyData.read(without_blank_lines(path), mmap=False)
         elements = {
             element.name: {prop.name: np.asarray(element[prop.name]) for prop in element.properties}
             for element in content.elements
@@ -228,11 +233,39 @@ def read_vertices(path: Path, rounded: bool = True) -> dict[str, np.ndarray]:
                     f"made of, or run: {next_command('export', path, path.with_suffix('').with_suffix('.ply'))}."
                 )
             return decompress(vertices, elements["chunk"], elements.get("sh", {}))
-        return vertices
+        return plain_names(vertices)
     except InputError:
         raise
     except (PlyParseError, KeyError, ValueError, TypeError, EOFError, MemoryError, OSError) as error:
         raise InputError(f"PLY {path} is damaged or not a PLY ({reason(error)}); export it again.") from error
+
+
+def without_blank_lines(path: Path) -> str | io.BytesIO:
+    """Return what plyfile reads: the path, or the content of a text PLY without blank lines, which it does not take."""
+    data = path.read_bytes() if is_text(path) else b""
+    header, end, body = data.partition(b"end_header")
+    lines = body.splitlines()
+    if all(line.strip() for line in lines[1:]):  # the first is the rest of end_header's
+        return str(path)
+    kept = [line for line in lines[1:] if line.strip()]
+    return io.BytesIO(b"\n".join([header.replace(b"\r\n", b"\n") + end, *kept]) + b"\n")
+
+
+def is_text(path: Path) -> bool:
+    """Whether a PLY says that it holds its numbers as text."""
+    with open(path, "rb") as stream:
+        words = [line.split() for line in stream.read(MAX_HEADER).partition(b"end_header")[0].splitlines()]
+    return any(line[:2] == [b"format", b"ascii"] for line in words)
+
+
+def plain_names(vertices: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return columns of a model by their own names: CloudCompare writes `scalar_f_dc_0`, or `scalar_scal_f_dc_0`."""
+    result = dict(vertices)
+    for name, values in vertices.items():
+        plain = name.removeprefix("scalar_").removeprefix("scal_")
+        if plain in PROPERTIES:
+            result.setdefault(plain, values)
+    return result
 
 
 def check_header(path: Path) -> None:
@@ -245,6 +278,8 @@ def check_header(path: Path) -> None:
     except OSError as error:
         raise InputError(f"PLY {path} cannot be read ({reason(error)}).") from error
     header, found, _ = head.partition(b"end_header")
+    if is_pointer(path):
+        raise InputError(f"PLY {path} cannot be read: {HINT}.")
     if not header.startswith(b"ply") or not found:
         raise InputError(f"PLY {path} is damaged or not a PLY (no header); export it again.")
     element, count, needed = b"", 0, len(header)

@@ -24,13 +24,14 @@ class View:
     """One posed photograph.
 
     `name` is the image path relative to the scene, unique in it: the key under which a gate remembers the
-    view. The camera looks along +z, x right, y down; pixel centres lie at +0.5.
+    view. The camera looks along +z, x right, y down; pixel centres lie at +0.5. Camera matrices are float64, so that
+    a scene has the same cameras whatever format it came in; renderers take them as float32.
     """
 
     name: str
     image: Tensor  # [H, W, 3] uint8
-    K: Tensor  # [3, 3] float32, pixels of `image`
-    viewmat: Tensor  # [4, 4] float32, world to camera
+    K: Tensor  # [3, 3] float64, pixels of `image`
+    viewmat: Tensor  # [4, 4] float64, world to camera
     mask: Tensor | None = None  # [H, W] bool, False where a pixel does not count; None: all count
 
     @property
@@ -99,9 +100,12 @@ def assemble_scene(
         seen.add(view.name)
         check_view(view, source)
     check_points(points, source)
-    frame = Frame.of(torch.stack([view.viewmat for view in train]).double().numpy(), np.asarray(points, np.float64))
     for view in train + test:
-        view.viewmat = (frame.local_pose(view.viewmat) if frame.moves else view.viewmat).float()
+        view.viewmat, view.K = view.viewmat.double(), view.K.double()
+    frame = Frame.of(torch.stack([view.viewmat for view in train]).numpy(), np.asarray(points, np.float64))
+    if frame.moves:
+        for view in train + test:
+            view.viewmat = frame.local_pose(view.viewmat)
     points = frame.to_local(points) if frame.moves else points
     return Scene(
         name=name,

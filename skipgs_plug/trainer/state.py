@@ -20,6 +20,7 @@ from skipgs_plug.trainer.backend import Backend
 from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import DamagedCheckpointError, InputError, MissingFileError
+from skipgs_plug.trainer.frame import SAME, frame_of
 from skipgs_plug.trainer.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -136,7 +137,12 @@ def save_checkpoint(trainer: Capturable, path: str | Path) -> None:
     content = {
         **_view(trainer),
         "config": {**dataclasses.asdict(trainer.config), "schedule_steps": trainer.config.schedule},
-        "scene": {"name": trainer.scene.name, "view_names": list(trainer.view_names), **trainer.scene.frame.as_dict()},
+        "scene": {
+            "name": trainer.scene.name,
+            "view_names": list(trainer.view_names),
+            "viewmats": _viewmats(trainer.scene),
+            **trainer.scene.frame.as_dict(),
+        },
     }
     size = sum(tensor.nbytes for tensor in _tensors(content))
     # Through a file of ours: given a path, torch forgets why it could not write.
@@ -245,6 +251,7 @@ def _check_tensors(content: dict[str, Any]) -> None:
 def _require_same_run(trainer: Capturable, content: dict[str, Any], path: str | Path) -> None:
     if content["scene"]["view_names"] != list(trainer.view_names):
         raise InputError(f"Checkpoint {path} was made with other training views; resume with its own scene and split.")
+    _require_same_cameras(trainer.scene, content["scene"], path)
     # A checkpoint that is older than a setting was made with what is its default now.
     made_with = {field.name: field.default for field in dataclasses.fields(TrainConfig)} | content["config"]
     for name, value in dataclasses.asdict(trainer.config).items():
@@ -263,6 +270,39 @@ def _require_same_run(trainer: Capturable, content: dict[str, Any], path: str | 
             f"Checkpoint {path} is {content['step']} iterations old, more than max_steps={trainer.max_steps}; "
             "give at least as many."
         )
+
+
+def _require_same_cameras(scene: Scene, saved: Mapping[str, Any], path: str | Path) -> None:
+    """Raise InputError if Gaussians of a checkpoint would not lie where the cameras of the scene look."""
+    try:
+        frame = frame_of(saved)
+    except (TypeError, ValueError, KeyError) as error:
+        raise DamagedCheckpointError(f"Checkpoint {path} is damaged ({error}); use an older one.") from error
+    if not frame.is_like(scene.frame, scene.scene_scale):
+        raise InputError(
+            f"Checkpoint {path} was trained with {frame.as_dict()} subtracted and divided by, which is "
+            f"{scene.frame.as_dict()} for the scene now; resume with the scene as it was, or begin a new run with "
+            "--init-ply and the PLY of this one."
+        )
+    poses = saved.get("viewmats")  # not in checkpoints of version 0.1.0
+    if poses is None:
+        return
+    own = _viewmats(scene)
+    if not isinstance(poses, Tensor) or poses.shape != own.shape:
+        raise DamagedCheckpointError(f"Checkpoint {path} is damaged (its cameras are none); use an older one.")
+    apart = (poses.cpu().double() - own).abs()
+    apart[:, :3, 3] /= scene.scene_scale
+    changed = (apart.amax(dim=(1, 2)) > SAME).nonzero()[:, 0].tolist()
+    if changed:
+        raise InputError(
+            f"Checkpoint {path} was trained with other poses of {len(changed)} of its {len(own)} cameras, such as "
+            f"{scene.train[changed[0]].name!r}; resume with the reconstruction it was begun with, or start afresh."
+        )
+
+
+def _viewmats(scene: Scene) -> Tensor:
+    """Return the poses [C, 4, 4] of the training views."""
+    return torch.stack([view.viewmat for view in scene.train]).double().cpu()
 
 
 def _require_same_shape(trainer: Capturable, content: dict[str, Any], path: str | Path) -> None:

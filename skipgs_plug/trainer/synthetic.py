@@ -55,8 +55,8 @@ def make_scene(
         view = View(
             f"view_{i:03d}.png",
             torch.from_numpy(np.rint(image * 255).astype(np.uint8)),
-            torch.from_numpy(K).float(),
-            torch.from_numpy(viewmat).float(),
+            torch.from_numpy(K),
+            torch.from_numpy(viewmat),
         )
         (test if test_every and i % test_every == 0 else train).append(view)
     points, colours = sample_surfaces(n_points, np.random.default_rng(seed))

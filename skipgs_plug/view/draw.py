@@ -49,8 +49,8 @@ class Painter:
     def draw(
         self,
         splats: Mapping[str, Tensor],
-        viewmat: Tensor,  # [4, 4]
-        K: Tensor,  # [3, 3]
+        viewmat: Tensor,  # [4, 4] of any float type
+        K: Tensor,  # [3, 3] likewise
         width: int,
         height: int,
     ) -> tuple[Tensor, Tensor]:
@@ -65,8 +65,8 @@ class Painter:
                 scales=torch.exp(raw["scales"]),
                 opacities=torch.sigmoid(raw["opacities"]),
                 colors=torch.cat([raw["sh0"], raw["shN"]], dim=1),
-                viewmats=viewmat[None].to(device),
-                Ks=K[None].to(device),
+                viewmats=viewmat[None].to(device, torch.float32),
+                Ks=K[None].to(device, torch.float32),
                 width=width,
                 height=height,
                 near_plane=self._near_plane,

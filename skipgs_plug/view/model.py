@@ -1,11 +1,11 @@
-"""What a run folder or a PLY file holds to look at: models by iteration, and the scene they were trained on."""
+"""What a run folder or a file holds to look at: models by iteration, and the scene they were trained on."""
 
 from __future__ import annotations
 
 import pickle
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,19 @@ from skipgs_plug.trainer.near_plane import far_plane, near_plane
 from skipgs_plug.trainer.ply import read_ply, renderable
 from skipgs_plug.trainer.run_folder import SCENE
 from skipgs_plug.trainer.scene import BLACK, Scene
+from skipgs_plug.view.splat import read_splat
+from skipgs_plug.view.spz import read_spz
 
 # Where trainers leave their models: ours and gsplat's, then Inria's and those of its family. The last one of an
 # iteration counts: it is the format that is quickest to read.
 PLACES = ("ckpts/ckpt_*_rank0.pt", "point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 LOADING = ("test_every", "init_num_pts", "init_ply")  # settings that change what a scene is loaded as
 NEAR_PLANE = 0.01  # of a PLY alone
+FILES: dict[str, Callable[[Path], dict[str, Tensor]]] = {
+    ".ply": read_ply,  # plain or compressed
+    ".splat": read_splat,
+    ".spz": lambda path: read_spz(path).splats,
+}
 NUMBER = re.compile(r"(?:ckpt|point_cloud|iteration)_(\d+)")
 
 
@@ -44,8 +51,9 @@ class Snapshot:
         Raises:
             InputError: the file is damaged or no model.
         """
-        if self.path.suffix == ".ply":
-            return read_ply(self.path)
+        read = FILES.get(self.path.suffix.lower())
+        if read is not None:
+            return read(self.path)
         try:
             content = torch.load(self.path, map_location="cpu", weights_only=True)
             splats = content["splats"]
@@ -73,10 +81,17 @@ class Model:
     antialiased: bool = False
     exposure: bool = False
     far_plane: float = TrainConfig.far_plane
+    _frame: Frame | None = field(default=None, repr=False)
 
     def load(self, snapshot: Snapshot) -> dict[str, Tensor]:
-        """Return the raw parameters of a snapshot in the coordinates of the scene's cameras, float32."""
-        return (self.scene.frame if self.scene else Frame()).local_splats(snapshot.load())
+        """Return the raw parameters of a snapshot in the coordinates of the scene's cameras, float32.
+
+        Without a scene they are moved to the origin where float32 needs it, all snapshots alike.
+        """
+        splats = snapshot.load()
+        if self._frame is None:
+            self._frame = self.scene.frame if self.scene else Frame.around(splats["means"].numpy())
+        return self._frame.local_splats(splats)
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -85,11 +100,11 @@ class Model:
 
 
 def open_model(path: str | Path, scene: str | None = None, data_factor: int | None = None) -> Model:
-    """Open a run folder, or a PLY of any trainer.
+    """Open a run folder, or a PLY, .splat or .spz of any trainer.
 
     Args:
         scene: scene to take instead of the one that the run folder names.
-        data_factor: reduction of its images; default: as in training, 1 for a PLY.
+        data_factor: reduction of its images; default: as in training, 1 for a file.
 
     Raises:
         MissingFileError: there is no such file, no model in the folder, or no scene where the run folder says.
@@ -115,26 +130,34 @@ def open_model(path: str | Path, scene: str | None = None, data_factor: int | No
         snapshots,
         loaded,
         near_plane(planes, loaded) if loaded else NEAR_PLANE,
-        bool(config.get("antialiased", False)),
+        is_antialiased(path, config),
         bool(config.get("exposure", False)),
         far_plane(planes, loaded) if loaded else planes.far_plane,
     )
 
 
+def is_antialiased(path: Path, config: Mapping[str, Any] | None = None) -> bool:
+    """Whether a run folder or a file says that its model was trained with antialiasing."""
+    if path.suffix.lower() == ".spz" and path.is_file():
+        return read_spz(path).antialiased
+    settings = read_config(path) if config is None and path.is_dir() else config or {}
+    return bool(settings.get("antialiased", False))
+
+
 def open_snapshots(path: str | Path) -> list[Snapshot]:
-    """Return the models of a run folder by iteration, or the one of a PLY, without their scene.
+    """Return the models of a run folder by iteration, or the one of a file, without their scene.
 
     Raises:
         MissingFileError: there is no such file, or no model in the folder.
-        InputError: the file is no PLY.
+        InputError: the file is none of `FILES`.
     """
     path = Path(path).expanduser()
     if not path.exists():
-        raise MissingFileError(f"{path} does not exist; give a run folder or a PLY.")
+        raise MissingFileError(f"{path} does not exist; give a run folder or a PLY, .splat or .spz.")
     if path.is_dir():
         return find_snapshots(path)
-    if path.suffix.lower() != ".ply":
-        raise InputError(f"{path} is neither a run folder nor a PLY.")
+    if path.suffix.lower() not in FILES:
+        raise InputError(f"{path} is neither a run folder nor a file that is read here ({', '.join(FILES)}).")
     return [Snapshot(None, path)]
 
 
@@ -152,7 +175,9 @@ def find_snapshots(folder: Path) -> list[Snapshot]:
                 step = int(number.group(1))
                 found[step] = Snapshot(step, path)
     if not found:
-        raise MissingFileError(f"{folder} holds no model ({', '.join(PLACES)}); give a run folder or a PLY.")
+        raise MissingFileError(
+            f"{folder} holds no model ({', '.join(PLACES)}); give a run folder or a PLY, .splat or .spz."
+        )
     return [found[step] for step in sorted(found)]
 
 

@@ -213,7 +213,7 @@ class Page:
         """Return where a camera stands and a point it looks at, on the page."""
         pose = self._poses[view.name]
         assert self._scene is not None
-        depths = (self._scene.points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3])[:, 2]
+        depths = (self._scene.points.double() @ view.viewmat[:3, :3].double().T + view.viewmat[:3, 3].double())[:, 2]
         ahead = depths[depths > 0]
         distance = float(ahead.median()) if len(ahead) else self._scene.scene_scale
         return pose[:3, 3] * self._unit, (pose[:3, 3] + distance * pose[:3, 2]) * self._unit

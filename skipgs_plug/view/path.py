@@ -13,7 +13,7 @@ TURN_WEIGHT = 0.5  # distance, in path radii, that turning by one radian counts 
 
 
 def camera_path(views: list[View], frames: int) -> Tensor:
-    """Return world-to-camera poses [frames, 4, 4] from the first to the last view, at an even pace.
+    """Return world-to-camera poses [frames, 4, 4] float64 from the first to the last view, at an even pace.
 
     Orientations are interpolated by Slerp, positions by monotone cubics, which do not overshoot.
 
@@ -40,4 +40,4 @@ def camera_path(views: list[View], frames: int) -> Tensor:
         at = np.linspace(0.0, times[-1], frames)
         result[:, :3, :3] = Slerp(times, rotations[np.flatnonzero(kept)])(at).as_matrix()
         result[:, :3, 3] = PchipInterpolator(times, positions[kept])(at)
-    return torch.from_numpy(np.linalg.inv(result)).float()
+    return torch.from_numpy(np.linalg.inv(result))

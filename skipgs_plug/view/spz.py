@@ -1,7 +1,8 @@
-"""SPZ, version 2: the compressed format of Niantic that phones, glTF and web viewers read; about 20 bytes per Gaussian.
+"""SPZ: the compressed format of Niantic that phones, glTF and web viewers read; about 20 bytes per Gaussian.
 
-Written from the description at github.com/nianticlabs/spz. Its axes are right, up, back; those of a 3DGS model are
-right, down, front, so y and z change their signs, and with them rotations and spherical harmonics.
+Version 2 is written, which every reader knows; 1 to 3 are read. Made from the description at
+github.com/nianticlabs/spz. Its axes are right, up, back; those of a 3DGS model are right, down, front, so y and z
+change their signs, and with them rotations and spherical harmonics.
 """
 
 from __future__ import annotations
@@ -9,12 +10,22 @@ from __future__ import annotations
 import gzip
 import math
 import struct
+import zlib
 from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from skipgs_plug.trainer.errors import InputError, reason
+from skipgs_plug.trainer.ply import renderable
+
 MAGIC, VERSION = 0x5053474E, 2
+HEADER = "<IIIBBBB"  # magic, version, Gaussians, SH degree, bits behind the point, flags, nothing
+ANTIALIASED, EXTENDED = 1, 2  # flags
+MOST = 10_000_000  # Gaussians of a file, as the reader of the format's authors
 POSITION_BITS = 23  # and a sign
 COLOUR_SCALE = 0.15  # of the constant coefficients around one half, in bytes
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}  # by number of coefficients beyond the constant one
@@ -23,7 +34,14 @@ SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype
 FIRST_BAND_STEP, OTHER_BAND_STEP = 8, 16  # of 256: five and four bits
 
 
-def to_spz(splats: Mapping[str, Tensor]) -> bytes:
+class Spz(NamedTuple):
+    """What a file holds."""
+
+    splats: dict[str, Tensor]  # raw parameters, as of `read_ply`
+    antialiased: bool  # whether opacities are compensated for the blur, as the model was trained
+
+
+def to_spz(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
     """Return the file of a model with raw parameters, as of `read_ply`.
 
     Positions are kept to 2**-22 of the largest coordinate, but not finer than 2**-24; opacities, colours, scales and
@@ -40,7 +58,7 @@ def to_spz(splats: Mapping[str, Tensor]) -> bytes:
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(min=1e-12)
     quats = np.where(quats[:, :1] < 0, -quats, quats)[:, 1:] * (1.0, -1.0, -1.0)
     parts = [
-        struct.pack("<IIIBBBB", MAGIC, VERSION, n, DEGREES[rest.shape[1]], bits, 0, 0),
+        struct.pack(HEADER, MAGIC, VERSION, n, DEGREES[rest.shape[1]], bits, ANTIALIASED * antialiased, 0),
         fixed.view(np.uint8).reshape(n, 3, 4)[..., :3].tobytes(),  # three bytes, the lowest first
         _bytes(opacities),
         _bytes((colours[:, 0] * COLOUR_SCALE + 0.5) * 255.0),
@@ -49,6 +67,74 @@ def to_spz(splats: Mapping[str, Tensor]) -> bytes:
         _bytes(_harmonics(rest)),
     ]
     return gzip.compress(b"".join(parts), mtime=0)
+
+
+def read_spz(path: Path) -> Spz:
+    """Read a file of version 1 to 3.
+
+    Raises:
+        InputError: it is damaged, of another version, or has what is not read here; the sentence says which.
+    """
+    data = path.read_bytes()
+    if data[:4] == struct.pack("<I", MAGIC):
+        raise InputError(f"{path} is an SPZ of version 4 or later, 1 to 3 are read; export it as version 3 or as PLY.")
+    try:
+        content = gzip.decompress(data)
+        magic, version, n, degree, bits, flags, _ = struct.unpack_from(HEADER, content)
+    except (OSError, EOFError, zlib.error, struct.error, MemoryError) as error:
+        raise InputError(f"{path} is damaged or no SPZ ({reason(error)}); export it again.") from error
+    if magic != MAGIC or not 0 < n <= MOST:
+        raise InputError(f"{path} is damaged or no SPZ; export it again.")
+    if version not in (1, 2, 3) or degree not in DEGREES.values() or flags & EXTENDED:
+        what = "extensions" if flags & EXTENDED else f"version {version} and SH degree {degree}"
+        raise InputError(f"{path} is an SPZ with {what}, which is not read here; export it as PLY of degree 3 or less.")
+    k = (degree + 1) ** 2 - 1
+    sizes = (6 if version == 1 else 9, 1, 3, 3, 4 if version == 3 else 3, 3 * k)
+    raw = np.frombuffer(content, np.uint8, offset=struct.calcsize(HEADER))
+    if len(raw) != n * sum(sizes):
+        raise InputError(f"{path} is damaged: {len(raw):,} bytes for {n:,} Gaussians; export it again.")
+    means, alpha, colours, scales, quats, rest = np.split(raw, np.cumsum(sizes[:-1]) * n)
+    shares = alpha / 255.0
+    with np.errstate(divide="ignore"):
+        opacities = np.log(shares) - np.log1p(-shares)
+    values = {
+        "means": _positions(means, bits, version).reshape(n, 3) * (1.0, -1.0, -1.0),
+        "scales": scales.reshape(n, 3) / 16.0 - 10.0,
+        "quats": (_smallest_three if version == 3 else _first_three)(quats.reshape(n, -1)) * (1.0, 1.0, -1.0, -1.0),
+        "opacities": opacities,
+        "sh0": ((colours.reshape(n, 3) / 255.0 - 0.5) / COLOUR_SCALE)[:, None],
+        "shN": (rest.reshape(n, k, 3) / 128.0 - 1.0) * SH_SIGNS[:k, None],
+    }
+    splats = {name: torch.from_numpy(value.astype(np.float32)) for name, value in values.items()}
+    return Spz(renderable(splats, path), bool(flags & ANTIALIASED))
+
+
+def _positions(data: np.ndarray, bits: int, version: int) -> np.ndarray:
+    if version == 1:
+        return data.view("<f2").astype(np.float64)
+    whole = data.reshape(-1, 3).astype(np.int64) @ np.array([1, 1 << 8, 1 << 16])
+    return np.where(whole >= 1 << 23, whole - (1 << 24), whole) / 2.0**bits
+
+
+def _first_three(data: np.ndarray) -> np.ndarray:
+    """Return quaternions [N, 4] (wxyz) of which three bytes [N, 3] hold x, y and z."""
+    xyz = data / 127.5 - 1.0
+    return np.concatenate([np.sqrt((1.0 - (xyz**2).sum(axis=1, keepdims=True)).clip(0.0)), xyz], axis=1)
+
+
+def _smallest_three(data: np.ndarray) -> np.ndarray:
+    """Return quaternions [N, 4] (wxyz) of which four bytes [N, 4] hold all parts but the largest, in ten bits each."""
+    packed = np.ascontiguousarray(data).view("<u4")[:, 0]
+    largest = packed >> np.uint32(30)
+    parts = np.zeros((len(packed), 4))  # xyzw
+    for i in (3, 2, 1, 0):  # the last one lies lowest
+        held = largest != i
+        size = (packed & np.uint32(511)) * (math.sqrt(0.5) / 511)
+        parts[:, i] = np.where(held, np.where(packed & np.uint32(512), -size, size), 0.0)
+        packed = np.where(held, packed >> np.uint32(10), packed)
+    rows = np.arange(len(parts))
+    parts[rows, largest] = np.sqrt((1.0 - (parts**2).sum(axis=1)).clip(0.0))
+    return parts[:, [3, 0, 1, 2]]
 
 
 def _harmonics(rest: np.ndarray) -> np.ndarray:

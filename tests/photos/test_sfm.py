@@ -59,7 +59,7 @@ def test_photographs_become_a_scene(photos, tmp_path, capsys, monkeypatch, mappi
         assert reduced.train[0].width == round(loaded.train[0].width / factor)
     # Points lie in front of the cameras that see them and project into the image.
     view = loaded.train[0]
-    seen = loaded.points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    seen = loaded.points.double() @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
     pixels = (seen @ view.K.T)[:, :2] / seen[:, 2:]
     inside = (seen[:, 2] > 0) & (pixels > 0).all(dim=1) & (pixels[:, 0] < view.width) & (pixels[:, 1] < view.height)
     assert inside.float().mean() > 0.5

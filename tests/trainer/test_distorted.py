@@ -157,7 +157,7 @@ def test_nerfstudio(tmp_path: Path, model: str) -> None:
         assert_straight(view)
         # OpenGL poses look along -z with y up; ours along +z with y down.
         torch.testing.assert_close(view.viewmat, torch.tensor(
-            [[1.0, 0, 0, -i], [0, -1, 0, 2], [0, 0, -1, 3], [0, 0, 0, 1]]))  # fmt: skip
+            [[1.0, 0, 0, -i], [0, -1, 0, 2], [0, 0, -1, 3], [0, 0, 0, 1]]).double())  # fmt: skip
     assert scene.train[0].mask is not None and scene.train[1].mask is None
     assert scene.points[4].tolist() == [4, 0, 4] and scene.points_rgb[4].tolist() == [40, 0, 255]
 
@@ -171,7 +171,7 @@ def test_nerfstudio_pinhole_by_angle_split_and_factor(tmp_path: Path) -> None:
     scene = load_scene(folder)
     assert [view.name for view in scene.test] == ["images/frame_1.png"] and len(scene.train) == 2
     focal = 60 / np.tan(0.45)
-    torch.testing.assert_close(scene.test[0].K, torch.tensor([[focal, 0, 60], [0, focal, 45], [0, 0, 1]]).float())
+    torch.testing.assert_close(scene.test[0].K, torch.tensor([[focal, 0, 60], [0, focal, 45], [0, 0, 1]]).double())
     for i in range(3):
         save(picture(distorted_rays("OPENCV", 60, 45)), folder / f"images_2/frame_{i}.png")
     half = load_scene(folder, data_factor=2).test[0]

@@ -67,8 +67,8 @@ def test_missing_scene(tmp_path: Path) -> None:
 
 
 def test_missing_model_file(folder: Path) -> None:
-    (folder / "sparse/0/points3D.txt").unlink()
-    with pytest.raises(MissingFileError, match=r"Neither .*sparse/0 nor .*sparse holds cameras, images"):
+    (folder / "sparse/0/images.txt").unlink()
+    with pytest.raises(MissingFileError, match=r"Neither .*sparse/0 nor .*sparse holds cameras and images"):
         load_scene(folder)
 
 

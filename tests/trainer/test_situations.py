@@ -317,3 +317,30 @@ def test_what_a_fisheye_loses_is_said(tmp_path: Path, tiny_scene: Scene, caplog:
     fisheye = {"camera_model": "OPENCV_FISHEYE", "w": 32, "h": 24, "fl_x": 32 / math.pi, "fl_y": 32 / math.pi}
     load_scene(write_nerf(tiny_scene, tmp_path / "scene", **fisheye))
     assert "of about 180 degrees" in caplog.text
+
+
+@pytest.mark.parametrize("sizes", [(2.5, 2.5, 2.5), (1.0, 3.0, 0.2)])
+def test_the_size_of_a_camera_object_changes_nothing(tmp_path: Path, tiny_scene: Scene, sizes) -> None:
+    root = write_nerf(tiny_scene, tmp_path / "scene")
+    expected = load_scene(root)
+    turn_frames(root, lambda pose: pose @ np.diag([*sizes, 1.0]))
+    for first, second in zip(load_scene(root).train, expected.train, strict=True):
+        torch.testing.assert_close(first.viewmat, second.viewmat, rtol=0, atol=1e-12)
+
+
+def test_mirrored_and_sheared_cameras_are_refused(tmp_path: Path, tiny_scene: Scene) -> None:
+    root = write_nerf(tiny_scene, tmp_path / "scene")
+    shear = np.eye(4)
+    shear[0, 1] = 0.2
+    for change, said in ((np.diag([1.0, 1.0, -1.0, 1.0]), "mirror image"), (shear, "not at right angles")):
+        turn_frames(root, lambda pose, change=change: pose @ change)
+        with pytest.raises(InputError, match=said):
+            load_scene(root)
+        turn_frames(root, lambda pose, change=change: pose @ np.linalg.inv(change))
+
+
+def turn_frames(root: Path, change) -> None:
+    content = json.loads((root / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+    (root / "transforms.json").write_text(json.dumps(content))

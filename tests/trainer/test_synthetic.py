@@ -18,7 +18,7 @@ def test_same_arguments_same_scene(tiny_scene: Scene) -> None:
 def test_points_have_the_colour_of_their_pixel() -> None:
     scene = make_scene(n_views=8, width=96, height=72, n_points=1200, test_every=0)
     view = scene.train[-1]  # the steepest view hides the fewest points
-    camera = scene.points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    camera = scene.points.double() @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
     pixel = camera @ view.K.T
     x, y = (pixel[:, i] / pixel[:, 2] for i in (0, 1))
     inside = (pixel[:, 2] > 0) & (x >= 0) & (x < 96) & (y >= 0) & (y < 72)

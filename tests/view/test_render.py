@@ -113,7 +113,7 @@ def test_only_what_lies_between_the_planes_is_drawn(scene_file):
     view = load_scene(scene_file).train[0]
     pose = torch.linalg.inv(view.viewmat)
     splats = {
-        "means": (pose[:3, 3] + 0.2 * pose[:3, 2])[None],
+        "means": (pose[:3, 3] + 0.2 * pose[:3, 2])[None].float(),
         "quats": torch.tensor([[1.0, 0, 0, 0]]),
         "scales": torch.full((1, 3), -3.0),
         "opacities": torch.full((1,), 5.0),
@@ -132,7 +132,7 @@ def test_the_path_begins_and_ends_at_the_views_and_moves_evenly(scene_file):
     poses = camera_path(views, 101)
     assert torch.allclose(poses[0], views[0].viewmat, atol=1e-5)
     assert torch.allclose(poses[-1], views[-1].viewmat, atol=1e-5)
-    assert torch.allclose(poses[:, :3, :3] @ poses[:, :3, :3].mT, torch.eye(3).expand(101, 3, 3), atol=1e-5)
+    assert torch.allclose(poses[:, :3, :3] @ poses[:, :3, :3].mT, torch.eye(3).double().expand(101, 3, 3), atol=1e-5)
     worlds = torch.linalg.inv(poses)
     turns = (worlds[1:, :3, :3].mT @ worlds[:-1, :3, :3]).diagonal(dim1=1, dim2=2).sum(1)
     steps = (worlds[1:, :3, 3] - worlds[:-1, :3, 3]).norm(dim=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.camera_keys import read_camera
 from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.loaders.json_file import opencv_viewmat, read_object, read_pose, read_string
-from skipgs_plug.trainer.loaders.paths import IMAGE_SUFFIXES, find_image, inside, relative_name
+from skipgs_plug.trainer.loaders.paths import find_image, find_images, inside
 from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, load_photograph, model_name, scaled_matrix
 from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
 from skipgs_plug.trainer.ply import read_points
@@ -69,30 +68,35 @@ def read_transforms(path: Path, file_name: str, data_factor: int, images: ImageS
         raise InputError(f"{source} lists no frames; restore the file.")
     views, any_alpha = [], False
     cache = UndistortedCache(path)
-    for frame in images.reading(frames):
-        view, alpha = read_frame(path, {**content, **frame}, cache, data_factor, images, source)
+    names = [read_string(frame.get("file_path"), "file_path of a frame", source) for frame in frames]
+    for frame, image_path in images.reading(list(zip(frames, find_images(path, names), strict=True))):
+        view, alpha = read_frame(path, image_path, {**content, **frame}, cache, data_factor, images, source)
         views.append(view)
         any_alpha |= alpha
     return views, any_alpha
 
 
 def read_frame(
-    path: Path, values: dict[str, Any], cache: UndistortedCache, data_factor: int, images: ImageStore, source: Path
+    path: Path,
+    image_path: Path,
+    values: dict[str, Any],
+    cache: UndistortedCache,
+    data_factor: int,
+    images: ImageStore,
+    source: Path,
 ) -> tuple[View, bool]:
     """Return one view and whether its picture has transparency that was composed onto white."""
-    file_path = read_string(values.get("file_path"), "file_path of a frame", source)
-    viewmat = opencv_viewmat(read_pose(values.get("transform_matrix"), file_path, source))
-    image_path = find_image(path, _with_suffix(path, file_path))
     name = image_path.relative_to(path).as_posix()
+    viewmat = opencv_viewmat(read_pose(values.get("transform_matrix"), name, source))
     camera = read_camera(values, image_path, source)
     mask = values.get("mask_path")
     if mask is not None:
-        mask = inside(path, read_string(mask, f"mask_path of {name!r}", source))
+        mask = find_image(path, read_string(mask, f"mask_path of {name!r}", source))
     if mask is not None or model_name(camera) not in PINHOLE_MODELS:
         return load_photograph(name, image_path, camera, viewmat, cache, data_factor, mask, images), False
     size = (camera.width, camera.height)
     pixels, alpha = read_image(image_path, image_path, WHITE, data_factor, size)
-    K = torch.from_numpy(scaled_matrix(camera, pixels)).float()
+    K = torch.from_numpy(scaled_matrix(camera, pixels))
     view = View(name, pixels, K, torch.from_numpy(viewmat))
     return images.keep(view, partial(read_opaque, image_path, data_factor, size)), alpha is not None
 
@@ -100,10 +104,3 @@ def read_frame(
 def read_opaque(image_path: Path, data_factor: int, size: tuple[int, int]) -> tuple[Tensor, None]:
     """Return the image [H, W, 3], composed onto white, which needs no mask."""
     return read_image(image_path, image_path, WHITE, data_factor, size)[0], None
-
-
-def _with_suffix(folder: Path, name: str) -> str:
-    """NeRF-synthetic leaves the images' suffix out, and what is left may hold a dot ("train/r_0.5")."""
-    name = relative_name(folder, name)
-    whole = Path(name).suffix in IMAGE_SUFFIXES or os.path.isfile(folder / name)
-    return name if whole else name + ".png"

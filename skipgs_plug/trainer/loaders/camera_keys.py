@@ -16,17 +16,20 @@ PERSPECTIVE = ("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RAD
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", *DISTORTION)
-# What changes a picture and is not modelled here: refused unless it is zero, false or empty.
+UNDISTORT = "undistort the images"
+ALPHA = "write what is transparent as the alpha channel of the images"
+# What changes a picture and is not modelled here: refused unless it is zero, false or empty. What it is; what helps.
 UNSUPPORTED = {
-    **dict.fromkeys(("k5", "k6", "p3", "p4", "b1", "b2", "s1", "s2", "s3", "s4", "skew", "shear"), "this distortion"),
-    **dict.fromkeys(("ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4"), "the f-theta lens"),
-    "latlong": "a panorama",
-    "is_equirectangular": "a panorama",
-    "is_latlong": "a panorama",
-    "is_orthographic": "a parallel projection",
-    "ortho_scale": "a parallel projection",
-    "distortion_params": "this distortion",
-    "rolling_shutter": "a rolling shutter",
+    **dict.fromkeys(
+        ("k5", "k6", "p3", "p4", "b1", "b2", "s1", "s2", "s3", "s4", "skew", "shear", "distortion_params"),
+        ("this distortion", UNDISTORT),
+    ),
+    **dict.fromkeys(("ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4"), ("the f-theta lens", UNDISTORT)),
+    **dict.fromkeys(("latlong", "is_equirectangular", "is_latlong"), ("a panorama", "cut it into pinhole images")),
+    **dict.fromkeys(("is_orthographic", "ortho_scale"), ("a parallel projection", "render a perspective one")),
+    "rolling_shutter": ("a rolling shutter", UNDISTORT),
+    **dict.fromkeys(("white_transparent", "black_transparent", "mask_color"), ("transparency by colour", ALPHA)),
+    **dict.fromkeys(("from_mitsuba", "normal_mts_args"), ("the axes of Mitsuba", "export with those of Blender")),
 }
 
 
@@ -95,11 +98,11 @@ def focal_length(numbers: dict[str, float], axis: str, side: float, source: Path
 
 def refuse_unsupported(values: dict[str, Any], source: Path) -> None:
     """Raise InputError for a key that changes the picture and is not modelled."""
-    for key, what in UNSUPPORTED.items():
+    for key, (what, cure) in UNSUPPORTED.items():
         value = values.get(key)
         parts = value if isinstance(value, list) else [value]
         if any(parts):
-            raise InputError(f"{source}: {key} is {short(value)}, and {what} is not supported; undistort the images.")
+            raise InputError(f"{source}: {key} is {short(value)}, and {what} is not supported; {cure}.")
     start, end = values.get("transform_matrix_start"), values.get("transform_matrix_end")
     if start != end:
         raise InputError(f"{source}: a frame moves while it is taken (transform_matrix_start, _end): not supported.")

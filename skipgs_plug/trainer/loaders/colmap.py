@@ -13,18 +13,20 @@ import numpy as np
 
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.image_store import ImageStore
-from skipgs_plug.trainer.loaders.colmap_files import check_lengths
+from skipgs_plug.trainer.loaders.colmap_files import check_lengths, leave_out_points
 from skipgs_plug.trainer.loaders.colmap_text import content_lines, image_records, simplify
 from skipgs_plug.trainer.loaders.native import import_pycolmap
-from skipgs_plug.trainer.loaders.paths import find_image, relative_name
+from skipgs_plug.trainer.loaders.paths import find_images, relative_name
 from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, find_mask, load_photograph, lost_angle, model_name
+from skipgs_plug.trainer.loaders.said import say_bare, say_what_is_unlisted
 from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
+from skipgs_plug.trainer.ply import read_points
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene, split_views
 
 log = logging.getLogger(__name__)
 
 
-STEMS = ("cameras", "images", "points3D")
+STEMS = ("cameras", "images")
 MODEL_FOLDERS = ("sparse", "colmap/sparse")  # the second: nerfstudio's
 Cloud = tuple[np.ndarray, np.ndarray]
 
@@ -42,16 +44,16 @@ def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStor
     folder, factor = image_folder(path, data_factor)
     masks = path / "masks"
     cache = UndistortedCache(path)
-    views, bare, unplaced, distorted = [], 0, 0, set()
-    for image in images.reading(list(reconstruction.images.values())):
-        if not image.has_pose:
-            unplaced += 1
-            continue
-        name = relative_name(folder, names.get(image.image_id) or image_name(image, model))
-        mask = find_mask(masks, name) if masks.is_dir() else None
-        bare += mask is None
+    listed = [reconstruction.images[number] for number in sorted(reconstruction.images)]
+    called = [relative_name(folder, names.get(image.image_id) or image_name(image, model)) for image in listed]
+    placed = [(image, name) for image, name in zip(listed, called, strict=True) if image.has_pose]
+    unplaced = len(listed) - len(placed)
+    paths = find_images(folder, [name for _, name in placed])
+    found_masks = [find_mask(masks, name) if masks.is_dir() else None for _, name in placed]
+    views, distorted = [], set()
+    for (image, name), image_path, mask in images.reading(list(zip(placed, paths, found_masks, strict=True))):
         camera = reconstruction.cameras[image.camera_id]
-        pose, image_path = pose_of(image, name, model), find_image(folder, name)
+        pose = pose_of(image, name, model)
         views.append(load_photograph(name, image_path, camera, pose, cache, factor, mask, images))
         if model_name(camera) not in PINHOLE_MODELS:
             distorted.add(model_name(camera) + lost_angle(camera, views[-1]))
@@ -61,8 +63,8 @@ def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStor
         log.warning("%s: lens distortion (%s) is removed, and the result kept.", path, ", ".join(sorted(distorted)))
     if unplaced:
         log.warning("%s: %d of %d images have no pose and are left out.", model, unplaced, unplaced + len(views))
-    if masks.is_dir() and bare:
-        log.warning("%s: %d of %d views have no mask there and count whole.", masks, bare, len(views))
+    say_what_is_unlisted(folder, [*paths, *(folder / name for name in called)], "image of the model")
+    say_bare(masks, found_masks)
     return assemble(path, model, views, reconstruction, test_every, cloud)
 
 
@@ -72,15 +74,31 @@ def assemble(
     train, test = split_views(views, test_every)
     if cloud is not None:
         return assemble_scene(model, path.resolve().name, train, test, *cloud)
+    beside = cloud_beside(model)
+    if beside is not None:
+        return assemble_scene(model, path.resolve().name, train, test, *beside)
     points = [reconstruction.points3D[i] for i in sorted(reconstruction.points3D)]
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
     return assemble_scene(model, path.resolve().name, train, test, xyz, rgb)
 
 
+def cloud_beside(model: Path) -> Cloud | None:
+    """Return points and colours of the points3D.ply that Inria's trainer leaves, in a model without other points."""
+    path = model / "points3D.ply"
+    others = (model / f"points3D{suffix}" for suffix in (".bin", ".txt"))
+    if any(other.is_file() for other in others) or not path.is_file():
+        return None
+    return read_points(path)
+
+
 def is_model(folder: Path) -> bool:
-    """Whether a folder holds cameras, images and points3D (.bin or .txt)."""
-    return any(all((folder / (stem + suffix)).is_file() for stem in STEMS) for suffix in (".bin", ".txt"))
+    """Whether a folder holds cameras and images (.bin or .txt); its points may come from elsewhere."""
+    return any(is_complete(folder, suffix) for suffix in (".bin", ".txt"))
+
+
+def is_complete(folder: Path, suffix: str) -> bool:
+    return all((folder / (stem + suffix)).is_file() for stem in STEMS)
 
 
 def scene_of(model: Path) -> Path:
@@ -104,7 +122,7 @@ def find_model(path: Path) -> Path:
             break
     if not found:
         raise MissingFileError(
-            f"Neither {path / 'sparse' / '0'} nor {path / 'sparse'} holds cameras, images and points3D "
+            f"Neither {path / 'sparse' / '0'} nor {path / 'sparse'} holds cameras and images "
             "(.bin or .txt); run COLMAP's mapper."
         )
     counts = [listed_images(folder) for folder in found]
@@ -136,12 +154,16 @@ def read_model(model: Path) -> tuple[Any, dict[int, str]]:
         The reconstruction, and the names of a text model's images by id, in place of those in it.
     """
     pycolmap = import_pycolmap()
-    check_lengths(model, camera_models(pycolmap))
+    models = camera_models(pycolmap)
+    check_lengths(model, {number: count for number, (_, count) in models.items()})
     try:
-        if all((model / f"{stem}.bin").is_file() for stem in STEMS):
+        if is_complete(model, ".bin") and (model / "points3D.bin").is_file():
             return pycolmap.Reconstruction(str(model)), {}
         with tempfile.TemporaryDirectory() as folder:
-            names = simplify(model, Path(folder))
+            if is_complete(model, ".bin"):
+                leave_out_points(model, Path(folder))
+                return pycolmap.Reconstruction(folder), {}
+            names = simplify(model, Path(folder), dict(models.values()))
             reconstruction = pycolmap.Reconstruction(folder)
         if len(reconstruction.images) != len(names):
             raise InputError(
@@ -154,11 +176,11 @@ def read_model(model: Path) -> tuple[Any, dict[int, str]]:
         raise InputError(f"COLMAP model {model} cannot be read ({reason(error)}); export it again.") from error
 
 
-def camera_models(pycolmap: Any) -> dict[int, int]:
-    """Return the number of parameters of each camera model by its id in files."""
+def camera_models(pycolmap: Any) -> dict[int, tuple[str, int]]:
+    """Return name and number of parameters of each camera model by its id in files."""
     create = getattr(pycolmap.Camera, "create_from_model_id", pycolmap.Camera.create)  # create: before pycolmap 4
     models = [model for model in pycolmap.CameraModelId.__members__.values() if int(model) >= 0]
-    return {int(model): len(create(1, model, 1.0, 2, 2).params) for model in models}
+    return {int(model): (model.name, len(create(1, model, 1.0, 2, 2).params)) for model in models}
 
 
 def image_name(image: Any, model: Path) -> str:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import mmap
 import os
+import shutil
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from skipgs_plug.trainer.errors import InputError, reason
+from skipgs_plug.trainer.lfs import HINT, is_pointer
 
 POINT_2D = 24  # x, y, id of the 3D point
 TRACK_ELEMENT = 8  # image id, index of the 2D point
@@ -30,6 +33,8 @@ def check_lengths(model: Path, camera_models: dict[int, int]) -> None:
         path = model / name
         if not path.is_file():
             continue
+        if is_pointer(path):
+            raise InputError(f"{path} cannot be read: {HINT}.")
         try:
             with open(path, "rb") as stream:
                 size = os.fstat(stream.fileno()).st_size
@@ -48,6 +53,19 @@ def check_lengths(model: Path, camera_models: dict[int, int]) -> None:
         if at != size:
             what = "ends early" if at > size else f"has {size - at:,} bytes too many"
             raise InputError(f"{path} {what}: its counts do not fit its {size:,} bytes; export the model again.")
+
+
+def leave_out_points(model: Path, target: Path) -> None:
+    """Write a binary model without points into `target`: cameras, and images without the observations of points."""
+    shutil.copyfile(model / "cameras.bin", target / "cameras.bin")
+    (target / "points3D.bin").write_bytes(struct.pack("<Q", 0))
+    data = (model / "images.bin").read_bytes()
+    kept, start = [data[:8]], 8
+    for end in itertools.islice(walk_images(data, None), 1, None):
+        name = data.index(b"\0", start + 4 + POSE + 4) + 1
+        kept += [data[start:name], struct.pack("<Q", 0)]
+        start = end
+    (target / "images.bin").write_bytes(b"".join(kept))
 
 
 def walk_cameras(data: Any, camera_models: dict[int, int]) -> Iterator[int]:

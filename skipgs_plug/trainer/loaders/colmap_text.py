@@ -8,6 +8,7 @@ observations, which nothing here uses.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 from skipgs_plug.trainer.errors import InputError, reason
@@ -15,8 +16,11 @@ from skipgs_plug.trainer.errors import InputError, reason
 IMAGE_FIELDS = 9  # id, quaternion, translation, camera; then the name
 
 
-def simplify(model: Path, target: Path) -> dict[int, str]:
+def simplify(model: Path, target: Path, camera_models: Mapping[str, int]) -> dict[int, str]:
     """Write a text model into `target` without observations, its images named by their numbers.
+
+    Args:
+        camera_models: number of parameters by name of the camera model.
 
     Returns:
         The names of the images, by their ids.
@@ -25,6 +29,8 @@ def simplify(model: Path, target: Path) -> dict[int, str]:
         InputError: a file cannot be read, or a line of it is none of its kind.
     """
     cameras = content_lines(model / "cameras.txt")
+    for line in cameras:
+        check_parameters(line.split(), camera_models, model / "cameras.txt")
     (target / "cameras.txt").write_text("\n".join(cameras) + "\n", encoding="utf-8")
     known = {line.split()[0] for line in cameras if line.strip()}
     names, lines = {}, []
@@ -34,9 +40,22 @@ def simplify(model: Path, target: Path) -> dict[int, str]:
         names[number] = fields[IMAGE_FIELDS]
         lines += [" ".join([*fields[:IMAGE_FIELDS], str(number)]), ""]
     (target / "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    points = (" ".join(line.split()[:8]) for line in content_lines(model / "points3D.txt") if line.strip())
+    listed = content_lines(model / "points3D.txt") if (model / "points3D.txt").is_file() else []
+    points = (" ".join(line.split()[:8]) for line in listed if line.strip())
     (target / "points3D.txt").write_text("\n".join(points) + "\n", encoding="utf-8")
     return names
+
+
+def check_parameters(fields: list[str], camera_models: Mapping[str, int], path: Path) -> None:
+    """Raise InputError for a camera with more or fewer numbers than its model has; pycolmap does not say which."""
+    if len(fields) < 4 or fields[1] not in camera_models:
+        return
+    expected, given = camera_models[fields[1]], len(fields) - 4
+    if given != expected:
+        raise InputError(
+            f"{path}: camera {fields[0]} is a {fields[1]} of {given} parameters, which has {expected}; export the "
+            "model again."
+        )
 
 
 def image_records(path: Path, cameras: set[str]) -> list[tuple[int, list[str]]]:

@@ -13,6 +13,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
+from skipgs_plug.trainer.lfs import HINT, is_pointer
 
 ORIENTATION = 0x0112  # EXIF tag; 5 to 8 exchange width and height
 
@@ -84,6 +85,8 @@ def decode(source: Path | IO[bytes], label: Path | str) -> Image.Image:
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError, KeyError, IndexError, TypeError,
             OverflowError, AttributeError, NotImplementedError, RuntimeError, ZeroDivisionError) as error:  # fmt: skip
         # Pillow's plugins raise whatever their parser stumbles over.
+        if isinstance(source, Path) and is_pointer(source):
+            raise InputError(f"Image {label} cannot be decoded: {HINT}.") from error
         raise InputError(f"Image {label} cannot be decoded ({reason(error)}); replace the file.") from error
     if picture.mode.startswith("I;16") or (picture.mode == "I" and opened.format == "PNG"):
         values = np.asarray(picture).astype(np.uint16)

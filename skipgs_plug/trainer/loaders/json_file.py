@@ -11,15 +11,18 @@ import numpy as np
 
 from skipgs_plug.trainer.errors import InputError, reason
 
+ROUNDED = 1e-3  # lengths of axes in a file of few digits differ from 1 by less
+SHEARED = 0.02  # cosine between two axes from which they cannot be rounded ones
+
 
 def read_object(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file, which is UTF-8 whatever the locale.
+    """Return the object in a JSON file: UTF-8 whatever the locale, or UTF-16, as PowerShell writes it.
 
     Raises:
         InputError: the file cannot be read, is not JSON, nested too deeply, or not an object.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
+        content = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"{path} is not valid JSON ({reason(error)}); restore the file.") from error
     if not isinstance(content, dict):
@@ -45,16 +48,36 @@ def read_string(value: Any, name: str, source: Path) -> str:
 
 
 def read_pose(value: Any, name: str, source: Path) -> np.ndarray:
-    """Return a camera-to-world matrix [4, 4] that can be inverted."""
+    """Return a camera-to-world matrix [4, 4] of a rotation and a position.
+
+    Three rows stand for four. The size of a camera object, which 3D programs export with its pose, is taken out.
+
+    Raises:
+        InputError: it is none; the sentence says what is wrong.
+    """
     try:
         pose = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{source}: transform_matrix of {name!r} is not 4x4 numbers; restore the file.") from error
+    if pose.shape == (3, 4):
+        pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
     if pose.shape != (4, 4):
         raise InputError(f"{source}: transform_matrix of {name!r} is not 4x4; restore the file.")
     sound = np.isfinite(pose).all() and np.abs(pose).max() < 1e12 and np.allclose(pose[3], (0, 0, 0, 1))
     if not sound or abs(np.linalg.det(pose[:3, :3])) < 1e-6:
         raise InputError(f"{source}: transform_matrix of {name!r} is not a finite pose; restore the file.")
+    sizes = np.linalg.norm(pose[:3, :3], axis=0)
+    if np.abs(sizes - 1.0).max() > ROUNDED:
+        pose[:3, :3] /= sizes
+    if np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max() > SHEARED:
+        raise InputError(
+            f"{source}: the axes of transform_matrix of {name!r} are not at right angles; export it again."
+        )
+    if np.linalg.det(pose[:3, :3]) < 0:
+        raise InputError(
+            f"{source}: transform_matrix of {name!r} is a mirror image; export it with right-handed axes (x right, y "
+            "up, looking along -z)."
+        )
     return pose
 
 

@@ -13,8 +13,9 @@ from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.camera_keys import read_camera
 from skipgs_plug.trainer.loaders.json_file import opencv_viewmat, read_object, read_pose, read_string
-from skipgs_plug.trainer.loaders.paths import find_image, inside, relative_name
-from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, load_photograph, lost_angle, model_name
+from skipgs_plug.trainer.loaders.paths import find_image, find_images, inside, relative_name
+from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, find_mask, load_photograph, lost_angle, model_name
+from skipgs_plug.trainer.loaders.said import say_bare, say_what_is_unlisted
 from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
 from skipgs_plug.trainer.ply import read_points
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene, split_views
@@ -39,30 +40,42 @@ def load_nerfstudio(
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames) or not frames:
         raise InputError(f"{source} lists no frames; run ns-process-data again.")
     cache = UndistortedCache(path)
+    names = [read_string(frame.get("file_path"), "file_path of a frame", source) for frame in frames]
+    names = [relative_name(path, name) for name in names]
+    paths = find_images(path, names)
+    masks = [mask_of(path, frame, name, source) for frame, name in zip(frames, names, strict=True)]
     views, distorted = [], set()
-    for frame in images.reading(frames):
-        file_path = read_string(frame.get("file_path"), "file_path of a frame", source)
-        name = relative_name(path, file_path)
-        viewmat = opencv_viewmat(read_pose(frame.get("transform_matrix"), file_path, source))
-        full = find_image(path, name)
+    for frame, name, full, mask in images.reading(list(zip(frames, names, paths, masks, strict=True))):
+        viewmat = opencv_viewmat(read_pose(frame.get("transform_matrix"), name, source))
         camera = read_camera({**content, **frame}, full, source)
-        mask = frame.get("mask_path")
-        if mask is not None:
-            mask = inside(path, read_string(mask, f"mask_path of {name!r}", source))
-        image_path, factor = reduced_image(path, name, full, data_factor)
+        image_path, factor = reduced_image(path, full, data_factor)
         views.append(load_photograph(name, image_path, camera, viewmat, cache, factor, mask, images))
         if model_name(camera) not in PINHOLE_MODELS:
             distorted.add(model_name(camera) + lost_angle(camera, views[-1]))
     if distorted:
         log.warning("%s: lens distortion (%s) is removed, and the result kept.", source, ", ".join(sorted(distorted)))
+    for folder in sorted({path / full.relative_to(path).parts[0] for full in paths} - set(paths)):
+        say_what_is_unlisted(folder, paths, f"frame of {FILE}")
+    say_bare(path / "masks", masks)
+    if len({repr(frame.get("time")) for frame in frames}) > 1:
+        log.warning("%s: its frames have different times; whatever moved between them will be blurred.", source)
     train, test = own_split(content, views, path, source) or split_views(views, test_every)
     points, colours = cloud or read_cloud(path, content, source)
     return assemble_scene(source, path.resolve().name, train, test, points, colours)
 
 
-def reduced_image(path: Path, name: str, full: Path, data_factor: int) -> tuple[Path, int]:
+def mask_of(path: Path, frame: dict[str, Any], name: str, source: Path) -> Path | None:
+    """Return the mask of a frame: its `mask_path`, else masks/x.png for images/x.jpg where it exists."""
+    given = frame.get("mask_path")
+    if given is not None:
+        return find_image(path, read_string(given, f"mask_path of {name!r}", source))
+    masks, below = path / "masks", name.partition("/")[2]
+    return find_mask(masks, below or name) if masks.is_dir() else None
+
+
+def reduced_image(path: Path, full: Path, data_factor: int) -> tuple[Path, int]:
     """Return the image to read and the factor that is left: images_4/x.png for images/x.png where it exists."""
-    first, _, rest = name.partition("/")
+    first, _, rest = full.relative_to(path).as_posix().partition("/")
     folder = path / f"{first}_{data_factor}"
     if data_factor > 1 and rest and folder.is_dir():
         return find_image(folder, rest), 1

@@ -57,7 +57,7 @@ def save_packed(scene: Scene, path: str | Path) -> None:
 
 
 def placed(scene: Scene, view: View) -> torch.Tensor:
-    """Return the pose [4, 4] in coordinates of the dataset; in float64 where they are not those of the scene."""
+    """Return the pose [4, 4] float64 in coordinates of the dataset."""
     return scene.frame.dataset_pose(view.viewmat) if scene.frame.moves else view.viewmat
 
 
@@ -84,7 +84,7 @@ def load_packed(path: Path, cloud: tuple[np.ndarray, np.ndarray] | None = None) 
         label = f"{names[i]} in {path}"
         pixels, alpha = read_image(io.BytesIO(data[start : start + size]), label)
         start += size
-        K = torch.from_numpy(content["Ks"][i].astype(np.float32))
+        K = torch.from_numpy(content["Ks"][i].astype(np.float64))
         viewmat = torch.from_numpy(content["viewmats"][i].astype(np.float64))
         views.append(View(str(names[i]), pixels, K, viewmat, None if alpha is None else alpha >= 128))
     background = tuple(float(channel) for channel in content["background"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from skipgs_plug.trainer.errors import InputError, MissingFileError
@@ -14,8 +15,9 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".t
 def relative_name(folder: Path, name: str) -> str:
     """Return a name that a scene gives as a path relative to its folder, with slashes.
 
-    Backslashes separate folders, as programs on Windows write them, unless a file has them in its name. An absolute
-    path is taken where it lies in the folder.
+    Backslashes separate folders, as programs on Windows write them, unless a file has them in its name. Of a path
+    that leaves the folder (written on another machine, or relative to elsewhere), the longest end counts that is an
+    image in it.
 
     Raises:
         InputError: the name is empty, leaves the folder or cannot be a file name.
@@ -25,15 +27,29 @@ def relative_name(folder: Path, name: str) -> str:
     given = name
     if "\\" in name and not os.path.isfile(folder / name):
         name = name.replace("\\", "/")
-    if os.path.isabs(name):
+    path = PurePosixPath(name)
+    if path.is_absolute():
         for root in (os.path.abspath(folder), os.path.realpath(folder)):
-            if PurePosixPath(name).is_relative_to(PurePosixPath(root)):
-                name = PurePosixPath(name).relative_to(PurePosixPath(root)).as_posix()
+            if path.is_relative_to(root):
+                path = path.relative_to(root)
                 break
-    parts = PurePosixPath(name).parts
-    if not PurePosixPath(name).name or name.startswith("/") or PureWindowsPath(name).drive or ".." in parts:
-        raise InputError(f"{folder}: file name {given!r} leaves the scene; only paths inside it are read.")
-    return PurePosixPath(name).as_posix()
+    if not path.name:
+        raise InputError(f"{folder}: file name {given!r} names no file; restore it.")
+    if leaves(path):
+        ends = (PurePosixPath(*path.parts[i:]) for i in range(1, len(path.parts)))
+        inner = next((end for end in ends if not leaves(end) and look_up(folder, end) is not None), None)
+        if inner is None:
+            raise InputError(
+                f"{folder}: file name {given!r} leaves the scene, and nothing in the scene is called like its end; "
+                "only paths inside it are read."
+            )
+        path = inner
+    return path.as_posix()
+
+
+def leaves(path: PurePosixPath) -> bool:
+    """Whether a path leads out of the folder that it is relative to, or may do so on Windows."""
+    return path.is_absolute() or ".." in path.parts or bool(PureWindowsPath(path.as_posix()).drive)
 
 
 def inside(folder: Path, name: str) -> Path:
@@ -46,11 +62,99 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def find_image(folder: Path, name: str) -> Path:
-    """Return folder/name, or the same with another image suffix or one added (downscaled copies are often PNG)."""
-    path = inside(folder, name)
-    others = (path.with_suffix(suffix) for suffix in IMAGE_SUFFIXES)
-    added = (path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES)
-    for candidate in (path, *others, *added):
-        if os.path.isfile(candidate):  # unlike Path.is_file, no error for names that are too long
-            return candidate
-    raise MissingFileError(f"Image {path} does not exist; restore it or remove it from the reconstruction.")
+    """Return the file of an image; see `find_images`."""
+    return find_images(folder, [name])[0]
+
+
+def find_images(folder: Path, names: Sequence[str]) -> list[Path]:
+    """Return the files of images by their names in a scene.
+
+    Downscaled copies are often PNG, so another image suffix will do, or one that is added. Where letters differ in
+    case, as Windows does not mind, and where there are leading folders too many (instant-ngp writes paths as seen from
+    where it was called), the file is found as well.
+
+    Raises:
+        MissingFileError: some are not there; says how many.
+    """
+    found = [look_up(folder, PurePosixPath(relative_name(folder, name))) for name in names]
+    missing = [name for name, path in zip(names, found, strict=True) if path is None]
+    if missing:
+        path = inside(folder, missing[0])
+        path = path if path.suffix else path.with_suffix(".png")
+        others = len(missing) - 1
+        more = f", and neither do {others} others of {len(names)}" if others else ""
+        pronoun = "them" if others else "it"
+        near = same_stem(path)
+        instead = f" ({near.name} is there, which is not read: convert it to PNG)" if near else ""
+        raise MissingFileError(
+            f"Image {path} does not exist{instead}{more}; restore {pronoun} or remove {pronoun} from the "
+            "reconstruction."
+        )
+    return [path for path in found if path is not None]
+
+
+def look_up(folder: Path, name: PurePosixPath) -> Path | None:
+    """Return the image that is called so, or nearly so, in a folder; None where there is none."""
+    # Down to one folder and the name: a name alone would be taken for one of another camera.
+    ends = [PurePosixPath(*name.parts[start:]) for start in range(max(len(name.parts) - 1, 1))]
+    if len(name.parts) == 2 and name.parts[0] == folder.name:  # as seen from the folder above
+        ends.append(PurePosixPath(name.name))
+    for end in ends:
+        for candidate in spellings(end):
+            if os.path.isfile(folder / candidate):  # unlike Path.is_file, no error for names that are too long
+                return folder / candidate
+        path = in_any_case(folder, end)
+        if path is not None:
+            return path
+    return None
+
+
+def spellings(name: PurePosixPath) -> Iterator[PurePosixPath]:
+    """Yield a name, the name with other image suffixes, and the name with one added."""
+    yield name
+    if name.suffix.lower() in IMAGE_SUFFIXES:  # what follows a dot may be part of the name
+        yield from (name.with_suffix(suffix) for suffix in IMAGE_SUFFIXES)
+    yield from (name.with_name(name.name + suffix) for suffix in IMAGE_SUFFIXES)
+
+
+def in_any_case(folder: Path, name: PurePosixPath) -> Path | None:
+    """Return the only file whose path differs from `name` by capital letters alone, image suffixes apart."""
+    places = [folder]
+    for part in name.parts[:-1]:
+        places = [Path(entry.path) for place in places for entry in entries(place, [part]) if entry.is_dir()]
+    wanted = [spelling.name for spelling in spellings(PurePosixPath(name.name))]
+    found = [entry.path for place in places for entry in entries(place, wanted) if entry.is_file()]
+    return Path(found[0]) if len(found) == 1 else None
+
+
+def same_stem(path: Path) -> Path | None:
+    """Return a file beside `path` that differs from it by its suffix alone."""
+    try:
+        return next((other for other in sorted(path.parent.iterdir()) if other.stem == path.stem), None)
+    except OSError:
+        return None
+
+
+def entries(folder: Path, names: Sequence[str]) -> list[os.DirEntry[str]]:
+    """Return what a folder holds under one of these names in any case."""
+    wanted = {name.casefold() for name in names}
+    try:
+        with os.scandir(folder) as listing:
+            return [entry for entry in listing if entry.name.casefold() in wanted]
+    except OSError:
+        return []
+
+
+def unlisted_images(folder: Path, listed: Sequence[Path]) -> list[str]:
+    """Return the images in a folder and below that are none of `listed`: sorted relative paths, without hidden ones."""
+    known = {os.path.normpath(path) for path in listed}
+    suffixes = {suffix.lower() for suffix in IMAGE_SUFFIXES}
+    result = []
+    for root, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in files:
+            path = os.path.join(root, name)
+            image = os.path.splitext(name)[1].lower() in suffixes and not name.startswith(".")
+            if image and os.path.normpath(path) not in known:
+                result.append(os.path.relpath(path, folder))
+    return sorted(result)

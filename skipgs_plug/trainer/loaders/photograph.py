@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from skipgs_plug.trainer.errors import InputError, reason
 from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.images import read_image, read_mask
 from skipgs_plug.trainer.loaders.native import import_pycolmap
-from skipgs_plug.trainer.loaders.paths import inside
+from skipgs_plug.trainer.loaders.paths import inside, look_up
 from skipgs_plug.trainer.loaders.undistorted_cache import Straight, UndistortedCache
 from skipgs_plug.trainer.scene import View
 
@@ -51,7 +51,7 @@ def load_photograph(
         return read_straight(image_path, camera, cache, factor, mask_path)
 
     pixels, mask, K = read()
-    view = View(name, pixels, torch.from_numpy(K).float(), torch.from_numpy(viewmat), mask)
+    view = View(name, pixels, torch.from_numpy(K), torch.from_numpy(viewmat), mask)
     return view if images is None else images.keep(view, lambda: read()[:2])
 
 
@@ -146,9 +146,7 @@ def model_name(camera: Any) -> str:
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
-    """Return the mask of an image: its name with .png added (COLMAP's way) or in place of its suffix, or its name."""
+    """Return the mask of an image: its name with .png added (COLMAP's way), or its name with any image suffix."""
     path = inside(folder, name)
-    for candidate in (path.with_name(path.name + ".png"), path.with_suffix(".png"), path):
-        if os.path.isfile(candidate):
-            return candidate
-    return None
+    added = path.with_name(path.name + ".png")
+    return added if os.path.isfile(added) else look_up(folder, PurePosixPath(path.relative_to(folder).as_posix()))

@@ -1,0 +1,32 @@
+"""What is said about files that a scene holds and does not use."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from skipgs_plug.trainer.loaders.paths import unlisted_images
+
+log = logging.getLogger(__name__)
+
+
+def say_what_is_unlisted(folder: Path, listed: Sequence[Path], what: str) -> None:
+    """Say how many images of a folder no `what` lists: photographs that could not be placed, or were added later."""
+    others = unlisted_images(folder, listed)
+    if others:
+        log.warning(
+            "%s: %d of its images are no %s and are left out, such as %s.", folder, len(others), what, others[0]
+        )
+
+
+def say_bare(masks: Path, found: Sequence[Path | None]) -> None:
+    """Say how many views have no mask where others have, and how many masks belong to no view."""
+    if not masks.is_dir():
+        return
+    bare = sum(path is None for path in found)
+    if bare:
+        log.warning("%s: %d of %d views have no mask there and count whole.", masks, bare, len(found))
+        others = unlisted_images(masks, [path for path in found if path is not None])
+        if others:
+            log.warning("%s: %d masks are called like no view, such as %s.", masks, len(others), others[0])
