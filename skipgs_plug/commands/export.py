@@ -14,19 +14,23 @@ from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.ply import write_ply
 from skipgs_plug.view.model import is_antialiased, open_snapshots
+from skipgs_plug.view.sog import position_error, to_sog
 from skipgs_plug.view.spz import POSITION_BITS, to_spz
 
 log = logging.getLogger(__name__)
 
-FORMATS = {".compressed.ply": "ply_compressed", ".splat": "splat"}  # as gsplat.export_splats calls them
+GSPLATS = {".compressed.ply": "ply_compressed", ".splat": "splat"}  # as gsplat.export_splats calls them
+OURS = {".spz": to_spz, ".sog": to_sog}
+ENDINGS = (*GSPLATS, *OURS, ".ply")
 
 
 def run(args: Args) -> int:
     """Convert; see `Args`."""
     out = args.out.expanduser()
-    ending = next((ending for ending in (*FORMATS, ".spz", ".ply") if out.name.lower().endswith(ending)), None)
+    ending = next((ending for ending in ENDINGS if out.name.lower().endswith(ending)), None)
     if ending is None:
-        raise InputError(f"{out.name} has an ending that is not written here; use {', '.join(FORMATS)}, .spz or .ply.")
+        known = f"{', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
+        raise InputError(f"{out.name} has an ending that is not written here; use {known}.")
     source = Path(args.model).expanduser()
     splats = open_snapshots(source)[-1].load()
     if ending == ".ply":
@@ -37,8 +41,12 @@ def run(args: Args) -> int:
                 "%s holds positions of single precision: they are rounded by up to %.2g units. A .ply keeps them.",
                 *(out, rounding(splats["means"], ending)),
             )
-            splats["means"] = splats["means"].float()
-        data = to_spz(splats, is_antialiased(source)) if ending == ".spz" else exported(splats, FORMATS[ending])
+            if ending != ".sog":  # its numbers are relative to the extent
+                splats["means"] = splats["means"].float()
+        if ending in OURS:
+            data = OURS[ending](splats, is_antialiased(source))
+        else:
+            data = exported(splats, GSPLATS[ending])
         with write_aside(out) as temporary:
             temporary.write_bytes(data)
     print(f"{len(splats['means']):,} Gaussians, {out.stat().st_size / 2**20:.1f} MiB: {out}")
@@ -48,6 +56,8 @@ def run(args: Args) -> int:
 def rounding(means: Tensor, ending: str) -> float:
     """Return by how much a format moves positions [N, 3] at most."""
     largest = float(means.abs().max())
+    if ending == ".sog":
+        return max(largest * 2.0**-24, position_error(means))
     return largest * 2.0 ** -(POSITION_BITS if ending == ".spz" else 24)
 
 

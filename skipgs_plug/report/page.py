@@ -10,6 +10,7 @@ from skipgs_plug.bench.summary import row_from_dict
 from skipgs_plug.bench.table import is_whole, legend, notes, tables
 from skipgs_plug.report import plots
 from skipgs_plug.report.blocks import Block, Details, Picture, Section, Strip, Table, Text, write_page
+from skipgs_plug.report.phases import phase_blocks
 from skipgs_plug.report.source import BenchSource, RunSource
 
 GATE_HEADING = (
@@ -63,6 +64,7 @@ def comparison(runs: Sequence[RunSource]) -> Section:
     curves = {name: run.curve for name, run in names.items() if run.curve}
     if curves:
         blocks.append(picture(plots.loss_over_time(curves), "Training loss over iterations."))
+        blocks.append(picture(plots.gaussians_over_time(curves, {}), "Gaussians over the seconds of training."))
     views = {name: run.views for name, run in names.items() if run.views}
     if views:
         blocks.append(picture(plots.quality_of_views(views), "PSNR of every held-out view; dashed: their means."))
@@ -79,10 +81,13 @@ def run_section(run: RunSource) -> Section:
     blocks: list[Block] = [results("Results", [run])]
     if run.curve:
         blocks.append(picture(plots.loss_over_time({run.name: run.curve}), "Training loss over iterations."))
+        blocks.append(gaussians(run))
     if run.views:
         blocks.append(picture(plots.quality_of_views({run.name: run.views}), "PSNR of held-out views; dashed: mean."))
     blocks += pictured_views(run)
     if run.gate is not None:
+        if run.gate.get("refine_share") is not None:  # reports from before iterations could be left out do not say
+            blocks += phase_blocks(run.gate, run.curve)
         blocks += gate_blocks(run.name, run.gate)
     if run.views:
         names = list(run.views[0])
@@ -94,6 +99,16 @@ def run_section(run: RunSource) -> Section:
     if run.settings:
         blocks.append(Details("Settings of training", [settings_table("Settings of training", run.settings)]))
     return Section(run.name, blocks)
+
+
+def gaussians(run: RunSource) -> Picture:
+    """How many there were in the course of training, and where densification ended if that is known."""
+    caption = "Gaussians over the seconds of training."
+    ends = {}
+    if run.t_total is not None and run.t_post:
+        ends[run.name] = run.t_total - run.t_post
+        caption = "Gaussians over the seconds of training; dashed: the end of growing."
+    return picture(plots.gaussians_over_time({run.name: run.curve}, ends), caption)
 
 
 def pictured_views(run: RunSource) -> list[Block]:

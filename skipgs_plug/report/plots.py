@@ -62,6 +62,23 @@ def loss_over_time(curves: Mapping[str, Mapping[str, list[float]]]) -> Figure:
     return figure
 
 
+def gaussians_over_time(curves: Mapping[str, Mapping[str, list[float]]], ends: Mapping[str, float]) -> Figure:
+    """Number of Gaussians of every run over the seconds of training; `ends`: seconds at which growing ended."""
+    figure, axes = new_figure(WIDTH, 3.4)
+    for i, (name, curve) in enumerate(curves.items()):
+        colour = COLOURS[i % len(COLOURS)]
+        axes.plot(curve["seconds"], curve["num_GS"], color=colour, linewidth=1.2, label=name)
+        if name in ends:
+            axes.axvline(ends[name], color=colour, linewidth=0.8, linestyle="--")
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("training (s)")
+    axes.set_ylabel("Gaussians")
+    axes.yaxis.set_major_formatter("{x:,.0f}")
+    if len(curves) > 1:
+        figure.legend(frameon=False, fontsize=SMALL, ncols=2, loc="outside upper center")
+    return figure
+
+
 def quality_of_views(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
     """Held-out PSNR of every view, in the order of their names; one mark per run."""
     figure, axes = new_figure(WIDTH, 3.4)

@@ -9,6 +9,7 @@ from browser import Browser
 from report_browser import body_count
 
 from skipgs_plug.cli import main
+from skipgs_plug.report.phases import phases
 from skipgs_plug.trainer import TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.curve import LossCurve
 
@@ -34,8 +35,8 @@ def test_browser_shows_a_training_run(train_folder, tmp_path, dump_dom):
     assert row[:5] == ["gated", "40", "20", str(data["backwards_run"]), str(data["backwards_skipped"])]
     assert len(rows_of(dom, "Training views")) == 6
     assert dict(rows_of(dom, "Last evaluation"))["num_GS"].isdigit()
-    # Loss, quality of views, three plots of the gate; photograph, render and error of two held-out views.
-    assert body_count(dom, "images") == body_count(dom, "decoded") == 5 + 6
+    # Loss, Gaussians, quality of views, three plots of the gate; photograph, render and error of two held-out views.
+    assert body_count(dom, "images") == body_count(dom, "decoded") == 6 + 6
 
 
 def test_a_run_without_a_gate_is_shown_with_its_worst_view_first(ungated_folder, tmp_path, dump_dom):
@@ -55,7 +56,7 @@ def test_a_run_without_a_gate_is_shown_with_its_worst_view_first(ungated_folder,
     assert captions[first].startswith(f"{worst['view']}: {worst['psnr']:.2f} dB, worst of 2")
     assert captions[second].startswith(best["view"])
     assert "What the gate did" not in dom
-    assert body_count(dom, "images") == body_count(dom, "decoded") == 2 + 6
+    assert body_count(dom, "images") == body_count(dom, "decoded") == 3 + 6
 
 
 def test_pages_fit_a_phone(train_folder, bench_folder, script_folder, tmp_path):
@@ -118,8 +119,8 @@ def test_browser_compares_several_runs(train_folder, ungated_folder, script_fold
     expected = [json.loads((f / "stats/val_step39.json").read_text()) for f in (train_folder, ungated_folder)]
     assert rows["SSIM"] == [*(f"{stats['ssim']:.4f}" for stats in expected), "-"]
     assert rows["Gaussians"] == [*(f"{stats['num_GS']:,}" for stats in expected), "-"]
-    # Two of the comparison, then those of each run and of the bench.
-    assert body_count(dom, "images") == body_count(dom, "decoded") == 2 + 11 + 8 + 3 + 6
+    # Three of the comparison, then those of each run and of the bench.
+    assert body_count(dom, "images") == body_count(dom, "decoded") == 3 + 12 + 9 + 3 + 6
 
 
 def test_runs_of_one_name_are_told_apart_by_their_paths(ungated_folder, tmp_path):
@@ -210,3 +211,41 @@ def test_iterations_left_out_are_told(train_folder, tmp_path, share, cells):
     (folder / "skipgs.json").write_text(json.dumps(data))
     page = make_page(tmp_path, folder).read_text()
     assert rows_of(page, "Whole iterations left out") == [["run", cells[0], "1,234", "2,000", "32", *cells[1:]]]
+
+
+@pytest.fixture(scope="session")
+def shared_folder(scene_file, tmp_path_factory):
+    """A run of which whole iterations and densification events are left out."""
+    folder = tmp_path_factory.mktemp("train") / "shared"
+    command = ["train", scene_file, "--out", str(folder), "--share", "0.5", "--max-steps", "400", "--no-progress"]
+    assert main(command) == 0
+    return folder
+
+
+def test_the_phases_of_a_run_are_told_and_the_whole_is_estimated(shared_folder, tmp_path):
+    page = make_page(tmp_path, shared_folder).read_text()
+    rows = {name: cells for name, *cells in rows_of(page, "The two phases of the run")}
+    data = json.loads((shared_folder / "skipgs.json").read_text())
+    growing = data["growing"]
+    run, left_out = growing["iterations_run"], growing["iterations_skipped"]
+    assert run + left_out == 200 and left_out > 0
+    ran, skipped = data["iterations_run"], data["iterations_skipped"]
+    assert ran + skipped == 200 and skipped > 0
+    assert rows["iterations of the schedule"] == ["200", "200", "400"]
+    assert rows["left out"] == [f"{left_out}", f"{skipped}", f"{left_out + skipped}"]
+    events = str(growing["events_skipped"])
+    assert rows["densification events left out"] == [events, "-", events]
+    gaussians = json.loads((shared_folder / "stats/train_curve.json").read_text())["num_GS"]
+    assert rows["Gaussians at the end"][2] == f"{gaussians[-1]:,}"
+    whole = (data["t_total"] - data["t_post"]) * 200 / run + data["t_post"] * 200 / ran
+    assert rows["without leaving out, s (estimate)"][2] == f"{whole:.0f}"
+    assert "It was not measured" in page and "dashed: the end of growing" in page
+
+
+def test_a_phase_that_runs_whole_is_told_too():
+    gate = {"settings": {"start_iter": 100}, "iterations": 140, "gated_iterations": 40, "t_total": 3.0, "t_post": 1.0}
+    gate |= {"iterations_run": 40, "iterations_skipped": 60, "growing": None}
+    curve = {"step": [50, 99, 130, 199], "num_GS": [10, 20, 30, 30]}
+    growing, refining = phases(gate, curve)
+    assert (growing.run, growing.left_out, growing.gaussians, growing.without) == (100, 0, 20, 2.0)
+    assert (refining.iterations, refining.gaussians, refining.without) == (100, 30, 2.5)

@@ -44,7 +44,7 @@ def test_a_run_folder_is_exported_compressed_and_as_ply(run_folder, ply, tmp_pat
 @pytest.mark.parametrize("name", ["model.obj", "model"])
 def test_other_endings_are_refused(ply, tmp_path, capsys, name):
     assert main(["export", str(ply), str(tmp_path / name)]) == 2
-    assert "use .compressed.ply, .splat, .spz or .ply" in capsys.readouterr().err
+    assert "use .compressed.ply, .splat, .spz, .sog or .ply" in capsys.readouterr().err
 
 
 def test_a_run_is_exported_without_its_scene(run_folder, tmp_path, capsys):

@@ -18,6 +18,7 @@ class Args:
     .compressed.ply: SuperSplat, PlayCanvas; 61 bytes per Gaussian, invisible ones left out.
     .splat: antimatter15 and most web viewers; 32 bytes, colours that do not change with direction.
     .spz: phones, glTF, Niantic's and most web viewers; about 20 bytes, colours that change with direction.
+    .sog: SuperSplat, PlayCanvas, most web viewers; about 15 bytes, colours that change with direction.
     .ply: 62 properties, exact.
     """
 

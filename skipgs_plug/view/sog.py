@@ -1,0 +1,164 @@
+"""SOG, version 2: PlayCanvas's compressed format for the web, lossless WebP pictures in a ZIP file.
+
+Written from the specification at developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog. Axes are those of
+the PLY.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import zipfile
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skipgs_plug.trainer.row_order import morton_order
+
+VERSION = 2
+STEPS = (1 << 16) - 1  # from the lowest position to the highest
+LEVELS = 256  # of a codebook
+ROUNDS = 8  # of k-means
+ROW = 64  # palette entries in a row of their picture
+BANDS = {0: 0, 3: 1, 8: 2, 15: 3}  # by number of coefficients beyond the constant one
+LARGEST_COMPONENT = 252  # alpha of a rotation whose w is the largest; 253 to 255 stand for x, y and z
+MOST_ENTRIES = 1 << 16  # a label has two bytes
+GAUSSIANS_PER_ENTRY = 8
+PAIRS = 5e9  # of Gaussians and entries that are compared once: half a minute on one core
+SAMPLES_PER_ENTRY = 16  # that entries are found from
+CHUNK = 4096  # Gaussians that are compared with all entries at once
+
+
+def to_sog(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
+    """Return the file of a model with raw parameters, as of `read_ply`; rows are put in the order of space.
+
+    Positions are kept to 2**-17 of the extent on a scale that is finer near the origin (`position_error`); opacities and rotations in a
+    byte a number; scales and constant colours in 256 levels that suit the model; the other harmonics as a palette of up
+    to 65,536 entries.
+    """
+    means = splats["means"].detach().cpu().double()
+    order = morton_order(means)
+    splats = {name: tensor.detach().cpu().float()[order] for name, tensor in splats.items()}
+    n, bands = len(order), BANDS[splats["shN"].shape[1]]
+    meta: dict[str, object] = {"version": VERSION, "asset": {"generator": "skipgs_plug"}, "count": n}
+    if antialiased:
+        meta["model"] = "antialiased"
+    pictures: dict[str, np.ndarray] = {}
+
+    places, lowest, highest = _positions(means[order].numpy())
+    pictures["means_l"], pictures["means_u"] = _grid(places & 255), _grid(places >> 8)
+    meta["means"] = {"mins": lowest, "maxs": highest, "files": ["means_l.webp", "means_u.webp"]}
+
+    scales, codebook = _levels(splats["scales"].numpy())
+    pictures["scales"] = _grid(scales)
+    meta["scales"] = {"codebook": codebook, "files": ["scales.webp"]}
+
+    pictures["quats"] = _grid(_rotations(splats["quats"].numpy()))
+    meta["quats"] = {"files": ["quats.webp"]}
+
+    colours, codebook = _levels(splats["sh0"][:, 0].numpy())
+    opacities = np.rint(torch.sigmoid(splats["opacities"])[:, None].numpy() * 255)
+    pictures["sh0"] = _grid(np.concatenate([colours, opacities], axis=1))
+    meta["sh0"] = {"codebook": codebook, "files": ["sh0.webp"]}
+
+    if bands:
+        palette, labels = _palette(splats["shN"].flatten(1))
+        entries, codebook = _levels(palette.reshape(-1, 3))
+        rows = -(-len(palette) // ROW)
+        padded = np.zeros((rows * ROW, palette.shape[1]), np.uint8)
+        padded[: len(palette)] = entries.reshape(len(palette), -1)
+        pictures["shN_centroids"] = padded.reshape(rows, -1, 3)
+        pictures["shN_labels"] = _grid(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1))
+        files = ["shN_centroids.webp", "shN_labels.webp"]
+        meta["shN"] = {"count": len(palette), "bands": bands, "codebook": codebook, "files": files}
+
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
+        for name, picture in pictures.items():
+            archive.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(picture))
+    return stream.getvalue()
+
+
+def position_error(means: Tensor) -> float:
+    """Return by how much positions [N, 3] are rounded at most."""
+    _, lowest, highest = _positions(means.numpy())
+    return max(
+        (high - low) / STEPS / 2 * math.exp(max(abs(low), abs(high))) for low, high in zip(lowest, highest, strict=True)
+    )
+
+
+def _positions(means: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
+    """Return 16 bits a coordinate [N, 3], and what 0 and 65,535 stand for on the logarithmic scale."""
+    scaled = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
+    lowest, highest = scaled.min(axis=0), scaled.max(axis=0)
+    extent = np.where(highest > lowest, highest - lowest, 1.0)
+    places = np.rint((scaled - lowest) / extent * STEPS).astype(np.uint16)
+    return places, lowest.tolist(), (lowest + extent).tolist()
+
+
+def _rotations(quats: np.ndarray) -> np.ndarray:
+    """Return the three smaller components, made so that the largest is positive, and which that is [N, 4]."""
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(min=1e-12)
+    largest = np.abs(quats).argmax(axis=1)[:, None]
+    quats = quats * np.where(np.take_along_axis(quats, largest, axis=1) < 0, -1.0, 1.0)
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest[:, 0]]
+    smaller = np.take_along_axis(quats, others, axis=1) * 2**0.5  # none exceeds the root of one half
+    return np.concatenate([np.rint((smaller * 0.5 + 0.5) * 255), LARGEST_COMPONENT + largest], axis=1)
+
+
+def _levels(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
+    """Return 256 levels by k-means, ascending, and the number of the nearest one to each value [N, M]."""
+    ordered = np.sort(values, axis=None).astype(np.float64)
+    sums = np.concatenate([[0.0], np.cumsum(ordered)])
+    # Between equal ranks and equal steps: tails are rare, and large Gaussians are seen.
+    ranks, steps = (np.linspace(0, 1, LEVELS), np.linspace(ordered[0], ordered[-1], LEVELS))
+    levels = np.sort((np.quantile(ordered, ranks) + steps) / 2)
+    for _ in range(ROUNDS):
+        edges = np.searchsorted(ordered, np.concatenate([[-np.inf], (levels[1:] + levels[:-1]) / 2, [np.inf]]))
+        counts = np.diff(edges)
+        levels = np.where(counts > 0, np.diff(sums[edges]) / counts.clip(min=1), levels)
+        levels.sort()
+    return np.searchsorted((levels[1:] + levels[:-1]) / 2, values).astype(np.uint8), levels.tolist()
+
+
+def _palette(rows: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Return entries [K, C] by k-means, and the number of the nearest one to each row [N, C]."""
+    n = len(rows)
+    entries = int(min(MOST_ENTRIES, PAIRS // n, max(1, n // GAUSSIANS_PER_ENTRY)))
+    generator = torch.Generator().manual_seed(0)
+    sample = rows[torch.randperm(n, generator=generator)[: entries * SAMPLES_PER_ENTRY]]
+    palette = sample[:entries].clone()
+    for _ in range(ROUNDS if entries < n else 0):
+        labels = _nearest(sample, palette)
+        counts = torch.bincount(labels, minlength=entries)
+        sums = torch.zeros_like(palette).index_add_(0, labels, sample)
+        palette = torch.where(counts[:, None] > 0, sums / counts.clamp(min=1)[:, None], palette)
+    return palette.numpy(), _nearest(rows, palette).numpy()
+
+
+def _nearest(rows: Tensor, palette: Tensor) -> Tensor:
+    half = (palette**2).sum(dim=1) / 2
+    parts = [(half - part @ palette.T).argmin(dim=1) for part in rows.split(CHUNK)]
+    return torch.cat(parts)
+
+
+def _grid(rows: np.ndarray) -> np.ndarray:
+    """Lay out one pixel a row [N, 3 or 4], from left to right, then down."""
+    width = max(4, -(-int(np.ceil(len(rows) ** 0.5)) // 4) * 4)
+    height = max(1, -(-len(rows) // width))
+    picture = np.zeros((height * width, rows.shape[1]), np.uint8)
+    picture[: len(rows)] = rows
+    return picture.reshape(height, width, -1)
+
+
+def _webp(picture: np.ndarray) -> bytes:
+    from PIL import Image
+
+    stream = io.BytesIO()
+    # exact: colours of transparent pixels are numbers too.
+    Image.fromarray(picture).save(stream, format="WEBP", lossless=True, quality=60, method=4, exact=True)
+    return stream.getvalue()
