@@ -43,10 +43,7 @@ def run(args: Args) -> int:
             )
             if ending != ".sog":  # its numbers are relative to the extent
                 splats["means"] = splats["means"].float()
-        if ending in OURS:
-            data = OURS[ending](splats, is_antialiased(source))
-        else:
-            data = exported(splats, GSPLATS[ending])
+        data = OURS[ending](splats, is_antialiased(source)) if ending in OURS else exported(splats, GSPLATS[ending])
         with write_aside(out) as temporary:
             temporary.write_bytes(data)
     print(f"{len(splats['means']):,} Gaussians, {out.stat().st_size / 2**20:.1f} MiB: {out}")

@@ -35,9 +35,13 @@ CHUNK = 4096  # Gaussians that are compared with all entries at once
 def to_sog(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
     """Return the file of a model with raw parameters, as of `read_ply`; rows are put in the order of space.
 
-    Positions are kept to 2**-17 of the extent on a scale that is finer near the origin (`position_error`); opacities and rotations in a
-    byte a number; scales and constant colours in 256 levels that suit the model; the other harmonics as a palette of up
-    to 65,536 entries.
+    Positions are kept to 2**-17 of the extent on a scale that is finer near the origin (`position_error`); opacities
+    and rotations in a byte a number; scales and constant colours in 256 levels that suit the model; the other
+    harmonics as a palette of up to 65,536 entries.
+
+    Args:
+        splats: `means scales quats opacities sh0 shN`.
+        antialiased: the model compensates opacities for the blur, and wants viewers to do the same.
     """
     means = splats["means"].detach().cpu().double()
     order = morton_order(means)
