@@ -12,6 +12,7 @@ PAGES = (
     "*.md",
     "docs/**/*.md",
     "docs/**/*.png",
+    "docs/site.css",
     "examples/*.md",
     "examples/*.py",
     "tests/SITUATIONS.md",

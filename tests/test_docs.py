@@ -36,6 +36,12 @@ def test_readme_stays_short_and_links_every_page() -> None:
     assert {page.name for page in ROOT.glob("docs/*.md")} <= set(re.findall(r"\(docs/([\w.]+)", readme))
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_lists_begin_after_an_empty_line_as_the_site_needs_it(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    assert not re.findall(r"^(?!\s|- |#|\d+\. |<!--)[^\n]+\n- .*$", text, re.MULTILINE)
+
+
 def test_user_path_stays_below_8000_words() -> None:
     words = {page.name: sum(any(map(str.isalnum, word)) for word in page.read_text().split()) for page in USER_PATH}
     assert sum(words.values()) < 8_000, words
