@@ -1,5 +1,6 @@
 """FastGS and Taming: gradients of earlier iterations are applied in iterations that are skipped themselves."""
 
+import pytest
 import torch
 from cases import SkipAlways, run, script
 from lookalikes import fastgs, taming
@@ -45,3 +46,9 @@ def test_prunes_of_fastgs_are_events():
     assert [step for step, kind, _ in gated.structure if step > 20] == list(fastgs.PRUNES)
     assert gate.stats()["events"] == {"prune_points": 2}
     assert [row.step for row in gate.trace if row.reason == "pause"] == [*range(33, 39), *range(45, 51)]
+
+
+def test_growth_without_an_event_that_the_loop_tells_runs_whole():
+    with pytest.warns(RuntimeWarning, match="that names densification_interval holds before iteration 20"):
+        gated, _ = run(CASES["fastgs"], share=0.5)
+    assert gated.backwards[:19] == list(range(1, 20)) and len(gated.backwards) < 64
