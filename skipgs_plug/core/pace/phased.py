@@ -211,8 +211,8 @@ class Phased(Pace):
             assert self._densification is not None
             hidden = {n for n in (*self._hidden(grown), *self._chosen) if n in grown}
             if not self.growing.begin(grown, found[0], hidden, self._densification, epoch):
-                names = ", ".join(self._densification.marks)
-                self._grow_whole(f"No condition of the loop that names {names} holds before iteration {self._start}")
+                marks = ", ".join(self._densification.marks)
+                self._grow_whole(f"No condition of the loop that names {marks} holds before iteration {self._start}")
 
     def _require_events(self) -> None:
         """Let growth run whole where its densification events are not known."""
