@@ -26,49 +26,60 @@ from skipgs_plug.core.views import view_key
 
 
 class SkipGate:
-    """Leaves out backwards that a 3DGS trainer does not need after densification (SkipGS).
+    """Shortens the training of 3D Gaussians from outside, without editing the trainer.
 
-    Two entrances, one engine. For a known trainer (an object, a train module, or a training function):
+    There are two ways to use it. For a known trainer (an object, a train module, or a training function):
 
-        gate = SkipGate(runner)
-        runner.train()                  # unchanged
+        gate = SkipGate(runner, share="auto")
+        runner.train()  # unchanged
         print(gate.summary())
 
-    For any other loop, verbs as in `torch.amp.GradScaler`:
+    For any other loop, call its verbs, as with `torch.amp.GradScaler`; see the examples.
 
-        gate = SkipGate(start_iter=15_000)
-        for step in range(1, 30_001):
-            ...
-            if gate.backward(loss, view=camera.image_name, step=step):
-                optimizer.step()
-                optimizer.zero_grad(set_to_none=True)
+    There are three policies. `share` leaves out whole iterations of the whole run, densification included, and larger,
+    shrinking steps make up for them. `refine_share` does the same after densification only. Without either, the gate
+    follows the paper (SkipGS, arXiv 2603.08997): every forward pass runs, and the backward pass of a view is skipped
+    while its loss is at or below its own running mean.
 
-    With `share` whole iterations are left out, densification included, and larger, shrinking steps make up for those
-    of refinement (see `skipgs_plug.core.pace`); `refine_share` leaves densification as it is. A loop of your own is
-    then written as
+    Learning-rate and SH schedules, logging and checkpoints count iterations, not updates: let them run in skipped
+    iterations too. Where the decision depends on the loss, the gate reads it before the backward pass. That is one
+    device sync per iteration; most trainers read the loss anyway, after the backward pass.
 
-        gate = SkipGate(start_iter=15_000, share="auto")
-        for step in gate.iterations(range(1, 30_001), views=names, events=range(600, 15_000, 100)):
-
-    Learning-rate and SH schedules, logging and checkpoints count iterations, not updates: let them run on
-    skipped iterations too. From `start_iter` on the loss is read on the host before the backward, one
-    device sync per iteration; most trainers read it anyway, just later.
-
-    As a context manager the gate detaches at the end of the block, on exceptions too.
+    As a context manager, the gate detaches at the end of the block, after an exception too.
 
     Args:
-        trainer: What to attach to. None for a loop of your own, or, with `adapter`, for a training script
-            that is about to be run in this process.
-        adapter: Name of an adapter, when the right one is not found by itself.
+        trainer: The trainer to attach to. None for a loop of your own, or, with `adapter`, for a training script
+            that will run in this process.
+        adapter: Name of the adapter, when the gate does not find the right one by itself.
         config: All settings in one object, instead of `config_fields`.
-        policy: Decides in place of `SkipPolicy`; derived from `skipgs_plug.core.policy.Policy`.
-        record_trace: Keep every gated decision in `trace`.
+        policy: Decides in place of `SkipPolicy`. Derive it from `skipgs_plug.core.policy.Policy`.
+        record_trace: Keep every decision in `trace`.
         **config_fields: Fields of `SkipConfig`.
 
     Raises:
         UnknownTrainerError: No adapter knows the trainer.
-        AdapterMismatchError: The trainer lacks something that its adapter needs.
-        SkipGSError: A setting is out of range, the policy is none, or the trainer is gated already.
+        AdapterMismatchError: The trainer lacks an attribute that its adapter needs.
+        SkipGSError: A setting is out of range, `policy` is not a `Policy`, or the trainer has a gate already.
+
+    Examples:
+        The paper's gate in a loop of your own. The first visits of a view always run; later the floor
+        `min_bwd_ratio` bounds how many backward passes are skipped.
+
+        >>> import torch
+        >>> from skipgs_plug import SkipGate
+        >>> weight = torch.nn.Parameter(torch.zeros(1))
+        >>> optimizer = torch.optim.Adam([weight], lr=0.1)
+        >>> gate = SkipGate(start_iter=0, warmup=4)
+        >>> for step in range(200):
+        ...     loss = (weight - 1).square().mean()
+        ...     if gate.backward(loss, view=f"view_{step % 2}.png", step=step):
+        ...         optimizer.step()
+        ...         optimizer.zero_grad(set_to_none=True)
+        >>> stats = gate.stats()
+        >>> stats["backwards_run"] + stats["backwards_skipped"]
+        200
+        >>> stats["backwards_skipped"] > 50
+        True
     """
 
     def __init__(
@@ -83,7 +94,9 @@ class SkipGate:
     ) -> None:
         settings = _settings(config, config_fields)
         if not (policy is None or isinstance(policy, Policy)):
-            raise SkipGSError(f"{type(policy).__name__} is no policy; derive it from skipgs_plug.core.policy.Policy.")
+            raise SkipGSError(
+                f"{type(policy).__name__} is not a policy; derive it from skipgs_plug.core.policy.Policy."
+            )
         self._hooks: Hooks | None = None
         self._adapter: Adapter | None = None
         if trainer is not None or adapter is not None:
@@ -110,21 +123,31 @@ class SkipGate:
     ) -> LoopRange:
         """Return the iterations of your loop that run: `for step in gate.iterations(range(30_000))`.
 
-        Also for a loop of yours around a trainer that the gate is attached to.
+        It also suits a loop of yours around a trainer that the gate is attached to.
 
-        Iterations that something hangs on always run: those for which the loop's own conditions on the number
-        hold (`if step % 1000 == 0`), read from its source, and the last one. What advances per call, such as a
-        scheduler, is yours to advance by number.
+        Some iterations always run: the last one, and those for which a condition of your loop on the number holds
+        (`if step % 1000 == 0`). The conditions are read from the source of the loop. A scheduler that advances with
+        each call must be advanced by number instead.
 
         Args:
             numbers: All iterations of the run, or all that are left, one by one.
-            always: Iterations that must run, instead of those read from the loop; what an adapter knows comes on top.
-            views: Keys of all training views; `share="auto"` and `refine_share="auto"` must know them.
-            events: Iterations in which your loop densifies, such as `range(600, 15_000, 100)`; `share` thins them out.
+            always: Iterations that always run, instead of those read from the loop. Iterations that an adapter names
+                are added.
+            views: Keys of all training views. `share="auto"` and `refine_share="auto"` need them.
+            events: Iterations in which your loop densifies, such as `range(600, 15_000, 100)`. `share` leaves out
+                some of them.
 
         Raises:
-            SkipGSError: The numbers do not go up by one, or go on after those of an earlier call, or a condition of the
-                loop cannot be foreseen.
+            SkipGSError: The numbers do not increase by one, they continue those of an earlier call, or a condition
+                of the loop cannot be evaluated ahead.
+
+        Examples:
+            Four of ten iterations run after densification, which ends here at iteration 10. The last one always runs.
+
+            >>> from skipgs_plug import SkipGate
+            >>> gate = SkipGate(start_iter=10, refine_share=0.4)
+            >>> list(gate.iterations(range(20), always=[15]))
+            [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 15, 19]
         """
         if not isinstance(numbers, range) or numbers.step != 1:
             raise SkipGSError("iterations() takes a range that goes up by one, such as range(30_000).")
@@ -138,28 +161,40 @@ class SkipGate:
         return self._engine.pace.follow(numbers, source, always or (), keys, events)
 
     def backward(self, loss: Any, view: Any, step: int, *, signal: Any = None) -> bool:
-        """Run `loss.backward()` unless this view can do without; True when gradients were computed.
+        """Run `loss.backward()`, or skip it; return True when gradients were computed.
 
         Args:
-            loss: Scalar loss of this view. Or a list of per-view losses, with a list of keys as `view`:
-                each is decided on by itself, and one backward runs on the sum of those that stay.
-            view: Stable key of the view: image name, or index. One constant key for a joint loss of a batch.
-            step: Iteration, in the same counting as `start_iter`.
-            signal: Value (or list of values) to decide on when it is not the loss itself: the image term, or
+            loss: Scalar loss of this view. Or a list of per-view losses, with a list of keys as `view`: each view is
+                decided by itself, and one backward pass runs on the sum of the losses that are kept.
+            view: Stable key of the view: image name or index. For a joint loss of a batch, one constant key.
+            step: Iteration, counted like `start_iter`.
+            signal: Value (or list of values) to decide by, when it is not the loss itself: the image term, or
                 the loss before an AMP scaler.
 
         Raises:
-            GateOrderError: The view was decided on already in this iteration, the iteration was ended by
-                `update`, or iterations go backwards.
-            SkipGSError: The key is not usable, the loss is no tensor, losses stay non-finite, or `refine_share` is
-                given and no loop over `iterations` runs.
+            GateOrderError: The view was decided already in this iteration, `update` has ended the iteration, or the
+                iteration number decreases.
+            SkipGSError: The key is not usable, the loss is not a tensor, losses stay non-finite, or a share is
+                given and the loop does not run over `iterations`.
+
+        Examples:
+            A batch of two views in one iteration:
+
+            >>> import torch
+            >>> from skipgs_plug import SkipGate
+            >>> weight = torch.nn.Parameter(torch.ones(2))
+            >>> gate = SkipGate(start_iter=0)
+            >>> gate.backward([weight[0] ** 2, weight[1] ** 2], view=["a.png", "b.png"], step=0)
+            True
+            >>> weight.grad
+            tensor([2., 2.])
         """
         self._require_manual("backward")
         engine, now, step = self._engine, self._iteration, int(step)
         self._check_losses(loss, view)
         if engine.pace.lacks_loop and engine.pace.needs_loop(step):
             raise SkipGSError(
-                "share and refine_share leave out iterations of a loop that they are given: write the loop as "
+                "share and refine_share leave out iterations, so the gate must count them; write the loop as "
                 "for step in gate.iterations(range(...))."
             )
         if step != now.step:
@@ -175,17 +210,17 @@ class SkipGate:
         return engine.gate(self._new_in_iteration(view), loss if signal is None else signal, loss.backward, loss)
 
     def step(self, optimizer: Any, *args: Any) -> bool:
-        """Call `optimizer.step(*args)` if it has a pending gradient; True when it stepped.
+        """Call `optimizer.step(*args)` if a gradient is pending; return True when it stepped.
 
-        Pending means computed and not yet used, in this iteration or, where gradients are accumulated, an
-        earlier one. Zero the gradients only when True is returned, and with `set_to_none=True`.
+        A pending gradient was computed in this iteration, or in an earlier one where gradients are accumulated, and
+        has not been used. Zero the gradients only when True is returned, with `set_to_none=True`.
 
         Args:
             optimizer: One optimizer, or a list or dict of all that step together.
-            *args: Passed on, such as the mask of visible Gaussians for a sparse optimizer.
+            *args: Arguments of `optimizer.step`, such as the mask of visible Gaussians for a sparse optimizer.
 
         Raises:
-            GateOrderError: No `backward` came first in this iteration, or the optimizer was stepped in it.
+            GateOrderError: `backward` was not called first in this iteration, or the optimizer has stepped in it.
         """
         self._require_backward_before("step")
         optimizers = listed(optimizer)
@@ -196,27 +231,27 @@ class SkipGate:
         return step_pending(optimizers, args, always=not self._engine.config.enabled)
 
     def update(self) -> None:
-        """End the iteration, and free the graph of a backward that was skipped.
+        """End the iteration and free the graph of a skipped backward pass.
 
-        Optional: a new step number ends it too, but in most loops the next forward has run by then, and two graphs
-        need memory.
+        This is optional: a new step number ends the iteration too. But in most loops the next forward pass has run
+        by then, and two graphs are in memory.
 
         Raises:
-            GateOrderError: No `backward` came first in this iteration.
+            GateOrderError: `backward` was not called first in this iteration.
         """
         self._require_backward_before("update")
         self._iteration.ended = True
         self._engine.free_skipped()
 
     def notify_event(self, kind: str, step: int | None = None) -> None:
-        """Tell of a structural change: real backwards follow for a while, and means are left alone.
+        """Report a structural change: real backward passes follow for a while, and the means do not change.
 
         Args:
-            kind: What happened ("prune", "opacity reset"), for the report.
-            step: Iteration it happened in; the present one when left out.
+            kind: Name of the change for the report, such as "prune" or "opacity reset".
+            step: Iteration of the change; default: the present one.
 
         Raises:
-            GateOrderError: No iteration was seen yet and no step is given.
+            GateOrderError: No iteration has run yet and `step` is not given.
         """
         step = self._iteration.step if step is None else int(step)
         if step is None or self._engine.policy is None:
@@ -227,7 +262,7 @@ class SkipGate:
 
     @property
     def skipped(self) -> bool:
-        """Whether the present iteration's backward was skipped."""
+        """Whether the backward pass of the present iteration was skipped."""
         return self._iteration.skipped
 
     @property
@@ -237,20 +272,20 @@ class SkipGate:
 
     @property
     def policy(self) -> Policy | None:
-        """What decides; None until an adapter knows when densification ends."""
+        """The policy in force; None until an adapter knows when densification ends."""
         return self._engine.policy
 
     @property
     def adapter(self) -> Adapter | None:
-        """The adapter that is attached, None for a loop of your own."""
+        """The attached adapter; None for a loop of your own."""
         return self._adapter
 
     @property
     def trace(self) -> list[TraceRow]:
-        """One row per gated decision.
+        """One row per decision.
 
         Raises:
-            SkipGSError: The gate was made without `record_trace=True`.
+            SkipGSError: The gate was created without `record_trace=True`.
         """
         if self._engine.trace is None:
             raise SkipGSError("This gate records no trace; make it with record_trace=True.")
@@ -258,21 +293,21 @@ class SkipGate:
 
     @property
     def script_globals(self) -> dict[str, Any]:
-        """Names that a script which is about to run must find among its globals."""
+        """Names that `skipgs-plug run` puts among the globals of a script before it runs the script."""
         return {} if self._hooks is None else self._hooks.script_globals
 
     @property
     def patched(self) -> list[str]:
-        """Every name replaced in the trainer and in PyTorch, as "owner.name"; empty once detached.
+        """Every name that was replaced in the trainer and in PyTorch, as "owner.name"; empty after `detach`.
 
-        In a script under `skipgs-plug run` also what that replaces around it for as long as it runs: `torch.save` and
-        `torch.load` (with `weights_only=False` unless the script says otherwise), with `--cpu` names of `torch.cuda`.
+        Under `skipgs-plug run` the list also holds the names that are replaced while the script runs: `torch.save`,
+        `torch.load` (with `weights_only=False` unless the script sets it) and, with `--cpu`, names of `torch.cuda`.
         """
         own = [] if self._hooks is None else self._hooks.patched
         return [*own, *self._adapter.replaced] if own and self._adapter is not None else own
 
     def stats(self) -> dict[str, Any]:
-        """Counters and seconds, by their names in skipgs.json; see `skipgs_plug.core.report`."""
+        """Counters and times in seconds, with their names in skipgs.json; see `skipgs_plug.core.report`."""
         own = None if self.adapter is None else self.adapter.timing()
         times = self._engine.clock.times if own is None else own
         return counters(self._engine.stats, self._floor, times, self._engine.pace.report())
@@ -283,60 +318,60 @@ class SkipGate:
         return build_report(settings, self.stats(), self.view_table())
 
     def view_table(self) -> list[dict[str, Any]]:
-        """One row per view seen since `start_iter`: `view visits backwards skips mean_loss last_loss`."""
+        """One row per view since `start_iter`, with `view visits backwards skips mean_loss last_loss`."""
         return self._engine.stats.view_table(self._engine.mean)
 
     def scalars(self) -> dict[str, float]:
-        """A flat dict of numbers for a logger, keys "skipgs/...": call it at any iteration."""
+        """Return numbers for a logger, with keys "skipgs/..."; call it in any iteration."""
         scalars = self._engine.stats.scalars()
         scalars["skipgs/skipped"] = float(self.skipped)
         scalars["skipgs/floor"] = self._floor or 0.0
         return scalars
 
     def summary(self) -> str:
-        """What the gate did, in a few lines for people."""
+        """Return a few lines that say how much was skipped and why."""
         return summarise(self.config, self.stats())
 
     # State and attachment.
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on as if never interrupted: plain values with string keys.
+        """Return the state from which `load_state_dict` continues exactly: plain values with string keys.
 
         Save it after an iteration, beside the trainer's own checkpoint.
 
         Returns:
             `version` (2), `policy` (see `SkipPolicy.state_dict`), `stats` (counts, per-view rows),
-            `non_finite_in_a_row`, `clock` (seconds), `step` (last
-            iteration, None before the first). Empty while an adapter does not know yet when to begin.
+            `non_finite_in_a_row`, `clock` (seconds), `step` (last iteration, None before the first). The dictionary
+            is empty until an adapter knows when densification ends.
         """
         return self._engine.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict()`, or from a state of the authors' controller (version 1).
 
-        Another scene with the same view names is noticed later: when the first ten losses are all far from
-        the means of their views, the tenth raises SkipGSError.
+        A state of another scene with the same view names is noticed later: when the first ten losses are all far
+        from the means of their views, the tenth raises SkipGSError.
 
         Raises:
-            SkipGSError: The state is damaged, of another version, or of another scene.
+            SkipGSError: The state is damaged, has another version, or belongs to another scene.
         """
         self._engine.load_state_dict(state)
 
     @property
     def trained(self) -> bool:
-        """Whether anything of a training was seen so far: an iteration, or a backward in none."""
+        """Whether training has begun: an iteration or a backward pass was seen."""
         return self._engine.iteration.step is not None if self._hooks is None else self._hooks.trained
 
     def verify(self) -> None:
-        """Raise AdapterMismatchError unless the attached trainer ran one training backward per iteration.
+        """Raise AdapterMismatchError unless the attached trainer ran one training backward pass per iteration.
 
-        The first ten iterations are checked anyway; call it after a run that may have been shorter.
+        The gate checks the first ten iterations by itself. Call this after a run that may have been shorter.
         """
         if self._hooks is not None:
             self._hooks.verify()
 
     def detach(self) -> None:
-        """Put back everything that was replaced; counts and summary stay readable."""
+        """Put back everything that was replaced. Counts and summary stay readable."""
         if self._hooks is not None:
             self._hooks.restore()
         self._engine.release()

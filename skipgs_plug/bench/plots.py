@@ -23,8 +23,8 @@ COLOURS = ("#000000", "#D55E00", "#E69F00", "#CC79A7", "#0072B2", "#56B4E9", "#0
 MARKERS = "so^vDPX"
 PHASES = {"forward": "#0072B2", "loss": "#56B4E9", "backward": "#D55E00", "optimizer": "#E69F00", "strategy": "#009E73"}
 NOT_VISITED, RUN, SKIPPED = 0, 1, 2
-EXAMPLES = 3  # views shown one by one
-SMALL = 9
+EXAMPLES = 3  # views with a plot of their own
+SMALL = 9  # font size of legends, points
 
 
 def write_plots(

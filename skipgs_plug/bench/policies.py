@@ -19,8 +19,8 @@ from skipgs_plug.core.pace.rates import path_factor
 from skipgs_plug.trainer import Trainer
 from skipgs_plug.trainer.errors import InputError
 
-REFERENCE = "own"  # what the others are compared with
-THINNED = "refine_share=0.4"  # whose steps and iterations controls share
+REFERENCE = "own"  # policy that all others are compared with
+THINNED = "refine_share=0.4"  # policy whose steps and iterations the controls copy
 Earlier = Mapping[str, RunRecord]
 GateMaker = Callable[[Trainer, Earlier], SkipGate | None]
 Plan = Callable[[int, int, int, int], PlannedSkipping]  # of first, end, number of skips, seed

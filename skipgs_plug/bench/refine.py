@@ -20,10 +20,10 @@ from skipgs_plug.trainer.loop import Iteration
 from skipgs_plug.trainer.metrics import METRICS, chosen
 from skipgs_plug.trainer.scalars import ScalarLog
 
-PARTS = 10  # of refinement, each followed by an evaluation; one more comes before the first
+PARTS = 10  # parts of refinement, each followed by an evaluation; policies take turns by part
 
 
-MOST_DB = 100.0  # PSNR that an image counts with at most: one that is hit exactly, such as bare background, has none
+MOST_DB = 100.0  # PSNR of an image, at most: an exact image, such as bare background, would have an infinite one
 
 
 class DivergedError(Exception):

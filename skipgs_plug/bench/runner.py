@@ -24,7 +24,7 @@ from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.metrics import LPIPS_WEIGHTS, require_lpips
 
 NOT_SETTINGS = ("data_dir", "result_dir", "seed", "backend")
-WARM_UP = 20  # iterations that load and compile what all runs need, so that memory of the first does not hold it
+WARM_UP = 20  # iterations before the first run: they load and compile, which the memory of the first run must not hold
 Begin = Callable[[str, Earlier], Generator[None, None, RunRecord]]
 
 

@@ -19,10 +19,10 @@ from skipgs_plug.trainer import Trainer
 from skipgs_plug.trainer.loop import Iteration
 from skipgs_plug.trainer.scalars import ScalarLog
 
-PARTS = 20  # of a run, by iteration number, each followed by an evaluation
-SAME_TIME = 0.05  # difference of two times that counts as none, as a share
-SAME_COUNT = 0.02  # difference of two numbers of Gaussians that counts as none, as a share
-MOST_TRIES = 5  # of a search
+PARTS = 20  # parts of a run, by iteration number; policies take turns by part, and each part ends with an evaluation
+SAME_TIME = 0.05  # relative difference of two times that counts as equal
+SAME_COUNT = 0.02  # relative difference of two numbers of Gaussians that counts as equal
+MOST_TRIES = 5  # runs of a search, at most: each costs a whole run or a densification
 
 Turns = Generator[None, None, None]
 Numbers = Callable[[range, Iterable[int], int, int], set[int]]  # of numbers, events among them, how many, seed

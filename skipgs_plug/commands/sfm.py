@@ -22,7 +22,7 @@ from skipgs_plug.photos.scene_folder import check_target, write_scene
 from skipgs_plug.photos.unplaced import explain_unplaced
 from skipgs_plug.trainer.errors import InputError
 
-NAMES_SHOWN = 6
+NAMES_SHOWN = 6  # photographs named per reason, at most, so that the list stays readable
 
 
 def run(args: Args) -> int:

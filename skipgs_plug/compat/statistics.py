@@ -13,7 +13,7 @@ from skipgs_plug.fallback_raster.runtime.launch import FloatArray, IntArray, wor
 from skipgs_plug.fallback_raster.runtime.source import read_kernel
 from skipgs_plug.fallback_raster.stages.binning import bin_gaussians
 
-SUMS = 8  # of a (tile, Gaussian) pair, six of them used
+SUMS = 8  # floats per (tile, Gaussian) pair; the kernel uses six
 
 
 class Footprint(NamedTuple):

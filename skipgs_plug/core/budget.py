@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-MIN_SAMPLES = 100  # the floor is in force once more iterations than this are recorded
-UNCALIBRATED_FLOOR = 0.5
+MIN_SAMPLES = 100  # iterations recorded before the floor is in force; of fewer, the share says little (authors' value)
+UNCALIBRATED_FLOOR = 0.5  # floor until warm-up has set one (authors' value)
 
 
 class BackwardBudget:

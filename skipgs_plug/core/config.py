@@ -1,4 +1,4 @@
-"""Every knob of the gate, its default and the reason for it."""
+"""Settings of the gate, with defaults and their reasons."""
 
 from __future__ import annotations
 
@@ -13,40 +13,50 @@ ON_NONFINITE = ("skip", "raise", "pass")
 
 @dataclasses.dataclass(frozen=True)
 class SkipConfig:
-    """Settings of a gate; names and defaults of the first six as in the authors' controller.
+    """Settings of a gate. The first six have the names and defaults of the authors' controller.
 
     Args:
-        start_iter: First iteration that may be skipped, in the trainer's own counting: the end of
-            densification. None when the adapter knows it.
-        threshold: Skip when loss <= mean * (1 + threshold). Raise it to skip more.
+        start_iter: First iteration that may be skipped, counted like the trainer does: the end of densification.
+            None if the adapter knows it.
+        threshold: Skip when loss <= mean * (1 + threshold). A larger value skips more.
         ema_decay: Decay of each view's running mean of its loss, per visit.
-        warmup: Gated iterations without skipping, which seed the means and calibrate the floor.
-        min_bwd_ratio: Least share of gated iterations that run a real backward. "auto" sets
+        warmup: Iterations after `start_iter` without skips. They seed the means and set the floor.
+        min_bwd_ratio: Least share of backward passes that run. "auto" is
             max(0.5, 1 - 0.5 * share that warm-up would have skipped); 0.0 removes the floor.
         enabled: False leaves training bit-identical to training without a gate.
-        on_nonfinite: What a NaN or infinite loss does: "skip" its backward, "raise" at once, or "pass" it
-            through. It never enters a mean.
-        pause_iters: Real backwards after a structural change; None for max(number of views, 500).
-        share: Leave out whole iterations in the whole run, densification included: the share of them that runs, or
-            "auto" for what the scene needs. It stands for both `grow_share` and `refine_share`, where these are None.
-        grow_share: Leave out whole iterations until densification ends, and densification events with too little
-            behind them: the share of iterations that runs, or "auto".
-        refine_share: Leave out whole iterations from `start_iter` on instead of single backwards: the share of
-            them that runs, or "auto" for what the scene needs. None for the paper's gate, unless `share` is given.
-        max_gaussians: With `share` or `grow_share`, densification events stop before one could take the number of
-            Gaussians beyond this. None for no bound.
-        always: With `share`, `grow_share` or `refine_share`, iterations that run in any case, instead of those that
-            the conditions of the loop name. None to read the conditions.
-        tolerance: Decibels that the rest of refinement may be worth when "auto" ends it.
-        compensate: Make up for what is left out with larger, shrinking steps. None: with `refine_share`, not
-            with the paper's gate.
-        rate_peak: Factor on learning rates when refinement begins, falling linearly to 0; the higher SH bands,
-            positions and scales take more of it, the constant band less, opacities at most 1. None for
-            2 / share * sqrt(3 * shown), with at least a quarter for the share that runs, and the share of the
-            Gaussians that a view shows, measured.
+        on_nonfinite: How to treat a NaN or infinite loss: "skip" its backward pass, "raise" an error, or "pass" it
+            on. It never enters a mean.
+        pause_iters: Real backward passes after a structural change. None is max(number of views, 500).
+        share: Share of all iterations that runs, densification included, or "auto" for as many as the scene needs. It
+            sets `grow_share` and `refine_share` where they are None.
+        grow_share: Share of the iterations until densification ends that runs, or "auto". Densification events with
+            too few iterations before them are left out.
+        refine_share: Share of the iterations from `start_iter` on that runs, or "auto". None for the paper's gate,
+            unless `share` is given.
+        max_gaussians: With `share` or `grow_share`: densification stops before an event could exceed this number
+            of Gaussians. None for no bound.
+        always: With a share: iterations that always run, instead of those that the conditions of the loop name. None
+            to read the conditions.
+        tolerance: Decibels. "auto" ends refinement when the rest would gain less.
+        compensate: Make up for iterations that are left out with larger, shrinking steps. None is True with a share
+            and False with the paper's gate.
+        rate_peak: Factor on learning rates when refinement begins; it falls linearly to 0. Higher SH bands, positions
+            and scales take a multiple of it, the constant band half, opacities at most 1. None is
+            2 / max(refine_share, 0.25) * sqrt(3 * shown), where `shown` is the measured share of the Gaussians that
+            a view shows.
 
     Raises:
-        SkipGSError: A value is out of its range; names the field and the range.
+        SkipGSError: A value is out of its range. The message names the field and the range.
+
+    Examples:
+        >>> from skipgs_plug import SkipConfig
+        >>> config = SkipConfig(share="auto", max_gaussians=500_000)
+        >>> config.leaves_out, config.compensates
+        (True, True)
+        >>> SkipConfig(threshold=-2)
+        Traceback (most recent call last):
+        ...
+        skipgs_plug.core.errors.SkipGSError: threshold must be a number above -1, not -2.
     """
 
     start_iter: int | None = None
@@ -98,12 +108,12 @@ class SkipConfig:
 
     @property
     def growing(self) -> float | str | None:
-        """Share of the iterations before the end of densification that runs, or "auto"; None for all, untouched."""
+        """Share of the iterations before the end of densification that runs, or "auto"; None if all run."""
         return self.share if self.grow_share is None else self.grow_share
 
     @property
     def refining(self) -> float | str | None:
-        """Share of the iterations after it, or "auto"; None for the paper's gate."""
+        """Share of the iterations after densification that runs, or "auto"; None for the paper's gate."""
         if self.refine_share is not None or self.growing is None:
             return self.refine_share
         return 1.0 if self.share is None else self.share
@@ -121,7 +131,7 @@ class SkipConfig:
         return self.refining is not None if self.compensate is None else self.compensate
 
     def as_dict(self) -> dict[str, Any]:
-        """The settings as plain values, as written to skipgs.json."""
+        """Return the settings as plain values, as skipgs.json holds them."""
         return dataclasses.asdict(self)
 
 

@@ -1,4 +1,4 @@
-"""What a policy answers: skip or not, and why."""
+"""The answer of a policy: skip or run, and the reason."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ class Decision(NamedTuple):
     """Answer of a policy for one view in one iteration.
 
     Attributes:
-        skip: True when the backward is to be left out.
-        reason: what decided: "warm-up", "new view", "deviation" (loss against the view's mean), "budget"
-            (a skip that the floor forbids), "pause", "non-finite", "inactive", "forced" (the adapter rules
-            skipping out in this iteration), "other rank" (a process of the group needs the backward), "full" (an
-            iteration that was not left out runs whole), "watched" (the view is not trained on for a while) or
-            "over" (refinement has ended).
+        skip: True if the backward pass is skipped.
+        reason: Why: "warm-up", "new view", "deviation" (loss against the view's mean), "budget" (the floor forbids a
+            skip), "pause", "non-finite", "inactive", "forced" (the adapter forbids a skip in this iteration),
+            "other rank" (another process needs the backward pass), "full" (with a share, an iteration that is not
+            left out runs whole), "watched" (the view is not trained on for a while) or "over" (refinement has ended).
+
+    Examples:
+        >>> from skipgs_plug import Decision
+        >>> Decision(True, "deviation")
+        Decision(skip=True, reason='deviation')
     """
 
     skip: bool

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-MIN_PAUSE_ITERS = 500
+MIN_PAUSE_ITERS = 500  # iterations of a pause, at least, so that a scene of few views has time to settle
 
 
 class Pause:

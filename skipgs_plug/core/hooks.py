@@ -27,7 +27,9 @@ from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.rates import Named
 from skipgs_plug.core.views import view_key
 
-CHECKED_ITERATIONS = 10  # after these, exactly one training backward each must have been seen
+# First iterations in which training backward passes are counted. Any number but one in each is a wrong attachment, and
+# the user hears of it within seconds.
+CHECKED_ITERATIONS = 10
 
 
 class Adapter(Protocol):
@@ -40,15 +42,20 @@ class Adapter(Protocol):
     released: str | None
     replaced: Sequence[str]
 
-    def attach(self, hooks: Hooks) -> None: ...
+    def attach(self, hooks: Hooks) -> None:
+        """Attach the gate to a trainer that exists."""
 
-    def attach_script(self, hooks: Hooks) -> None: ...
+    def attach_script(self, hooks: Hooks) -> None:
+        """Attach the gate to a script that is about to run in this process."""
 
-    def must_run(self, step: int) -> bool: ...
+    def must_run(self, step: int) -> bool:
+        """Return whether the backward pass of this iteration must not be skipped."""
 
-    def optimizers(self) -> Iterable[torch.optim.Optimizer]: ...
+    def optimizers(self) -> Iterable[torch.optim.Optimizer]:
+        """Return the optimizers of the training loop."""
 
-    def timing(self) -> Times | None: ...
+    def timing(self) -> Times | None:
+        """Return the times that the trainer measures itself, or None."""
 
 
 class Hooks:

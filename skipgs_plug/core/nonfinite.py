@@ -8,7 +8,7 @@ from skipgs_plug.core import decision
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.errors import BrokenTrainingError
 
-MIN_IN_A_ROW = 10
+MIN_IN_A_ROW = 10  # non-finite losses in a row, at least, that make an error: fewer can come from single views
 
 
 class NonFiniteGuard:

@@ -15,9 +15,11 @@ from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.events import Pause
 from skipgs_plug.core.state import POLICY_VERSION, policy_state
 
-EPS = 1e-8  # keeps the deviation score defined for a mean of zero
+# Added to a mean (unit of the loss) before the loss is divided by it, so that a mean of 0 is no division by zero. The
+# value is that of the authors' controller.
+EPS = 1e-8
 
-# What the floor counts; a pause counts neither for nor against it.
+# Decisions that the floor counts. A pause counts neither for nor against it.
 _COUNTED = (
     decision.WARM_UP,
     decision.NEW_VIEW,
@@ -28,9 +30,10 @@ _COUNTED = (
 
 
 class Policy(ABC):
-    """What a gate asks of a policy, be it the rule or a control for a benchmark.
+    """Base class of policies: the rule of the paper, or a control for a benchmark.
 
-    Derive from it and write the four abstract methods; the other members suit a policy without start, means or floor.
+    Derive from it and write the four abstract methods. The defaults of the other members suit a policy without a start,
+    means or a floor.
     """
 
     __slots__ = ()
@@ -42,17 +45,18 @@ class Policy(ABC):
 
     @property
     def floor(self) -> float | None:
-        """Least share of real backwards in force, None without one."""
+        """Least share of backward passes that must run; None without a floor."""
         return None
 
     def mean(self, view: Hashable) -> float | None:
-        """Running mean of a view's loss, None for a view or a policy without."""
+        """Return the running mean of a view's loss; None if the view or the policy has no mean."""
         return None
 
     def foreseen(self, view: Hashable | None, step: int) -> bool | None:
-        """Whether `decide` will skip, if that is known without the loss, and for None without the view; None if not.
+        """Return whether `decide` will skip, if that is known without the loss; None if it is unknown.
 
-        Changes nothing. True only in iterations that train nothing, whose loss is then not told.
+        A `view` of None asks for an answer that holds for every view. The call changes nothing. It returns True only in
+        iterations that train nothing; `decide` is then not called with their loss.
         """
         return None
 
@@ -61,16 +65,16 @@ class Policy(ABC):
         """Decide on one view in one iteration, and record the answer."""
 
     def overrule(self, own: Decision, answer: Decision) -> None:
-        """What was decided and recorded last, `own`, does not happen: the processes agreed on `answer`."""
+        """Replace the decision that was recorded last, `own`, by `answer`, on which the processes agreed."""
         return None
 
     @abstractmethod
     def notify_event(self, step: int, n_views: int) -> None:
-        """A structural change happened in iteration `step`."""
+        """Take note of a structural change in iteration `step`."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """Plain values from which `load_state_dict` continues exactly."""
+        """Return plain values from which `load_state_dict` continues exactly."""
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -78,13 +82,23 @@ class Policy(ABC):
 
 
 class SkipPolicy(Policy):
-    """Skip a view's backward when its loss is at or below the view's own running mean.
+    """The rule of the paper: skip a view's backward pass while its loss is at or below its own running mean.
 
-    From `start_iter` on, the deviation score of a view is loss / (mean + 1e-8), and its backward is skipped
-    when the score is at most 1 + threshold, under a floor on the share of real backwards. Arguments are
-    those of `SkipConfig`. With no events and finite losses the decisions are those of the authors' released
-    controller, one for one, except that warm-up counts from the first gated iteration seen, so that a run
-    resumed late still calibrates.
+    From `start_iter` on, the deviation score of a view is loss / (mean + 1e-8). Its backward pass is skipped when the
+    score is at most 1 + threshold, unless the floor on the share of backward passes forbids it. The arguments are
+    those of `SkipConfig`. Without events and with finite losses, the decisions are those of the authors' released
+    controller, one for one, with one exception: warm-up counts from the first iteration that the policy sees, so
+    that a run that is resumed late still sets its floor.
+
+    Examples:
+        >>> from skipgs_plug.core.policy import SkipPolicy
+        >>> policy = SkipPolicy(start_iter=100, warmup=0)
+        >>> policy.decide("a.png", loss=0.5, step=99)
+        Decision(skip=False, reason='inactive')
+        >>> policy.decide("a.png", loss=0.5, step=100)
+        Decision(skip=False, reason='new view')
+        >>> policy.decide("a.png", loss=0.4, step=101)
+        Decision(skip=True, reason='deviation')
     """
 
     __slots__ = (
@@ -122,10 +136,10 @@ class SkipPolicy(Policy):
 
     @classmethod
     def from_config(cls, config: SkipConfig) -> SkipPolicy:
-        """Return the policy of these settings.
+        """Return the policy with these settings.
 
         Raises:
-            SkipGSError: They hold no `start_iter`.
+            SkipGSError: `start_iter` is None.
         """
         names = ("threshold", "ema_decay", "warmup", "min_bwd_ratio", "enabled", "pause_iters")
         return cls(config.start_iter, **{name: getattr(config, name) for name in names})
@@ -137,7 +151,7 @@ class SkipPolicy(Policy):
 
     @property
     def floor(self) -> float:
-        """Least share of real backwards in force."""
+        """Least share of backward passes that must run."""
         return self.budget.floor
 
     def mean(self, view: Hashable) -> float | None:

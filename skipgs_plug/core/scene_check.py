@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from skipgs_plug.core.errors import SkipGSError
 
-CHECKED_LOSSES = 10
-FAR = 2.0  # a mean lags behind its loss, but where training goes on as it was the two are close
+CHECKED_LOSSES = 10  # first losses after a resume that are compared with the means of their views
+# Factor between a loss and the mean of its view above which the scenes differ. A mean lags behind its loss,
+# but by less than that when training continues.
+FAR = 2.0
 
 
 class SceneCheck:

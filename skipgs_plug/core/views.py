@@ -13,9 +13,9 @@ from typing import Any
 
 from skipgs_plug.core.errors import SkipGSError
 
-CHECKED_KEYS = 5_000  # when as many have come, some must have come again
-RECURRING = 0.01  # least share of decisions on views that were seen before
-MAX_VIEWS = 200_000  # kept per table, some 60 MB in all; more than any scene has
+CHECKED_KEYS = 5_000  # different views after which some must have come twice; if not, keys do not name views
+RECURRING = 0.01  # share of decisions on views that were seen before, at least, for keys to name views
+MAX_VIEWS = 200_000  # views per table, at most: more than any scene has, and about 60 MB in all
 
 
 def view_key(view: Any) -> str:

@@ -49,9 +49,9 @@ def install_as_gsplat() -> Installation:
     `from gsplat import rasterization` keeps what it imported, so call this first. Installing again while
     installed is harmless; gsplat's function returns when the last installation is undone.
 
-        install_as_gsplat()            # for the rest of the process
+        install_as_gsplat()  # for the rest of the process
 
-        with install_as_gsplat():      # or for a while
+        with install_as_gsplat():  # or for a while
             image, alpha, info = gsplat.rasterization(...)
 
     Returns:

@@ -59,7 +59,7 @@ def rasterization(
     rolling_shutter: Any = None,
     viewmats_rs: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Renders N Gaussians (Kerbl et al. 2023) into C pinhole cameras; arguments and results as in gsplat 1.5.
+    """Render N Gaussians (Kerbl et al. 2023) into C pinhole cameras, with the arguments and results of gsplat 1.5.
 
     Computes in float32 on all cores (see `set_num_threads`) and returns the dtype of `means`. The result, images
     and gradients, is bit-equal for any number of threads. Differentiable in means, quats, scales, opacities,
@@ -112,6 +112,32 @@ def rasterization(
     Raises:
         ValueError: A shape, dtype, device or mode does not fit, or a camera is not finite or cannot be inverted.
         NotImplementedError: An option is not supported on the CPU.
+
+    Examples:
+        One red Gaussian, one unit in front of a camera at the origin:
+
+        >>> import torch
+        >>> from skipgs_plug.fallback_raster import rasterization
+        >>> means = torch.tensor([[0.0, 0.0, 1.0]], requires_grad=True)
+        >>> image, alpha, info = rasterization(
+        ...     means,
+        ...     quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        ...     scales=torch.full((1, 3), 0.1),
+        ...     opacities=torch.ones(1),
+        ...     colors=torch.tensor([[1.0, 0.0, 0.0]]),
+        ...     viewmats=torch.eye(4)[None],
+        ...     Ks=torch.tensor([[[20.0, 0.0, 16.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]]]),
+        ...     width=32,
+        ...     height=24,
+        ... )
+        >>> image.shape, alpha.shape
+        (torch.Size([1, 24, 32, 3]), torch.Size([1, 24, 32, 1]))
+        >>> red, green, blue = image[0, 12, 16].tolist()
+        >>> red > 0.9, green, blue
+        (True, 0.0, 0.0)
+        >>> image.sum().backward()
+        >>> means.grad.shape
+        torch.Size([1, 3])
     """
     refuse_unsupported(
         sparse_grad=sparse_grad,

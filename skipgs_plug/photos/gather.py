@@ -22,8 +22,8 @@ CONVERTED = (".webp", ".bmp", ".tif", ".tiff")
 UNREADABLE = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
 MODEL, FOCAL_LENGTH, EXIF_BLOCK = 0x0110, 0x920A, 0x8769  # EXIF tags
 QUALITY: dict[str, Any] = {"quality": 97, "subsampling": 0}
-OPAQUE = 128  # alpha from which a pixel counts, as in the loaders
-LEAST = 3  # photographs, below which nothing can be reconstructed
+OPAQUE = 128  # alpha (of 255), at least, of a pixel that counts, as in the loaders
+LEAST = 3  # photographs, at least: fewer cannot be reconstructed
 
 
 @dataclass

@@ -16,11 +16,13 @@ from typing import Any
 
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 
-STAGES = 6  # focal lengths, positions, three adjustments at most, points
-TRACKS = 500  # the longest ones of each photograph place it; points of the others are added afterwards
-LEAST_POINTS = 30  # that a placed photograph shows; COLMAP asks for as many where it places one after another
-SEED = 0
-GLANCE = 0.5  # seconds
+STAGES = 6  # steps of the progress bar: focal lengths, positions, up to three adjustments, points
+# Longest tracks of each photograph that place it. All tracks take longer for the same accuracy, see
+# benchmarks/notes/PHOTOS.md; points of the other tracks are added afterwards.
+TRACKS = 500
+LEAST_POINTS = 30  # points that a placed photograph shows, at least: COLMAP's bound for incremental mapping
+SEED = 0  # of COLMAP's random numbers
+GLANCE = 0.5  # seconds between two looks at COLMAP's progress
 
 
 def map_globally(database: Path, photos: Path, output: Path, progress: Callable[[int], None]) -> list[Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 
-LEAST_MATCHES = 15  # verified matches that make two photographs neighbours: COLMAP's own threshold for mapping
+LEAST_MATCHES = 15  # verified matches, at least, of two connected photographs: COLMAP's threshold for mapping
 
 
 @dataclass

@@ -19,13 +19,16 @@ from skipgs_plug.photos.progress import counted
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.photograph import undistort
 
-EXHAUSTIVE_UP_TO = 100  # photographs; beyond, all pairs take longer than neighbours in order
-OVERLAP = 10  # neighbours on either side, then those 16, 32, ... away
-KEY_PHOTOGRAPHS = 40  # of a sequence, compared each with each
-ALL_AT_ONCE_BEYOND = 100  # photographs; up to there, placing one after another takes little and keeps more points
-ENOUGH = 0.9  # of the photographs that hang together, for a model of all at once to be taken
-FEATURE_SIZE = 1600  # larger sides are reduced for feature detection, which gains little above
-SEED = 0
+EXHAUSTIVE_UP_TO = (
+    100  # photographs of which all pairs are compared; of more, that takes longer than neighbours in order
+)
+OVERLAP = 10  # neighbours on either side that a photograph is compared with; then those 16, 32, ... away
+KEY_PHOTOGRAPHS = 40  # photographs of a sequence that are compared with each other: walks return to where they were
+ALL_AT_ONCE_BEYOND = 100  # photographs; up to this number, incremental mapping is quick and keeps more points
+# Share of the matched photographs that global mapping must place. If it places fewer, incremental mapping is tried.
+ENOUGH = 0.9
+FEATURE_SIZE = 1600  # longer side in pixels for feature detection; larger photographs gain little
+SEED = 0  # of COLMAP's random numbers
 
 Progress = Callable[[int], None]
 

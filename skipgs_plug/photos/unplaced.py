@@ -13,9 +13,11 @@ from skipgs_plug.photos.video import sharpness
 from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.scene import BLACK
 
-FEW_FEATURES = 0.25  # of the median of the placed photographs
-BLURRED = 0.25  # of the median sharpness of the placed photographs
-SAMPLE = 15  # placed photographs that the sharpness of the others is compared with
+# A photograph that was not placed counts as poor in features, or as blurred, below these shares of the median of placed
+# photographs. They only choose the reason that is printed.
+FEW_FEATURES = 0.25
+BLURRED = 0.25
+SAMPLE = 15  # placed photographs whose sharpness is measured for the median: each must be decoded
 
 
 def explain_unplaced(photos: Gathered, models: Sequence[Any], links: Links) -> dict[str, str]:

@@ -10,7 +10,7 @@ import numpy as np
 from skipgs_plug.trainer.errors import InputError, reason
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp")
-JUDGED_SIZE = 640  # sharpness is judged on frames of about this many pixels, where sensor noise does not count
+JUDGED_SIZE = 640  # longer side in pixels of the frames whose sharpness is compared: sensor noise does not count there
 
 
 def count_frames(path: Path) -> int:

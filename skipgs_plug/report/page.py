@@ -44,7 +44,7 @@ RESULTS = (
     "after densification, s",
     "backwards skipped, %",
 )
-PICTURED = 3  # held-out views of each run, the worst ones
+PICTURED = 3  # worst held-out views of each run that the page shows
 
 
 def build_page(sources: Sequence[RunSource | BenchSource]) -> str:

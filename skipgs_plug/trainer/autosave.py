@@ -6,7 +6,7 @@ from skipgs_plug.files import keep_going
 from skipgs_plug.trainer.loop import Iteration, Trainer
 from skipgs_plug.trainer.run_folder import RunFolder
 
-SECONDS = 300.0  # of training between two checkpoints, unless told otherwise
+SECONDS = 300.0  # training time between two checkpoints by default: a killed run loses at most five minutes
 
 
 class Autosave:

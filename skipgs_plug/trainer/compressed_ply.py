@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-CHUNK = 256  # Gaussians that share one set of bounds
+CHUNK = 256  # Gaussians that share one set of bounds, as the format says
 SH_C0 = 0.28209479177387814
 Columns = dict[str, np.ndarray]
 XYZ, RGB = ("x", "y", "z"), ("r", "g", "b")

@@ -1,4 +1,4 @@
-"""TrainConfig: every knob of the reference trainer, named as in gsplat's simple_trainer."""
+"""Settings of the reference trainer, with the names of gsplat's simple_trainer."""
 
 from __future__ import annotations
 
@@ -9,13 +9,18 @@ from typing import Literal, NamedTuple
 
 from skipgs_plug.trainer.errors import InputError
 
-REFERENCE_STEPS = 30_000  # the schedule that all milestone defaults describe
-MIN_REFINE_EVERY = 100  # below, gradients are averaged over too few views and the count explodes
-MIN_RESET_EVERY = 3000  # a reset takes thousands of updates to recover from, whatever the length of the run
+# Iterations of the 3DGS schedule. All milestone defaults are given for it.
+REFERENCE_STEPS = 30_000
+# Iterations between densifications, at least. With fewer, gradients are averaged over too few views and the number of
+# Gaussians explodes: 4,000 points became 140,000 within 400 iterations at an interval of 3.
+MIN_REFINE_EVERY = 100
+# Iterations between opacity resets, at least. Gaussians need thousands of updates to recover from a reset, also in a
+# short run: resets every 300 iterations cost 7 dB on fern.
+MIN_RESET_EVERY = 3000
 
-TINY = 1e-6
-MANY = 1 << 31
-INTEGERS = {  # least and greatest value
+TINY = 1e-6  # smallest opacity, distance to 1, and scale: their logits and logarithms stay moderate
+MANY = 1 << 31  # largest count: it fits the 32-bit indices of gsplat and of the kernels
+INTEGERS = {  # least and greatest value of each setting
     "data_factor": (1, 64),
     "test_every": (0, MANY),
     "init_num_pts": (4, 1 << 27),
@@ -53,7 +58,7 @@ NUMBERS = {
 
 
 class Recipe(NamedTuple):
-    """Settings whose defaults belong to the strategy."""
+    """Settings whose defaults depend on the strategy."""
 
     init_opa: float
     init_scale: float
@@ -67,18 +72,29 @@ BELONGS_TO = {
     **dict.fromkeys(("grow_grad2d", "grow_scale3d", "prune_scale3d", "reset_every", "absgrad"), "default"),
     **dict.fromkeys(("cap_max", "noise_lr"), "mcmc"),
 }
-FROM_OTHERS = ("schedule_steps", "near_plane", *Recipe._fields)  # None: follows from other settings or the scene
+FROM_OTHERS = ("schedule_steps", "near_plane", *Recipe._fields)  # None: taken from other settings or the scene
 
 
 @dataclass
 class TrainConfig:
-    """Settings of one training run; defaults are the 3DGS recipe for 30,000 iterations.
+    """Settings of one training run. The defaults are the 3DGS recipe for 30,000 iterations.
 
-    Milestones (`refine_*`, `reset_every`, `sh_degree_interval`) are given for 30,000 iterations and scaled
-    together by `max_steps / 30_000`, so a short run keeps the shape of the full one: see `scaled`. The two
-    intervals stop shrinking at 100 and 3,000 iterations, because Gaussians adapt per update, not per share of
-    the run: scaled to 3 iterations, `refine_every` turned 4,000 points into 140,000 within 400 iterations, and
-    resets every 300 iterations cost 7 dB on fern (3,000 iterations, grow_grad2d 0.001).
+    Milestones (`refine_*`, `reset_every`, `sh_degree_interval`) are given for 30,000 iterations. They are scaled
+    together by `max_steps / 30_000`, so a short run keeps the shape of the full one. `refine_every` and `reset_every`
+    stop shrinking at 100 and 3,000 iterations, because Gaussians adapt per update, not per share of the run.
+
+    Raises:
+        InputError: A value is out of its range, or belongs to the other strategy.
+
+    Examples:
+        >>> from skipgs_plug.trainer import TrainConfig
+        >>> config = TrainConfig(data_dir="scenes/statue", result_dir="runs/statue", max_steps=3000)
+        >>> config.scaled(15_000)  # densification ends after half of the run
+        1500
+        >>> TrainConfig(sh_degree=4)
+        Traceback (most recent call last):
+        ...
+        skipgs_plug.trainer.errors.InputError: sh_degree=4 is not an integer in 0..3.
     """
 
     data_dir: str = ""
@@ -196,7 +212,7 @@ class TrainConfig:
 
     @property
     def recipe(self) -> Recipe:
-        """Settings in force where the defaults belong to the strategy."""
+        """Values in force of the settings whose defaults depend on the strategy."""
         given = {name: getattr(self, name) for name in Recipe._fields}
         return RECIPES[self.strategy]._replace(**{name: value for name, value in given.items() if value is not None})
 
@@ -210,5 +226,5 @@ class TrainConfig:
         return max(1, round(milestone * self.schedule / REFERENCE_STEPS))
 
     def scaled_interval(self, interval: int, least: int) -> int:
-        """Like `scaled`, but shrinks an interval no further than to `least` (or to itself if smaller)."""
+        """Scale an interval like `scaled`, but to no less than `least`, or than itself if it is smaller."""
         return max(self.scaled(interval), min(interval, least))

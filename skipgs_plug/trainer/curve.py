@@ -8,7 +8,7 @@ from typing import Any
 from skipgs_plug.trainer.files import write_json
 from skipgs_plug.trainer.loop import Iteration, Trainer
 
-POINTS = 500  # of a whole run
+POINTS = 500  # points of the loss curve of a whole run: more only make the report larger
 
 
 class LossCurve:

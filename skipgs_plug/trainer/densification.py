@@ -16,7 +16,12 @@ from torch import Tensor, nn
 
 from skipgs_plug.trainer.row_order import morton_order, sort_rows, take
 
-DECIDING = ("means", "quats", "scales", "opacities")  # what gsplat looks at or changes; other rows are copies
+DECIDING = (
+    "means",
+    "quats",
+    "scales",
+    "opacities",
+)  # parameters that gsplat reads or changes; it only copies rows of the others
 ROWS = "rows"
 
 

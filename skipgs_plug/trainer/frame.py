@@ -15,11 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-FAR = 100.0  # distance from the origin, in extents, from which float32 loses what a picture shows
+# Distance from the origin, in extents of the cameras, from which a scene is moved: float32 would lose fine structure.
+FAR = 100.0
 SMALL, LARGE = 2.0**-6, 2.0**10  # extents between which a scene keeps its unit
-MOST = 0.9  # of the Gaussians of a model alone, whose distance from its middle counts as its extent
-SAME = 1e-5  # of the size of a scene, by which the frames of two sessions may differ
-SHARE_OF_DEPTH = 0.01  # of the distance to points, below which cameras that turn on the spot have no extent
+MOST = 0.9  # share of the Gaussians that lie within a model's extent, if it has no cameras: outliers do not count
+SAME = 1e-5  # difference of two sessions' frames that counts as rounding, as a share of the scene's size
+# Extent of the cameras, at least, as a share of the distance to the points: cameras that turn on the spot have none of
+# their own.
+SHARE_OF_DEPTH = 0.01
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 MEMINFO = "proc/meminfo"
 CGROUP_V2 = ("sys/fs/cgroup/memory.max", "sys/fs/cgroup/memory.current")  # bytes; "max" for no limit
 CGROUP_V1 = ("sys/fs/cgroup/memory/memory.limit_in_bytes", "sys/fs/cgroup/memory/memory.usage_in_bytes")
-UNKNOWN = 8 << 30  # assumed where the system does not say, as on macOS and Windows
+UNKNOWN = 8 << 30  # bytes of free memory assumed on systems that do not say, such as macOS and Windows
 
 
 def free_memory(root: Path = Path("/")) -> int:

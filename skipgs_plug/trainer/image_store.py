@@ -21,10 +21,10 @@ from skipgs_plug.trainer.scene import View
 
 T = TypeVar("T")
 Picture = tuple[Tensor, Tensor | None]  # pixels [H, W, 3] uint8, mask [H, W] bool
-SHARE_OF_FREE = 4  # by default a quarter of the memory that is free
-SHARE_AHEAD = 4  # a quarter of the bound is for photographs that are decoded ahead
-MOST_AHEAD = 64  # photographs
-CORES_PER_THREAD = 4  # decoding takes a small part of an iteration's time
+SHARE_OF_FREE = 4  # photographs take at most a quarter of the free memory by default: the model needs the rest
+SHARE_AHEAD = 4  # a quarter of the bound is for photographs that are decoded ahead of their turn
+MOST_AHEAD = 64  # photographs decoded ahead, at most: more would only take memory
+CORES_PER_THREAD = 4  # one decoding thread per four cores: decoding takes a small part of an iteration's time
 
 
 class StreamedView(View):

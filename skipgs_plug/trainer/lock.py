@@ -16,8 +16,8 @@ from skipgs_plug.trainer.files import write_json
 
 log = logging.getLogger(__name__)
 
-LOCK = ".lock"  # held by the operating system, which frees it however its process ends: it is never stale
-OWNER = ".owner.json"  # says who holds it
+LOCK = ".lock"  # the operating system holds the lock and frees it however its process ends, so it is never stale
+OWNER = ".owner.json"  # host and process id of the holder
 
 
 @contextlib.contextmanager

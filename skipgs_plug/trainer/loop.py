@@ -34,12 +34,12 @@ from skipgs_plug.trainer.scene import Scene, View
 from skipgs_plug.trainer.state import Stateful
 from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
 
-MEANS_LR_END = 0.01  # share of the positions' learning rate that is left at the end of the schedule
-DRAWING = threading.Lock()  # held by the trainer that draws: all threads share the generator that gsplat draws from
+MEANS_LR_END = 0.01  # learning rate of positions at the end of the schedule, as a share of the first; 3DGS's value
+DRAWING = threading.Lock()  # held while a trainer draws random numbers: gsplat draws from one generator for all threads
 
 
 class Iteration(NamedTuple):
-    """What one iteration saw, for whoever looks on."""
+    """Facts about one iteration, for `Trainer.on_step`."""
 
     step: int
     since: int  # number right after the previous iteration; smaller than `step` where a gate left some out
@@ -49,11 +49,11 @@ class Iteration(NamedTuple):
     target: Tensor  # [H, W, 3] uint8
 
     def passes(self, every: int) -> bool:
-        """Whether a multiple of `every` lies among the numbers of this iteration and of those left out before it."""
+        """Whether this iteration, or one that was left out right before it, is a multiple of `every`."""
         return self.step // every > (self.since - 1) // every
 
     def completes(self, every: int) -> bool:
-        """Whether another `every` numbers are done after this iteration."""
+        """Whether a multiple of `every` iterations is done after this one, counting those that were left out."""
         return (self.step + 1) // every > self.since // every
 
 
@@ -61,15 +61,26 @@ class Trainer:
     """Trains one scene by the 3DGS recipe.
 
     Attributes:
-        step: next iteration, 0-based.
-        ran: iterations that ran, which is fewer where a gate leaves some out; every view has its turn among these.
-        strategy: gsplat's DefaultStrategy, or None where `mcmc` densifies.
-        exposure: colour correction of each photograph, with an optimizer of its own; None unless asked for.
-        refine_stop_iter: end of densification in iterations of this run.
-        near_plane: near clipping plane, in the units of `scene.frame`, as are the Gaussians.
-        on_step: called after every iteration, outside the clock.
-        stop_requested: set it (from a signal handler, say) to end `train` after the current iteration, or, before it,
-            the next `train` at once.
+        step: Next iteration, from 0.
+        ran: Number of iterations that ran. It is less than `step` when a gate leaves some out. Views take turns
+            among the iterations that run.
+        strategy: gsplat's DefaultStrategy, or None with `mcmc`.
+        exposure: Colour correction of each photograph, with an optimizer of its own; None unless asked for.
+        refine_stop_iter: Iteration at which densification ends.
+        near_plane: Near clipping plane, in the units of `scene.frame`, like the Gaussians.
+        on_step: Called after every iteration, outside the clock.
+        stop_requested: Set it, for example in a signal handler, to end `train` after the current iteration.
+
+    Examples:
+        >>> from skipgs_plug import SkipGate
+        >>> from skipgs_plug.trainer import TrainConfig, Trainer
+        >>> from skipgs_plug.trainer.synthetic import make_scene
+        >>> scene = make_scene(n_views=10, width=32, height=24, n_points=160)
+        >>> trainer = Trainer(TrainConfig(max_steps=40), scene)
+        >>> with SkipGate(trainer, refine_share=0.4) as gate:
+        ...     trainer.train(progress=False)
+        >>> trainer.step, gate.stats()["iterations_run"]
+        (40, 9)
     """
 
     @single_precision()

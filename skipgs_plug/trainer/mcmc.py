@@ -10,7 +10,9 @@ from torch import nn
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.strategy import gsplat_class
 
-MIN_MOVE_EVERY = 25  # unlike the default strategy it averages nothing over views
+# Iterations between moves, at least. MCMC averages no gradients over views, so it can do with less than the default
+# strategy's 100.
+MIN_MOVE_EVERY = 25
 
 
 class Mcmc:

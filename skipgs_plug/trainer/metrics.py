@@ -18,7 +18,7 @@ from skipgs_plug.trainer.mask import leave_out
 from skipgs_plug.trainer.ssim import ssim_map
 
 SSIM_FLAVOUR = "torchmetrics 1.9: 11x11 Gaussian window, borders reflected, mean over all windows"
-LEAST_ERROR = 1e-10  # mean square, of 100 dB
+LEAST_ERROR = 1e-10  # mean squared error of an image, at least: PSNR is at most 100 dB instead of infinite
 LPIPS_WEIGHTS = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 
 

@@ -19,9 +19,11 @@ ADAM_EPS = 1e-15
 
 
 def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near: float = 0.0) -> nn.ParameterDict:
-    """Return `means [N, 3]`, `scales [N, 3]` (log), `quats [N, 4]` (wxyz), `opacities [N]` (logit),
-    `sh0 [N, 1, 3]` and `shN [N, K - 1, 3]`: the Gaussians of the scene, else an isotropic one per point,
-    without those of points that lie before a lens, nearer than the near plane `near`, in the order of space.
+    """Return the Gaussians that training starts from: those of the scene, else an isotropic one per point.
+
+    They are `means [N, 3]`, `scales [N, 3]` (log), `quats [N, 4]` (wxyz), `opacities [N]` (logit), `sh0 [N, 1, 3]` and
+    `shN [N, K - 1, 3]`, in the order of space. Points in front of a lens, nearer than the near plane `near`, are
+    left out.
 
     Raises:
         InputError: all points do.

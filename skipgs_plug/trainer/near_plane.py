@@ -9,11 +9,13 @@ from skipgs_plug.trainer.config import TINY, TrainConfig
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.scene import Scene, View
 
-SHARE = 0.1  # of the depth of the nearest points
-NEAREST = 0.01  # share of a view's points that may be nearer: wrong matches
-LEAST = 20  # points that tell a view's depths
-MOST = 20_000  # points looked at
-SHARE_OF_EXTENT = 0.04  # where points tell nothing: 3DGS cuts at 0.2 in scenes whose cameras spread over about 5
+SHARE = 0.1  # near plane as a share of the depth of the nearest points: surfaces may be nearer than any point on them
+NEAREST = 0.01  # share of a view's points that may be nearer than its depth: these are wrong matches
+LEAST = 20  # points in a view, at least, for its depth to count
+MOST = 20_000  # points that are projected, at most, which bounds the time; of more, every n-th
+# Near plane as a share of the cameras' extent, for a scene whose points tell no depth: 3DGS uses 0.2 units in scenes
+# whose cameras spread over about 5.
+SHARE_OF_EXTENT = 0.04
 
 
 def near_plane(config: TrainConfig, scene: Scene) -> float:

@@ -15,7 +15,7 @@ from skipgs_plug.trainer.scene import View
 
 log = logging.getLogger(__name__)
 
-SHARE = 0.25  # of the device's free memory, at most, for photographs: the model grows into the rest
+SHARE = 0.25  # photographs take at most this share of the device's free memory: the model grows into the rest
 
 
 class Photographs:

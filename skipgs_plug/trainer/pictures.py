@@ -12,9 +12,9 @@ from torch import Tensor
 from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.scene import View
 
-ERROR_GAIN = 4.0  # absolute errors are shown this much brighter
-ZOOM = 2
-SMOOTH = 0.95
+ERROR_GAIN = 4.0  # factor on absolute errors: at 1, an error of 0.05 would look black
+ZOOM = 2  # size of a pixel of the render in the picture, in pixels
+SMOOTH = 0.95  # decay of the running mean of losses, per iteration: about the mean of the last 20
 
 
 @dataclass

@@ -22,13 +22,15 @@ from skipgs_plug.trainer.scene import check_points
 
 log = logging.getLogger(__name__)
 
-REST = 15  # coefficients of SH degrees 1 to 3
+REST = 15  # SH coefficients of degrees 1 to 3, per colour channel
 SATURATING = ("opacity", "scale_0", "scale_1", "scale_2")  # infinite where a model is saturated
 REST_COUNTS = (0, 9, 24, 45)  # f_rest properties of SH degrees 0 to 3
-MAX_LOG_SCALE = 80.0  # float32 overflows at e^88
-MAX_LOGIT = 20.0  # of an opacity that is 1 in float32, where a file has infinity
-MIN_LOG_SCALE = -40.0  # squares of e^-40 are still numbers in float32
-MAX_HEADER = 1 << 16
+MAX_LOG_SCALE = 80.0  # largest logarithm of a scale that is read: float32 overflows at e^88
+MAX_LOGIT = 20.0  # opacity logit that stands for infinity in a file: its opacity is 1 in float32
+MIN_LOG_SCALE = -40.0  # smallest logarithm of a scale: the square of e^-40 is still a normal float32
+MAX_HEADER = (
+    1 << 16
+)  # bytes of a header, at most: 3DGS headers take about 2 KB, and a damaged file may have no end_header
 COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 PACKED_COLOURS = ("rgb", "rgba")  # of the Point Cloud Library: one number, bytes 0xAARRGGBB
 PROPERTIES = (

@@ -15,9 +15,11 @@ from torch import Tensor, nn
 
 from skipgs_plug.fallback_raster import take_rows
 
-EVERY = 4  # refinements between two sorts; those in between add few rows at the end
-BITS = 10  # of a coordinate
-MARGIN = 0.02  # share of the centres at either end of an axis that does not count for the extent
+EVERY = 4  # densifications between two sorts: each adds few rows, at the end, and sorting all rows costs more
+BITS = 10  # bits per coordinate in a Morton code: three coordinates fit a 32-bit integer
+# Share of the centres at either end of an axis that lies outside the grid. Else a few far centres would leave all
+# others in one cell.
+MARGIN = 0.02
 
 
 def sorts_rows(strategy: Any, step: int) -> bool:

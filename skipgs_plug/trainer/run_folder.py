@@ -17,8 +17,8 @@ from skipgs_plug.trainer.image_store import one_by_one
 from skipgs_plug.trainer.loop import Trainer
 
 CHECKPOINT = re.compile(r"ckpt_(\d+)_rank0\.pt")
-SCENE = "scene"  # folder in a run, of the scene that was made of photographs for it
-KEPT = 2  # checkpoints; the older one serves when the last is damaged
+SCENE = "scene"  # folder in a run folder with the scene that `train --sfm` reconstructed
+KEPT = 2  # checkpoints that stay: the older one is read when the last is damaged
 FOLDERS = ("", "ckpts", "ply", "stats", "renders")
 
 

@@ -14,7 +14,7 @@ from skipgs_plug.files import WriteError, keep_going
 from skipgs_plug.trainer.loop import Iteration, Trainer
 from skipgs_plug.trainer.metrics import METRICS
 
-EVERY = 10  # iterations between two points of a curve
+EVERY = 10  # iterations between two logged points, as in gsplat's script
 
 
 class ScalarLog:

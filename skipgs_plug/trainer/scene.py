@@ -1,4 +1,4 @@
-"""Scene and View: posed images plus a point cloud, whatever format they came in."""
+"""Scene and View: images with camera poses, and a point cloud, whatever format they were read from."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from skipgs_plug.trainer.frame import Frame
 
 BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
-MIN_POINTS = 4  # each has three neighbours
-MIN_SIDE = 11  # window of SSIM
-MAX_COORDINATE = 1e15  # squares of distances stay finite in float32
+MIN_POINTS = 4  # the scale of an initial Gaussian is the mean distance to its three nearest neighbours
+MIN_SIDE = 11  # pixels: the side of SSIM's window
+MAX_COORDINATE = 1e15  # units of the scene: squares of distances stay below the largest float32, 3e38
 
 
 @dataclass
@@ -36,15 +36,17 @@ class View:
 
     @property
     def width(self) -> int:
+        """Image width in pixels."""
         return self.image.shape[1]
 
     @property
     def height(self) -> int:
+        """Image height in pixels."""
         return self.image.shape[0]
 
     @property
     def blank(self) -> bool:
-        """Whether its mask leaves no pixel."""
+        """Whether the mask leaves no pixel to train on."""
         return self.mask is not None and not bool(self.mask.any())
 
 
@@ -52,9 +54,15 @@ class View:
 class Scene:
     """Training views, held-out views and the points that training starts from.
 
-    Cameras and points are in local coordinates, which are those of the dataset unless `frame` says otherwise; files
-    are written in those of the dataset, so an exported PLY lies where its cameras do. Everything in the recipe that
-    has a length is multiplied by `scene_scale`.
+    Cameras and points are in local coordinates. These are the coordinates of the dataset unless `frame` says otherwise.
+    Files are written in coordinates of the dataset, so an exported PLY lies where its cameras are. Every length in
+    the recipe is multiplied by `scene_scale`.
+
+    Examples:
+        >>> from skipgs_plug.trainer.synthetic import make_scene
+        >>> scene = make_scene(n_views=10, width=32, height=24, n_points=160)
+        >>> scene.points.shape, scene.test[0].name
+        (torch.Size([160, 3]), 'view_000.png')
     """
 
     name: str
@@ -86,7 +94,7 @@ def assemble_scene(
     points_rgb: np.ndarray,
     background: tuple[float, float, float] = BLACK,
 ) -> Scene:
-    """Check what every format must fulfil and build the Scene; `source` is named in errors."""
+    """Check views and points, and build the Scene. Errors name `source`."""
     if not train:
         held_out = "view is" if len(test) == 1 else f"{len(test)} views are"
         raise InputError(
@@ -120,9 +128,9 @@ def assemble_scene(
 
 
 def check_view(view: View, source: Path) -> None:
-    """Refuse what cannot be trained on, before training begins."""
+    """Raise InputError for a view that cannot be trained on."""
     if not is_text(view.name):
-        raise InputError(f"{source}: view name {view.name[:80]!r} holds control characters or no UTF-8; rename it.")
+        raise InputError(f"{source}: view name {view.name[:80]!r} holds control characters or is not UTF-8; rename it.")
     if not (torch.isfinite(view.viewmat).all() and torch.isfinite(view.K).all()):
         raise InputError(f"{source}: camera of {view.name!r} holds NaN or infinity; reconstruct it again.")
     if view.K[0, 0] <= 0 or view.K[1, 1] <= 0:
@@ -139,7 +147,7 @@ def check_view(view: View, source: Path) -> None:
 
 
 def check_points(points: np.ndarray, source: Path) -> None:
-    """Refuse point clouds that training cannot start from."""
+    """Raise InputError for a point cloud that training cannot start from."""
     if len(points) < MIN_POINTS:
         raise InputError(
             f"{source} has {len(points)} points, at least {MIN_POINTS} are needed; get a larger cloud, or give "
@@ -151,7 +159,7 @@ def check_points(points: np.ndarray, source: Path) -> None:
 
 
 def is_text(name: str) -> bool:
-    """Whether a name can be printed and written: no control characters, none of the surrogates of other encodings."""
+    """Whether a name can be printed and written: it has no control characters and no surrogates."""
     return not any(ord(c) < 32 or 0xD800 <= ord(c) <= 0xDFFF for c in name)
 
 

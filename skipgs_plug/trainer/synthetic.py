@@ -25,7 +25,7 @@ from skipgs_plug.trainer.raytrace import (
 )
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene
 
-RADIUS = 3.6  # of the camera dome
+RADIUS = 3.6  # units of the scene, from its middle to each camera: the floor, 5.2 wide, fills most of the picture
 FOV_X = np.deg2rad(52.0)
 
 
@@ -37,13 +37,21 @@ def make_scene(
     test_every: int = 8,
     seed: int = 0,
 ) -> Scene:
-    """Trace the scene with 2x2 samples per pixel; the same arguments give the same scene.
+    """Ray-trace a small scene with 2x2 samples per pixel. The same arguments give the same scene.
 
     Args:
-        n_views: cameras, spread evenly over the dome (golden angle).
-        width, height: image size in pixels.
-        n_points: surface points, coloured by their texture under the light.
-        test_every: every n-th view by name is held out.
+        n_views: Number of cameras. They are spread evenly over a dome (golden angle).
+        width: Image width in pixels.
+        height: Image height in pixels.
+        n_points: Number of surface points, with the colour of their texture under the light.
+        test_every: Hold out every n-th view by name.
+        seed: Seed of the surface points.
+
+    Examples:
+        >>> from skipgs_plug.trainer.synthetic import make_scene
+        >>> scene = make_scene(n_views=10, width=32, height=24, n_points=160)
+        >>> len(scene.train), len(scene.test)
+        (8, 2)
     """
     focal = 0.5 * width / np.tan(0.5 * FOV_X)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])

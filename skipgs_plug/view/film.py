@@ -13,7 +13,7 @@ from skipgs_plug.files import WriteError
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.files import write_aside
 
-QUALITY = 8  # of imageio's scale to 10
+QUALITY = 8  # on imageio's scale from 0 (smallest file) to 10 (best picture)
 
 
 def write_film(path: Path, frames: Iterable[np.ndarray], fps: int) -> None:

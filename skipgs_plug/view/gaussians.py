@@ -11,7 +11,7 @@ from torch import Tensor
 
 from skipgs_plug.trainer.model import SH_C0
 
-HALF_MAX = 65_504.0  # viser sends covariances in half precision
+HALF_MAX = 65_504.0  # largest float16: viser sends covariances in half precision
 
 
 class Gaussians(NamedTuple):

@@ -7,9 +7,9 @@ import time
 from skipgs_plug.trainer.loop import Iteration, Trainer
 from skipgs_plug.view.page import Page
 
-SHARE = 0.02  # of the time of training that the page may take
-EVERY = 2.0  # seconds between two models, at least
-LOOK = 0.5  # seconds between two looks for visitors
+SHARE = 0.02  # share of the training time that updates of the page may take
+EVERY = 2.0  # seconds between two updates of the page, at least
+LOOK = 0.5  # seconds between two checks whether somebody has the page open
 
 
 class LiveView:

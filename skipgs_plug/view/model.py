@@ -26,8 +26,8 @@ from skipgs_plug.view.spz import read_spz
 # Where trainers leave their models: ours and gsplat's, then Inria's and those of its family. The last one of an
 # iteration counts: it is the format that is quickest to read.
 PLACES = ("ckpts/ckpt_*_rank0.pt", "point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
-LOADING = ("test_every", "init_num_pts", "init_ply")  # settings that change what a scene is loaded as
-NEAR_PLANE = 0.01  # of a PLY alone
+LOADING = ("test_every", "init_num_pts", "init_ply")  # settings of a run that change how its scene is loaded
+NEAR_PLANE = 0.01  # near clipping plane of a PLY without a scene, in its units; gsplat's default
 FILES: dict[str, Callable[[Path], dict[str, Tensor]]] = {
     ".ply": read_ply,  # plain or compressed
     ".splat": read_splat,

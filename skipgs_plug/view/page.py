@@ -22,11 +22,13 @@ from skipgs_plug.view.draw import to_bytes
 from skipgs_plug.view.gaussians import to_gaussians
 from skipgs_plug.view.upright import up_direction
 
-RADIUS = 5.0  # of the cameras on the page: half precision, near planes and mouse speeds suit such lengths
+RADIUS = (
+    5.0  # radius of the cameras on the page, in its units: viser's half precision, near plane and mouse speed suit it
+)
 FRUSTUM = 0.04  # height of a camera's frustum, in radii
-STEP_BACK = 2.0
-THUMBNAIL = 96  # pixels, longer side
-ERROR_GAIN = 4.0
+STEP_BACK = 2.0  # distance of the first viewpoint behind the first camera, in units of the page
+THUMBNAIL = 96  # longer side of the photograph in a frustum, in pixels: a scene may have hundreds
+ERROR_GAIN = 4.0  # factor on absolute errors: at 1, an error of 0.05 would look black
 TRAIN_COLOUR, TEST_COLOUR = (90, 110, 140), (230, 120, 20)
 WORST_SHOWN = 8
 

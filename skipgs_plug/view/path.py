@@ -8,8 +8,8 @@ from torch import Tensor
 
 from skipgs_plug.trainer.scene import View
 
-MOST_KEYS = 30  # cameras the path goes through; more of them make it tremble as the hand did
-TURN_WEIGHT = 0.5  # distance, in path radii, that turning by one radian counts for
+MOST_KEYS = 30  # cameras that the path goes through, at most: with more, it trembles like the hand that took them
+TURN_WEIGHT = 0.5  # path radii per radian: a turn by one radian takes as long as half a radius
 
 
 def camera_path(views: list[View], frames: int) -> Tensor:

@@ -25,9 +25,9 @@ from skipgs_plug.trainer.ply import renderable
 MAGIC, VERSION = 0x5053474E, 2
 HEADER = "<IIIBBBB"  # magic, version, Gaussians, SH degree, bits behind the point, flags, nothing
 ANTIALIASED, EXTENDED = 1, 2  # flags
-MOST = 10_000_000  # Gaussians of a file, as the reader of the format's authors
-POSITION_BITS = 23  # and a sign
-COLOUR_SCALE = 0.15  # of the constant coefficients around one half, in bytes
+MOST = 10_000_000  # Gaussians in a file, at most: the reader of the format's authors refuses more
+POSITION_BITS = 23  # bits of a coordinate beside its sign: the format has 24
+COLOUR_SCALE = 0.15  # factor on constant SH coefficients before 0.5 is added, as the format says
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}  # by number of coefficients beyond the constant one
 # Signs of the coefficients of bands 1 to 3 when y and z are turned: (y z x) (xy yz zz xz xx-yy) (...)
 SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)

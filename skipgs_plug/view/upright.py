@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-TRUST = 0.02  # in the mean of the cameras' own up, against that they were held level
+# Weight of the cameras' mean up direction against the assumption that they were held level. It only decides where the
+# assumption leaves the direction open.
+TRUST = 0.02
 
 
 def up_direction(poses: np.ndarray) -> np.ndarray:

@@ -52,7 +52,7 @@ def test_gate_names_unknown_settings() -> None:
         SkipGate(config=SkipConfig(start_iter=0), warmup=3)
     with pytest.raises(SkipGSError, match="start_iter"):
         SkipGate()
-    with pytest.raises(SkipGSError, match="str is no policy; derive it from"):
+    with pytest.raises(SkipGSError, match="str is not a policy; derive it from"):
         SkipGate(start_iter=0, policy="random")  # type: ignore[arg-type]
 
 

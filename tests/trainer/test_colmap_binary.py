@@ -102,5 +102,5 @@ def test_names_of_images(folder: Path, name: bytes) -> None:
     path = folder / "sparse/0/images.bin"
     content = path.read_bytes()
     path.write_bytes(content.replace(b"cam/view_001.png", name))
-    with pytest.raises(InputError, match=r"leaves the scene|holds control characters or no UTF-8|in no UTF-8"):
+    with pytest.raises(InputError, match=r"leaves the scene|holds control characters or is not UTF-8|in no UTF-8"):
         load_scene(folder)

@@ -104,5 +104,5 @@ def test_names_that_no_file_has(folder: Path, name: str) -> None:
     content = json.loads(path.read_text())
     content["frames"][0]["file_path"] = name
     path.write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"control characters or no UTF-8|does not exist"):
+    with pytest.raises(InputError, match=r"control characters or is not UTF-8|does not exist"):
         load_scene(folder)

@@ -168,7 +168,6 @@ def composite(
     absolute: Tensor | None,  # [R, 2] collects sums of absolute gradients of means2d
 ) -> tuple[Tensor, Tensor]:
     """Blend all rows into all pixels front to back. Returns image [H, W, D] and alpha [H, W, 1]."""
-
     by_depth = torch.sort(projected.depths.detach(), stable=True).indices
 
     def blend(pixels: Tensor, order: Tensor, *rows: Tensor) -> Tensor:

@@ -36,23 +36,35 @@ def load_scene(
     init_ply: str | Path | None = None,
     images: ImageStore | None = None,
 ) -> Scene:
-    """Load a COLMAP, nerfstudio or Blender folder or a packed .npz.
+    """Load a COLMAP, nerfstudio or Blender folder or a packed .npz file.
 
-    Writes nothing but `undistorted_cache` in a scene whose cameras are distorted, if it can.
+    The only file written into a scene is `undistorted_cache`, when its cameras are distorted and it is writable.
 
     Args:
-        path: folder with `sparse/0` or `sparse`, one model of such a folder (SCENE/sparse/1), folder with
-            `transforms_train.json`, with `transforms.json`, or .npz file.
-        data_factor: use `images_{data_factor}`; resized in memory when that folder is missing.
-        test_every: views sorted by name, index % test_every == 0 held out; 0 holds out none. Blender scenes
-            with `transforms_test.json`, nerfstudio files with `train_filenames` and packed files bring their own split.
-        init_num_pts: random points for a Blender scene, which has no point cloud.
-        init_ply: point cloud, or 3DGS model, to start from instead of the scene's points; in its coordinates.
-        images: bounds the memory of decoded photographs; None: to a quarter of what is free.
+        path: A folder with `sparse/0` or `sparse`, one model of such a folder (SCENE/sparse/1), a folder with
+            `transforms_train.json` or `transforms.json`, or an .npz file.
+        data_factor: Read `images_{data_factor}`; if that folder is missing, shrink `images` in memory.
+        test_every: Hold out every n-th view by name (index % n == 0); 0 holds out no view. Blender scenes with
+            `transforms_test.json`, nerfstudio files with `train_filenames` and packed files have their own split.
+        init_num_pts: Number of random points for a Blender scene, which has no point cloud.
+        init_ply: Point cloud or 3DGS model to start from instead of the scene's points, in coordinates of the scene.
+        images: Bounds the memory of decoded photographs. None: a quarter of the memory that is free.
 
     Raises:
-        MissingFileError: a folder or image is not there.
-        InputError: the content cannot be used (camera model, empty or non-finite points, damaged image...).
+        MissingFileError: A folder or an image does not exist.
+        InputError: The content cannot be used, such as an unknown camera model, points that are missing or not
+            finite, or a damaged image.
+
+    Examples:
+        >>> import tempfile
+        >>> from skipgs_plug.trainer import load_scene, save_packed
+        >>> from skipgs_plug.trainer.synthetic import make_scene
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> save_packed(make_scene(n_views=10, width=32, height=24, n_points=160), f"{folder.name}/small.npz")
+        >>> scene = load_scene(f"{folder.name}/small.npz")
+        >>> len(scene.train), len(scene.test), scene.train[0].image.shape
+        (8, 2, torch.Size([24, 32, 3]))
+        >>> folder.cleanup()
     """
     path = Path(path).expanduser()
     images = images or ImageStore()

@@ -11,8 +11,8 @@ import numpy as np
 
 from skipgs_plug.trainer.errors import InputError, reason
 
-ROUNDED = 1e-3  # lengths of axes in a file of few digits differ from 1 by less
-SHEARED = 0.02  # cosine between two axes from which they cannot be rounded ones
+ROUNDED = 1e-3  # difference of an axis' length from 1 that rounding to few digits explains
+SHEARED = 0.02  # cosine of two axes, at least, that rounding cannot explain: the pose is refused
 
 
 def read_object(path: Path) -> dict[str, Any]:

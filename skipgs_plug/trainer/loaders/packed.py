@@ -18,7 +18,9 @@ from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene
 
 VERSION = 1
-BOMB = 1 << 28  # bytes above which an array that shrinks to a twentieth is no scene
+# Bytes (256 MiB). A larger array that was compressed to less than a twentieth is refused: photographs and points do not
+# compress that far, and a damaged or hostile file could ask for any amount of memory.
+BOMB = 1 << 28
 SHAPES: dict[str, tuple[int | None, ...]] = {  # None: any; the number of views is checked apart
     "version": (),
     "name": (),
@@ -36,7 +38,21 @@ KINDS = {"name": "U", "view_names": "U", "Ks": "f", "viewmats": "f", "points": "
 
 
 def save_packed(scene: Scene, path: str | Path) -> None:
-    """Write the scene, images as lossless PNG bytes (masks as their alpha), split and background included."""
+    """Write a scene into one .npz file, split and background included; `load_scene` reads it.
+
+    Images are stored as PNG without loss, masks as their alpha channel.
+
+    Examples:
+        >>> import tempfile
+        >>> from skipgs_plug.trainer import load_scene, save_packed
+        >>> from skipgs_plug.trainer.synthetic import make_scene
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> scene = make_scene(n_views=10, width=32, height=24, n_points=160)
+        >>> save_packed(scene, f"{folder.name}/small.npz")
+        >>> bool((load_scene(f"{folder.name}/small.npz").points == scene.points).all())
+        True
+        >>> folder.cleanup()
+    """
     views = scene.train + scene.test
     encoded = [encode_png(view) for view in views]
     content: dict[str, Any] = {
@@ -57,12 +73,12 @@ def save_packed(scene: Scene, path: str | Path) -> None:
 
 
 def placed(scene: Scene, view: View) -> torch.Tensor:
-    """Return the pose [4, 4] float64 in coordinates of the dataset."""
+    """Return the view's pose [4, 4] float64 in coordinates of the dataset."""
     return scene.frame.dataset_pose(view.viewmat) if scene.frame.moves else view.viewmat
 
 
 def points_of(scene: Scene) -> np.ndarray:
-    """Return the points [M, 3] likewise."""
+    """Return the points [M, 3] in coordinates of the dataset."""
     points = scene.points.numpy()
     return points.astype(np.float64) * scene.frame.unit + scene.frame.centre if scene.frame.moves else points
 
@@ -125,6 +141,7 @@ def check_header(archive: zipfile.ZipFile, name: str, expected: tuple[int | None
 
 
 def encode_png(view: View) -> bytes:
+    """Return the photograph as PNG bytes, with the mask as its alpha channel."""
     stream = io.BytesIO()
     pixels = view.image.numpy()
     if view.mask is not None:
