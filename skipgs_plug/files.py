@@ -80,7 +80,7 @@ def write_error(path: Path, error: OSError, size: int | None = None) -> WriteErr
     blocking = next((parent for parent in path.parents if os.path.isfile(parent)), None)
     if blocking is not None:
         return WriteError(
-            f"{path} cannot be written ({reason}): {blocking} is a file and no folder; give another place."
+            f"{path} cannot be written ({reason}): {blocking} is a file, not a folder; give another path."
         )
     free = _free(path)
     # numpy's writer says how many items it wrote instead of why it stopped.

@@ -288,7 +288,7 @@ class SkipGate:
             SkipGSError: The gate was created without `record_trace=True`.
         """
         if self._engine.trace is None:
-            raise SkipGSError("This gate records no trace; make it with record_trace=True.")
+            raise SkipGSError("This gate records no trace; create it with record_trace=True.")
         return self._engine.trace
 
     @property

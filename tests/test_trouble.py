@@ -217,8 +217,8 @@ def test_only_leftovers_are_removed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("target", "cure"),
     [
-        ("file/x.html", "file is a file and no folder; give another place."),
-        ("file/deeper/x.html", "file is a file and no folder; give another place."),
+        ("file/x.html", "file is a file, not a folder; give another path."),
+        ("file/deeper/x.html", "file is a file, not a folder; give another path."),
         ("folder", "folder is a folder; give the name of a file."),
         ("", " is a folder; give the name of a file."),
     ],

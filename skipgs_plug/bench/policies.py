@@ -213,7 +213,7 @@ def check_policies(names: Sequence[str], find: Callable[[str], Policy | None], k
         known: Policies to name in a refusal.
     """
     if not names:
-        raise InputError(f"--policies names none; give some of {', '.join(known)}, or leave it out for all.")
+        raise InputError(f"--policies is empty; give some of {', '.join(known)}, or leave it out for all.")
     for name in names:
         spec = find(name)
         if spec is None:

@@ -30,9 +30,9 @@ class GateSettings:
         before = state["settings"]
         if (before is None) != (self._settings is None):
             raise InputError(
-                "The run was begun without a gate; resume it without --gate and settings of it."
+                "The run was begun without a gate; resume it without --gate and without gate settings."
                 if before is None
-                else "The run was begun with a gate; resume it with --gate, or the settings of it that were given."
+                else "The run was begun with a gate; resume it with --gate, or with the gate settings that it had."
             )
         # A run that is older than a setting was begun with what is its default now.
         before = SkipConfig().as_dict() | (before or {})

@@ -60,10 +60,10 @@ def run(args: Args) -> int:
     out = args.out.expanduser()
     if out.suffix.lower() == ".mp4":
         if len({(lens.width, lens.height) for _, lens in cameras}) > 1:
-            raise InputError("The held-out views differ in size, which a film cannot; give a folder as OUT.")
+            raise InputError("The held-out views differ in size, so they cannot become a film; give a folder as OUT.")
         write_film(out, frames(), args.fps)
     elif out.suffix:
-        raise InputError(f"{out} ends neither in .mp4 nor is it a folder's name; give one of the two.")
+        raise InputError(f"{out} is neither a film (.mp4) nor a folder; give one of the two.")
     else:
         write_pictures(out, frames(), names)
     near, far = (limit * model.scene.frame.unit for limit in limits)

@@ -68,8 +68,8 @@ class Session:
             lost = f"{len(self._failed)} files of {self._folder.root} could not be written"
             if not self._folder.checkpoints():
                 raise InputError(
-                    f"{lost}, and no checkpoint is there to go on from; make room, and give the same command again, "
-                    "without --resume: it trains anew."
+                    f"{lost}, and there is no checkpoint to continue from; make room, and give the same command again, "
+                    "without --resume: it trains from the start."
                 )
             raise InputError(f"{lost}; make room, and the same command with --resume writes them.")
         if stop.exit_code:

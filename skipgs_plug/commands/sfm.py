@@ -76,7 +76,7 @@ def reconstruct(args: Args) -> Path:
     )
     print_unplaced(unplaced, matching)
     if gathered.masks is not None:
-        print("Transparent pixels of the photographs are left out of training: masks/ says which.")
+        print("Transparent pixels of the photographs are left out of training; masks/ shows them.")
     return scene
 
 

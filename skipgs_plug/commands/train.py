@@ -100,7 +100,7 @@ def check(args: Args, checkpoints: list[Path]) -> None:
         raise InputError(f"{args.scene} {what}; leave out --sfm or give photographs.")
     if not args.sfm and are_photographs(given):
         raise InputError(
-            f"{args.scene} holds photographs and nothing that says where they were taken; add --sfm to find that out "
+            f"{args.scene} holds photographs but no cameras; add --sfm to reconstruct them out "
             f"first, or run: {next_command('sfm', args.scene, 'SCENE')}."
         )
     if args.session.lpips_net is not None:

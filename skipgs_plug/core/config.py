@@ -97,7 +97,7 @@ class SkipConfig:
         if self.max_gaussians is not None:
             _check_count("max_gaussians", self.max_gaussians, "Gaussians")
             if self.growing is None and self.enabled:
-                raise SkipGSError("max_gaussians holds back densification events; give share or grow_share, too.")
+                raise SkipGSError("max_gaussians needs share or grow_share; give one of them too.")
         if self.always is not None:
             # A frozen dataclass takes any collection of whole numbers, and holds a tuple.
             object.__setattr__(self, "always", tuple(sorted(int(number) for number in self.always)))

@@ -356,7 +356,7 @@ class Engine:
             saved = None if state is None else state["refining"]["asked"]
             raise SkipGSError(
                 f"The gate state was saved with refine_share={saved!r}, not {self.config.refining!r}; "
-                "go on with its setting, or start the gate afresh."
+                "continue with that setting, or start the gate afresh."
             )
         if "shown" in whole:
             self.rates.shown.load_state_dict(whole["shown"])

@@ -201,7 +201,7 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
     accumulator = state.get("accumulator") or {}
     if accumulator.get("norm_mean") is not None:
         raise SkipGSError(
-            'The gate state was saved with step_mode="adaptive_norm", which there is no more; start the gate afresh.'
+            'The gate state was saved with step_mode="adaptive_norm", which no longer exists; start the gate afresh.'
         )
     if is_release_state(state):
         _require_release_version(state)
@@ -210,8 +210,8 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
         _require_version(state, GATE_VERSION)
         if state.get("refinement") is not None:
             raise SkipGSError(
-                "The gate state was saved by a version before 0.2.0, which left out iterations in another way; go on "
-                "with that version, or start the gate afresh."
+                "The gate state was saved by a version before 0.2.0, which left out iterations in another way; "
+                "continue with that version, or start the gate afresh."
             )
         # States from before iterations could be left out, and before steps depended on what a view shows.
         state = {"pace": None, "shown": [0.0, 0], **state}

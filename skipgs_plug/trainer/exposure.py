@@ -60,7 +60,7 @@ class Exposure:
         moments = [name for name in MOMENTS if name in state]
         for name in ("affine", *moments):
             if state[name].shape != self.affine.shape or not bool(torch.isfinite(state[name]).all()):
-                raise ValueError(f"its exposure ({name}) is none of {len(self._index)} views")
+                raise ValueError(f"its exposure ({name}) does not fit {len(self._index)} views")
         with torch.no_grad():
             self.affine.copy_(state["affine"])
         self.optimizer.state.clear()

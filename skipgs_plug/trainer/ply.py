@@ -296,7 +296,9 @@ def check_header(path: Path) -> None:
             if element == b"vertex" and words[1:2] == [b"list"]:
                 raise InputError(f"PLY {path} has lists in its vertices, so it is neither a model nor a point cloud.")
     if needed > size:
-        raise InputError(f"PLY {path} is damaged: it claims {needed:,} bytes at least, has {size:,}; export it again.")
+        raise InputError(
+            f"PLY {path} is damaged: it claims {needed:,} bytes at least, but has {size:,}; export it again."
+        )
 
 
 def columns(

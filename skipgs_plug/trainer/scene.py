@@ -143,7 +143,7 @@ def check_view(view: View, source: Path) -> None:
             "use larger images or a smaller data_factor."
         )
     if view.blank:
-        raise InputError(f"{source}: the mask of {view.name!r} leaves no pixel; white is what counts.")
+        raise InputError(f"{source}: the mask of {view.name!r} leaves no pixel; white pixels are kept.")
 
 
 def check_points(points: np.ndarray, source: Path) -> None:

@@ -58,7 +58,7 @@ def gsplat_class(name: str) -> Any:
         import gsplat
     except ImportError as error:
         raise InputError(
-            f"Densification needs gsplat and it cannot be imported ({error}); run: {install_command()}."
+            f"Densification needs gsplat, which cannot be imported ({error}); run: {install_command()}."
         ) from error
     return getattr(gsplat, name)
 

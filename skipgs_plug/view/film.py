@@ -51,8 +51,7 @@ def coder_ended_early(path: Path) -> Iterator[None]:
         yield
     except (OSError, RuntimeError) as error:
         raise WriteError(
-            f"{path} cannot be written (the coder ended early, and may have said why); make room there or give "
-            "another place."
+            f"{path} cannot be written (the coder ended early; see its output); make room or give another path."
         ) from error
 
 

@@ -27,12 +27,13 @@ def read_splat(path: Path) -> dict[str, Tensor]:
     data = path.read_bytes()
     if not data or len(data) % ROW.itemsize:
         raise InputError(
-            f"{path} is damaged or no .splat: its {len(data):,} bytes are not rows of {ROW.itemsize}; export it again."
+            f"{path} is damaged or not a .splat: its {len(data):,} bytes are not rows of {ROW.itemsize}; "
+            "export it again."
         )
     rows = np.frombuffer(data, dtype=ROW)
     quats = (rows["quats"].astype(np.float32) - 128.0) / 128.0
     if not np.abs(quats).max(axis=1).all() or (rows["scales"] < 0).any():
-        raise InputError(f"{path} is damaged or no .splat: it holds rotations of length 0 or negative scales.")
+        raise InputError(f"{path} is damaged or not a .splat: it holds rotations of length 0 or negative scales.")
     alpha = rows["rgba"][:, 3] / 255.0
     with np.errstate(divide="ignore"):
         opacities, scales = np.log(alpha) - np.log1p(-alpha), np.log(rows["scales"])

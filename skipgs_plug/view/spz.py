@@ -82,9 +82,9 @@ def read_spz(path: Path) -> Spz:
         content = gzip.decompress(data)
         magic, version, n, degree, bits, flags, _ = struct.unpack_from(HEADER, content)
     except (OSError, EOFError, zlib.error, struct.error, MemoryError) as error:
-        raise InputError(f"{path} is damaged or no SPZ ({reason(error)}); export it again.") from error
+        raise InputError(f"{path} is damaged or not an SPZ ({reason(error)}); export it again.") from error
     if magic != MAGIC or not 0 < n <= MOST:
-        raise InputError(f"{path} is damaged or no SPZ; export it again.")
+        raise InputError(f"{path} is damaged or not an SPZ; export it again.")
     if version not in (1, 2, 3) or degree not in DEGREES.values() or flags & EXTENDED:
         what = "extensions" if flags & EXTENDED else f"version {version} and SH degree {degree}"
         raise InputError(f"{path} is an SPZ with {what}, which is not read here; export it as PLY of degree 3 or less.")

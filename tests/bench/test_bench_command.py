@@ -47,7 +47,7 @@ def test_command_prints_the_table_and_leaves_json_and_plots(packed, tmp_path, ca
     ("more", "sentence"),
     [
         (("--policies", "gatee"), "There is no policy 'gatee'"),
-        (("--policies",), "--policies names none"),
+        (("--policies",), "--policies is empty"),
         (("--policies", "random", "own"), "add gate to --policies"),
         (("--seeds", "1", "1"), "each once"),
         (("--max-steps", "1"), "nothing to refine"),

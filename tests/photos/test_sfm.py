@@ -111,7 +111,7 @@ def test_photographs_are_told_from_scenes(fern, tmp_path, capsys):
     assert "is neither a video nor a folder with photographs; leave out --sfm" in capsys.readouterr().err
     (photos / "first day/one.JPG").write_bytes(b"")
     assert main(["train", str(photos), *out]) == 2
-    assert "holds photographs and nothing that says where they were taken; add --sfm" in capsys.readouterr().err
+    assert "holds photographs but no cameras; add --sfm" in capsys.readouterr().err
     (photos / "transforms.json").write_text("{}")
     assert main(["train", str(photos), *out, "--sfm"]) == 2
     assert "is a scene already; leave out --sfm" in capsys.readouterr().err

@@ -78,7 +78,7 @@ def test_counts_that_no_file_holds(folder: Path, name: str, count: int) -> None:
         (32, "<d", -30.0, r"has a focal length of -30"),
         (32, "<d", np.nan, r"has parameters \[nan"),
         (48, "<d", np.inf, r"has parameters"),
-        (24, "<Q", 32, r"is 32x24, which has not the shape of its camera, 32x32"),
+        (24, "<Q", 32, r"is 32x24, but its camera is 32x32"),
     ],
 )
 def test_camera_values(folder: Path, offset: int, kind: str, value: float, sentence: str) -> None:
@@ -102,5 +102,7 @@ def test_names_of_images(folder: Path, name: bytes) -> None:
     path = folder / "sparse/0/images.bin"
     content = path.read_bytes()
     path.write_bytes(content.replace(b"cam/view_001.png", name))
-    with pytest.raises(InputError, match=r"leaves the scene|holds control characters or is not UTF-8|in no UTF-8"):
+    with pytest.raises(
+        InputError, match=r"leaves the scene|holds control characters or is not UTF-8|in a name that is not UTF-8"
+    ):
         load_scene(folder)

@@ -356,7 +356,7 @@ def test_other_versions_of_spz_are_named(tmp_path: Path) -> None:
         "is an SPZ of version 4 or later": struct.pack("<II", 0x5053474E, 4) + bytes(40),
         "version 7 and SH degree 0": spz(7, bytes(3)),
         "with extensions": spz(2, bytes(3), flags=2),
-        "damaged or no SPZ": b"no zip",
+        "damaged or not an SPZ": b"no zip",
         "bytes for 1 Gaussians": spz(3, bytes(3)),
     }
     for said, data in cases.items():

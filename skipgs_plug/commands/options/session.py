@@ -34,4 +34,4 @@ class SessionOptions:
             if value is not None and value < 0:
                 raise InputError(f"{name}={value} is not a number of iterations; 0 stands for the end only.")
         if self.image_memory is not None and not 0 < self.image_memory < 1e6:
-            raise InputError(f"image_memory={self.image_memory} is no amount of memory; give gigabytes, such as 4.")
+            raise InputError(f"image_memory={self.image_memory} is not an amount of memory; give gigabytes, such as 4.")

@@ -53,7 +53,8 @@ class LoopFinder:
         self._without += needed
         if self._without == SEARCHED:
             raise AdapterMismatchError(
-                "No loop over range(...) counts the iterations of this trainer, so none can be left out; gate "
-                "without share and refine_share, or write the loop as: for step in gate.iterations(range(...))."
+                "No loop over range(...) counts the iterations of this trainer, so the gate cannot leave any "
+                "out; use it without share and refine_share, or write the loop as: "
+                "for step in gate.iterations(range(...))."
             )
         return False

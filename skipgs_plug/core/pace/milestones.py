@@ -80,9 +80,9 @@ class Condition:
         leaf = self._leaf(node)
         if leaf.unforeseeable and self._is_tested(node):
             raise SkipGSError(
-                f"Line {self.line} of {self._loop.file} decides by the iteration's number in a way that cannot be "
-                f"foreseen ({self.text}), so leaving out iterations could lose what it does; gate without "
-                "refine_share, or name the iterations that must run (always=)."
+                f"Line {self.line} of {self._loop.file} has a condition on the iteration's number that cannot be "
+                f"evaluated ahead ({self.text}), so an iteration that it needs could be left out; use the gate "
+                "without a share, or name the iterations that must run (always=)."
             )
         if leaf.code is None:
             return assumed
@@ -299,7 +299,7 @@ def _loop_at(code: CodeType, line: int, pure: frozenset[str]) -> _Loop:
         ):
             return _Loop(node, code.co_filename, first, pure)
     raise SkipGSError(
-        f"Line {line} of {code.co_filename} stands in no loop over a single number; "
+        f"Line {line} of {code.co_filename} is not in a loop over one number; "
         "write the loop as: for step in gate.iterations(range(...))."
     )
 

@@ -264,8 +264,8 @@ class Phased(Pace):
         if (state["refining"]["asked"], saved_growing) != (self._config.refining, asked):
             raise SkipGSError(
                 f"The gate state was saved with refine_share={state['refining']['asked']!r} and "
-                f"grow_share={saved_growing!r}, not {self._config.refining!r} and {asked!r}; go on with its settings, "
-                "or start the gate afresh."
+                f"grow_share={saved_growing!r}, not {self._config.refining!r} and {asked!r}; continue with those "
+                "settings, or start the gate afresh."
             )
         self.refining.load_state_dict(state["refining"])
         if self.growing is not None:

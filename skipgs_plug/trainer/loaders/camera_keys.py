@@ -50,7 +50,9 @@ def read_camera(values: dict[str, Any], image_path: Path, source: Path) -> Any:
         numbers["h"], numbers["w"] = pixels.shape[:2]
     width, height = numbers["w"], numbers["h"]
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width == int(width) and height == int(height)):
-        raise InputError(f"{source}: w and h are {width:g} and {height:g}, no size of an image; restore the file.")
+        raise InputError(
+            f"{source}: w and h are {width:g} and {height:g}, which is not an image size; restore the file."
+        )
     focal_x, focal_y = focal_length(numbers, "x", width, source), focal_length(numbers, "y", height, source)
     if focal_x is None and focal_y is None:
         raise InputError(
@@ -105,4 +107,6 @@ def refuse_unsupported(values: dict[str, Any], source: Path) -> None:
             raise InputError(f"{source}: {key} is {short(value)}, and {what} is not supported; {cure}.")
     start, end = values.get("transform_matrix_start"), values.get("transform_matrix_end")
     if start != end:
-        raise InputError(f"{source}: a frame moves while it is taken (transform_matrix_start, _end): not supported.")
+        raise InputError(
+            f"{source}: a camera that moves during the exposure (transform_matrix_start, _end) is not supported."
+        )

@@ -167,7 +167,8 @@ def read_model(model: Path) -> tuple[Any, dict[int, str]]:
             reconstruction = pycolmap.Reconstruction(folder)
         if len(reconstruction.images) != len(names):
             raise InputError(
-                f"{model} lists {len(names)} images, and {len(reconstruction.images)} can be read; export it again."
+                f"{model} lists {len(names)} images, but only {len(reconstruction.images)} can be read; "
+                "export it again."
             )
         return reconstruction, names
     except InputError:
@@ -187,7 +188,9 @@ def image_name(image: Any, model: Path) -> str:
     try:
         return image.name
     except UnicodeDecodeError as error:
-        raise InputError(f"{model} names image {image.image_id} in no UTF-8; rename the file and map again.") from error
+        raise InputError(
+            f"{model} names image {image.image_id} in a name that is not UTF-8; rename the file and map again."
+        ) from error
 
 
 def pose_of(image: Any, name: str, model: Path) -> np.ndarray:
@@ -197,7 +200,7 @@ def pose_of(image: Any, name: str, model: Path) -> np.ndarray:
     viewmat[:3] = pose.matrix()
     length = np.linalg.norm(pose.rotation.quat)
     if not (np.isfinite(viewmat).all() and abs(length - 1) < 1e-3 and np.abs(viewmat).max() < 1e12):
-        raise InputError(f"{model}: the pose of {name!r} is not one (quaternion of length {length:g}); map it again.")
+        raise InputError(f"{model}: the pose of {name!r} is not valid (quaternion of length {length:g}); map it again.")
     return viewmat
 
 

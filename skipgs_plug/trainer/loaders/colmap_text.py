@@ -74,7 +74,7 @@ def image_records(path: Path, cameras: set[str]) -> list[tuple[int, list[str]]]:
         if not fields:
             continue
         if len(fields) <= IMAGE_FIELDS or not fields[0].isdigit():
-            raise InputError(f"{path}: {line[:80]!r} describes no image; export the model again.")
+            raise InputError(f"{path}: {line[:80]!r} is not the line of an image; export the model again.")
         records.append((int(fields[0]), fields))
         observations = True
     return records

@@ -111,7 +111,7 @@ def upright(picture: Image.Image, label: Path | str, size: tuple[int, int] | Non
         if same_aspect(turned.size, size):
             return turned
     raise InputError(
-        f"Image {label} is {picture.width}x{picture.height}, which has not the shape of its camera, "
+        f"Image {label} is {picture.width}x{picture.height}, but its camera is "
         f"{size[0]}x{size[1]}; restore the image that the camera was calibrated for"
         + (" (it seems to be rotated)." if same_aspect(picture.size, size[::-1]) else ".")
     )

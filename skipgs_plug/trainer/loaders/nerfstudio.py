@@ -99,7 +99,9 @@ def own_split(
     held_out = named.get("val_filenames", set()) | named.get("test_filenames", set())
     unknown = (held_out | named["train_filenames"]) - {view.name for view in views}
     if unknown:
-        raise InputError(f"{source}: its split names {min(unknown)!r}, which is no frame; run ns-process-data again.")
+        raise InputError(
+            f"{source}: its split names {min(unknown)!r}, which is not a frame; run ns-process-data again."
+        )
     views = sorted(views, key=lambda view: view.name)
     train = [view for view in views if view.name in named["train_filenames"]]
     return train, [view for view in views if view.name in held_out - named["train_filenames"]]

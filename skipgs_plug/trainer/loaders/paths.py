@@ -23,7 +23,9 @@ def relative_name(folder: Path, name: str) -> str:
         InputError: the name is empty, leaves the folder or cannot be a file name.
     """
     if not is_text(name):
-        raise InputError(f"{folder}: file name {name[:80]!r} holds control characters or no UTF-8; rename the file.")
+        raise InputError(
+            f"{folder}: file name {name[:80]!r} holds control characters or is not UTF-8; rename the file."
+        )
     given = name
     if "\\" in name and not os.path.isfile(folder / name):
         name = name.replace("\\", "/")
@@ -40,8 +42,8 @@ def relative_name(folder: Path, name: str) -> str:
         inner = next((end for end in ends if not leaves(end) and look_up(folder, end) is not None), None)
         if inner is None:
             raise InputError(
-                f"{folder}: file name {given!r} leaves the scene, and nothing in the scene is called like its end; "
-                "only paths inside it are read."
+                f"{folder}: file name {given!r} leaves the scene, and no file in the scene has the end of its path; "
+                "only files inside the scene are read."
             )
         path = inner
     return path.as_posix()

@@ -153,7 +153,7 @@ def test_a_name_that_is_given_below_is_of_the_iteration_before():
                 print("save")
             before = step
 
-    with pytest.raises(SkipGSError, match=r"cannot be foreseen \(step - before == 10\)"):
+    with pytest.raises(SkipGSError, match=r"cannot be evaluated ahead \(step - before == 10\)"):
         found(loop)
 
 
@@ -165,7 +165,7 @@ def test_a_number_that_the_loop_changes_is_refused():
             if step % 25 == 0:
                 print("save")
 
-    with pytest.raises(SkipGSError, match=r"cannot be foreseen \(step % 25 == 0\)"):
+    with pytest.raises(SkipGSError, match=r"cannot be evaluated ahead \(step % 25 == 0\)"):
         found(loop)
 
 
@@ -190,7 +190,7 @@ def test_functions_that_only_look_at_numbers():
                 print("log")
 
     assert found(loop, pure=["is_due"]) == {"is_due(step, 45)": [90]}
-    with pytest.raises(SkipGSError, match=r"in a way that cannot be foreseen \(is_due\(step, 45\)\)"):
+    with pytest.raises(SkipGSError, match=r"that cannot be evaluated ahead \(is_due\(step, 45\)\)"):
         found(loop)
 
 
@@ -201,7 +201,7 @@ def test_a_condition_on_what_changes_in_the_loop_is_refused():
             if step == upcoming:
                 upcoming += 10
 
-    with pytest.raises(SkipGSError, match=r"cannot be foreseen \(step == upcoming\).*name the iterations"):
+    with pytest.raises(SkipGSError, match=r"cannot be evaluated ahead \(step == upcoming\).*name the iterations"):
         found(loop)
 
 
@@ -249,7 +249,7 @@ def test_conditions_on_what_an_object_keeps_from_iteration_to_iteration_are_refu
                 saves.pop(0)
 
     for loop, condition in ((attribute, "step - run.saved == 10"), (entry, "saved'] == 10"), (queue, "step == saves")):
-        with pytest.raises(SkipGSError, match=f"cannot be foreseen .*{re.escape(condition)}"):
+        with pytest.raises(SkipGSError, match=f"cannot be evaluated ahead .*{re.escape(condition)}"):
             found(loop)
 
 
@@ -262,7 +262,7 @@ def test_a_number_that_no_loop_hands_out_is_refused():
                 if step == 90:
                     print("save")
 
-    with pytest.raises(SkipGSError, match="stands in no loop over a single number"):
+    with pytest.raises(SkipGSError, match="is not in a loop over one number"):
         found(loop)
 
 
