@@ -23,7 +23,7 @@ __all__ = [
     "register_adapter",
 ]
 
-# Loaded on first use: torch takes seconds, in which the command must already answer Ctrl-C and name what is missing.
+# Loaded on first use: torch takes seconds to load, and the command must answer Ctrl-C and name missing packages before.
 _HOMES = {
     "AdapterMismatchError": "core.errors",
     "Decision": "core.decision",

@@ -17,7 +17,7 @@ from skipgs_plug.terminate import UNREAD, Terminated, terminable
 
 
 class Command(NamedTuple):
-    """What a command does, and the extra that brings what it imports."""
+    """The purpose of a command, and the extra that installs its imports."""
 
     meaning: str
     extra: str
@@ -104,7 +104,7 @@ def print_any_name() -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """Find the command and call it, or say what there is."""
+    """Find the command and call it, or list the commands."""
     name, *rest = arguments or [""]
     if name == "--version":
         from importlib.metadata import PackageNotFoundError, version
@@ -115,7 +115,7 @@ def run(arguments: list[str]) -> int:
             print("not installed: run from a checkout")
         return 0
     if name in COMMANDS:
-        # What it takes is read before what it needs is loaded: --help and mistakes are answered at once.
+        # Options are read before heavy packages are loaded, so --help and mistakes are answered at once.
         args = importlib.import_module(f"skipgs_plug.commands.options.{name}").parse(rest)
         return importlib.import_module(f"skipgs_plug.commands.{name}").run(args)
     if name and not name.startswith("-"):
@@ -145,7 +145,7 @@ def overview(arguments: list[str]) -> int:
 
 
 def explain(error: Exception, extra: str) -> str | None:
-    """Return the sentence for the user, or None for a defect of ours, which deserves its traceback.
+    """Return the sentence for the user, or None for a defect of ours, which needs its traceback.
 
     `extra` brings the packages of the command.
 
@@ -170,7 +170,7 @@ def explain(error: Exception, extra: str) -> str | None:
 
 
 def chain(error: BaseException | None) -> Iterator[BaseException]:
-    """An error, and those that it arose from."""
+    """Yield an error and its causes."""
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__

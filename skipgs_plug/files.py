@@ -23,7 +23,7 @@ class WriteError(OSError):
 
 @contextlib.contextmanager
 def write_aside(path: str | Path, size: int | None = None) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; renamed onto it on success, removed on failure.
+    """Yield a temporary path next to `path`. It is renamed to `path` on success and removed on failure.
 
     Args:
         size: bytes that the file will about have, where that is known beforehand.
@@ -43,7 +43,7 @@ def write_aside(path: str | Path, size: int | None = None) -> Iterator[Path]:
                 temporary.unlink(missing_ok=True)
     except (OSError, RuntimeError) as error:
         cause = os_error(error)
-        if cause is None or type(error).__module__.startswith("skipgs_plug."):  # which carries its own sentence
+        if cause is None or type(error).__module__.startswith("skipgs_plug."):  # the error has a sentence of its own
             raise
         raise write_error(path, cause, size) from error
 
@@ -68,14 +68,14 @@ def keep_going(failed: list[WriteError]) -> Iterator[None]:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what writers that were killed left aside in a folder; nobody may be writing there now."""
+    """Remove temporary files of killed writers from a folder. No other process may be writing there."""
     for path in folder.glob(".*"):
         if LEFTOVER.fullmatch(path.name) and path.is_file():
             path.unlink(missing_ok=True)
 
 
 def write_error(path: Path, error: OSError, size: int | None = None) -> WriteError:
-    """Return what to raise when `path`, of `size` bytes, cannot be written."""
+    """Return the error to raise when `path`, of `size` bytes, cannot be written."""
     reason = os.strerror(error.errno) if error.errno else str(error)
     blocking = next((parent for parent in path.parents if os.path.isfile(parent)), None)
     if blocking is not None:

@@ -258,7 +258,7 @@ class SkipGate:
             raise GateOrderError("notify_event() came before the first iteration; give its step.")
         self._engine.notify_event(kind, step)
 
-    # What was done.
+    # Counts and settings.
 
     @property
     def skipped(self) -> bool:

@@ -1,4 +1,4 @@
-"""A number on its way from the device to the host, which nobody waits for before it is needed."""
+"""A number that is copied from the device to the host. The host waits only when it needs the value."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class HostCopy:
         return self._event is not None
 
     def value(self) -> float:
-        """The value, as soon as it is here."""
+        """Return the value; wait until it has arrived."""
         if self._value is None:
             if self._event is not None:
                 self._event.synchronize()

@@ -1,4 +1,4 @@
-"""Commands to tell the user: to get the optional packages, to go on; they work wherever this package came from."""
+"""Commands that are printed for the user: to install optional packages, and to continue. They fit the installation."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ PROGRAM = "skipgs-plug"
 
 
 def program() -> str:
-    """Return what the command of this package is called with: its name, or Python where it is not on the path."""
+    """Return how to call the command of this package: by its name, or by Python if it is not on the path."""
     return PROGRAM if shutil.which(PROGRAM) else f"{shlex.quote(sys.executable)} -m {NAME}"
 
 
 def next_command(*words: str | Path) -> str:
-    """Return a command line of this package that can be pasted into a shell, whatever folders are called."""
+    """Return a command line of this package that can be pasted into a shell; names of folders are quoted."""
     return f"{program()} {shlex.join(map(str, words))}"
 
 

@@ -22,7 +22,7 @@ def check(value: Any, kind: Any, name: str) -> None:
         kind: A TypedDict (entries it does not know are let pass), `dict[K, V]`, `list[T]`, `tuple[A, B, ...]` (a list
             serves as well), a union, `Any`, or a class. `int` is a count (a whole number >= 0, no bool), `float` a
             finite number; `numbers.Real` lets NaN and infinity pass.
-        name: What messages call the value.
+        name: Name of the value in messages.
     """
     origin, inner = get_origin(kind), get_args(kind)
     if kind is Any:

@@ -1,4 +1,4 @@
-"""SIGTERM ends a command as Ctrl-C does, so that it cleans up what it had begun."""
+"""SIGTERM ends a command like Ctrl-C does, so that it can clean up."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import signal
 from collections.abc import Iterator
 from typing import Any
 
-UNREAD = 141  # exit code when nobody reads the output any more, as a shell reports SIGPIPE
+UNREAD = 141  # exit code when the reader of the output has gone away: 128 + SIGPIPE, as in a shell
 
 
 class Terminated(KeyboardInterrupt):

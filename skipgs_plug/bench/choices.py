@@ -1,4 +1,4 @@
-"""What an option of the bench may be."""
+"""Values that an option of the bench may have."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""decisions.json: every decision of every run, small enough to be kept beside the results.
+"""decisions.json: every decision of every run, small enough to be stored with the results.
 
     {"kind": "skipgs-decisions", "schema_version": 1, "start": 1500,
      "views": {"0": "12 3 15 ..."},                          by seed: index of the view of each iteration that ran
@@ -6,7 +6,7 @@
 
 The letters are those of REASON_CODES; upper case means that the backward was skipped, a point that the whole iteration
 was left out. All policies of a seed see the same views in the same order, one that runs fewer iterations only the first
-of them. What is missing here of a trace are losses and means.
+of them. Losses and means of a trace are left out.
 """
 
 from __future__ import annotations

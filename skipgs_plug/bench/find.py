@@ -9,7 +9,7 @@ from skipgs_plug.bench.whole_policies import WHOLE_POLICIES, whole_policy
 
 
 def find_policy(name: str, whole: bool) -> Policy | None:
-    """Return the policy of a name in whole runs, or in refinements; None if there is none."""
+    """Return the policy with this name for whole runs or for refinement; None if it does not exist."""
     return whole_policy(name) if whole else refinement_policy(name)
 
 

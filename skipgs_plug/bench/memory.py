@@ -16,7 +16,7 @@ RESET_PEAK = "5"  # as proc(5) has it
 
 
 class MemoryMeter(Protocol):
-    """Tells peaks since it was reset."""
+    """Measures the peak of memory since the last reset."""
 
     def reset(self) -> int:
         """Forget the peak so far; returns the bytes in use."""
@@ -44,7 +44,7 @@ class CudaMeter:
 class ProcessMeter:
     """Bytes of this process that lie in memory, as Linux counts them.
 
-    Memory that was freed goes back to the system first: else a run would find what another left, and seem to need none.
+    Freed memory goes back to the system first. Else a run would reuse the memory of another and seem to need less.
     """
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ class ProcessMeter:
 
 
 def memory_meter(device: torch.device) -> MemoryMeter | None:
-    """Return what measures on this device; None where this system does not tell."""
+    """Return the meter for this device; None if this system does not report memory."""
     if device.type == "cuda":
         return CudaMeter(device)
     if not CLEAR.exists():

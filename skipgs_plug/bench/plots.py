@@ -1,4 +1,4 @@
-"""The pictures of a bench, written as PNG. Colours are told apart by colour-blind readers (Okabe-Ito)."""
+"""The plots of a bench, written as PNG, in colours that colour-blind readers can distinguish (Okabe-Ito)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""What is compared after one densification: the trainer's own refinement, the gate, thinned refinement, and controls.
+"""Policies of refinement after one densification: the trainer's own, the gate, fewer iterations, and controls.
 
-A policy is called by what a user would give to `SkipGate`: `gate`, `refine_share=auto`, and further settings after a
-comma. A new one is one entry of POLICIES. It makes its gate and its number of iterations itself, from a trainer that
-stands at the end of densification and from the finished runs of the same seed, of which it may copy rate or time.
+A policy has the name of the settings that a user would give to `SkipGate`: `gate`, `refine_share=auto`, and further
+settings after a comma. A new policy is one entry of POLICIES. It makes its gate and its number of iterations itself,
+from a trainer at the end of densification and from the finished runs of the same seed, whose rate or time it may copy.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ Plan = Callable[[int, int, int, int], PlannedSkipping]  # of first, end, number 
 
 
 def gate_with(**settings: Any) -> GateMaker:
-    """Return what attaches a gate: `settings` are arguments of SkipGate that differ from the default."""
+    """Return a function that attaches a gate; `settings` are the arguments of SkipGate that differ from the default."""
     # A loss that is not finite ends the run: a bench must not average over it.
     return lambda trainer, earlier: SkipGate(trainer, record_trace=True, on_nonfinite="raise", **settings)
 
 
 def planned_as(name: str, plan: Plan, **settings: Any) -> GateMaker:
-    """Return what attaches a control: as many skips as policy `name`, after the same warm-up; `settings` as above."""
+    """Return a function that attaches a control with as many skips as policy `name`, after the same warm-up."""
 
     def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
         copied = earlier[name]
@@ -45,7 +45,7 @@ def planned_as(name: str, plan: Plan, **settings: Any) -> GateMaker:
 
 
 def as_long_as(name: str) -> Callable[[Trainer, Earlier], int]:
-    """Return what tells how many iterations of the own run take as long as policy `name` did."""
+    """Return a function that computes how many iterations of the own run take as long as policy `name`."""
 
     def iterations(trainer: Trainer, earlier: Earlier) -> int:
         full = all_iterations(trainer, earlier)
@@ -55,7 +55,7 @@ def as_long_as(name: str) -> Callable[[Trainer, Earlier], int]:
 
 
 def stepping_as(name: str) -> GateMaker:
-    """Return what runs every iteration, with the factors on rates of policy `name`, which leaves some out."""
+    """Return a function that runs every iteration with the learning-rate factors of policy `name`."""
 
     def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
         peak = path_factor(float(name.partition("=")[2]), 0.0, shown=earlier[name].gaussians_shown)
@@ -65,7 +65,7 @@ def stepping_as(name: str) -> GateMaker:
 
 
 def thinned_as_long_as(name: str) -> GateMaker:
-    """Return what leaves out whole iterations, so many that the rest takes as long as policy `name` did."""
+    """Return a function that leaves out so many iterations that the rest takes as long as policy `name`."""
 
     def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
         return gate_with(refine_share=share_of_time(name, earlier))(trainer, earlier)  # type: ignore[return-value]
@@ -107,7 +107,7 @@ class PolicySpec(Policy):
     """One row of the comparison of refinements.
 
     Attributes:
-        gate: attaches the gate of this policy to a trainer and returns it; None for a run without.
+        gate: Attaches the gate of this policy to a trainer and returns it; None for a run without a gate.
         iterations: number of iterations; fewer than are left run through the same schedule, compressed.
     """
 
@@ -188,7 +188,7 @@ POLICIES = table_of(
 
 
 def refinement_policy(name: str) -> PolicySpec | None:
-    """Return the policy of a name; None if there is none. `refine_share=` takes any number in (0, 1]."""
+    """Return the policy with this name; None if it does not exist. `refine_share=` takes any number in (0, 1]."""
     if name in POLICIES:
         return POLICIES[name]
     share = number_after("refine_share", name)
@@ -199,7 +199,7 @@ def refinement_policy(name: str) -> PolicySpec | None:
 
 
 def number_after(setting: str, name: str) -> float | None:
-    """Return X of a policy called `setting=X`, in (0, 1]; None if it is not called so."""
+    """Return X of a policy named `setting=X`, in (0, 1]; None if it has another name."""
     found = re.fullmatch(rf"{setting}=(\d*\.?\d+)", name)
     return float(found[1]) if found is not None and 0.0 < float(found[1]) <= 1.0 else None
 
@@ -209,7 +209,7 @@ def check_policies(names: Sequence[str], find: Callable[[str], Policy | None], k
 
     Args:
         names: Policies that are to run.
-        find: Returns the policy of a name, None if there is none.
+        find: Returns the policy with a name, or None if it does not exist.
         known: Policies to name in a refusal.
     """
     if not names:
@@ -226,7 +226,7 @@ def check_policies(names: Sequence[str], find: Callable[[str], Policy | None], k
 
 
 def rounds(specs: Sequence[AnyPolicy], position: int) -> list[list[AnyPolicy]]:
-    """Return what may run in turns: policies that copy nothing, then those that copy from them, and so on.
+    """Return groups that run in turns: policies that copy nothing, then policies that copy from them, and so on.
 
     The order within a round is rotated by `position`, that of the seed.
     """

@@ -22,7 +22,7 @@ PACKAGES = ("torch", "warp-lang", "gsplat", "numpy", "torchmetrics")
 
 
 def machine(backend: Backend) -> dict[str, Any]:
-    """Return what decides about speed: processor, cores, threads, memory, GPU, backend."""
+    """Return the facts that determine speed: processor, cores, threads, memory, GPU, backend."""
     return {
         "cpu": cpu_name(),
         "cores": os.cpu_count(),
@@ -46,7 +46,7 @@ def cpu_name() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python, this package, and those that compute."""
+    """Return the versions of Python, of this package, and of the packages that compute."""
     found = {"python": platform.python_version()}
     for name in ("skipgs_plug", *PACKAGES):
         try:
@@ -75,7 +75,7 @@ def git(root: Path, *arguments: str) -> str:
 
 
 def scene_facts(scene: Scene, config: TrainConfig) -> dict[str, Any]:
-    """Return what a reader must know to compare numbers: images and their source, factor, split."""
+    """Return the facts that a reader needs to compare numbers: images and their source, factor, split."""
     sizes = sorted({(view.width, view.height) for view in scene.train + scene.test})
     return {
         "name": scene.name,

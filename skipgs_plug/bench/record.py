@@ -1,4 +1,4 @@
-"""What one run (one seed under one policy) leaves behind, as plain values."""
+"""The results of one run (one seed under one policy), as plain values."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Trace:
         start: iteration of the first entry.
         view: index into the list of training views; None for an iteration that was left out.
         loss: loss that was decided on; None for an iteration that was left out.
-        mean: the view's running mean before this loss; None without one.
+        mean: The view's running mean before this loss; None for a view without a mean.
         codes: reason letters, see REASON_CODES, or LEFT_OUT.
     """
 
@@ -100,14 +100,14 @@ class RunRecord:
     """One seed under one policy.
 
     Attributes:
-        status: "done"; "diverged" (its loss stopped being finite); "not run" (what it copies diverged).
+        status: "done"; "diverged" (its loss stopped being finite); "not run" (the policy that it copies diverged).
         note: one sentence for a run that is not done.
-        iterations: of refinement, by number: those that were left out too.
-        iterations_run: those that ran, if only their forward.
+        iterations: Iterations of refinement by number, including those that were left out.
+        iterations_run: Iterations that ran, even if only their forward pass did.
         backwards: of refinement.
         warm_up: refinement iterations that the gate kept from skipping; 0 without a gate.
         floor: least share of backwards in force at the end; None without a gate.
-        gaussians_shown: share of them that a view shows, as larger steps know it; None without these.
+        gaussians_shown: Share of the Gaussians that a view shows; None if steps are not larger.
         reasons: gated decisions by reason; empty without a gate.
         t_post, t_total: seconds of training, of refinement and in all, by the clock of the bench.
         seconds: both by both clocks, see `TrainClock.seconds`.
@@ -120,7 +120,7 @@ class RunRecord:
             the system does not tell.
         chosen: shares and factor on rates in a whole run that leaves out iterations: `grow_share`, `grow_rate_factor`,
             `refine_share`; empty otherwise.
-        tries: settings that a search tried and what they gave; empty without a search.
+        tries: Settings that a search tried, with their results; empty without a search.
         commit: of this package, when it ran.
     """
 
@@ -170,7 +170,7 @@ class RunRecord:
         """
         record = cls(**content)
         for name in (known.name for known in dataclasses.fields(cls)):
-            content[name]  # a run of an older version lacks what has a default here
+            content[name]  # a run of an older version lacks the fields with a default
         record.points = [Point.from_dict(point) for point in content["points"]]
         record.trace = None if content["trace"] is None else Trace(**content["trace"])
         return record

@@ -124,7 +124,7 @@ def measured(stats: dict[str, Any]) -> tuple[dict[str, float], int]:
 
 @contextlib.contextmanager
 def peak_memory(trainer: Trainer, record: RunRecord) -> Iterator[None]:
-    """Raise `record.peak_memory` to what this part used; other runs in turns stay out of it."""
+    """Raise `record.peak_memory` to the peak of this part, without the memory of other runs that take turns."""
     meter = memory_meter(trainer.backend.device)
     if meter is None:
         yield
@@ -196,7 +196,7 @@ def recorded(trainer: Trainer, trace: Trace, gate: SkipGate | None, log: ScalarL
     def on_step(iteration: Iteration) -> None:
         trace.fill(iteration.step)
         row = gate.trace[-1] if gate is not None and gate.trace else None
-        if row is None or row.step != iteration.step:  # nothing was there to decide
+        if row is None or row.step != iteration.step:  # the iteration had no decision
             trace.add(index[iteration.view], iteration.loss, None, REFERENCE, False)
         else:
             trace.add(index[row.view], row.loss, row.mean, row.reason, row.skip)

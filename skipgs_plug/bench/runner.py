@@ -29,7 +29,7 @@ Begin = Callable[[str, Earlier], Generator[None, None, RunRecord]]
 
 
 class Bench:
-    """Runs what is missing in a folder and returns all runs.
+    """Runs the missing runs of a folder and returns all runs.
 
     Args:
         config: settings of training; its seed is replaced by each of `seeds`.
@@ -126,9 +126,9 @@ class Bench:
     def _in_turns(
         self, seed: int, specs: list[Policy], begin: Begin, earlier: dict[str, RunRecord]
     ) -> Iterator[RunRecord]:
-        """Train under each policy, a part of one after a part of the other; yields what has finished.
+        """Train under each policy, taking turns by part; yield each finished run.
 
-        A machine that slows down hits all alike. Each run has a trainer of its own.
+        A machine that slows down affects all policies alike. Each run has a trainer of its own.
         """
         runs = {}
         for spec in specs:
@@ -153,7 +153,7 @@ class Bench:
                     yield RunRecord(seed, name, "not run", str(error))
 
     def _refinements(self, seed: int) -> Begin:
-        """Densify once; returns what refines that under a policy."""
+        """Densify once; return a function that refines the snapshot under a policy."""
         snapshot = self._densified(self._trainer(seed))
 
         def begin(name: str, earlier: Earlier) -> Generator[None, None, RunRecord]:
@@ -165,7 +165,7 @@ class Bench:
         return begin
 
     def _whole_runs(self, seed: int) -> Begin:
-        """Return what trains under a policy from the first iteration on."""
+        """Return a function that trains under a policy from the first iteration on."""
         self._trainer(seed).train(until=WARM_UP, progress=False)
 
         def begin(name: str, earlier: Earlier) -> Generator[None, None, RunRecord]:

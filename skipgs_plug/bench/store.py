@@ -18,7 +18,7 @@ class BenchFolder:
         self.root = Path(root).expanduser()
 
     def require_settings(self, settings: dict[str, Any]) -> None:
-        """Store the settings of a new folder; those of an old one must be the same.
+        """Store the settings of a new folder; an existing folder must have the same settings.
 
         Seeds and policies are not among them: more of either may be added to a folder.
 
@@ -46,7 +46,7 @@ class BenchFolder:
         return self.root / "tb" / f"seed{seed}_{name}"
 
     def load(self, seed: int, policy: str) -> RunRecord | None:
-        """Return a finished run, None when it has not finished yet."""
+        """Return a finished run; None if it has not finished."""
         path = self._run(seed, policy)
         if not path.is_file():
             return None

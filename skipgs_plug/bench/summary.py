@@ -33,7 +33,7 @@ class Row:
     """One policy over all its seeds.
 
     Attributes:
-        seeds: those that the means are over.
+        seeds: Seeds that the means are taken over.
         excluded: the others, with the reason.
         values: by name: `t_post t_total` (s), the same with `_wall` and `_processor`, `t_post_saved t_total_saved`
             (% less than the own run, same seed), `t_total_share` (% of its), `time_to_own` (s until the final PSNR of
@@ -68,7 +68,7 @@ def summarise(
 
 
 def measured(record: RunRecord, own: RunRecord | None, full_iterations: int, whole: bool = False) -> dict[str, float]:
-    """Return the quantities of one run; those against the own run only where that seed has one."""
+    """Return the quantities of one run. Differences to the own run need an own run of that seed."""
     values: dict[str, float] = {"t_post": record.t_post, "t_total": record.t_total}
     for name in ("t_post", "t_total"):
         values[f"{name}_wall"] = record.seconds[name]
@@ -124,7 +124,7 @@ def quantity(sample: Sequence[float], total: int) -> Quantity:
 
 
 def ceiling(rows: Sequence[Row]) -> dict[str, float] | None:
-    """Return what a perfect gate could save at the gate's skip rate, in % of refinement time.
+    """Return how much a perfect gate could save at the gate's skip rate, in % of refinement time.
 
     A skipped iteration still pays forward, loss and decision, so no gate can save more than the share of
     backward and optimizer in the own run's time, times the share of iterations skipped.
@@ -149,7 +149,7 @@ def ceiling(rows: Sequence[Row]) -> dict[str, float] | None:
 def timing_noise(records: Sequence[RunRecord]) -> float | None:
     """Return by how much forward time per iteration differed within a seed, in %, at worst; None for single runs.
 
-    Every policy renders the same views of nearly the same model, so this is what the machine adds.
+    Every policy renders the same views of nearly the same model, so the difference comes from the machine.
     """
     worst = None
     for seed in {record.seed for record in records}:

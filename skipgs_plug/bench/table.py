@@ -120,7 +120,7 @@ def markdown(lines: Sequence[Sequence[str]]) -> str:
 
 
 def notes(rows: Sequence[Row], bench: dict[str, Any]) -> list[str]:
-    """Return the sentences under the table: what was left out, what it could have been, how to read it."""
+    """Return the sentences under the table: values left out, bounds, and how to read the table."""
     sentences = [
         f"Seed {seed} of {row.policy} is left out of its means: {reason}."
         for row in rows
@@ -176,7 +176,7 @@ def notes(rows: Sequence[Row], bench: dict[str, Any]) -> list[str]:
 
 
 def searched(run: dict[str, Any]) -> str:
-    """Return a sentence about what a search tried."""
+    """Return a sentence about the tries of a search."""
     tries = "; ".join(", ".join(f"{name} {value:.6g}" for name, value in one.items()) for one in run["tries"])
     return f"Seed {run['seed']} of {run['policy']} was found by these tries: {tries}."
 

@@ -34,8 +34,8 @@ class Maker:
 
     Attributes:
         create: makes one with changed settings of training.
-        lpips_net: backbone for LPIPS at the end; None for none.
-        scalars: folder for TensorBoard scalars; None for none.
+        lpips_net: Backbone for LPIPS at the end; None for no LPIPS.
+        scalars: Folder for TensorBoard scalars; None for no scalars.
     """
 
     create: Callable[..., Trainer]
@@ -106,7 +106,7 @@ def stopping_at(trainer: Trainer, bound: int) -> Iterator[None]:
 def finish(
     trainer: Trainer, gate: SkipGate | None, record: RunRecord, lpips_net: str | None, log: ScalarLog | None
 ) -> None:
-    """Evaluate, and write down what the run took."""
+    """Evaluate, and record the time and memory of the run."""
     stats = trainer.evaluate("test", lpips_net)
     record.points.append(point(trainer, stats, log, trainer.t_total))
     record.metrics, record.exact_views = measured(stats)
@@ -132,7 +132,7 @@ def finish(
 
 
 def planned(name: str, numbers: Numbers) -> Callable[[Maker, Earlier, RunRecord], Turns]:
-    """Return what runs as many iterations as policy `name` in each phase; `numbers` says which."""
+    """Return a function that runs as many iterations as policy `name` in each phase; `numbers` chooses them."""
 
     def run(make: Maker, earlier: Earlier, record: RunRecord) -> Turns:
         trainer, copied = make(), earlier[name].trace
@@ -161,7 +161,7 @@ def events(trainer: Trainer) -> set[int]:
 def shortened(
     name: str, gate: Callable[[Trainer, Earlier], SkipGate] | None = None
 ) -> Callable[[Maker, Earlier, RunRecord], Turns]:
-    """Return what runs a schedule with all its milestones scaled, so short that it takes as long as policy `name`.
+    """Return a function that scales the whole schedule so that it takes as long as policy `name`.
 
     How long a schedule takes is not proportional to its length: each try is a whole run, from which the next length is
     interpolated. The one whose time is nearest counts.
@@ -191,10 +191,10 @@ def shortened(
 
 
 def as_many_gaussians(name: str) -> Callable[[Maker, Earlier, RunRecord], Turns]:
-    """Return what runs every iteration with `grow_grad2d` set so that as many Gaussians are there in the end.
+    """Return a function that runs every iteration, with `grow_grad2d` chosen for as many Gaussians in the end.
 
     Each try is a densification, from which the next threshold is interpolated (logarithms of both); the one that comes
-    nearest goes on to the end of the run.
+    nearest one trains to the end of the run.
     """
 
     def run(make: Maker, earlier: Earlier, record: RunRecord) -> Turns:

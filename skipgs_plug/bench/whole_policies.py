@@ -1,7 +1,7 @@
-"""What is compared over the whole run, from its first iteration on, and the controls.
+"""Policies of the whole run, from its first iteration on, and the controls.
 
-A policy is called by what a user would give to `SkipGate`, as in `policies`. A new one is one entry of WHOLE_POLICIES:
-a name, a line for people, the policies that it copies from, and what runs it.
+A policy has the name of the settings that a user would give to `SkipGate`, as in `policies`. A new policy is one entry
+of WHOLE_POLICIES: a name, a line of explanation, the policies that it copies from, and the function that runs it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def own(make: Maker, earlier: Earlier, record: RunRecord) -> Generator[None, Non
 
 
 def gated(**settings: object) -> Run:
-    """Return what trains with a gate; `settings` are arguments of SkipGate."""
+    """Return a function that trains with a gate; `settings` are arguments of SkipGate."""
 
     def run(make: Maker, earlier: Earlier, record: RunRecord) -> Generator[None, None, None]:
         trainer = make()
@@ -105,7 +105,7 @@ WHOLE_POLICIES = table_of(
 
 
 def whole_policy(name: str) -> WholePolicy | None:
-    """Return the policy of a name; None if there is none. `share=` and `refine_share=` take any number in (0, 1]."""
+    """Return the policy with this name; None if it does not exist. Shares are numbers in (0, 1]."""
     if name in WHOLE_POLICIES:
         return WHOLE_POLICIES[name]
     share, refined = number_after("share", name), number_after("refine_share", name)

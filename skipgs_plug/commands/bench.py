@@ -1,4 +1,4 @@
-"""`skipgs-plug bench SCENE`: what skipping saves, what it costs, and against what."""
+"""`skipgs-plug bench SCENE`: compare the time and quality of policies on a scene."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from skipgs_plug.trainer.lock import exclusive
 
 
 def run(args: Args) -> int:
-    """Run what is missing, and print and write what came of it; see `Args`."""
+    """Run the policies that are missing, and print and write the results; see `Args`."""
     compare(args)
     return 0
 
 
 def compare(args: Args) -> list[Row]:
-    """Run what is missing, print the table, write bench.json, decisions.json, table.md and plots; returns the rows."""
+    """Run the missing policies, print the table, write bench.json, decisions.json, table.md and plots; return rows."""
     require_names(("SCENE", args.scene), ("--out", args.out))
     whole, known = args.whole, known_policies(args.whole)
     policies = tuple(known) if args.policies is None else args.policies

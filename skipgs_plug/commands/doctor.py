@@ -1,4 +1,4 @@
-"""`skipgs-plug doctor`: what works on this machine, tried rather than guessed."""
+"""`skipgs-plug doctor`: try which backends and extras work on this machine."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 from skipgs_plug.install import install_command
 
-# import name, distribution, what for
+# import name, distribution, purpose
 EXTRAS = (
     ("warp", "warp-lang", "rasterizer on the CPU"),
     ("gsplat", "gsplat", "densification, rasterizer on CUDA"),
@@ -87,7 +87,7 @@ def check_backend(name: str) -> bool:
         backend.loss(image[0], torch.zeros_like(image[0]), 0.2).backward()
         if not (float(image.detach().sum()) > 0 and means.grad is not None and bool(means.grad.any())):
             raise RuntimeError("it rendered nothing")
-    except Exception as error:  # whatever a backend fails with is the finding
+    except Exception as error:  # any error of a backend is a finding
         report(False, name, str(error).splitlines()[0] if str(error) else type(error).__name__)
         return False
     report(True, name, f"renders and differentiates on {backend.device}")

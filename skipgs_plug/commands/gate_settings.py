@@ -1,4 +1,4 @@
-"""The settings of the gate in a checkpoint: a run goes on with those that it began with."""
+"""The settings of the gate in a checkpoint: a run continues with the settings that it began with."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class GateSettings:
     """Travels in the checkpoints of a trainer, and refuses one that was made with other settings.
 
     Args:
-        gate: the gate of the run, None for a run without.
+        gate: The gate of the run; None if it has no gate.
     """
 
     def __init__(self, gate: SkipGate | None) -> None:
@@ -34,7 +34,7 @@ class GateSettings:
                 if before is None
                 else "The run was begun with a gate; resume it with --gate, or with the gate settings that it had."
             )
-        # A run that is older than a setting was begun with what is its default now.
+        # A run that began before a setting existed began with the present default.
         before = SkipConfig().as_dict() | (before or {})
         for name, value in (self._settings or {}).items():
             if before[name] != value:

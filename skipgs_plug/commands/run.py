@@ -47,7 +47,7 @@ def run(args: Args) -> int:
 
 
 def run_spawned(args: Args, command: list[str], rank: int, call: bytes) -> None:
-    """What a process does that the script spawns: all of `run`, with the script's call at the end."""
+    """The work of a process that the script spawns: everything that `run` does, then the script's call."""
     code, gate = run_gated(args, command, lambda attach: spawned.run_call(command, attach, rank, call, args.cpu), rank)
     if code:
         sys.exit(code)
@@ -69,7 +69,7 @@ def verify(code: int, gate: SkipGate | None) -> None:
 def run_gated(
     args: Args, command: list[str], execute: Callable[[Attach], int], rank: int = 0
 ) -> tuple[int, SkipGate | None]:
-    """Attach a gate to what `execute(attach)` runs, and write skipgs.json where `rank` is 0."""
+    """Attach a gate to the script that `execute(attach)` runs, and write skipgs.json if `rank` is 0."""
     adapter = get_adapter(args.adapter)()
     checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
     for_cpu = (*CUDA_REPLACED, ADAM_REPLACED)
@@ -107,12 +107,12 @@ def say(sentence: str) -> None:
 
 
 def script_name(command: Sequence[str]) -> str:
-    """What is run, whatever folder it lies in."""
+    """Return the file name of the script."""
     return next((Path(word).name for word in command if word != "-m"), "")
 
 
 def report(gate: SkipGate, adapter: AbstractAdapter) -> None:
-    """Write what is known, also of a run that failed half-way, once the script has an output folder."""
+    """Write the report, also of a run that failed half-way, once the script has an output folder."""
     if gate.stats()["iterations"] == 0:
         return
     folder = Path(adapter.output_folder or ".")
@@ -125,7 +125,7 @@ def cpu_instead_of_cuda(args: Args, command: Sequence[str]) -> Iterator[None]:
     """Let the script believe in CUDA.
 
     Raises:
-        SkipGSError: There are no stand-ins for what this trainer imports.
+        SkipGSError: There are no stand-ins for the CUDA modules of this trainer.
     """
     family = get_adapter(args.adapter).stand_ins_for(command)
     if family not in FAMILIES:

@@ -1,4 +1,4 @@
-"""One session of a run: the iterations that are left, what happens between them, and what they leave behind."""
+"""One session of a run: it trains the remaining iterations, saves and evaluates on the way, and writes the results."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class Session:
         return stats
 
     def _finish(self) -> None:
-        """Evaluate and write everything that a finished run leaves; also what an earlier session did not get to."""
+        """Evaluate, and write all files of a finished run, also those that an earlier session did not write."""
         folder, trainer = self._folder, self._trainer
         stats = self._evaluate(self._failed)
         with keep_going(self._failed):

@@ -26,7 +26,7 @@ NAMES_SHOWN = 6  # photographs named per reason, at most, so that the list stays
 
 
 def run(args: Args) -> int:
-    """Reconstruct and print what was placed; see `Args`."""
+    """Reconstruct, and print how many photographs were placed; see `Args`."""
     scene = reconstruct(args)
     train = next_command("train", scene, "--out", f"runs/{scene.resolve().name}")
     print(f"Scene: {scene}. Next: {train}")
@@ -34,7 +34,7 @@ def run(args: Args) -> int:
 
 
 def reconstruct(args: Args) -> Path:
-    """Write the scene, whole or not at all, and print what was placed; returns its folder.
+    """Write the scene, whole or not at all, print how many photographs were placed, and return its folder.
 
     Raises:
         InputError: the photographs cannot be read or placed, or the folder holds something.
@@ -49,7 +49,7 @@ def reconstruct(args: Args) -> Path:
     work = Path(tempfile.mkdtemp(prefix=f".{scene.name}.", dir=scene.parent))
 
     def bar(title: str, total: int | None = None, **options: Any) -> tqdm:
-        # Where nothing can be wiped out, bars end with a line break, before whatever is printed next.
+        # Where the output is not a terminal, a bar ends with a line break before the next line is printed.
         leave = not sys.stderr.isatty()
         return tqdm(total=total, desc=title, disable=args.no_progress, unit="", leave=leave, **options)
 
@@ -90,7 +90,7 @@ def place(
     """
     models, taken = [], reconstruction.resolve(mapping)
     if taken == "global":
-        # Stages take seconds or minutes each: no rest can be foretold, but the clock shows that it goes on.
+        # Stages take seconds or minutes each, so the rest cannot be estimated; the clock shows that the work continues.
         honest = {"miniters": 0, "bar_format": "{desc}: {n_fmt} of {total_fmt} stages done, {elapsed}"}
         with bar("Placing photographs all at once", global_mapping.STAGES, **honest) as shown:
             models = reconstruction.map_globally(shown.update)

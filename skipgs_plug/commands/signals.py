@@ -13,7 +13,7 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stop:
-    """What arrived.
+    """The signal that arrived.
 
     Attributes:
         exit_code: 0, or 128 + number of the signal, as a shell reports it.

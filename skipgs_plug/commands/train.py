@@ -76,7 +76,7 @@ def run(args: Args) -> int:
 
 
 def share(folder: RunFolder, trainer: Trainer) -> None:
-    """Write the model small enough to be sent, and say what to open and what to share."""
+    """Write the model as a small file, and print the command that opens it and the file to share."""
     path = folder.root / f"{folder.root.resolve().name}.spz"
     local = {name: parameter.detach().cpu() for name, parameter in trainer.splats.items()}
     data = to_spz(trainer.scene.frame.dataset_splats(local), trainer.config.antialiased)
@@ -86,10 +86,10 @@ def share(folder: RunFolder, trainer: Trainer) -> None:
 
 
 def check(args: Args, checkpoints: list[Path]) -> None:
-    """Refuse what can be refused before anything is read.
+    """Refuse options that do not fit, before anything is read.
 
     Raises:
-        InputError: LPIPS cannot be computed, --resume does not fit what --out holds, or --sfm what SCENE is.
+        InputError: LPIPS cannot be computed, --resume does not fit the content of --out, or --sfm does not fit SCENE.
         SkipGSError: A setting of the gate is out of its range.
     """
     require_names(("SCENE", args.scene), ("--out", args.out))
@@ -100,7 +100,7 @@ def check(args: Args, checkpoints: list[Path]) -> None:
         raise InputError(f"{args.scene} {what}; leave out --sfm or give photographs.")
     if not args.sfm and are_photographs(given):
         raise InputError(
-            f"{args.scene} holds photographs but no cameras; add --sfm to reconstruct them out "
+            f"{args.scene} holds photographs but no cameras; add --sfm to reconstruct them "
             f"first, or run: {next_command('sfm', args.scene, 'SCENE')}."
         )
     if args.session.lpips_net is not None:
@@ -132,7 +132,7 @@ def configure(args: Args, checkpoints: list[Path]) -> tuple[list[Path], TrainCon
         checkpoints, run = first_sound(checkpoints, lengths)
     if args.max_steps is not None:
         run["max_steps"] = args.max_steps
-    # What looks at the run later may do so from another folder.
+    # Later commands may run in another folder.
     paths = (args.scene, args.train.init_ply)
     scene, start = (os.path.abspath(Path(path).expanduser()) if path else "" for path in paths)
     return checkpoints, dataclasses.replace(args.train, data_dir=scene, init_ply=start, result_dir=args.out, **run)

@@ -1,1 +1,1 @@
-"""The method: when to skip a backward, and how a loop is told. Knows no trainer and no renderer."""
+"""The method: when to skip a backward pass, and how to act on a loop. It knows no trainer and no renderer."""

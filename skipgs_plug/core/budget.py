@@ -34,13 +34,13 @@ class BackwardBudget:
         return total <= MIN_SAMPLES or self.backwards / total >= self.floor
 
     def observe_warmup(self, would_skip: bool) -> None:
-        """Note what the rule would have done on a warm-up visit of a view that has a mean."""
+        """Record the rule's decision on a warm-up visit of a view that has a mean."""
         self.would_total += 1
         if would_skip:
             self.would_skip += 1
 
     def calibrate(self) -> None:
-        """Set an "auto" floor from what warm-up saw; with nothing seen it stays 0.5."""
+        """Set an "auto" floor from the decisions of warm-up; without any, it stays 0.5."""
         if self.would_total > 0:
             self.floor = max(0.5, 1.0 - 0.5 * (self.would_skip / self.would_total))
             self.calibrating = False

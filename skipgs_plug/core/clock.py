@@ -12,10 +12,10 @@ class Times(NamedTuple):
 
     Attributes:
         t_total: of all iterations, by the clock on the wall.
-        t_post: of those from `start_iter` on.
+        t_post: Seconds of iterations from `start_iter` on.
         t_total_processor: as `t_total`, but seconds for which threads of this process were running, added up over
             them. Other programs hardly change them. NaN where a part of the run was not measured.
-        t_post_processor: as `t_post`, likewise.
+        t_post_processor: The same for `t_post`.
     """
 
     t_total: float = 0.0
@@ -27,7 +27,7 @@ class Times(NamedTuple):
 class GateClock:
     """Seconds from iteration to iteration; the last one counts up to its backward.
 
-    What a trainer does between two iterations (evaluation, saving) is in these figures.
+    Work between two iterations (evaluation, saving) is included.
 
     Attributes:
         times: seconds of the iterations seen so far.

@@ -1,4 +1,4 @@
-"""Several processes: all ranks run the backward of an iteration, or none, else its collectives hang."""
+"""Several processes: either all ranks run the backward pass of an iteration or no rank does, else collectives hang."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def refuse_several(because: str, instead: str) -> None:
 
 
 def agree(own: Decision, device: torch.device | None = None) -> Decision:
-    """Reduce this rank's decision with those of all others: skip only when every rank would.
+    """Combine this rank's decision with those of all others: skip only if every rank would.
 
     Args:
         own: Of this rank.
@@ -64,7 +64,7 @@ def agree(own: Decision, device: torch.device | None = None) -> Decision:
 
 
 def abort(device: torch.device | None = None) -> None:
-    """Tell the other ranks that this one raises, so that they do not wait for it; they may be gone themselves."""
+    """Tell the other ranks that this one raises, so that they do not wait for it. They may have ended themselves."""
     with contextlib.suppress(SkipGSError):
         _lowest(_ABORT, device)
 

@@ -24,7 +24,7 @@ class ViewMeans:
         self.values: dict[Hashable, float] = {}
 
     def update(self, view: Hashable, loss: float) -> float | None:
-        """Take in a finite loss and return the mean before it, None for a view without one."""
+        """Update the mean with a finite loss, and return the mean before it; None for a new view."""
         values = self.values
         mean = values.get(view)
         if mean is None and (type(view) is str or (mean := values.pop(str(view), None)) is None):
@@ -35,7 +35,7 @@ class ViewMeans:
         return mean
 
     def get(self, view: Hashable) -> float | None:
-        """The mean of a view, None when it has none yet."""
+        """Return the mean of a view; None for a new view."""
         mean = self.values.get(view)
         return self.values.get(str(view)) if mean is None else mean
 

@@ -1,4 +1,4 @@
-"""What happens in one gated iteration, whoever drives it: verbs by hand, or an adapter's hooks."""
+"""One gated iteration, driven by the verbs of a user's loop or by the hooks of an adapter."""
 
 from __future__ import annotations
 
@@ -44,19 +44,19 @@ class Engine:
         policy: Decides in place of `SkipPolicy`.
         record_trace: Keep every gated decision.
         must_run: Whether skipping is forbidden in an iteration, whose loss is not to be recorded either.
-        saved_state: Gives the state that belongs to the checkpoint which training goes on from, if any; asked
+        saved_state: Returns the state of the checkpoint from which training continues, if any; called
             once, with the first iteration.
 
     Attributes:
         config: settings in force.
-        policy: None until `configure` was called.
+        policy: The policy; None until `configure` is called.
         start: first iteration that may be skipped.
-        iteration: what is known of the present iteration.
+        iteration: Facts about the present iteration.
         stats, clock: counts, seconds.
         rates: scales learning rates, for the pace.
         pace: says which iterations run, and scales learning rates.
-        graph: what autograd saves for backwards that may be skipped.
-        trace: rows of gated decisions; None when they are not recorded.
+        graph: Tensors that autograd saves for backward passes that may be skipped.
+        trace: Rows of gated decisions; None if they are not recorded.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Engine:
         self._scene_check = SceneCheck()
 
     def configure(self, facts: TrainerFacts, given: frozenset[str] = frozenset()) -> None:
-        """Complete the settings with what is known of the trainer, and make the policy.
+        """Complete the settings with the facts about the trainer, and create the policy.
 
         Args:
             facts: About the trainer.
@@ -143,16 +143,16 @@ class Engine:
 
     @property
     def skipped(self) -> bool:
-        """Whether the present iteration has a backward that was skipped, and none that ran."""
+        """Whether a backward pass of the present iteration was skipped and no other one ran."""
         return self.iteration.skipped
 
     @property
     def n_views(self) -> int:
-        """Number of training views, or of those seen so far where the trainer does not tell."""
+        """Number of training views; if the trainer does not tell it, of the views seen so far."""
         return self.stats.n_views if self._view_names is None else len(self._view_names)
 
     def mean(self, view: str) -> float | None:
-        """Running mean of a view's loss, None for a view without one or a policy without means."""
+        """Return the running mean of a view's loss; None if the view or the policy has no mean."""
         return None if self.policy is None else self.policy.mean(view)
 
     def open_iteration(self, step: int) -> None:
@@ -188,7 +188,7 @@ class Engine:
             view: Key of the view.
             signal: Value to decide on.
             run: The backward.
-            loss: What it goes back from, where that is not the signal.
+            loss: The tensor whose backward pass runs, if it is not the signal.
             alone: Whether no other backward of this iteration needs what this one shares with it: a skipped graph is
                 freed at once.
         """
@@ -215,7 +215,7 @@ class Engine:
         return not skip
 
     def free_skipped(self) -> None:
-        """Free what was saved for the skipped backwards of this iteration: it has no other backward."""
+        """Free the tensors saved for the skipped backward passes of this iteration; it has no other one."""
         for reference in self._skipped:
             loss = reference()
             if loss is not None:
@@ -254,7 +254,7 @@ class Engine:
         return skip
 
     def _keep_graph(self, step: int) -> None:
-        """Keep what iteration `step` saves within reach, if its backward may be skipped."""
+        """Track the tensors that autograd saves in iteration `step`, if its backward pass may be skipped."""
         if not self.config.enabled or step < self.start or self.policy is None:
             return
         if self.policy.foreseen(None, step) is not False:
@@ -265,7 +265,7 @@ class Engine:
 
         Args:
             view: Key of the view.
-            signal: Value to decide on, read on the host only from `start` on; None in iterations that train nothing.
+            signal: Value to decide by, read on the host only from `start` on; None in iterations that train nothing.
         """
         now = self.iteration
         assert now.step is not None
@@ -288,7 +288,7 @@ class Engine:
         return answer
 
     def notify_event(self, kind: str, step: int) -> None:
-        """A structural change happened in iteration `step`; those of densification are ignored."""
+        """Take note of a structural change in iteration `step`; changes of densification are ignored."""
         assert self.policy is not None
         if not self.config.enabled or step < self.start - 1:
             return
@@ -343,7 +343,7 @@ class Engine:
         self.iteration.begin(step)
 
     def _go_on_from_saved(self, step: int) -> None:
-        """Load the state that belongs to what training goes on from with iteration `step`, if there is one."""
+        """Load the state of the checkpoint from which training continues with iteration `step`, if there is one."""
         state = None if self._saved_state is None else self._saved_state(step)
         if state is not None:
             self._saved_state = None

@@ -10,11 +10,11 @@ class SkipGSError(RuntimeError):
 
 
 class UnknownTrainerError(SkipGSError):
-    """No adapter recognises the trainer, or there is none of the given name."""
+    """No adapter recognises the trainer, or none has the given name."""
 
 
 class AdapterMismatchError(SkipGSError):
-    """The trainer does not have, or does not do, what its adapter expects."""
+    """The trainer lacks an attribute, or behaves differently, than its adapter expects."""
 
 
 class BrokenTrainingError(SkipGSError):
@@ -26,7 +26,7 @@ class GateOrderError(SkipGSError):
 
 
 def warn_of_release(error: Exception, step: int | None) -> str:
-    """Warn that the gate let go of a training that goes on, and return the sentence: no run is lost to the gate."""
+    """Warn that the gate let go, and return the sentence. Training continues: no run is lost to the gate."""
     reason = str(error) if isinstance(error, SkipGSError) else f"{type(error).__name__}: {error}"
     said = (
         f"The gate is released in iteration {step}, and training goes on without it, in all its iterations ({reason})"

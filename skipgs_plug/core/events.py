@@ -9,7 +9,7 @@ class Pause:
     """The iterations after a structural change that all run a real backward and are not recorded.
 
     A change makes every loss jump. Means keep their values from before the jump, so that a view counts as
-    recovered only when it really is; and views without a mean get none, so that none is seeded at the peak.
+    recovered only when it really is. New views get no mean during a pause, so that no mean is seeded at the peak.
 
     Attributes:
         until: first iteration that is not paused any more.
@@ -24,7 +24,7 @@ class Pause:
         self.events = 0
 
     def extend(self, step: int, n_views: int) -> int:
-        """Pause the iterations after `step`; return how many that adds to those already paused."""
+        """Pause the iterations after `step`; return by how many iterations the pause grows."""
         iters = max(n_views, MIN_PAUSE_ITERS) if self._iters is None else self._iters
         begin = max(self.until, step + 1)
         end = step + 1 + iters

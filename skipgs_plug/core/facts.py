@@ -1,4 +1,4 @@
-"""What a gate must know of a trainer before its first iteration."""
+"""Facts about a trainer that a gate needs before the first iteration."""
 
 from __future__ import annotations
 

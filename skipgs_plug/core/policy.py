@@ -204,7 +204,7 @@ class SkipPolicy(Policy):
         return False if view is not None and self.means.get(view) is None else None
 
     def overrule(self, own: Decision, answer: Decision) -> None:
-        """Count what happens instead of what was decided last.
+        """Count the decision that takes effect instead of the one that was recorded last.
 
         Another process needed the backward, or its loss was not finite: then the iteration counts for nothing, as one
         with such a loss of its own.

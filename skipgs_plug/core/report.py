@@ -1,4 +1,4 @@
-"""skipgs.json: what a gated run did, for people and for comparisons."""
+"""skipgs.json: the report of a gated run, for people and for comparisons."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NO_REFINEMENT: dict[str, Any] = {
 
 
 class Reporting(Protocol):
-    """What has a report: a `SkipGate`."""
+    """An object with a report: a `SkipGate`."""
 
     def report(self) -> dict[str, Any]: ...
 
@@ -31,7 +31,7 @@ class Reporting(Protocol):
 def counters(
     stats: GateStats, floor: float | None, times: Times, left_out: dict[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Return what was counted and timed.
+    """Return counters and times.
 
     Returns:
         `iterations` (training backwards seen, run or skipped); `gated_iterations` (those from start_iter on,

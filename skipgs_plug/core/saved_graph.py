@@ -19,7 +19,7 @@ from skipgs_plug.core.errors import SkipGSError
 
 
 class _Saved:
-    """One saved tensor; None once it is freed."""
+    """One saved tensor; None after it is freed."""
 
     __slots__ = ("tensor", "version")
 
@@ -29,7 +29,7 @@ class _Saved:
 
 
 class SavedGraph:
-    """Keeps what autograd saves from `open` to `close` within reach.
+    """Tracks the tensors that autograd saves between `open` and `close`.
 
     Only one level of hooks is used, and none inside hooks of the trainer's own.
     """
@@ -39,7 +39,7 @@ class SavedGraph:
         self._freeing = False
 
     def open(self) -> None:
-        """Begin to keep what is saved in this thread, unless it is begun already or hooks of others are at work."""
+        """Begin to track saved tensors in this thread, unless it has begun already or other hooks are active."""
         if self._open:
             return
         top = _top()
@@ -52,19 +52,19 @@ class SavedGraph:
         self._open = True
 
     def close(self) -> None:
-        """Keep nothing of what is saved from now on."""
+        """Stop tracking saved tensors."""
         if self._open and _top() is not None and _top()[0] == self._pack:
             torch._C._autograd._pop_saved_tensors_default_hooks()
             self._open = False
 
     def free(self, loss: Tensor) -> None:
-        """Free what was saved for the backward of a loss: no backward reaches it any more."""
+        """Free the tensors saved for the backward pass of a loss; no backward pass can reach them any more."""
         self._freeing = True
         try:
             for node in nodes(loss):
                 for name in _saved_names(node.__class__):
                     with contextlib.suppress(RuntimeError):  # freed already, or changed in place since
-                        getattr(node, name)  # asks `_unpack`, which empties what it finds
+                        getattr(node, name)  # calls `_unpack`, which empties the tensor that it finds
         finally:
             self._freeing = False
 

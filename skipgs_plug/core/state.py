@@ -1,4 +1,4 @@
-"""Saved states: what they hold, their versions, and the one of the authors' controller."""
+"""Saved states: their content, their versions, and the state of the authors' controller."""
 
 from __future__ import annotations
 

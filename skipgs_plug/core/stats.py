@@ -1,4 +1,4 @@
-"""What the gate did: counts, per-view table, flat scalars for loggers."""
+"""Statistics of a gate: counts, per-view table, scalars for loggers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class GateStats:
         backwards: real backwards from `start_iter` on (warm-up and paused ones included).
         skips: skipped backwards.
         reasons: gated decisions by reason.
-        events: structural changes that the policy was told of, by kind.
+        events: Number of structural changes that the policy was notified of, by kind.
     """
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class GateStats:
         self._views: dict[str, list[Any]] = {}  # visits, backwards, skips, last loss
 
     def record(self, decision: Decision, view: str, loss: float | None) -> bool:
-        """Count one gated decision; True for a view that was not counted before. None for a loss that was not read."""
+        """Count one gated decision; return True for a new view. The loss is None if it was not read."""
         self.reasons[decision.reason] = self.reasons.get(decision.reason, 0) + 1
         row = self._views.get(view)
         new = row is None
@@ -59,7 +59,7 @@ class GateStats:
 
     @property
     def n_views(self) -> int:
-        """Number of different views seen from `start_iter` on, as far as they are kept (MAX_VIEWS)."""
+        """Number of different views since `start_iter`, at most MAX_VIEWS."""
         return len(self._views)
 
     def view_table(self, mean_of: Callable[[str], float | None]) -> list[dict[str, Any]]:
@@ -87,7 +87,7 @@ class GateStats:
         }
 
     def load_release_state(self, state: dict[str, Any]) -> None:
-        """Take the counts from a state of the authors' controller, which has none per view."""
+        """Take the counts from a state of the authors' controller, which has no counts per view."""
         self.backwards, self.skips = state["stats"]["bwd"], state["stats"]["skip"]
         self.iterations = self.gated
 

@@ -12,7 +12,7 @@ class TraceRow(NamedTuple):
         step: iteration.
         view: view key.
         loss: loss that was decided on.
-        mean: the view's mean before this loss, None for a view without one.
+        mean: The view's mean before this loss; None for a new view.
         reason: as in `Decision`.
         skip: True when the backward was skipped.
     """

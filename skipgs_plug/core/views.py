@@ -1,4 +1,4 @@
-"""View keys: what names a training view, in state, tables and traces."""
+"""View keys: the names of training views in states, tables and traces."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def require_unique(names: Iterable[str]) -> list[str]:
 
 
 def warn_unless_recurring(keys: int, decisions: int) -> None:
-    """Warn when the keys of so many decisions hardly ever came twice; to be called at each new key."""
+    """Warn if keys hardly ever came twice in many decisions; call it at each new key."""
     if keys == CHECKED_KEYS and decisions - keys < RECURRING * decisions:
         warnings.warn(
             f"{keys:,} different view keys came in {decisions:,} gated decisions, and a view that does not come again "

@@ -1,4 +1,4 @@
-"""What options of structure from motion may be."""
+"""Values that the options of structure from motion may have."""
 
 from typing import Literal
 

@@ -33,7 +33,7 @@ class Gathered:
     Attributes:
         names: paths relative to the folder, sorted.
         masks: folder with a mask for each photograph that is transparent somewhere, `photo.png.png` for
-            `photo.png`, black where alpha is below one half; None where none is.
+            `photo.png`, black where alpha is below one half; None if no pixel is transparent.
         one_camera: whether all have one size, camera model and focal length, so that they share intrinsics.
     """
 
@@ -54,10 +54,10 @@ def are_photographs(source: Path) -> bool:
 
 
 def walk(folder: Path) -> Iterator[Path]:
-    """Yield the files in a folder and in those below it, also behind links, each real folder once."""
+    """Yield the files in a folder and its subfolders. Links are followed, and each real folder is visited once."""
     seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True):
-        # What starts with a dot was put there by programs: .ipynb_checkpoints, .thumbnails, .Trash.
+        # Names that start with a dot come from programs: .ipynb_checkpoints, .thumbnails, .Trash.
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         real = os.path.realpath(root)
         if real in seen:  # a link to a folder that holds it, or a second one
@@ -68,7 +68,7 @@ def walk(folder: Path) -> Iterator[Path]:
 
 
 def check_source(source: Path) -> None:
-    """Refuse what is neither a folder nor a video.
+    """Raise an error if `source` is neither a folder nor a video.
 
     Raises:
         MissingFileError: `source` does not exist.
@@ -90,7 +90,7 @@ def gather(source: Path, folder: Path, frames: int, progress: Callable[[int], No
         progress: called with 1 for every photograph.
 
     Raises:
-        MissingFileError: `source` does not exist, or what a link among the photographs points to.
+        MissingFileError: `source` does not exist, or the target of a link among the photographs does not.
         InputError: a photograph or the video cannot be decoded, or there are fewer than three photographs.
     """
     check_source(source)
@@ -143,7 +143,7 @@ def place(path: Path, source: Path, folder: Path, masks: Path) -> tuple[str, tup
     """Link or convert one photograph, with its transparency in `masks`.
 
     Returns:
-        Its name, and what tells its camera from others.
+        Its name, and the values that identify its camera.
     """
     picture = decode(path, path)  # also so that a damaged file is named here, not by C++ code later
     exif = picture.getexif()

@@ -26,7 +26,7 @@ GLANCE = 0.5  # seconds between two looks at COLMAP's progress
 
 
 def map_globally(database: Path, photos: Path, output: Path, progress: Callable[[int], None]) -> list[Any]:
-    """Return the models, largest first; none where the process failed.
+    """Return the models, largest first; an empty list if the process failed.
 
     Args:
         output: folder to make, for the models and a copy of the database, whose focal lengths are corrected.
@@ -72,7 +72,7 @@ def leave_out_unsupported(model: Any) -> None:
 
 
 def main(database: Path, photos: Path, output: Path) -> None:
-    """Map, say what is done, and write the models to numbered folders."""
+    """Map, report progress, and write the models to numbered folders."""
 
     def done() -> None:
         print("done", flush=True)

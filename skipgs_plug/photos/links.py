@@ -1,4 +1,4 @@
-"""What the database of a reconstruction says about photographs: their features and who shares some with whom."""
+"""Features and matches of photographs, read from the database of a reconstruction."""
 
 from __future__ import annotations
 

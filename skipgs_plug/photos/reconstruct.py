@@ -41,7 +41,9 @@ class Reconstruction:
 
     def __init__(self, photos: Gathered, work: Path) -> None:
         self._colmap = import_pycolmap()
-        self._colmap.logging.minloglevel = int(self._colmap.logging.FATAL)  # what matters is raised or counted here
+        self._colmap.logging.minloglevel = int(
+            self._colmap.logging.FATAL
+        )  # errors that matter are raised or counted here
         self._photos = photos
         self._work = work
         self.database = work / "database.db"
@@ -86,7 +88,7 @@ class Reconstruction:
         return matching
 
     def links(self) -> Links:
-        """Return what features and matches say, after `match`."""
+        """Return the features and matches; call it after `match`."""
         return read_links(self.database)
 
     def resolve(self, mapping: Mapping) -> Mapping:
@@ -96,7 +98,7 @@ class Reconstruction:
         return "global" if len(self._photos.names) > ALL_AT_ONCE_BEYOND else "incremental"
 
     def map_globally(self, progress: Progress) -> list[Any]:
-        """Place photographs all at once; return the models, largest first, none where that failed.
+        """Place photographs all at once; return the models, largest first, or an empty list if that failed.
 
         `progress` is called with the number of finished stages out of `global_mapping.STAGES`.
         """
@@ -107,7 +109,7 @@ class Reconstruction:
         return bool(models) and models[0].num_reg_images() >= ENOUGH * len(largest_group(self.links().neighbours))
 
     def map_incrementally(self, progress: Progress) -> list[Any]:
-        """Place photographs one after another; return the models, largest first, none where no two could be placed."""
+        """Place photographs one after another; return the models, largest first, or an empty list if no two fit."""
         options = self._colmap.IncrementalPipelineOptions()
         options.random_seed = SEED
         options.min_model_size = 3

@@ -1,4 +1,4 @@
-"""Which photographs a reconstruction left out, and what its database says about why."""
+"""Photographs that a reconstruction did not place, and the likeliest reason for each."""
 
 from __future__ import annotations
 

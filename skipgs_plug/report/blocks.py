@@ -1,4 +1,4 @@
-"""What a page is made of, and the page made of it; everything from outside is escaped by the template."""
+"""The parts of a page, and the page made of them. The template escapes everything from outside."""
 
 from __future__ import annotations
 

@@ -161,7 +161,7 @@ def bench_section(bench: BenchSource) -> Section:
 
 
 def results(caption: str, runs: Sequence[RunSource]) -> Table:
-    """What runs reached, and in what time, one column per run; a dash where a folder does not say."""
+    """Quality and time, one column per run; a dash where a folder lacks the value."""
     columns = []
     for run in runs:
         worst = min((row["psnr"] for row in run.views), default=None)

@@ -1,4 +1,4 @@
-"""The two phases of a run, growing and refining: what ran, what was left out, and what all of it would have taken."""
+"""The two phases of a run, growing and refining: iterations that ran or were left out, and estimated times."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ESTIMATE = (
 
 @dataclass(frozen=True)
 class Phase:
-    """One phase; None where the run does not say.
+    """One phase. A field is None if the run does not record it.
 
     Attributes:
         run: iterations that ran.
@@ -53,7 +53,7 @@ class Phase:
 
     @property
     def without(self) -> float | None:
-        """Seconds that all its iterations would have taken, estimated; None where none ran."""
+        """Estimated seconds that all its iterations would have taken; None if no iteration ran."""
         return self.seconds * self.iterations / self.run if self.run else None if self.left_out else 0.0
 
 

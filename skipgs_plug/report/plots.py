@@ -1,4 +1,4 @@
-"""Pictures of runs, drawn from what their folders hold, and of a bench, drawn from its decisions."""
+"""Plots of runs, drawn from their folders, and of a bench, drawn from its decisions."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def loss_against_skips(views: list[dict[str, Any]]) -> Figure:
 
 
 def reasons(data: dict[str, Any]) -> Figure:
-    """All gated iterations by what decided: one bar of backwards run, one of those skipped."""
+    """Plot all gated iterations by reason: one bar of backward passes that ran, one of skipped ones."""
     figure, axes = new_figure(WIDTH, 2.6)
     run = {k: v for k, v in data["reasons"].items() if k not in ("deviation", "non-finite")}
     lost = data["non_finite"]
@@ -180,7 +180,7 @@ def split_render(path: Path) -> list[tuple[str, str]]:
 
 
 def inline_jpeg(picture: np.ndarray) -> str:
-    """Return a picture [H, W, 3] uint8 as a data URI, a tenth of what a PNG takes."""
+    """Return a picture [H, W, 3] uint8 as a data URI, in a tenth of the bytes of a PNG."""
     from PIL import Image
 
     stream = io.BytesIO()

@@ -1,4 +1,4 @@
-"""What a folder holds: a gated run (ours or a script's), or a bench."""
+"""The content of a folder: a gated run (ours or a script's), or a bench."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class RunSource:
     """A run, gated or not.
 
     Attributes:
-        gate: content of skipgs.json; None for a run without a gate.
+        gate: Content of skipgs.json; None if the run has no gate.
         metrics: of the last evaluation that the run folder holds in gsplat's layout; empty without.
-        views: metrics of each evaluated view, in the order of `renders`; empty where the trainer wrote none.
-        renders: pictures of that evaluation, truth beside render.
+        views: Metrics of each evaluated view, in the order of `renders`; empty if the trainer wrote none.
+        renders: Pictures of that evaluation, each with the photograph and the render.
         curve: columns `step seconds loss num_GS` of the course of training; empty without.
-        settings: those of training; empty without.
+        settings: Settings of the training; empty if unknown.
     """
 
     name: str
@@ -79,7 +79,7 @@ class RunSource:
 
 @dataclass
 class BenchSource:
-    """A bench: content of bench.json, the pictures beside it with what they show, and its decisions if it has them."""
+    """A bench: content of bench.json, its plots with captions, and its decisions if there are any."""
 
     name: str
     path: Path
@@ -92,7 +92,7 @@ def read_source(path: str | Path) -> RunSource | BenchSource:
     """Read a run folder, a bench folder, or the JSON file of either.
 
     Raises:
-        SkipGSError: there is none, or it is damaged or of another version; names the file.
+        SkipGSError: The file is missing, damaged or of another version; the message names it.
     """
     path = Path(path).expanduser()
     if not path.exists():
@@ -124,7 +124,7 @@ def read_source(path: str | Path) -> RunSource | BenchSource:
 
 
 def read_run(name: str, folder: Path, gate: dict[str, Any] | None) -> RunSource:
-    """Read what a folder holds besides skipgs.json."""
+    """Read the files of a folder besides skipgs.json."""
     metrics, renders = last_evaluation(folder)
     views = metrics.pop("per_view", [])
     curve = folder / "stats" / CURVE
@@ -135,7 +135,7 @@ def read_run(name: str, folder: Path, gate: dict[str, Any] | None) -> RunSource:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """Return the settings of training in cfg.yml; empty for trainers that write none, or Python objects."""
+    """Return the settings of training in cfg.yml; empty if the trainer writes no such file, or Python objects."""
     import yaml
 
     file = folder / "cfg.yml"

@@ -10,10 +10,10 @@ SECONDS = 300.0  # training time between two checkpoints by default: a killed ru
 
 
 class Autosave:
-    """Writes a checkpoint now and then; one that cannot be written is reported, and training goes on.
+    """Writes checkpoints at intervals. A checkpoint that cannot be written is reported, and training continues.
 
     Args:
-        every: iterations between two checkpoints; None for five minutes of training; 0 for none.
+        every: Iterations between two checkpoints; None for five minutes of training, 0 for no checkpoints.
     """
 
     def __init__(self, folder: RunFolder, trainer: Trainer, every: int | None) -> None:

@@ -41,7 +41,7 @@ class Backend:
         Args:
             splats: logarithms of scales, logits of opacities, SH coefficients in two parts.
             viewmat: world to camera, of any float type.
-            K: intrinsics in pixels, likewise.
+            K: Intrinsics [3, 3], pixels.
             background: colour behind everything; None for black, which needs no compositing.
             antialiased: compensate opacities for the blur.
             with_rows: whether the dictionary has to hold rows of Gaussians.
@@ -103,9 +103,9 @@ class Backend:
 
 @contextmanager
 def single_precision() -> Iterator[None]:
-    """Let new tensors be float32 inside the block, whatever type the process has chosen as default.
+    """Make float32 the default dtype inside the block, whatever the process has chosen.
 
-    Parameters and kernels are of float32; gsplat's strategies make tensors of the default type beside them.
+    Parameters and kernels are float32, but gsplat's strategies create tensors of the default dtype.
     """
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float32)
@@ -119,7 +119,7 @@ def resolve_backend(name: str = "auto") -> Backend:
     """Return the backend called "gsplat" or "warp"; "auto" takes gsplat where CUDA works, else warp.
 
     Raises:
-        InputError: the backend cannot run here; the sentence says what is missing.
+        InputError: The backend cannot run here; the message names the missing part.
     """
     if name == "auto":
         name = "gsplat" if torch.cuda.is_available() and _has_gsplat() else "warp"

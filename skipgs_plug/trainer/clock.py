@@ -14,7 +14,7 @@ PHASES = ("forward", "loss", "backward", "optimizer", "strategy")
 
 @dataclass
 class Sums:
-    """Seconds of training: all, and those after densification."""
+    """Seconds of training: in all, and after densification."""
 
     total: float = 0.0
     post: float = 0.0
@@ -26,7 +26,7 @@ class Sums:
 
 
 class TrainClock:
-    """Adds up the seconds of training iterations; whatever runs between iterations is not counted.
+    """Adds up the seconds of training iterations. Work between iterations is not counted.
 
     A GPU works on while the host is ahead. Where phases are asked for, every border of one synchronises, so that it
     holds its own kernels. Otherwise nothing synchronises within iterations: what is still under way is booked by
@@ -88,7 +88,7 @@ class TrainClock:
         self._book(self._last)
 
     def settle(self) -> None:
-        """Wait for what is under way and book it: something else follows, such as an evaluation or a checkpoint."""
+        """Wait for running kernels and book their time, before an evaluation, a checkpoint or other work follows."""
         if self._under_way:
             self._started = self._now()
             self._synchronize()

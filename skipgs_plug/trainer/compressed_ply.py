@@ -13,7 +13,7 @@ XYZ, RGB = ("x", "y", "z"), ("r", "g", "b")
 
 
 def is_compressed(vertices: Mapping[str, np.ndarray]) -> bool:
-    """Whether the columns of `vertex` are those of a compressed PLY."""
+    """Return whether `vertex` has the columns of a compressed PLY."""
     return {"packed_position", "packed_rotation", "packed_scale", "packed_color"} <= set(vertices)
 
 
@@ -67,7 +67,7 @@ def unpack_111011(packed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def unpack_rotation(packed: np.ndarray) -> list[np.ndarray]:
-    """Return the four parts of unit quaternions, of which the largest was left out and its place is told by 2 bits."""
+    """Return the four parts of unit quaternions. The file leaves out the largest one; 2 bits give its index."""
     bits = [packed >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
     others = np.stack([(value / 1023.0 - 0.5) * np.sqrt(2.0) for value in bits])  # [3, N]
     largest = np.sqrt(np.maximum(1.0 - (others**2).sum(axis=0), 0.0))

@@ -35,7 +35,7 @@ def densify(
     info: dict[str, Any],
     in_order: bool,
 ) -> None:
-    """Do what `strategy.step_post_backward` does, with the same result.
+    """Densify like `strategy.step_post_backward`, with the same result.
 
     Parameters are new objects where their rows changed, with moments of zero for new rows, as gsplat has it.
 
@@ -80,7 +80,7 @@ def densify(
 
 
 def _hand_over(optimizer: torch.optim.Optimizer, old: Tensor, new: Tensor, rows: Tensor, fresh: Tensor) -> None:
-    """Let an optimizer go on with another parameter: moments are those of `rows` of the old one, 0 where `fresh`."""
+    """Give an optimizer another parameter: its moments are those of `rows` of the old one, and 0 where `fresh`."""
     optimizer.param_groups[0]["params"] = [new]
     state = optimizer.state.pop(old, None)
     if state is None:

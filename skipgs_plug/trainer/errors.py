@@ -12,10 +12,10 @@ class MissingFileError(InputError, FileNotFoundError):
 
 
 class DamagedCheckpointError(InputError):
-    """A checkpoint that does not hold what it should; an older one may."""
+    """A checkpoint is damaged; an older one may be sound."""
 
 
 def reason(error: BaseException) -> str:
-    """Return what a library complains of as part of a sentence: its first line, or its type, in 200 characters."""
+    """Return a library's error as part of a sentence: its first line, or its type, up to 200 characters."""
     text = str(error).strip().partition("\n")[0] or type(error).__name__
     return text if len(text) <= 200 else text[:197] + "..."

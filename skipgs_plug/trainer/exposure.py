@@ -13,9 +13,9 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class Exposure:
-    """Learns, for every training view, how its photograph's colours follow from those of the model.
+    """Learns for every training view a map from the model's colours to those of its photograph.
 
-    The model itself stays without: what it looks like is what the photographs have in common, so the mean of all
+    The model itself has the common colours of all photographs, so the mean of all
     corrections is kept at the identity. Held-out views have none of their own; see `fit_colours`.
 
     Attributes:
@@ -33,7 +33,7 @@ class Exposure:
         self.optimizer.param_groups[0]["lr"] = LR * (LR_END / LR) ** progress
 
     def apply(self, image: Tensor, name: str) -> Tensor:
-        """Return a render [H, W, 3] in the colours of the photograph `name`; of an unknown one, as it is."""
+        """Return a render [H, W, 3] in the colours of photograph `name`; unchanged if the name is unknown."""
         if name not in self._index:
             return image
         affine = self.affine[self._index[name]]
@@ -75,7 +75,7 @@ def fit_colours(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Te
     """Return the image [H, W, 3] after the affine map on its colours that brings it closest to the target.
 
     Least squares over the pixels of `mask` [H, W], as evaluations of models with exposure are customary: a held-out
-    photograph has an exposure that nobody could know.
+    photograph has an exposure that cannot be known.
     """
     source = torch.cat([image, torch.ones_like(image[..., :1])], dim=-1)  # [H, W, 4]
     known = (source.reshape(-1, 4), target.reshape(-1, 3))

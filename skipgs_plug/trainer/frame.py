@@ -1,4 +1,4 @@
-"""Coordinates that training runs in: those of the dataset, moved to the origin and scaled, where float32 needs it.
+"""Coordinates of training: the dataset's, moved to the origin and scaled where float32 needs it.
 
 float32 tells 500,000.0 from 500,000.03 and nothing between, so a scene in coordinates of a map is a blur of half a
 metre; and recipes hold absolute constants, so a scene in an odd unit trains otherwise. Both are undone in float64.
@@ -58,7 +58,7 @@ class Frame:
 
     @classmethod
     def at(cls, centre: np.ndarray, extent: float) -> Frame:
-        """Return the frame of what lies within `extent` of `centre` [3]; that of the dataset where float32 will do."""
+        """Return the frame of a scene within `extent` of `centre` [3]; the dataset's own if float32 suffices."""
         if not (extent > 0.0 and math.isfinite(extent)):
             return cls()
         kept = SMALL <= extent < LARGE
@@ -69,7 +69,7 @@ class Frame:
 
     @property
     def moves(self) -> bool:
-        """Whether local coordinates differ from those of the dataset."""
+        """Return whether local coordinates differ from those of the dataset."""
         return self != Frame()
 
     def is_like(self, other: Frame, size: float) -> bool:
@@ -78,7 +78,7 @@ class Frame:
         return self.unit == other.unit and apart <= SAME * size * self.unit
 
     def as_dict(self) -> dict[str, object]:
-        """Return the entries of skipgs.json and cfg.yml: what was subtracted from positions, then divided by."""
+        """Return the entries of skipgs.json and cfg.yml: the vector subtracted from positions, and the divisor."""
         return {"centre": list(self.centre), "unit": self.unit}
 
     def to_local(self, positions: np.ndarray) -> np.ndarray:
@@ -123,7 +123,7 @@ def frame_of(content: Mapping[str, object]) -> Frame:
     """Return the frame that `as_dict` described; that of the dataset where nothing is said of one.
 
     Raises:
-        ValueError, TypeError: it is none.
+        ValueError, TypeError: The value is not a frame.
     """
     if "centre" not in content:
         return Frame()

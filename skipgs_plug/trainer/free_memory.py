@@ -1,4 +1,4 @@
-"""How much memory this process may still take: what the machine has free, and what its control group leaves."""
+"""Memory that this process may still take: the free memory of the machine, bounded by its control group."""
 
 from __future__ import annotations
 

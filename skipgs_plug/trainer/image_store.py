@@ -74,18 +74,18 @@ class ImageStore:
         self._window = self.capacity // SHARE_AHEAD
         self._resident = 0
         self._ahead: dict[str, Future[Picture]] = {}
-        self._last: str | None = None  # asked for without being expected
+        self._last: str | None = None  # view that was requested out of turn
         self._lock = threading.Lock()
         self._pool: ThreadPoolExecutor | None = None
 
     def reading(self, items: Sequence[T]) -> Iterator[T]:
-        """Iterate over what is read, with a progress bar where it takes long."""
+        """Iterate over the photographs that are read, with a progress bar if it takes long."""
         from tqdm.auto import tqdm
 
         return iter(tqdm(items, desc="Reading photographs", unit="", delay=2.0, disable=not self._progress))
 
     def keep(self, view: View, load: Callable[[], Picture]) -> View:
-        """Return the view as it is while there is room, else one that `load` decodes again when it is needed."""
+        """Return the view itself if there is room, else a view that `load` decodes again when it is needed."""
         size = picture_bytes(view)
         if self._resident + size <= self.capacity - self._window:
             self._resident += size
@@ -132,7 +132,7 @@ class ImageStore:
 
 
 class ReadAhead:
-    """Tells the store of a trainer's views which ones come next; does nothing where all stay in memory."""
+    """Tells the store which views come next. It does nothing if all views stay in memory."""
 
     def __init__(self, views: Sequence[View], seed: int) -> None:
         self._views = views
@@ -149,13 +149,13 @@ class ReadAhead:
         self._store.expect([self._views[order.at(n)] for order, n in orders])
 
     def end(self) -> None:
-        """No iteration follows: what is still being decoded would only delay the end of the process."""
+        """Stop decoding ahead: no iteration follows, and it would only delay the end of the process."""
         if self._store is not None:
             self._store.expect([])
 
 
 def one_by_one(views: Sequence[View]) -> Iterator[View]:
-    """Iterate over views of one scene; while one is used, those behind it are decoded."""
+    """Iterate over views of one scene. While one is used, the next ones are decoded."""
     store = next((view.store for view in views if isinstance(view, StreamedView)), None)
     if store is None:
         yield from views

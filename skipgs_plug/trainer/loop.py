@@ -143,7 +143,7 @@ class Trainer:
 
     @property
     def all_optimizers(self) -> list[torch.optim.Optimizer]:
-        """Those of the Gaussians' parameters, and that of the exposure; their moments may be behind."""
+        """Optimizers of the Gaussians and of the exposure. Unlike those of `optimizers`, moments may lag behind."""
         return [*self._optimizers.values(), *([] if self.exposure is None else [self.exposure.optimizer])]
 
     @property
@@ -172,7 +172,9 @@ class Trainer:
                 before, self.step = self.step, step
                 self._since = before
                 loss = self.train_step()
-                bar.update(self.step - before)  # after the iteration: it raises when nobody reads any more
+                bar.update(
+                    self.step - before
+                )  # after the iteration: it raises when the reader of the output has gone away
                 if self.ran % 10 == 0:
                     bar.set_postfix_str(f"loss={loss:.3f} | GS={self.num_gaussians}", refresh=False)
                 if self.stop_requested:
@@ -258,7 +260,7 @@ class Trainer:
             )
 
     def set_learning_rate(self, step: float) -> None:
-        """Set the learning rates of positions and exposure to those of iteration `step`; the others are constant."""
+        """Set the learning rates of positions and exposure for iteration `step`; the others are constant."""
         progress = min(step / self.config.schedule, 1.0)
         rate = self.config.means_lr * self.scene.scene_scale * MEANS_LR_END**progress
         self._optimizers["means"].param_groups[0]["lr"] = rate
@@ -279,7 +281,7 @@ class Trainer:
 
     @single_precision()
     def evaluate(self, split: str = "test", lpips_net: str | None = None) -> dict[str, Any]:
-        """Return the means of the chosen metrics over the views of "test" or "train", and what belongs to them.
+        """Return the means of the chosen metrics over the views of "test" or "train", with the number of Gaussians.
 
         Returns:
             The means by name, their flavours, `num_GS step split views`, and `per_view`: the metrics of each.
@@ -424,15 +426,15 @@ class Trainer:
             sort_rows(self.splats, self.optimizers, self.strategy_state)
 
     def _catch_up(self) -> None:
-        """Advance what the last views did not show, before somebody else looks at it."""
+        """Apply the missed updates of Gaussians that the last views did not show, before other code reads them."""
         if self._lazy is not None:
             self._lazy.catch_up()
 
     @contextmanager
     def _seeded(self, step: int) -> Iterator[None]:
-        """Let gsplat, which draws from the global generator, draw what belongs to this iteration.
+        """Seed the global generator, from which gsplat draws, for this iteration.
 
-        So resuming is exact, and the caller's random state is left alone.
+        So resuming is exact. The caller's random state is put back.
         """
         with DRAWING, torch.random.fork_rng(devices=self._random_devices):
             torch.manual_seed(derive_seed(self.config.seed, step))

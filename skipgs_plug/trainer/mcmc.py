@@ -16,9 +16,9 @@ MIN_MOVE_EVERY = 25
 
 
 class Mcmc:
-    """In the units of the scene: the same scene at twice the size trains alike.
+    """MCMC in units of the scene: the same scene at twice the size trains in the same way.
 
-    Nothing of it has to travel in checkpoints: what it draws is a function of seed and iteration.
+    Checkpoints need no state of it: its random numbers are a function of seed and iteration.
 
     Attributes:
         refine_start_iter: first iteration of the moves, exclusive, as all three in iterations of this run.

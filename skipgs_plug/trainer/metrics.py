@@ -24,17 +24,17 @@ LPIPS_WEIGHTS = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"
 
 @dataclass(frozen=True)
 class Metric:
-    """What evaluations, tables and logs need to know of one metric.
+    """One metric, with everything that evaluations, tables and logs need.
 
     Attributes:
         name: key in stats and results.
         label: name for people.
         digits: shown after the point.
-        flavour: what tells it from others of that name; a clause.
+        flavour: A clause that distinguishes it from other metrics of that name.
         measure: function of render and target, images [H, W, 3], the target in [0, 1], and mask [H, W] or None.
         unit: shown after the label.
         tag: name in TensorBoard, where gsplat names no flavour; the key itself if empty.
-        net: LPIPS backbone, which must be asked for; None for a metric of every evaluation.
+        net: LPIPS backbone; the metric is computed on request only. None for a metric of every evaluation.
         fitted: of the render after `fit_colours`, for models that were trained with exposure.
     """
 

@@ -41,12 +41,12 @@ def near_plane(config: TrainConfig, scene: Scene) -> float:
 
 
 def far_plane(config: TrainConfig, scene: Scene) -> float:
-    """Return the far clipping plane in local units; the default cuts nothing, whatever the unit."""
+    """Return the far clipping plane in local units. The default cuts nothing, whatever the unit."""
     return config.far_plane if config.far_plane == TrainConfig.far_plane else config.far_plane / scene.frame.unit
 
 
 def nearest_depth(views: list[View], points: torch.Tensor) -> float | None:
-    """Return the least depth, over all views, at which a view's nearest points lie; None where no view shows enough.
+    """Return the least depth of a view's nearest points, over all views; None if no view shows enough points.
 
     Args:
         points: [M, 3], those that lie within a view's picture count for it, whether or not something hides them.

@@ -85,7 +85,7 @@ def read_ply(path: str | Path) -> dict[str, Tensor]:
 
 
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a point cloud: positions [M, 3] and colours [M, 3] uint8, grey where the file has none.
+    """Read a point cloud: positions [M, 3] and colours [M, 3] uint8, grey if the file has no colours.
 
     Positions are float32, or float64 where that would lose some.
 
@@ -97,7 +97,7 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_start(path: str | Path) -> tuple[tuple[np.ndarray, np.ndarray], dict[str, Tensor] | None]:
-    """Read what training may start from: positions and colours as `read_points`, and, of a 3DGS model, its Gaussians.
+    """Read a start for training: positions and colours like `read_points`, and the Gaussians of a 3DGS model.
 
     Raises:
         MissingFileError: no such file.
@@ -141,7 +141,7 @@ def model_of(path: Path, vertices: Mapping[str, np.ndarray]) -> dict[str, Tensor
 
 
 def saturated(splats: Mapping[str, Tensor], path: str | Path) -> dict[str, Tensor]:
-    """Return raw parameters with finite numbers in place of infinite opacities and scales of zero, which is said.
+    """Return raw parameters with finite numbers in place of infinite opacities and zero scales, and print their number.
 
     A saturated model has them: an opacity of 1 is infinite as a logit, a flat Gaussian has a scale of e^-inf.
     """
@@ -187,7 +187,7 @@ def positions_of(vertices: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def colours_of(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return colours [M, 3] uint8 whatever their columns are called and their type; grey where there are none.
+    """Return colours [M, 3] uint8 from columns of any known name and type; grey if there are no colours.
 
     Bytes are taken as they are. The range of other types is told by the largest value: up to 1 for floats, else up to
     255, else up to 65,535.
@@ -216,7 +216,7 @@ def colours_of(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def read_vertices(path: Path, rounded: bool = True) -> dict[str, np.ndarray]:
-    """Return the vertices' properties [N] by name; what the header claims is checked before anything is allocated."""
+    """Return the vertices' properties [N] by name. The claims of the header are checked before memory is allocated."""
     from plyfile import PlyData, PlyParseError
 
     check_header(path)
@@ -243,7 +243,7 @@ def read_vertices(path: Path, rounded: bool = True) -> dict[str, np.ndarray]:
 
 
 def without_blank_lines(path: Path) -> str | io.BytesIO:
-    """Return what plyfile reads: the path, or the content of a text PLY without blank lines, which it does not take."""
+    """Return the input for plyfile: the path, or a text PLY without its blank lines, which plyfile refuses."""
     data = path.read_bytes() if is_text(path) else b""
     header, end, body = data.partition(b"end_header")
     lines = body.splitlines()

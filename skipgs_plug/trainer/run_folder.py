@@ -23,7 +23,7 @@ FOLDERS = ("", "ckpts", "ply", "stats", "renders")
 
 
 class RunFolder:
-    """Names and writes what a run leaves behind; file names carry the last finished iteration, from 0."""
+    """Writes the files of a run. File names carry the last finished iteration, from 0."""
 
     def __init__(self, root: str | Path) -> None:
         self.root = Path(root).expanduser()
@@ -52,7 +52,7 @@ class RunFolder:
         return [path for match, path in sorted(found, key=lambda entry: -int(entry[0][1]))]
 
     def remove_leftovers(self) -> None:
-        """Remove what a run that was killed left half written; nobody may be writing here now."""
+        """Remove half-written files of a killed run. No other process may be writing here."""
         for name in FOLDERS:
             remove_leftovers(self.root / name)
 
@@ -69,7 +69,7 @@ class RunFolder:
         return path
 
     def write_renders(self, trainer: Trainer, split: str = "val") -> None:
-        """Write truth beside render for every held-out (or, for "train", training) view."""
+        """Write photograph and render side by side for every held-out (or, for "train", training) view."""
         from PIL import Image
 
         views = trainer.scene.test if split == "val" else trainer.scene.train

@@ -18,10 +18,10 @@ EVERY = 10  # iterations between two logged points, as in gsplat's script
 
 
 class ScalarLog:
-    """Writes what a trainer does into a folder that TensorBoard reads.
+    """Writes scalars of a training into a folder that TensorBoard reads.
 
     A folder in which an earlier run got further is continued: TensorBoard drops what that run wrote from this
-    iteration on. When the disk is full the curves end, and training goes on.
+    iteration on. When the disk is full, the curves end and training continues.
 
     Args:
         more: asked for further scalars with their own tags, at each iteration that is written.
@@ -73,7 +73,7 @@ def peak_memory(device: torch.device) -> int | None:
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     status = Path("/proc/self/status")
-    if status.exists():  # getrusage on Linux also counts what a parent process used before this one started
+    if status.exists():  # getrusage on Linux also counts memory of the parent process before this one started
         (kibibytes,) = re.findall(r"^VmHWM:\s*(\d+) kB$", status.read_text(), re.MULTILINE)
         return int(kibibytes) * 1024
     try:

@@ -27,9 +27,9 @@ log = logging.getLogger(__name__)
 
 VERSION = 1
 MOMENTS = {"step", "exp_avg", "exp_avg_sq"}
-# May differ between a run and its continuation; what it means for the two lengths, `_require_same_run` says.
+# Settings that may differ between a run and its continuation; `_require_same_run` treats the two lengths.
 FREE_FIELDS = ("data_dir", "result_dir", "backend", "max_steps", "schedule_steps")
-# What reading damaged bytes raises depends on the byte: a length, a key, a decoder, a missing attribute.
+# Errors of reading damaged bytes: they depend on the byte, which may be a length, a key, a decoder or an attribute.
 DAMAGE = (
     *(pickle.UnpicklingError, zipfile.BadZipFile, EOFError, OSError, MemoryError, OverflowError),
     *(RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError),
@@ -66,21 +66,21 @@ class Capturable(Protocol):
 
 
 class ConfigEntry(TypedDict):
-    """What every config has: how long the run is, and how long its schedule."""
+    """Settings of every config: length of the run, and of its schedule."""
 
     max_steps: int
     schedule_steps: int
 
 
 class SceneEntry(TypedDict):
-    """What a checkpoint remembers of its scene."""
+    """Facts about the scene in a checkpoint."""
 
     name: str
     view_names: list[str]
 
 
 class Checkpoint(TypedDict):
-    """What a checkpoint file holds: as `capture`, with config and view names."""
+    """Content of a checkpoint file: that of `capture`, with config and view names."""
 
     version: int
     step: int
@@ -192,7 +192,7 @@ def load_checkpoint(trainer: Capturable, path: str | Path) -> None:
         apply(trainer, content)
     except InputError:
         raise
-    except DAMAGE as error:  # what a registered object refuses
+    except DAMAGE as error:  # a registered object refuses its state
         raise DamagedCheckpointError(f"Checkpoint {path} cannot be continued: {error}") from error
     for name in trainer.registered:
         if name not in content["registered"]:
@@ -200,7 +200,7 @@ def load_checkpoint(trainer: Capturable, path: str | Path) -> None:
 
 
 def _view(trainer: Capturable) -> dict[str, Any]:
-    """Return what `capture` copies, with the tensors of the trainer themselves."""
+    """Return the content of `capture` without copying tensors."""
     moments = {}
     for name, optimizer in trainer.optimizers.items():
         moments[name] = dict(optimizer.state.get(trainer.splats[name], {}))
@@ -252,7 +252,7 @@ def _require_same_run(trainer: Capturable, content: dict[str, Any], path: str | 
     if content["scene"]["view_names"] != list(trainer.view_names):
         raise InputError(f"Checkpoint {path} was made with other training views; resume with its own scene and split.")
     _require_same_cameras(trainer.scene, content["scene"], path)
-    # A checkpoint that is older than a setting was made with what is its default now.
+    # A checkpoint that is older than a setting was made with its present default.
     made_with = {field.name: field.default for field in dataclasses.fields(TrainConfig)} | content["config"]
     for name, value in dataclasses.asdict(trainer.config).items():
         if name not in FREE_FIELDS and made_with[name] != value:

@@ -40,7 +40,7 @@ class Painter:
 
     @classmethod
     def of(cls, model: Model, backend: str) -> Painter:
-        """Return what draws a model as it was trained, on the backend of that name."""
+        """Return the function that renders a model as it was trained, on the backend with this name."""
         settings = model.background, model.near_plane, model.antialiased, model.far_plane
         return cls(resolve_backend(backend), *settings)
 
@@ -50,7 +50,7 @@ class Painter:
         self,
         splats: Mapping[str, Tensor],
         viewmat: Tensor,  # [4, 4] of any float type
-        K: Tensor,  # [3, 3] likewise
+        K: Tensor,  # [3, 3], pixels
         width: int,
         height: int,
     ) -> tuple[Tensor, Tensor]:

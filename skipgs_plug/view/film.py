@@ -46,7 +46,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int) -> None:
 
 @contextlib.contextmanager
 def coder_ended_early(path: Path) -> Iterator[None]:
-    """Raise WriteError for what imageio raises then, which has the coder's whole command in it."""
+    """Raise WriteError instead of imageio's error, which holds the whole command line of the coder."""
     try:
         yield
     except (OSError, RuntimeError) as error:

@@ -15,8 +15,8 @@ LOOK = 0.5  # seconds between two checks whether somebody has the page open
 class LiveView:
     """Shows a trainer's model as it grows; its `iteration` may serve as `Trainer.on_step`.
 
-    It reads parameters and random state of nobody, so training gives the same result with it. Each update is timed,
-    and the next waits until it has cost no more than 2 % of training; without visitors there is none.
+    It does not touch parameters or random state, so training gives the same result with it. Each update is timed,
+    and the next one waits until updates have taken less than 2 % of training. Without visitors, there is no update.
     """
 
     def __init__(self, trainer: Trainer, host: str = "127.0.0.1", port: int = 8080) -> None:
@@ -25,7 +25,7 @@ class LiveView:
         self._next = 0.0
 
     def iteration(self, iteration: Iteration) -> None:
-        """Show the model if it is time to and somebody looks on."""
+        """Show the model, if an update is due and somebody has the page open."""
         now = time.perf_counter()
         if now < self._next:
             return

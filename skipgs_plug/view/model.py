@@ -1,4 +1,4 @@
-"""What a run folder or a file holds to look at: models by iteration, and the scene they were trained on."""
+"""Models in a run folder or a file, by iteration, and the scene that they were trained on."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from skipgs_plug.trainer.scene import BLACK, Scene
 from skipgs_plug.view.splat import read_splat
 from skipgs_plug.view.spz import read_spz
 
-# Where trainers leave their models: ours and gsplat's, then Inria's and those of its family. The last one of an
+# Where trainers write their models: ours and gsplat's, then those of the Inria family. The last one of an
 # iteration counts: it is the format that is quickest to read.
 PLACES = ("ckpts/ckpt_*_rank0.pt", "point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 LOADING = ("test_every", "init_num_pts", "init_ply")  # settings of a run that change how its scene is loaded
@@ -38,7 +38,7 @@ NUMBER = re.compile(r"(?:ckpt|point_cloud|iteration)_(\d+)")
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A model as it was after an iteration; `step` is None for a single file."""
+    """The model after an iteration; `step` is None for a single file."""
 
     step: int | None
     path: Path
@@ -69,7 +69,7 @@ class Model:
     """Snapshots by iteration, the scene if it is known, and the settings that change how a model looks.
 
     Attributes:
-        near_plane: that it was trained with, or what suits the scene.
+        near_plane: The near plane of the training, or one that suits the scene.
         exposure: whether photographs differ from the model by an exposure of their own.
         far_plane: that it was trained with.
     """
@@ -149,7 +149,7 @@ def open_snapshots(path: str | Path) -> list[Snapshot]:
 
     Raises:
         MissingFileError: there is no such file, or no model in the folder.
-        InputError: the file is none of `FILES`.
+        InputError: the file has none of the endings in `FILES`.
     """
     path = Path(path).expanduser()
     if not path.exists():
@@ -165,7 +165,7 @@ def find_snapshots(folder: Path) -> list[Snapshot]:
     """Return the models of a run folder, by iteration.
 
     Raises:
-        MissingFileError: there is none.
+        MissingFileError: the folder holds no model.
     """
     found = {}
     for place in PLACES:
@@ -182,7 +182,7 @@ def find_snapshots(folder: Path) -> list[Snapshot]:
 
 
 def read_config(folder: Path) -> Mapping[str, Any]:
-    """Return the content of cfg.yml; empty for folders of other trainers, which have none or another."""
+    """Return the content of cfg.yml; empty for folders of other trainers, which have no such file or another format."""
     import yaml
 
     file = folder / "cfg.yml"

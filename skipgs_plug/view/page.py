@@ -86,7 +86,7 @@ class Page:
 
     @property
     def chosen_step(self) -> int | None:
-        """The iteration that the slider stands at; None without a slider."""
+        """The iteration that the slider shows; None without a slider."""
         return None if self._slider is None else self._steps[int(self._slider.value)]
 
     @property
@@ -177,7 +177,7 @@ class Page:
         camera.position, camera.look_at, camera.fov = start + STEP_BACK * back, ahead, field_of_view(first)
 
     def _show_cameras(self, hidden: str | None = None) -> None:
-        """Show the cameras if visitors want to see them, except one that somebody stands in."""
+        """Show the cameras if visitors want to see them, except a camera that a visitor looks through."""
         for name, frustum in self._frustums.items():
             frustum.visible = self._shown.value and name != hidden
 
@@ -224,7 +224,7 @@ class Page:
 def require_address(host: str, port: int) -> None:
     """Raise InputError unless a server can listen there; the port may be taken.
 
-    Viser binds in a thread, whose errors leave its caller waiting for ever.
+    Viser binds the port in a thread; if that fails, its caller waits forever.
     """
     if not 1 <= port <= 65535:
         raise InputError(f"port={port} is not in 1..65535.")

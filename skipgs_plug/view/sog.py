@@ -96,7 +96,7 @@ def position_error(means: Tensor) -> float:
 
 
 def _positions(means: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
-    """Return 16 bits a coordinate [N, 3], and what 0 and 65,535 stand for on the logarithmic scale."""
+    """Return 16 bits per coordinate [N, 3], and the values of 0 and 65,535 on the logarithmic scale."""
     scaled = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     lowest, highest = scaled.min(axis=0), scaled.max(axis=0)
     extent = np.where(highest > lowest, highest - lowest, 1.0)
@@ -110,7 +110,7 @@ def _rotations(quats: np.ndarray) -> np.ndarray:
     largest = np.abs(quats).argmax(axis=1)[:, None]
     quats = quats * np.where(np.take_along_axis(quats, largest, axis=1) < 0, -1.0, 1.0)
     others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest[:, 0]]
-    smaller = np.take_along_axis(quats, others, axis=1) * 2**0.5  # none exceeds the root of one half
+    smaller = np.take_along_axis(quats, others, axis=1) * 2**0.5  # each is at most the root of one half
     return np.concatenate([np.rint((smaller * 0.5 + 0.5) * 255), LARGEST_COMPONENT + largest], axis=1)
 
 

@@ -35,7 +35,7 @@ FIRST_BAND_STEP, OTHER_BAND_STEP = 8, 16  # of 256: five and four bits
 
 
 class Spz(NamedTuple):
-    """What a file holds."""
+    """The content of a file."""
 
     splats: dict[str, Tensor]  # raw parameters, as of `read_ply`
     antialiased: bool  # whether opacities are compensated for the blur, as the model was trained
@@ -73,7 +73,7 @@ def read_spz(path: Path) -> Spz:
     """Read a file of version 1 to 3.
 
     Raises:
-        InputError: it is damaged, of another version, or has what is not read here; the sentence says which.
+        InputError: the file is damaged, of another version, or has unsupported content; the message says which.
     """
     data = path.read_bytes()
     if data[:4] == struct.pack("<I", MAGIC):

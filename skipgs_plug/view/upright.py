@@ -1,4 +1,4 @@
-"""Which way is up in a scene, told from how its photographs were held."""
+"""The up direction of a scene, estimated from how its photographs were held."""
 
 from __future__ import annotations
 

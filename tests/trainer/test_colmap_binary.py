@@ -93,7 +93,7 @@ def test_rotations_that_are_none(folder: Path, value: float) -> None:
     frames = folder / "sparse/0/frames.bin"
     if frames.is_file():  # newer versions take the pose from there
         patch(frames, 16, "<4d", *[value] * 4)
-    with pytest.raises(InputError, match=r"sparse/0: the pose of '.*' is not one|cannot be read"):
+    with pytest.raises(InputError, match=r"sparse/0: the pose of '.*' is not valid|cannot be read"):
         load_scene(folder)
 
 

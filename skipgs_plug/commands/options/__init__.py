@@ -1,1 +1,1 @@
-"""What each command takes, as dataclasses; nothing here imports torch, so `--help` and typing errors answer at once."""
+"""Options of each command, as dataclasses. Nothing here imports torch, so `--help` and typing errors answer at once."""

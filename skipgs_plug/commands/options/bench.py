@@ -1,4 +1,4 @@
-"""What `skipgs-plug bench` takes."""
+"""Options of `skipgs-plug bench`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `skipgs-plug demo` takes."""
+"""Options of `skipgs-plug demo`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `skipgs-plug doctor` takes: nothing. It needs no tyro, which it may find missing."""
+"""Usage of `skipgs-plug doctor`, which has no options. It does not need tyro, which may be missing."""
 
 from __future__ import annotations
 

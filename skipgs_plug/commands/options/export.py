@@ -1,4 +1,4 @@
-"""What `skipgs-plug export` takes."""
+"""Options of `skipgs-plug export`."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from skipgs_plug.core.errors import SkipGSError
 
 @dataclass
 class GateOptions:
-    """Settings of the gate, named as in SkipConfig; what is left out is the adapter's choice."""
+    """Settings of the gate, with the names of SkipConfig. The adapter chooses those that are not given."""
 
     start_iter: Annotated[int | None, shown("INT", "end of densification")] = None
     """First iteration that may be skipped."""
@@ -26,7 +26,7 @@ class GateOptions:
     min_bwd_ratio: Annotated[str | None, shown("SHARE|auto", "auto")] = None
     """Least share of gated iterations with a backward."""
     on_nonfinite: Annotated[Literal["skip", "raise", "pass"] | None, shown("skip|raise|pass", "skip")] = None
-    """What a NaN or infinite loss does."""
+    """How to treat a NaN or infinite loss."""
     pause_iters: Annotated[int | None, shown("INT", "one round of the views, at least 500; scaled in train")] = None
     """Real backwards after a prune or reset."""
 
@@ -39,16 +39,16 @@ class GateOptions:
     max_gaussians: Annotated[int | None, shown("INT", "no bound")] = None
     """With --share: densification events stop before one could go beyond this number of Gaussians."""
     always: Annotated[tuple[int, ...] | None, shown("INT ...", "read from the loop's conditions")] = None
-    """Iterations that run in any case, instead of those that the loop's conditions on its number name."""
+    """Iterations that always run, instead of those that the loop's conditions on its number name."""
     tolerance: Annotated[float | None, shown("FLOAT", "0.05")] = None
     """Decibels that the rest of refinement may be worth when auto ends it."""
     compensate: Annotated[bool | None, shown("True|False", "with --refine-share only")] = None
-    """Larger, shrinking steps for what is left out."""
+    """Make up for iterations that are left out with larger, shrinking steps."""
     rate_peak: Annotated[float | None, shown("FLOAT", "by the share that runs and what views show")] = None
     """Factor on learning rates when refinement begins, falling to 0."""
 
     def given(self) -> dict[str, Any]:
-        """The settings that the user gave, by name; what is no share is left for SkipConfig to refuse.
+        """Return the settings that the user gave, by name. SkipConfig refuses values that are not a share.
 
         Raises:
             SkipGSError: One of them does nothing without another, which is missing.

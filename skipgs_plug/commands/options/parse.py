@@ -10,10 +10,10 @@ T = TypeVar("T")
 
 
 def parse_as(kind: type[T], argv: list[str], command: str) -> T:
-    """Return what `skipgs-plug COMMAND` was given; prints help or what is wrong, and exits, as tyro does."""
+    """Return the options of `skipgs-plug COMMAND`; print help or the mistake, and exit, as tyro does."""
     return tyro.cli(kind, args=argv, prog=f"skipgs-plug {command}", config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def shown(kind: str, default: str) -> Any:
-    """How --help shows an option that may be left out, and what holds then."""
+    """Return how --help shows an optional setting and its default."""
     return tyro.conf.arg(metavar=kind, help_behavior_hint=f"(default: {default})")

@@ -1,4 +1,4 @@
-"""What `skipgs-plug render` takes."""
+"""Options of `skipgs-plug render`."""
 
 from __future__ import annotations
 

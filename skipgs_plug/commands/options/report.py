@@ -1,4 +1,4 @@
-"""What `skipgs-plug report` takes."""
+"""Options of `skipgs-plug report`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `skipgs-plug run` takes."""
+"""Options of `skipgs-plug run`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def split(argv: Sequence[str]) -> tuple[list[str], list[str]]:
 class Args:
     """Run a training script of another project, unedited and gated.
 
-    What follows `--` is what would follow `python`, for example: skipgs-plug run fastgs -- train.py -s data/garden.
+    Write after `--` what you would write after `python`: skipgs-plug run fastgs -- train.py -s data/garden.
     Exit code, output and files are the script's own; skipgs.json is added to its output folder.
     """
 
@@ -33,13 +33,13 @@ class Args:
     """Name of the trainer: inria, fastgs, taming, ...; or auto, to recognise it by its script."""
     gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
     resume_gate: str = "auto"
-    """State the gate goes on from: auto (the one beside the checkpoint the script loads), off (afresh), or a path."""
+    """State that the gate continues from: auto (beside the checkpoint that the script loads), off, or a path."""
     no_gate: bool = False
     """Change nothing in training; skipgs.json then holds the seconds of the ungated run."""
     cpu: bool = False
     """Run on the CPU: CUDA requests are redirected, and CUDA modules are served by the CPU rasterizer."""
     command: tyro.conf.Suppress[tuple[str, ...]] = ()
-    """What follows `--`."""
+    """The command line after `--`."""
 
 
 def parse(argv: list[str]) -> Args:

@@ -1,4 +1,4 @@
-"""What a session writes and shows, and when."""
+"""Files and pages of a session, and when they are written."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skipgs_plug.trainer.errors import InputError
 
 @dataclass
 class SessionOptions:
-    """What a session writes and shows, and when; none of it changes what is trained."""
+    """Files and pages of a session, and when they are written. They do not change the trained model."""
 
     save_every: int | None = None
     """Iterations between two checkpoints, of which two are kept; default: five minutes of training; 0: the end only."""
@@ -22,7 +22,7 @@ class SessionOptions:
     view: bool = False
     """Show training in the browser; costs at most 2 % of its time."""
     image_memory: Annotated[float | None, shown("GB", "a quarter of what is free")] = None
-    """Memory for decoded photographs; those of larger captures are decoded again ahead of their turn."""
+    """Memory for decoded photographs. Photographs that do not fit are decoded again, ahead of their turn."""
     lpips_net: Literal["alex", "vgg"] | None = None
     """Also report LPIPS; its weights must be on this machine."""
     no_progress: bool = False

@@ -1,4 +1,4 @@
-"""What `skipgs-plug sfm` takes."""
+"""Options of `skipgs-plug sfm`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `skipgs-plug train` takes."""
+"""Options of `skipgs-plug train`."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class Args:
     sfm: bool = False
     """Find out first where the photographs were taken, as the command sfm does, and keep the scene in OUT/scene."""
     max_steps: int | None = None
-    """Training iterations; default: 30,000, or with --resume those of the run, which a larger number extends."""
+    """Training iterations; default: 30,000, or with --resume the number of the run. A larger number extends the run."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
     gate: bool = False
     """Attach the paper's gate. Any of its settings, --refine-share among them, attaches a gate as well."""
     gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
     resume: bool = False
-    """Continue from the last checkpoint in --out, or write what a finished run lacks."""
+    """Continue from the last checkpoint in --out, or write the missing files of a finished run."""
     session: Annotated[SessionOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=SessionOptions)
 
 

@@ -1,4 +1,4 @@
-"""What `skipgs-plug view` takes."""
+"""Options of `skipgs-plug view`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Args:
     model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
     """Run folder or PLY."""
     scene: str | None = None
-    """Scene with the photographs; default: the one the run folder names. A PLY is shown without, too."""
+    """Scene with the photographs; default: the scene of the run folder. A PLY needs no scene."""
     data_factor: int | None = None
     """Reduction of the photographs; default: as in training."""
     host: str = "127.0.0.1"

@@ -1,4 +1,4 @@
-"""What the engine asks of a pace, and the pace of a run in which every iteration runs as it is."""
+"""The interface of a pace, and the pace of a run in which every iteration runs unchanged."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ NAMED = "named for this trainer"  # reason of iterations that must run and that 
 
 
 def nothing_always(numbers: range) -> Iterable[int]:
-    """No iteration must run but those that the loop's own conditions name."""
+    """Return that only iterations named by the loop's own conditions must run."""
     return ()
 
 
 class Pace:
-    """Every iteration runs, and learning rates stay as they are.
+    """Every iteration runs, and learning rates do not change.
 
     Other paces derive from this one. The engine asks one question per iteration, `LoopRange` asks it through `runs`,
     and tells one thing, that the iteration begins (`begin`).
@@ -108,11 +108,11 @@ class Pace:
         """Let go of the loop, which runs all its numbers from now on."""
 
     def report(self) -> dict[str, Any] | None:
-        """Return the entries of skipgs.json about iterations that were left out; None if none can be."""
+        """Return the entries of skipgs.json about iterations that were left out; None if none can be left out."""
         return None
 
     def state_dict(self) -> dict[str, Any] | None:
-        """Return everything that changes, None if nothing does."""
+        """Return the state; None if nothing changes."""
         return None
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

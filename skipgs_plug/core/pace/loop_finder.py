@@ -12,8 +12,8 @@ class LoopFinder:
     """The training loop is the one whose numbers the trainer's iterations follow.
 
     Attributes:
-        found: the training loop, None until it is known.
-        expected: number with which the loop of a resumed run goes on; None in a fresh run.
+        found: The training loop; None until it is known.
+        expected: Number with which the loop of a resumed run continues; None in a new run.
     """
 
     def __init__(self) -> None:

@@ -86,7 +86,7 @@ class LoopRange:
 
 
 def require_planned(numbers: range, last: int) -> None:
-    """Raise SkipGSError when a loop goes on after the iteration at which steps have shrunk to nothing."""
+    """Raise SkipGSError if a loop continues after the iteration at which steps have shrunk to zero."""
     if numbers and numbers[-1] > last:
         raise SkipGSError(
             f"Iterations up to {numbers[-1]} come after a plan that ends with {last}; "

@@ -1,4 +1,4 @@
-"""Iterations that something hangs on, read off the loop itself: its conditions on the iteration's number.
+"""Iterations that must run, read from the loop itself: its conditions on the iteration's number.
 
 A training loop saves, evaluates, prunes and reports by number: `if iteration % 1000 == 0`, `if iteration in
 saving_iterations`. Such conditions are read from the source of the function and evaluated ahead of time. Nothing of
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from skipgs_plug.core.errors import SkipGSError
 
 SAFE = frozenset({"abs", "bool", "int", "len", "max", "min", "round"})
-# Methods by which lists, sets and queues change: what they are called on is another thing in the next iteration.
+# Methods by which lists, sets and queues change: their object differs in the next iteration.
 CHANGES = frozenset({"add", "append", "appendleft", "clear", "discard", "extend", "insert", "pop", "popleft", "remove"})
 _POINT = (ast.Eq, ast.NotEq, ast.In, ast.NotIn, ast.Is, ast.IsNot)
 _PLACE = (ast.Name, ast.Attribute, ast.Subscript)
@@ -30,7 +30,7 @@ class _Leaf(NamedTuple):
     """A part of a condition that is no `and`, `or` or `not`.
 
     Attributes:
-        code: to be evaluated with the number; None when the part does not depend on it, or cannot be foreseen.
+        code: Evaluated with the number; None if the part does not depend on it, or cannot be evaluated ahead.
         unforeseeable: it depends on the number and on what only happens in the loop.
     """
 
@@ -54,7 +54,7 @@ class Condition:
         self._leaves: dict[int, _Leaf] = {}
 
     def numbers(self, numbers: range, names: Mapping[str, Any]) -> set[int]:
-        """Return those numbers for which the condition does the rarer of its two things, whatever else it depends on.
+        """Return the numbers for which the condition takes the rarer of its two branches, whatever else it depends on.
 
         Raises:
             SkipGSError: It depends on something that changes in the loop.
@@ -228,12 +228,12 @@ class _Inline(ast.NodeTransformer):
 def milestones(
     code: CodeType, line: int, numbers: range, names: Mapping[str, Any], pure: Iterable[str] = ()
 ) -> dict[str, set[int]]:
-    """Return the iterations that something hangs on, by what it is.
+    """Return the iterations that must run, by the condition that names them.
 
     Args:
         code: Of the function that holds the loop.
         line: Where the function stands when the loop asks for a number: in the first lines of its `for`.
-        numbers: Those that may be left out.
+        numbers: Iterations that may be left out.
         names: What the function had names for before its loop began.
         pure: Functions that only look at numbers, and may stand in conditions.
 
@@ -244,7 +244,7 @@ def milestones(
         RuntimeWarning: A condition is on what the loop counts by itself, and comes less often for each number left out.
 
     Raises:
-        SkipGSError: The source cannot be read, no loop is there, or a condition cannot be foreseen.
+        SkipGSError: The source cannot be read, has no loop, or a condition cannot be evaluated ahead.
     """
     loop = _loop_at(code, line, frozenset(pure))
     for leaf in loop.counted_by_itself():

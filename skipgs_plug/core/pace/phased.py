@@ -134,8 +134,8 @@ class Phased(Pace):
         """Whether the loop runs with this number; asked once for each, in order.
 
         Raises:
-            SkipGSError: The loop's conditions cannot be foreseen; raised with the first number that could be left out,
-                never later.
+            SkipGSError: The loop's conditions cannot be evaluated ahead. Raised at the first number that could be left
+                out, never later.
         """
         if self._removed:
             return True
@@ -185,7 +185,7 @@ class Phased(Pace):
             self._last = loop.numbers[-1]
         if self.refining.first is None:
             self.refining.first = max(self._start, number)
-        # Of a run that goes on, iterations behind it too: conditions are judged by how often they hold.
+        # On resume, include iterations that are done already: conditions are judged by how often they hold.
         # A trainer that is trained in parts, train(until=1000) first, has more numbers than its first loop.
         end = loop.numbers.stop if loop.source is not None else max(loop.numbers.stop, self._last + 1)
         refined = range(self.refining.first, end)

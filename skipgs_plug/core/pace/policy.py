@@ -1,4 +1,4 @@
-"""What happens to the backward of an iteration that was not left out."""
+"""Decisions on the backward pass of an iteration that was not left out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One file per scene format; each makes a `Scene` of what it reads."""
+"""Loaders of scenes, one file per format; each returns a `Scene`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TRANSFORMS = ("transforms_train.json", "transforms.json")
 
 
 def is_scene(folder: Path) -> bool:
-    """Whether `load_scene` recognises what a folder holds."""
+    """Return whether `load_scene` recognises the content of a folder."""
     places = (folder / place for place in MODEL_FOLDERS)
     return (
         is_model(folder)

@@ -54,7 +54,7 @@ def random_cloud(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def own_cloud(path: Path, file_name: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return points and colours of the file's `ply_file_path`; None where it names none."""
+    """Return points and colours of the file's `ply_file_path`; None if the file has no such entry."""
     name = read_object(path / file_name).get("ply_file_path")
     return None if name is None else read_points(inside(path, read_string(name, "ply_file_path", path / file_name)))
 

@@ -18,7 +18,7 @@ DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", *DISTORTION)
 UNDISTORT = "undistort the images"
 ALPHA = "write what is transparent as the alpha channel of the images"
-# What changes a picture and is not modelled here: refused unless it is zero, false or empty. What it is; what helps.
+# Keys that change a picture and are not modelled: refused unless zero, false or empty. Meaning and cure of each.
 UNSUPPORTED = {
     **dict.fromkeys(
         ("k5", "k6", "p3", "p4", "b1", "b2", "s1", "s2", "s3", "s4", "skew", "shear", "distortion_params"),

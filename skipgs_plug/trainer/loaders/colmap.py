@@ -111,7 +111,7 @@ def find_model(path: Path) -> Path:
     """Return the model of a scene: the first of sparse/0, sparse, sparse/1 and so on; names a larger one.
 
     Raises:
-        MissingFileError: there is none.
+        MissingFileError: There is no model.
     """
     found: list[Path] = []
     for place in MODEL_FOLDERS:
@@ -136,7 +136,7 @@ def find_model(path: Path) -> Path:
 
 
 def listed_images(model: Path) -> int:
-    """Return how many images a model lists; 0 where that cannot be told."""
+    """Return how many images a model lists; 0 if that is unknown."""
     try:
         if (model / "images.bin").is_file():
             with open(model / "images.bin", "rb") as stream:

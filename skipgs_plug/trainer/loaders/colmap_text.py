@@ -26,7 +26,7 @@ def simplify(model: Path, target: Path, camera_models: Mapping[str, int]) -> dic
         The names of the images, by their ids.
 
     Raises:
-        InputError: a file cannot be read, or a line of it is none of its kind.
+        InputError: A file cannot be read, or one of its lines has the wrong form.
     """
     cameras = content_lines(model / "cameras.txt")
     for line in cameras:

@@ -29,7 +29,7 @@ def read_image(
 
     Args:
         source: file or stream.
-        label: what errors call it.
+        label: Name of the image in errors.
         background: composes transparency onto this colour; None leaves colours as they are, for alpha as a mask.
         size: width and height that the camera was calibrated for. Pixels stay as they are stored, as COLMAP reads
             them; where only the orientation in EXIF makes them fit, it is applied.
@@ -84,7 +84,7 @@ def decode(source: Path | IO[bytes], label: Path | str) -> Image.Image:
         raise InputError(f"Image {label} has more than {limit} pixels; shrink it.") from error
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError, KeyError, IndexError, TypeError,
             OverflowError, AttributeError, NotImplementedError, RuntimeError, ZeroDivisionError) as error:  # fmt: skip
-        # Pillow's plugins raise whatever their parser stumbles over.
+        # Pillow's plugins raise many kinds of errors on damaged files.
         if isinstance(source, Path) and is_pointer(source):
             raise InputError(f"Image {label} cannot be decoded: {HINT}.") from error
         raise InputError(f"Image {label} cannot be decoded ({reason(error)}); replace the file.") from error

@@ -31,7 +31,7 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def read_number(value: Any, name: str, source: Path) -> float:
-    """Return a finite number, or name what is not one."""
+    """Return a finite number; raise InputError for another value."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -53,7 +53,7 @@ def read_pose(value: Any, name: str, source: Path) -> np.ndarray:
     Three rows stand for four. The size of a camera object, which 3D programs export with its pose, is taken out.
 
     Raises:
-        InputError: it is none; the sentence says what is wrong.
+        InputError: The value is not a pose; the message says why.
     """
     try:
         pose = np.array(value, dtype=np.float64)
@@ -87,7 +87,7 @@ def opencv_viewmat(camera_to_world: np.ndarray) -> np.ndarray:
 
 
 def short(value: Any) -> str:
-    """Return what is wrong in at most 60 characters; numbers of thousands of digits have no text."""
+    """Return a wrong value in at most 60 characters; a number with thousands of digits cannot be printed."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):

@@ -84,7 +84,7 @@ def points_of(scene: Scene) -> np.ndarray:
 
 
 def load_packed(path: Path, cloud: tuple[np.ndarray, np.ndarray] | None = None) -> Scene:
-    """Read what `save_packed` wrote; `cloud` (points, colours) takes the place of its points."""
+    """Read a file of `save_packed`; `cloud` (points, colours) replaces its points."""
     content = read_archive(path)
     if int(content["version"]) != VERSION:
         raise InputError(f"Packed scene {path} has version {content['version']}, expected {VERSION}; pack it again.")
@@ -118,7 +118,7 @@ def read_archive(path: Path) -> dict[str, Any]:
                 check_header(archive, name, shape)
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in SHAPES}
-    except Exception as error:  # zipfile, zlib and numpy raise whatever their parser stumbles over
+    except Exception as error:  # zipfile, zlib and numpy raise many kinds of errors on damaged files
         raise InputError(f"Packed scene {path} is damaged or not one ({reason(error)}); pack it again.") from error
 
 

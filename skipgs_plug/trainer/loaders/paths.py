@@ -96,7 +96,7 @@ def find_images(folder: Path, names: Sequence[str]) -> list[Path]:
 
 
 def look_up(folder: Path, name: PurePosixPath) -> Path | None:
-    """Return the image that is called so, or nearly so, in a folder; None where there is none."""
+    """Return the image in a folder with this name, or with nearly this name; None if it does not exist."""
     # Down to one folder and the name: a name alone would be taken for one of another camera.
     ends = [PurePosixPath(*name.parts[start:]) for start in range(max(len(name.parts) - 1, 1))]
     if len(name.parts) == 2 and name.parts[0] == folder.name:  # as seen from the folder above
@@ -138,7 +138,7 @@ def same_stem(path: Path) -> Path | None:
 
 
 def entries(folder: Path, names: Sequence[str]) -> list[os.DirEntry[str]]:
-    """Return what a folder holds under one of these names in any case."""
+    """Return the entries of a folder with one of these names, in any case."""
     wanted = {name.casefold() for name in names}
     try:
         with os.scandir(folder) as listing:
@@ -148,7 +148,7 @@ def entries(folder: Path, names: Sequence[str]) -> list[os.DirEntry[str]]:
 
 
 def unlisted_images(folder: Path, listed: Sequence[Path]) -> list[str]:
-    """Return the images in a folder and below that are none of `listed`: sorted relative paths, without hidden ones."""
+    """Return the images in a folder and its subfolders that are not `listed`: sorted relative paths, none hidden."""
     known = {os.path.normpath(path) for path in listed}
     suffixes = {suffix.lower() for suffix in IMAGE_SUFFIXES}
     result = []

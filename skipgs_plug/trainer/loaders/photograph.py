@@ -40,10 +40,10 @@ def load_photograph(
         image_path: at any scale of the size that the camera was calibrated for.
         camera: pycolmap.Camera of any model that pycolmap can undistort.
         viewmat: world to camera [4, 4].
-        cache: keeps what is undistorted.
+        cache: Keeps undistorted photographs.
         factor: shrink by this in memory.
         mask_path: picture of the same shape, black where pixels are left out.
-        images: keeps the photograph; None: it stays in memory.
+        images: Keeps the photograph; None: it stays in memory.
     """
     check_camera(camera, image_path)
 
@@ -75,7 +75,7 @@ def read_straight(
 def scaled_matrix(camera: Any, pixels: Tensor) -> np.ndarray:
     """Return the calibration matrix [3, 3] float64 of a pinhole camera for the size of `pixels` [H, W, 3]."""
     K = np.array(camera.calibration_matrix(), dtype=np.float64)
-    # The downscaled image has a rounded size: scale by what was really loaded, not by the factor.
+    # The downscaled image has a rounded size: scale by the size that was loaded, not by the factor.
     K[0] *= pixels.shape[1] / camera.width
     K[1] *= pixels.shape[0] / camera.height
     return K

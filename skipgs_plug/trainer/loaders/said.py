@@ -1,4 +1,4 @@
-"""What is said about files that a scene holds and does not use."""
+"""Notes about files of a scene that are not used."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 
 
 def say_what_is_unlisted(folder: Path, listed: Sequence[Path], what: str) -> None:
-    """Say how many images of a folder no `what` lists: photographs that could not be placed, or were added later."""
+    """Print how many images of a folder `what` does not list: they could not be placed, or were added later."""
     others = unlisted_images(folder, listed)
     if others:
         log.warning(

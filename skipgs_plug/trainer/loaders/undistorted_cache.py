@@ -1,4 +1,4 @@
-"""Photographs without lens distortion, kept beside their scene: removing it takes several times as long as reading."""
+"""Photographs without lens distortion, stored in their scene: undistorting takes several times as long as reading."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class UndistortedCache:
         return digest.hexdigest()[:32]
 
     def read(self, key: str) -> Straight | None:
-        """Return what is kept under a key; None for nothing, or a damaged file."""
+        """Return the entry of a key; None if it does not exist or its file is damaged."""
         path = self.folder / f"{key}.png"
         if not path.is_file():
             return None
@@ -63,7 +63,7 @@ class UndistortedCache:
             with Image.open(path) as opened:
                 pixels = torch.from_numpy(np.array(opened))  # [H, W, 3 or 4]
                 K = np.array(json.loads(opened.info[CAMERA]), dtype=np.float64).reshape(3, 3)
-        except Exception as error:  # Pillow raises whatever its parser stumbles over
+        except Exception as error:  # Pillow raises many kinds of errors on damaged files
             log.debug("%s cannot be read (%s) and is written again.", path, error)
             return None
         if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or not np.isfinite(K).all():
