@@ -19,6 +19,7 @@ DOCUMENTED = {
     "skipgs_plug.trainer.loop": ("Trainer",),
     "skipgs_plug.trainer.scene": ("Scene",),
     "skipgs_plug.trainer.synthetic": ("make_scene",),
+    "skipgs_plug.fallback_raster.install": ("install_as_gsplat",),
     "skipgs_plug.fallback_raster.rasterize": ("rasterization",),
 }
 

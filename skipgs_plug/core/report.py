@@ -92,20 +92,20 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
     ]
     if counted["gaussians_shown"] is not None:
         lines.append(
-            f"  a view shows {100 * counted['gaussians_shown']:.0f} % of the Gaussians: steps are as long for it"
+            f"  each view shows {100 * counted['gaussians_shown']:.0f} % of the Gaussians, which sets the length of steps"
         )
     foresight = counted["foresight"]
     if foresight is not None and not foresight["watched"]:
-        lines.append("  too few views to leave some out and judge by them: the whole share runs")
+        lines.append("  too few views to watch some of them: the whole share runs")
     elif foresight is not None:
         worth = foresight["rest_worth_db"]
-        judged = "not judged" if worth is None else f"worth at most {worth:.2f} dB when last judged"
+        judged = "was not estimated" if worth is None else f"could gain at most {worth:.2f} dB at the last check"
         lines.append(
             f"  {'ended early' if foresight['ended_early'] else 'not ended early'}, in cycle {foresight['cycle'] + 1}; "
-            f"the rest was {judged} (tolerance {config.tolerance} dB), {len(foresight['watched'])} views watched"
+            f"the rest {judged} (tolerance {config.tolerance} dB, {len(foresight['watched'])} views watched)"
         )
     elif config.refine_share == "auto":
-        lines.append("  refinement is too short, or views come up too seldom, to leave out iterations: all of them run")
+        lines.append("  all iterations run: refinement is too short, or views come up too seldom, to leave some out")
     return "\n".join(lines)
 
 

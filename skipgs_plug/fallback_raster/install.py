@@ -59,6 +59,13 @@ def install_as_gsplat() -> Installation:
 
     Raises:
         ImportError: gsplat is not installed.
+
+    Examples:
+        >>> import gsplat
+        >>> from skipgs_plug.fallback_raster import install_as_gsplat, rasterization
+        >>> with install_as_gsplat():
+        ...     gsplat.rasterization is rasterization
+        True
     """
     from .rasterize import rasterization
 

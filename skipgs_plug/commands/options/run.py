@@ -35,7 +35,7 @@ class Args:
     resume_gate: str = "auto"
     """State that the gate continues from: auto (beside the checkpoint that the script loads), off, or a path."""
     no_gate: bool = False
-    """Change nothing in training; skipgs.json then holds the seconds of the ungated run."""
+    """Change nothing in training; skipgs.json then holds the seconds of the trainer's own run."""
     cpu: bool = False
     """Run on the CPU: CUDA requests are redirected, and CUDA modules are served by the CPU rasterizer."""
     command: tyro.conf.Suppress[tuple[str, ...]] = ()

@@ -28,7 +28,7 @@ class Options(TrainConfig):
 class Args:
     """Train a COLMAP, nerfstudio or Blender folder or a packed .npz: the 3DGS recipe, every iteration of it.
 
-    --refine-share 0.4 (or auto) refines in fewer iterations with larger, shrinking steps.
+    --share auto trains in fewer iterations, with larger, shrinking steps.
     """
 
     scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
@@ -41,7 +41,7 @@ class Args:
     """Training iterations; default: 30,000, or with --resume the number of the run. A larger number extends the run."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
     gate: bool = False
-    """Attach the paper's gate. Any of its settings, --refine-share among them, attaches a gate as well."""
+    """Attach the paper's gate. Any gate setting, such as --share auto, attaches a gate too."""
     gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
     resume: bool = False
     """Continue from the last checkpoint in --out, or write the missing files of a finished run."""
