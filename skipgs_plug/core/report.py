@@ -92,7 +92,8 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
     ]
     if counted["gaussians_shown"] is not None:
         lines.append(
-            f"  each view shows {100 * counted['gaussians_shown']:.0f} % of the Gaussians, which sets the length of steps"
+            f"  each view shows {100 * counted['gaussians_shown']:.0f} % of the Gaussians, which decides how long "
+            "steps are"
         )
     foresight = counted["foresight"]
     if foresight is not None and not foresight["watched"]:

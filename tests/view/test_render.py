@@ -157,8 +157,8 @@ def test_a_film_that_cannot_be_written_is_one_sentence(run_folder, tmp_path, cap
     film = tmp_path / "file/film.mp4"
     assert main(["render", str(run_folder), str(film), "--frames", "2", "--no-progress"]) == 2
     assert capfd.readouterr().err.splitlines() == [
-        f"skipgs-plug: {film} cannot be written (File exists): {tmp_path / 'file'} is a file and no folder; "
-        "give another place."
+        f"skipgs-plug: {film} cannot be written (File exists): {tmp_path / 'file'} is a file, not a folder; "
+        "give another path."
     ]
 
 
