@@ -2,30 +2,62 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
+
 from torch import Tensor
 
 from skipgs_plug.commands.options.view import Args
 from skipgs_plug.trainer.exposure import fit_colours
 from skipgs_plug.trainer.scene import View
 from skipgs_plug.view.draw import Painter
-from skipgs_plug.view.model import open_model
+from skipgs_plug.view.model import Model, open_model
 from skipgs_plug.view.page import Page, Splats
+from skipgs_plug.view.web.server import WebPage
+
+
+class Draw:
+    """Renders a model as its photographs show it."""
+
+    def __init__(self, model: Model, backend: str) -> None:
+        self._model, self._painter = model, Painter.of(model, backend)
+
+    def __call__(self, splats: Splats, view: View) -> Tensor:
+        image = self._painter.draw(splats, view.viewmat, view.K, view.width, view.height)[0]
+        if not self._model.exposure:
+            return image
+        # Models know nothing of the exposure of photographs, which they are compared with here.
+        return fit_colours(image, view.image / 255.0, view.mask).clamp(0, 1)
 
 
 def run(args: Args) -> int:
     """Serve the page; see `Args`."""
     model = open_model(args.model, args.scene, args.data_factor)
-    painter = Painter.of(model, args.backend)
+    draw = Draw(model, args.backend)
+    with contextlib.suppress(KeyboardInterrupt):
+        (serve_cameras if args.cameras else serve_model)(model, draw, args)
+    return 0
 
-    def draw(splats: Splats, view: View) -> Tensor:
-        image = painter.draw(splats, view.viewmat, view.K, view.width, view.height)[0]
-        # Models know nothing of the exposure of photographs, which they are compared with here.
-        return fit_colours(image, view.image / 255.0, view.mask).clamp(0, 1) if model.exposure else image
 
+def serve_model(model: Model, draw: Draw, args: Args) -> None:
+    """Serve the last model, compressed, with held-out photographs beside their renders."""
+    splats = model.load(model.snapshots[-1])
+    page = WebPage(model, splats, draw, args.host, args.port)
+    try:
+        print_address(model, args.host, page.port)
+        page.prepare()
+        while True:  # with a timeout, so that Ctrl-C is heard on Windows too
+            threading.Event().wait(0.5)
+    finally:
+        page.stop()
+
+
+def serve_cameras(model: Model, draw: Draw, args: Args) -> None:
+    """Serve every model with its cameras and errors."""
     by_step = {snapshot.step: snapshot for snapshot in model.snapshots}
     steps = [step for step in by_step if step is not None]
     page = Page(model.scene, draw, steps, args.host, args.port)
-    print(f"{model.name}: http://{args.host}:{page.port} (Ctrl-C ends)", flush=True)
+    print_address(model, args.host, page.port)
     shown = object()
     try:
         while True:
@@ -37,7 +69,9 @@ def run(args: Args) -> int:
             else:
                 page.refresh()
             page.wait()
-    except KeyboardInterrupt:
-        return 0
     finally:
         page.stop()
+
+
+def print_address(model: Model, host: str, port: int) -> None:
+    print(f"{model.name}: http://{host}:{port} (Ctrl-C ends)", flush=True)

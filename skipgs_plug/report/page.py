@@ -79,6 +79,9 @@ def unique_names(runs: Sequence[RunSource]) -> dict[str, RunSource]:
 
 def run_section(run: RunSource) -> Section:
     blocks: list[Block] = [results("Results", [run])]
+    # Reports from before iterations could be left out do not say.
+    if run.gate is not None and run.gate.get("refine_share") is not None:
+        blocks += phase_blocks(run.gate, run.curve)
     if run.curve:
         blocks.append(picture(plots.loss_over_time({run.name: run.curve}), "Training loss over iterations."))
         blocks.append(gaussians(run))
@@ -86,8 +89,6 @@ def run_section(run: RunSource) -> Section:
         blocks.append(picture(plots.quality_of_views({run.name: run.views}), "PSNR of held-out views; dashed: mean."))
     blocks += pictured_views(run)
     if run.gate is not None:
-        if run.gate.get("refine_share") is not None:  # reports from before iterations could be left out do not say
-            blocks += phase_blocks(run.gate, run.curve)
         blocks += gate_blocks(run.name, run.gate)
     if run.views:
         names = list(run.views[0])

@@ -27,12 +27,12 @@ BANDS = {0: 0, 3: 1, 8: 2, 15: 3}  # by number of coefficients beyond the consta
 LARGEST_COMPONENT = 252  # alpha of a rotation whose w is the largest; 253 to 255 stand for x, y and z
 MOST_ENTRIES = 1 << 16  # a label has two bytes
 GAUSSIANS_PER_ENTRY = 8
-PAIRS = 5e9  # of Gaussians and entries that are compared once: half a minute on one core
+PAIRS = 5e8  # of Gaussians and entries that are compared once: seconds on one core
 SAMPLES_PER_ENTRY = 16  # that entries are found from
 CHUNK = 4096  # Gaussians that are compared with all entries at once
 
 
-def to_sog(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
+def to_sog(splats: Mapping[str, Tensor], antialiased: bool = False, pairs: float = PAIRS) -> bytes:
     """Return the file of a model with raw parameters, as of `read_ply`; rows are put in the order of space.
 
     Positions are kept to 2**-17 of the extent on a scale that is finer near the origin (`position_error`); opacities
@@ -42,6 +42,7 @@ def to_sog(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
     Args:
         splats: `means scales quats opacities sh0 shN`.
         antialiased: the model compensates opacities for the blur, and wants viewers to do the same.
+        pairs: of Gaussians and entries of the palette that may be compared at once in search of it; fewer are sooner.
     """
     means = splats["means"].detach().cpu().double()
     order = morton_order(means)
@@ -69,7 +70,7 @@ def to_sog(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
     meta["sh0"] = {"codebook": codebook, "files": ["sh0.webp"]}
 
     if bands:
-        palette, labels = _palette(splats["shN"].flatten(1))
+        palette, labels = _palette(splats["shN"].flatten(1), pairs)
         entries, codebook = _levels(palette.reshape(-1, 3))
         rows = -(-len(palette) // ROW)
         padded = np.zeros((rows * ROW, palette.shape[1]), np.uint8)
@@ -129,10 +130,10 @@ def _levels(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
     return np.searchsorted((levels[1:] + levels[:-1]) / 2, values).astype(np.uint8), levels.tolist()
 
 
-def _palette(rows: Tensor) -> tuple[np.ndarray, np.ndarray]:
+def _palette(rows: Tensor, pairs: float) -> tuple[np.ndarray, np.ndarray]:
     """Return entries [K, C] by k-means, and the number of the nearest one to each row [N, C]."""
     n = len(rows)
-    entries = int(min(MOST_ENTRIES, PAIRS // n, max(1, n // GAUSSIANS_PER_ENTRY)))
+    entries = int(max(1, min(MOST_ENTRIES, pairs // n, n // GAUSSIANS_PER_ENTRY)))
     generator = torch.Generator().manual_seed(0)
     sample = rows[torch.randperm(n, generator=generator)[: entries * SAMPLES_PER_ENTRY]]
     palette = sample[:entries].clone()

@@ -63,7 +63,7 @@ def test_a_run_is_shown_with_its_errors_and_checkpoints(run_folder, browser, tmp
     earlier = {name: tensor[:100] for name, tensor in read_ply(folder / "ply/point_cloud_39.ply").items()}
     write_ply(earlier, folder / "ply/point_cloud_19.ply")
     stats = json.loads((folder / "stats/val_step39.json").read_text())
-    with serve(str(folder), "--port", "18411", end=signal.SIGTERM) as url:
+    with serve(str(folder), "--cameras", "--port", "18411", end=signal.SIGTERM) as url:
         browser.open(url)
         # The page is filled in several messages, in any order.
         gaussians = f"{stats['num_GS']:,} Gaussians"
@@ -85,7 +85,7 @@ def test_a_run_is_shown_with_its_errors_and_checkpoints(run_folder, browser, tmp
 
 
 def test_a_ply_is_shown_without_a_scene(ply, browser):
-    with serve(str(ply), "--port", "18431") as url:
+    with serve(str(ply), "--cameras", "--port", "18431") as url:
         browser.open(url)
         wait_until(lambda: "point_cloud_39" in browser.text() and "Gaussians" in browser.text())
         assert "PSNR" not in browser.text()

@@ -12,7 +12,10 @@ from skipgs_plug.commands.options.parse import parse_as
 
 @dataclass
 class Args:
-    """Serve a page with the model, its cameras, and photographs beside renders and errors, until Ctrl-C."""
+    """Serve a page with the model, and held-out photographs beside their renders, until Ctrl-C.
+
+    It opens on phones too: one finger turns, two move; a button changes to flying.
+    """
 
     model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
     """Run folder or PLY."""
@@ -20,6 +23,8 @@ class Args:
     """Scene with the photographs; default: the scene of the run folder. A PLY needs no scene."""
     data_factor: int | None = None
     """Reduction of the photographs; default: as in training."""
+    cameras: bool = False
+    """The page for finding errors: all cameras in space, all models of the run, PSNR of every held-out view."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 lets other machines of the network in."""
     port: int = 8080

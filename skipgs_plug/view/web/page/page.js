@@ -1,0 +1,88 @@
+// The model in the viewer, and a panel with one photograph beside its render.
+const element = (id) => document.getElementById(id);
+
+const fail = (text) => {
+  element('status').textContent = text;
+  element('status').classList.add('failed');
+  element('status').hidden = false;
+};
+
+const start = async () => {
+  const [{ createViewer }, about] = await Promise.all([
+    import('./viewer.js'),
+    fetch('about.json').then((answer) => answer.json()),
+  ]);
+  document.title = about.name;
+  element('name').textContent = about.name;
+  element('count').textContent = `${about.gaussians.toLocaleString('en')} Gaussians`;
+  foldHelpOnPhones();
+  const viewer = await createViewer({
+    container: element('viewer'),
+    settings: about.settings,
+    contentUrl: 'scene.sog',
+    noanim: true,
+    renderer: new URL(location.href).searchParams.has('webgl') ? 'webgl' : 'webgpu',
+  });
+  viewer.state.showAnnotations = false; // cameras of photographs, which the panel goes to
+  viewer.events.on('progress:changed', (share) => {
+    element('status').textContent = `Loading the model, ${share} % …`;
+  });
+  const loaded = () => {
+    viewer.state.cameraMode = 'orbit'; // instead of the viewer's own flight
+    element('status').hidden = true;
+    document.body.dataset.loaded = Math.round(performance.now());
+  };
+  if (viewer.state.loaded) loaded();
+  else viewer.events.once('loaded:changed', loaded);
+  if (about.views.length) panel(viewer, about);
+};
+
+// The viewer's list of controls would cover the model there; its button opens it.
+const foldHelpOnPhones = () => {
+  try {
+    if (innerWidth <= 640 && localStorage.getItem('controlsPanelOpen') === null) {
+      localStorage.setItem('controlsPanelOpen', 'false');
+    }
+  } catch {
+    // Pages in frames may have no storage.
+  }
+};
+
+const panel = (viewer, about) => {
+  let chosen = 0;
+  const kind = about.held_out ? 'held out' : 'trained on';
+  const show = async () => {
+    const asked = chosen;
+    element('title').textContent = `${about.views[asked]} (${asked + 1} of ${about.views.length})`;
+    element('quality').textContent = 'Rendering …';
+    try {
+      const found = await fetch(`compare/${asked}.json`).then((answer) => answer.json());
+      if (asked !== chosen) return; // another one was asked for meanwhile
+      for (const name of ['photograph', 'render', 'error']) element(name).src = found[name];
+      element('gain').textContent = `Error ×${found.gain}`;
+      element('quality').textContent = `PSNR ${found.psnr.toFixed(2)} dB, ${kind}`;
+    } catch {
+      element('quality').textContent = 'The server does not answer.';
+    }
+  };
+  const step = (by) => () => {
+    chosen = (chosen + by + about.views.length) % about.views.length;
+    show();
+  };
+  const toggle = (open) => {
+    element('panel').hidden = !open;
+    element('open').setAttribute('aria-expanded', String(open));
+    if (open) show();
+  };
+  element('open').textContent = about.held_out ? 'Held-out photographs' : 'Photographs';
+  element('open').hidden = false;
+  element('open').addEventListener('click', () => toggle(element('panel').hidden));
+  element('close').addEventListener('click', () => toggle(false));
+  element('previous').addEventListener('click', step(-1));
+  element('next').addEventListener('click', step(1));
+  element('stand').addEventListener('click', () => {
+    if (viewer.state.loaded) viewer.selectAnnotation(chosen);
+  });
+};
+
+start().catch((error) => fail(`This browser cannot show the model (${error.message}); it needs WebGL 2 or WebGPU.`));

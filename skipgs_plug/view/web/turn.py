@@ -1,0 +1,60 @@
+"""Turn and scale a model, with its rotations and spherical harmonics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+DIRECTIONS = 64  # that coefficients are fitted to; degree 3 has 15
+
+
+def upright(up: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """Return the rotation [3, 3] after which `up` is -y, as viewers take it of a PLY, and `ahead` is about z."""
+    down = -up / np.linalg.norm(up)
+    ahead = ahead - (ahead @ down) * down
+    if np.linalg.norm(ahead) < 1e-6:
+        ahead = np.cross(down, [1.0, 0.0, 0.0] if abs(down[0]) < 0.9 else [0.0, 1.0, 0.0])
+    ahead = ahead / np.linalg.norm(ahead)
+    return np.stack([np.cross(down, ahead), down, ahead])
+
+
+@torch.no_grad()
+def turn(splats: Mapping[str, Tensor], rotation: np.ndarray, unit: float) -> dict[str, Tensor]:
+    """Return raw parameters, as of `read_ply`, of the model turned by `rotation` [3, 3], lengths times `unit`."""
+    from scipy.spatial.transform import Rotation
+
+    matrix = torch.from_numpy(rotation).double()
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float32)
+    rest = splats["shN"].float()
+    if rest.shape[1]:
+        rest = torch.einsum("ij,njc->nic", turned_harmonics(matrix, rest.shape[1]).float(), rest)
+    return {
+        "means": (splats["means"].double() @ matrix.T * unit).float(),
+        "scales": splats["scales"].float() + float(np.log(unit)),
+        "quats": splats["quats"].float() @ left.T,
+        "opacities": splats["opacities"].float(),
+        "sh0": splats["sh0"].float(),
+        "shN": rest,
+    }
+
+
+def turned_harmonics(rotation: Tensor, k: int) -> Tensor:
+    """Return the matrix [K, K] that turns K coefficients beyond the constant one, by a rotation [3, 3], float64."""
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(DIRECTIONS, 3, generator=generator, dtype=torch.float64)
+    # The turned colour along d is the colour along the direction that d came from.
+    return torch.linalg.lstsq(basis(directions, k), basis(directions @ rotation, k)).solution
+
+
+def basis(directions: Tensor, k: int) -> Tensor:
+    """Return the K functions beyond the constant one along directions [M, 3], as [M, K]."""
+    from skipgs_plug.fallback_raster.oracle.torch_reference_projection import spherical_harmonics
+
+    degree = round((k + 1) ** 0.5) - 1
+    ones = torch.eye(k + 1, dtype=directions.dtype)[1:, :, None].expand(k, k + 1, 3)
+    columns = [spherical_harmonics(degree, directions, one.expand(len(directions), k + 1, 3))[:, 0] for one in ones]
+    return torch.stack(columns, dim=1)
