@@ -1,8 +1,8 @@
-"""The tensors that autograd saved for a backward: freed when the backward is skipped, not with the next forward.
+"""Tensors that autograd saved for a backward pass, freed when the pass is skipped instead of at the next forward pass.
 
-A backward frees what the forward saved. A skipped one does not, and most trainers hold `loss` and `image` until the
-next forward is done, so that for as long there are two graphs: 41 % more memory at the peak in a model of Inria's
-sizes. PyTorch's hooks for saved tensors give each an intermediate object; at a skip these are emptied.
+A backward pass frees the tensors that the forward pass saved; a skipped one does not. Most trainers hold `loss` and
+`image` until the next forward pass is done, so two graphs exist at once: 41 % more memory at the peak in a model of
+Inria's sizes. PyTorch's hooks for saved tensors wrap each tensor in an object, which is emptied at a skip.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """All photographs placed at once (global structure from motion, GLOMAP), in a process of its own.
 
-While pycolmap does that it looks at no signal, and where it finds a defect it ends the process. Run as a module, this
-file is the program of that process: it prints a line whenever one of its `STAGES` is done.
+pycolmap handles no signals during global mapping, and ends the process when it finds a defect. Run as a module, this
+file is the program of that process. It prints a line when one of its `STAGES` is done.
 """
 
 from __future__ import annotations

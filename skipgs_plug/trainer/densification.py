@@ -1,9 +1,9 @@
 """Densification that moves every row once.
 
-gsplat's strategy clones, splits and prunes one after the other, and each of these copies all parameters and both of
-their moments; putting rows in the order of space copies them once more. Here the strategy works on what it decides by,
-beside the numbers of the rows, and everything else follows these numbers at the end, into memory that gradients leave
-free. With 110,000 Gaussians that takes a third of the time.
+gsplat's strategy clones, splits and prunes one after the other. Each of the three copies all parameters and both of
+their moments, and sorting rows in space copies them once more. Here the strategy works only on the parameters that it
+decides by and on row numbers. All other tensors follow these numbers at the end, into memory that the gradients have
+freed. With 110,000 Gaussians that takes a third of the time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Coordinates of training: the dataset's, moved to the origin and scaled where float32 needs it.
 
-float32 tells 500,000.0 from 500,000.03 and nothing between, so a scene in coordinates of a map is a blur of half a
-metre; and recipes hold absolute constants, so a scene in an odd unit trains otherwise. Both are undone in float64.
+Near 500,000, float32 has steps of 0.03, so a scene in coordinates of a map would be blurred. The recipe also holds
+absolute constants, so a scene in an odd unit would train differently. Both are undone in float64.
 """
 
 from __future__ import annotations

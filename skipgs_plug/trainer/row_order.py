@@ -1,9 +1,9 @@
 """The order of the Gaussians' rows: neighbours in space are neighbours in memory.
 
-A camera sees part of a scene. The CPU rasterizer leaves out 16 rows at a time that lie outside its view, and what it
-gathers for a tile lies close together, when rows follow a Morton curve (Morton 1966) through space. Densification
-appends rows; from time to time all are put in order again, with the state of optimizers and strategy. So training
-begins with another order than that of the points, and PLY files and checkpoints hold the rows as training has them.
+A camera sees part of a scene. When rows follow a Morton curve (Morton 1966) through space, the CPU rasterizer can leave
+out 16 rows at a time that lie outside the view, and the rows of a tile lie close together in memory. Densification
+appends rows, so all rows are sorted again from time to time, with the state of optimizers and strategy. Training
+therefore begins with another order than that of the points, and PLY files and checkpoints hold the sorted rows.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""SSIM as torchmetrics 1.9 computes it by default: its results, without its import.
+"""SSIM with the results of torchmetrics 1.9, without importing it.
 
-Its package brings SciPy's signal processing and matplotlib, which take longer to load than an evaluation does.
+torchmetrics loads SciPy's signal processing and matplotlib, which takes longer than an evaluation.
 """
 
 from __future__ import annotations

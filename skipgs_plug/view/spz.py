@@ -1,8 +1,8 @@
 """SPZ: the compressed format of Niantic that phones, glTF and web viewers read; about 20 bytes per Gaussian.
 
-Version 2 is written, which every reader knows; 1 to 3 are read. Made from the description at
-github.com/nianticlabs/spz. Its axes are right, up, back; those of a 3DGS model are right, down, front, so y and z
-change their signs, and with them rotations and spherical harmonics.
+Version 2 is written, which every reader knows; versions 1 to 3 are read. Written from the description at
+github.com/nianticlabs/spz. Its axes are right, up, back, and those of a 3DGS model are right, down, front. So y and z
+change their signs, and rotations and spherical harmonics change with them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """COLMAP's text models, as other programs write them.
 
-pycolmap ends a name at its first space, and takes every second line of images.txt for observations, also where a
-program left these lines out. Here both are read for what they are, and the model is handed to pycolmap without
-observations, which nothing here uses.
+pycolmap ends a name at its first space, and reads every second line of images.txt as observations, even if a program
+left these lines out. Here both are read correctly, and the model is passed to pycolmap without observations, which the
+package does not use.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """The one place that loads pycolmap: after Pillow, and without its handler of SIGTERM.
 
-On Linux pycolmap brings a zlib whose functions Pillow's own are then bound to, some of them: after `import pycolmap`
-the first PNG that Pillow writes ends the process (deflateEnd frees what another deflateInit allocated). With Pillow
-loaded first, both work.
+On Linux pycolmap brings its own zlib, and Pillow is then bound to some of its functions: after `import pycolmap`, the
+first PNG that Pillow writes ends the process (deflateEnd frees memory of another deflateInit). When Pillow is loaded
+first, both work.
 
-Its logging library answers SIGTERM with a stack trace of the process; what Python had in place comes back.
+pycolmap's logging library answers SIGTERM with a stack trace of the process; Python's handler is put back.
 """
 
 from __future__ import annotations
