@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from skipgs_plug.adapters.inria import InriaFamily
 
 
@@ -21,3 +24,7 @@ class AbsGS(InriaFamily):
     stand_ins = "absgs"
     mark = "use_prune_weight"
     calls = ("reduce_opacity", "initial_prune")
+
+    def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
+        # The loop counts its views when it takes the first one.
+        self.known_names["img_num"] = len(loop["scene"].getTrainCameras())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from skipgs_plug.adapters.inria import InriaFamily
@@ -13,7 +13,8 @@ class GaussianSpa(InriaFamily):
 
     That phase ends with a prune, in the last iteration before the gate begins. A gate that is started
     earlier by hand runs every iteration whose loss holds the ADMM term, and keeps it out of the means.
-    Iterations are counted, since `update_learning_rate` is called with shifted numbers.
+    Iterations are counted, since `update_learning_rate` is called with shifted numbers. With `share` the phase runs
+    whole: its terms pull at the model, and the iterations between them pull back.
     """
 
     name = "gaussianspa"
@@ -32,15 +33,21 @@ class GaussianSpa(InriaFamily):
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
         self._admm = range(0)  # iterations whose loss holds the term
+        self._phase = range(0)
 
     def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
         first, last = int(opt.optimizing_spa_start_iter) + 1, int(opt.optimizing_spa_stop_iter)
         interval = int(opt.optimizing_spa_interval)
         # The scripts disagree on whether the last of these carries the term; it is run either way.
         self._admm = range(first + -first % interval, last + 1, interval)
+        self._phase = range(first - 1, last + 1)
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return max(int(opt.optimizing_spa_stop_iter) + 1, int(opt.densify_until_iter))
+
+    def always_run(self, numbers: range) -> Iterable[int]:
+        """Those of the sparsifying phase."""
+        return (n for n in numbers if n in self._phase)
 
     def must_run(self, step: int) -> bool:
         return step in self._admm

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import ast
+import math
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from skipgs_plug.adapters.inria import InriaFamily
 from skipgs_plug.core.facts import Densification
+from skipgs_plug.core.hooks import Hooks
 
 ACCUMULATES_FROM = 20_000  # train.py has this number in it
+PRUNED = "prune_iter"  # the loop's variable for the iteration of the final prune
 
 
 class GNS(InriaFamily):
@@ -16,6 +20,8 @@ class GNS(InriaFamily):
 
     The final prune may come earlier, as soon as few enough are left. Both optimizers step every 5th and later every
     20th iteration. They are called in skipped iterations too, where they may have gradients of earlier ones to apply.
+    With `share` the selection runs whole: its term would act alone where iterations between are left out. Some time
+    after the final prune the loop lowers the opacities' rate again, in an iteration that only that prune shows.
     """
 
     name = "gns"
@@ -32,9 +38,35 @@ class GNS(InriaFamily):
     stand_ins = "improved_gs"
     mark = "update_opacity_lr"
     densification = Densification(marks=("densification_interval",), needs="nothing")
-    structural = (*InriaFamily.structural, "only_prune", "final_prune")
-    calls = ("add_densification_stats_abs", "densify_and_prune_Improved", "update_opacity_lr")
+    structural = (*InriaFamily.structural, "only_prune")
+    calls = ("add_densification_stats_abs", "final_prune", "densify_and_prune_Improved", "update_opacity_lr")
     arguments = ("pixel_weights",)
+
+    def __init__(self, trainer: Any = None) -> None:
+        super().__init__(trainer)
+        self._selection: list[range] = []
+
+    def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
+        self.known_names[PRUNED] = math.inf  # the condition never holds: the final prune requires its iteration
+        if self._fast:
+            self._selection = [range(int(opt.s1), int(opt.e1) + 1), range(int(opt.s2), int(opt.e2) + 1)]
+        elif opt.prune_reg:
+            self._selection = [range(int(opt.reg_start), int(opt.reg_end) + 1)]
+
+    def always_run(self, numbers: range) -> Iterable[int]:
+        """Those of the selection."""
+        return (n for n in numbers if any(n in one for one in self._selection))
+
+    def _attach_to_model(self, hooks: Hooks, names: dict[str, Any]) -> None:
+        super()._attach_to_model(hooks, names)
+
+        def pruned(*args: Any, **kwargs: Any) -> None:
+            hooks.event("final_prune")
+            syntax = None if self._code is None else self._code.syntax
+            for delay in () if syntax is None else delays(syntax):
+                hooks.require(self._step + delay)
+
+        hooks.before(names["GaussianModel"], "final_prune", pruned)
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         if self._fast:
@@ -51,3 +83,11 @@ class GNS(InriaFamily):
     def _fast(self) -> bool:
         """Whether the script is train-fast.py, which has two shorter selections of its own."""
         return self._code is not None and "s2" in self._code.used
+
+
+def delays(loop: ast.FunctionDef) -> Iterable[int]:
+    """Iterations after the final prune in which something happens: `iteration == prune_iter + 1000`."""
+    for node in ast.walk(loop):
+        match node:
+            case ast.BinOp(ast.Name(name), ast.Add(), ast.Constant(int(delay))) if name == PRUNED:
+                yield delay

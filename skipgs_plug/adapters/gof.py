@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.core.facts import Densification
 
 
 class GOF(InriaFamily):
@@ -22,3 +23,5 @@ class GOF(InriaFamily):
     mark = "depth_normal_from_iter"
     calls = ("compute_3D_filter", "get_apperance_embedding")
     arguments = ("kernel_size",)
+    # Its pictures for inspection come every `densification_interval` as well.
+    densification = Densification(marks=("iteration > opt.densify_from_iter",))

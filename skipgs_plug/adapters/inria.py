@@ -46,6 +46,7 @@ class InriaFamily(AbstractAdapter):
             noise, methods that change a tensor in place.
         arguments: arguments of the renderer that the adapter knows, beyond Inria's.
         densification: how its densification events are told; None if growth must run whole.
+        known_names: values of names that the loop assigns, where they are known before it; filled by `begin`.
     """
 
     mark: ClassVar[str] = ""
@@ -64,6 +65,7 @@ class InriaFamily(AbstractAdapter):
         self._label = "image_name"  # attribute of a camera that names its view
         self._code: LoopCode | None = None
         self._drift: DriftCheck
+        self.known_names: dict[str, Any] = {}
         self._strange = Unrecognised(*5 * (frozenset(),))
 
     @classmethod
@@ -116,7 +118,10 @@ class InriaFamily(AbstractAdapter):
         return f"{code.place} does more than {self.checked.partition(' (')[0]}, which adapter {self.name!r} is for"
 
     def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
-        """Keep what later answers need of a run, which begins now; arguments as for `start_iter`."""
+        """Keep what later answers need of a run, which begins now; arguments as for `start_iter`.
+
+        Called once more before the loop's conditions are read, where `loop` has no iteration yet.
+        """
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         """First iteration that may be skipped: by default the first one that does not densify.
@@ -230,7 +235,13 @@ class InriaFamily(AbstractAdapter):
     def _attach_to_loop(self, hooks: Hooks, script: dict[str, Any]) -> None:
         """Hold on to the loop's backward and to its range."""
         hooks.gate_tensor_backward(LOOP)
-        hooks.loop(script, LOOP, always=self.always_run, densification=self.densification)
+        hooks.loop(script, LOOP, always=self.always_run, densification=self.densification, known=self._known)
+
+    def _known(self, names: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Read the run before its conditions are read: the loop of a resumed one asks before its first iteration."""
+        if "opt" in names:
+            self.begin(names["opt"], names)
+        return self.known_names
 
     def always_run(self, numbers: range) -> Iterable[int]:
         """Those of these iterations on whose number something hangs that the loop itself does not say."""

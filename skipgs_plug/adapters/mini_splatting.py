@@ -11,6 +11,9 @@ from skipgs_plug.adapters.inria import InriaFamily
 class MiniSplatting(InriaFamily):
     """Both simplifications change the model after the backward of their iteration, and make a new optimizer.
 
+    What views show blurred is gathered beside the gradients, and waits for the next event as they do. Points are made
+    anew from depths every 5,000 iterations, in as many as ever.
+
     Iterations are counted, since `update_learning_rate` is called with shifted numbers.
     """
 
@@ -24,7 +27,6 @@ class MiniSplatting(InriaFamily):
     left_alone = "Scores and depths for pruning are rendered without gradients and always run."
     stand_ins = "gaussianspa"
     mark = "num_depth"
-    densification = None  # its loop gathers more between events than means over visits
     renders = ("render_imp",)
     structural = (*InriaFamily.structural, "reinitial_pts")
     calls = ("densify_and_prune_split",)

@@ -11,7 +11,8 @@ from skipgs_plug.adapters.inria import InriaFamily
 class MiniSplatting2(InriaFamily):
     """Half-way between its second simplification and the end all culled Gaussians return to their views.
 
-    Losses change there, so the gate begins after it.
+    Losses change there, so the gate begins after it. Clones by importance every 250 iterations, which read no
+    statistics of the loop, run as often as ever.
     """
 
     name = "mini_splatting2"
@@ -23,7 +24,6 @@ class MiniSplatting2(InriaFamily):
     )
     left_alone = "Its sparse Adam has no gradients in skipped iterations. Needs CUDA: its culling has no stand-in."
     mark = "depth_reinit"
-    densification = None  # its loop gathers more between events than means over visits
     renders = ("render_imp",)
     structural = (*InriaFamily.structural, "reinitial_pts", "init_culling")
     calls = (

@@ -24,9 +24,12 @@ class PerceptualGS(InriaFamily):
     left_alone = "Renders of sensitivity and alpha are of the same view, and belong to its loss."
     stand_ins = "gaussianspa"
     mark = "get_sensitivity"
-    densification = None  # its loop gathers more between events than means over visits
     structural = (*InriaFamily.structural, "reinitial_pts")
     calls = ("get_alpha", "get_sensitivity")
+
+    def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
+        if all(getattr(camera, "alpha", None) is None for camera in loop["scene"].getTrainCameras()):
+            self.known_names["gt_alpha"] = None
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter) + 1

@@ -21,7 +21,7 @@ from skipgs_plug.core.errors import (
 )
 from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.intercept import Around, Patches, intercept_tensor_backward
-from skipgs_plug.core.pace.base import Always, nothing_always
+from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_known
 from skipgs_plug.core.pace.loop_range import LoopRange, replace_range
 from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.rates import Named
@@ -205,6 +205,7 @@ class Hooks:
         always: Always | None = None,
         pure: Iterable[str] = (),
         densification: Densification | None = None,
+        known: Known | None = None,
     ) -> None:
         """The training loop counts with `range` in one of these functions: iterations can be left out there.
 
@@ -217,15 +218,24 @@ class Hooks:
                 in functions that the loop calls.
             pure: Functions that only look at numbers, and may stand in the loop's conditions.
             densification: How its densification events are told, where `ready` comes after the loop has begun.
+            known: Is given all that the loop's function has names for, right before its conditions are read; gives the
+                values of names that the loop assigns, where they are known before.
         """
         pace = self._engine.pace
         if isinstance(pace, Phased):
-            pace.describe(always or nothing_always, pure, densification)
+            pace.describe(always or nothing_always, pure, densification, known or nothing_known)
             replace_range(self._patches, names, functions, pace)
 
     def always(self, always: Always) -> None:
         """Iterations that must run, as for `loop`, where the loop is the user's own."""
         self._engine.pace.describe(always)
+
+    def require(self, number: int) -> None:
+        """Iteration `number` must run, which is only known now: a condition of the loop waits for what just happened.
+
+        A condition that waits like this is to be given a value by which it never holds; see `known` of `loop`.
+        """
+        self._engine.pace.require(number)
 
     def optimizer_names(self, named: Named) -> None:
         """`named` gives the trainer's optimizers by name, which tell parameters apart where groups have no names.

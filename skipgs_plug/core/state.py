@@ -123,6 +123,7 @@ class PaceState(TypedDict):
     last: int | None
     keeps_rates: bool
     next: int | None
+    required: list[int]
     refining: RefiningState
     growing: GrowingState | None
 

@@ -13,12 +13,18 @@ from skipgs_plug.core.policy import Policy, SkipPolicy
 
 Source = tuple[CodeType, Mapping[str, Any]]  # code of the function that holds a loop, and the names that it knew
 Always = Callable[[range], Iterable[int]]
+Known = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 NAMED = "named for this trainer"  # reason of iterations that must run and that no condition of the loop names
 
 
 def nothing_always(numbers: range) -> Iterable[int]:
     """Return that only iterations named by the loop's own conditions must run."""
     return ()
+
+
+def nothing_known(names: Mapping[str, Any]) -> Mapping[str, Any]:
+    """No name that the loop assigns has a value that is known before."""
+    return {}
 
 
 class Pace:
@@ -81,6 +87,7 @@ class Pace:
         always: Always = nothing_always,
         pure: Iterable[str] = (),
         densification: Densification | None = None,
+        known: Known = nothing_known,
     ) -> None:
         """Take facts that the loop's source does not show.
 
@@ -88,7 +95,12 @@ class Pace:
             always: Gives further iterations that must run.
             pure: Functions that only look at numbers, and may stand in the loop's conditions.
             densification: How its densification events are told; None if `configure` says it, or nobody knows.
+            known: Is given all that the loop's function has names for, right before the loop's conditions are read;
+                gives the values of names that the loop assigns, where they are known before.
         """
+
+    def require(self, number: int) -> None:
+        """Iteration `number` must run, which is only known now."""
 
     @property
     def leaves_out(self) -> bool:

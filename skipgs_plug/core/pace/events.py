@@ -46,6 +46,12 @@ class Events:
     def __len__(self) -> int:
         return len(self._numbers)
 
+    @property
+    def end(self) -> int | None:
+        """Iteration at which one more event would follow the last one in the trainer's own schedule; None if there is
+        no event."""
+        return self._numbers[-1] + self._distance(self._numbers[-1]) if self._numbers else None
+
     def ran(self, number: int) -> None:
         """An iteration runs, with its event if it has one."""
         if number in self._known:

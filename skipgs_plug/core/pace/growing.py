@@ -88,9 +88,9 @@ class Growing:
         for reason, hits in found.items():
             if any(mark in reason for mark in marks):
                 events |= hits
-            else:
+            elif hits:
                 others[reason] = hits
-        if not events and marks:
+        if marks and not any(mark in reason for reason in found for mark in marks):
             return False
         self.always = {**others, NAMED: hidden} if hidden else others
         self.events = Events(events, densification)
@@ -103,9 +103,14 @@ class Growing:
         self._must = frozenset(hidden).union(*rare, *(hits - events for hits in common))
         if self._first_number is None:
             self._first_number = numbers.start
-        self._length = numbers.stop - self._first_number
+        # Prunes and selections after the last event need no more iterations than these.
+        self._length = min(numbers.stop, self.events.end or numbers.stop) - self._first_number
         self._epoch = epoch or self._epoch
         return True
+
+    def require(self, number: int) -> None:
+        """Iteration `number` must run, which is only known now."""
+        self._must |= {number}
 
     def runs(self, number: int) -> bool:
         """Whether iteration `number` runs; asked once for each, in order."""
@@ -114,7 +119,7 @@ class Growing:
         assert self.share is not None
         must, barred = number in self._must, False
         if number in self.events and not must:
-            must = self.events.enough(number, self._shown) and not self._full()
+            must = (self.share >= 1.0 or self.events.enough(number, self._shown)) and not self._full()
             barred = not must
         self.sampling.share = self.share
         runs = self.sampling.runs(must, barred)

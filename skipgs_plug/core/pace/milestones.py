@@ -18,6 +18,7 @@ from types import CodeType
 from typing import Any, NamedTuple
 
 from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.pace.settled import Settled
 
 SAFE = frozenset({"abs", "bool", "int", "len", "max", "min", "round"})
 # Methods by which lists, sets and queues change: their object differs in the next iteration.
@@ -30,7 +31,7 @@ class _Leaf(NamedTuple):
     """A part of a condition that is no `and`, `or` or `not`.
 
     Attributes:
-        code: Evaluated with the number; None if the part does not depend on it, or cannot be evaluated ahead.
+        code: Evaluated, with the number where it stands in the part; None if the value is not known.
         unforeseeable: it depends on the number and on what only happens in the loop.
     """
 
@@ -52,6 +53,7 @@ class Condition:
         self._test = test
         self._path = path
         self._leaves: dict[int, _Leaf] = {}
+        self._ordered: dict[int, list[ast.expr]] = {}
 
     def numbers(self, numbers: range, names: Mapping[str, Any]) -> set[int]:
         """Return the numbers for which the condition takes the rarer of its two branches, whatever else it depends on.
@@ -74,7 +76,7 @@ class Condition:
     def _value(self, node: ast.expr, values: dict[str, Any], assumed: bool) -> bool:
         if isinstance(node, ast.BoolOp):
             combine = all if isinstance(node.op, ast.And) else any
-            return combine(self._value(part, values, assumed) for part in node.values)
+            return combine(self._value(part, values, assumed) for part in self._parts(node))
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
             return not self._value(node.operand, values, not assumed)
         leaf = self._leaf(node)
@@ -82,7 +84,7 @@ class Condition:
             raise SkipGSError(
                 f"Line {self.line} of {self._loop.file} has a condition on the iteration's number that cannot be "
                 f"evaluated ahead ({self.text}), so an iteration that it needs could be left out; use the gate "
-                "without a share, or name the iterations that must run (always=)."
+                "without a share, or name the iterations that must run (--always, always=)."
             )
         if leaf.code is None:
             return assumed
@@ -90,6 +92,14 @@ class Condition:
             return bool(eval(leaf.code, values))
         except Exception:  # a name that is not bound yet, a number of another kind
             return assumed
+
+    def _parts(self, node: ast.BoolOp) -> list[ast.expr]:
+        """The parts of an `and` or `or`, those last that cannot be foreseen: others may decide without them."""
+        found = self._ordered.get(id(node))
+        if found is None:
+            found = sorted(node.values, key=lambda part: any(self._leaf(leaf).unforeseeable for leaf in _leaves(part)))
+            self._ordered[id(node)] = found
+        return found
 
     def _is_tested(self, node: ast.expr) -> bool:
         """Whether a part is one of the condition itself, not of those around it, and picks single numbers."""
@@ -103,12 +113,29 @@ class Condition:
 
 
 class _Loop:
-    """One `for` statement of a function, whose target is the iteration's number."""
+    """One `for` statement of a function, whose target is the iteration's number.
 
-    def __init__(self, statement: ast.For, file: str, first_line: int, pure: frozenset[str]) -> None:
+    Args:
+        statement: The loop.
+        around: What it stands in: the function, or the module.
+        code: Of that.
+        names: What it has names for before the loop, and names that the loop gives a value which is known.
+        known: Which names these are.
+        pure: Functions that only look at numbers.
+    """
+
+    def __init__(
+        self,
+        statement: ast.For,
+        around: ast.AST,
+        code: CodeType,
+        names: Mapping[str, Any],
+        known: Iterable[str],
+        pure: frozenset[str],
+    ) -> None:
         assert isinstance(statement.target, ast.Name)
         self.target = statement.target.id
-        self.file, self.first_line = file, first_line
+        self.file, self.first_line = code.co_filename, _first_line(code)
         self._pure = pure | SAFE
         parts = [node for one in statement.body for node in ast.walk(one)]
         own = {id(name) for node in parts if isinstance(node, ast.comprehension) for name in ast.walk(node.target)}
@@ -119,23 +146,27 @@ class _Loop:
         ]
         called = [node.func for node in parts if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
         self._counters = {text for text in _counted(statement.body) if stored.count(text) == 1}
-        self._changing = {*stored, *(ast.unparse(method.value) for method in called if method.attr in CHANGES)}
+        changed = {*stored, *(ast.unparse(method.value) for method in called if method.attr in CHANGES)}
+        self._changing = changed.difference(known)
+        self._settled = Settled(code, around, names, self._changing | {self.target}, self._pure)
+        self._names = names
         self.body = self._spelled_out(statement.body, stored)
 
     def _spelled_out(self, body: list[ast.stmt], stored: list[str]) -> list[ast.stmt]:
-        """Replace names and attributes that stand for something of the number: `epoch_step = step % len(views)`."""
+        """Replace names and attributes that stand for something of the number, `epoch_step = step % len(views)`, or
+        for an option, `end = args.end`."""
         for index in range(len(_assigned(body))):
             place, value = _assigned(body)[index]  # what came before it is spelled out in it
             text = ast.unparse(place)
             if not isinstance(place, (ast.Name, ast.Attribute)) or stored.count(text) != 1:
                 continue
-            if self.mentions(value) and not self.leaf(value).unforeseeable:
+            if value in self._settled or (self.mentions(value) and not self.leaf(value).unforeseeable):
                 body = [_Inline(text, value, place.lineno).visit(copy.deepcopy(one)) for one in body]
         return body
 
     def leaf(self, node: ast.expr) -> _Leaf:
         if not self.mentions(node):
-            return _Leaf(None, False)
+            return _Leaf(self._compiled(node) if node in self._settled else None, False)
         inner = {
             name.id
             for part in ast.walk(node)
@@ -148,7 +179,10 @@ class _Loop:
         impure = any(not isinstance(call.func, ast.Name) or call.func.id not in self._pure for call in calls)
         if impure or places & self._changing:
             return _Leaf(None, True)
-        return _Leaf(compile(ast.Expression(node), self.file, "eval"), False)
+        return _Leaf(self._compiled(node), False)
+
+    def _compiled(self, node: ast.expr) -> CodeType:
+        return compile(ast.Expression(node), self.file, "eval")
 
     def mentions(self, node: ast.AST) -> bool:
         """Whether the number stands in this part of the source."""
@@ -162,12 +196,19 @@ class _Loop:
 
     def counted_by_itself(self) -> Iterator[ast.expr]:
         """All conditions on what the loop counts up by itself, which stands still where an iteration is left out."""
-        for test, _ in _tests(self.body, []):
+        for test, path in _tests(self.body, []):
+            if any(self._is_off(outer) for outer in path):
+                continue
             for leaf in _leaves(test):
                 read = {ast.unparse(part) for part in ast.walk(leaf) if isinstance(part, _PLACE)}
                 picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and _is_point(leaf)
                 if picks and read & self._counters and not self.mentions(leaf):
                     yield leaf
+
+    def _is_off(self, test: ast.expr) -> bool:
+        """Whether an option that is off keeps this condition from ever holding."""
+        parts = test.values if isinstance(test, ast.BoolOp) and isinstance(test.op, ast.And) else [test]
+        return any(part in self._settled and not eval(self._compiled(part), dict(self._names)) for part in parts)
 
     def lists(self) -> Iterator[ast.expr]:
         """What is handed on together with the number, where it may be a list of iterations."""
@@ -226,7 +267,12 @@ class _Inline(ast.NodeTransformer):
 
 
 def milestones(
-    code: CodeType, line: int, numbers: range, names: Mapping[str, Any], pure: Iterable[str] = ()
+    code: CodeType,
+    line: int,
+    numbers: range,
+    names: Mapping[str, Any],
+    pure: Iterable[str] = (),
+    known: Mapping[str, Any] | None = None,
 ) -> dict[str, set[int]]:
     """Return the iterations that must run, by the condition that names them.
 
@@ -236,9 +282,11 @@ def milestones(
         numbers: Iterations that may be left out.
         names: What the function had names for before its loop began.
         pure: Functions that only look at numbers, and may stand in conditions.
+        known: Values of names that the loop assigns, where they are known before it.
 
     Returns:
-        By "line N: condition", or "line N: list" of iterations that is handed to a function with the number.
+        By "line N: condition", or "line N: list" of iterations that is handed to a function with the number. Of a
+        condition that holds for none of the numbers there are none.
 
     Warns:
         RuntimeWarning: A condition is on what the loop counts by itself, and comes less often for each number left out.
@@ -246,7 +294,9 @@ def milestones(
     Raises:
         SkipGSError: The source cannot be read, has no loop, or a condition cannot be evaluated ahead.
     """
-    loop = _loop_at(code, line, frozenset(pure))
+    known = known or {}
+    names = {**names, **known}
+    loop = _loop_at(code, line, names, known, frozenset(pure))
     for leaf in loop.counted_by_itself():
         warnings.warn(
             f"Line {loop.first_line + leaf.lineno - 1} of {loop.file} ({ast.unparse(leaf)}) counts the iterations "
@@ -257,8 +307,7 @@ def milestones(
     found: dict[str, set[int]] = {}
     for condition in loop.conditions():
         hits = condition.numbers(numbers, names)
-        if hits:
-            found.setdefault(f"line {condition.line}: {condition.text}", set()).update(hits)
+        found.setdefault(f"line {condition.line}: {condition.text}", set()).update(hits)
     for node in loop.lists():
         try:
             value = eval(compile(ast.Expression(node), loop.file, "eval"), dict(names))
@@ -278,7 +327,12 @@ def _is_list(value: Any) -> bool:
     return isinstance(value, (list, tuple, set, frozenset)) and all(isinstance(entry, Integral) for entry in value)
 
 
-def _loop_at(code: CodeType, line: int, pure: frozenset[str]) -> _Loop:
+def _first_line(code: CodeType) -> int:
+    """Line of the file that is the first one of this code's source."""
+    return code.co_firstlineno if code.co_flags & inspect.CO_NEWLOCALS else 1
+
+
+def _loop_at(code: CodeType, line: int, names: Mapping[str, Any], known: Iterable[str], pure: frozenset[str]) -> _Loop:
     function = code.co_flags & inspect.CO_NEWLOCALS
     try:
         # Of a module, getsource gives what stands before its first function alone.
@@ -287,9 +341,9 @@ def _loop_at(code: CodeType, line: int, pure: frozenset[str]) -> _Loop:
     except (OSError, TypeError, SyntaxError) as error:
         raise SkipGSError(
             f"The source of {code.co_name}() in {code.co_filename} cannot be read ({error}), so it cannot be known "
-            "which iterations must run; gate without refine_share, or name them (always=)."
+            "which iterations must run; gate without share and refine_share, or name them (--always, always=)."
         ) from error
-    first = code.co_firstlineno if function else 1
+    first = _first_line(code)
     for node in ast.walk(tree):
         # Loops inside and around it do not stand there.
         if (
@@ -297,7 +351,7 @@ def _loop_at(code: CodeType, line: int, pure: frozenset[str]) -> _Loop:
             and isinstance(node.target, ast.Name)
             and node.lineno <= line - first + 1 <= (node.iter.end_lineno or node.lineno)
         ):
-            return _Loop(node, code.co_filename, first, pure)
+            return _Loop(node, tree, code, names, known, pure)
     raise SkipGSError(
         f"Line {line} of {code.co_filename} is not in a loop over one number; "
         "write the loop as: for step in gate.iterations(range(...))."
@@ -312,7 +366,8 @@ def _tests(body: list[ast.stmt], path: list[ast.expr]) -> Iterator[tuple[ast.exp
         if isinstance(statement, (ast.If, ast.While)):
             yield statement.test, path
             yield from _tests(statement.body, [*path, statement.test])
-            yield from _tests(statement.orelse, [*path, ast.UnaryOp(ast.Not(), statement.test)])
+            otherwise = ast.copy_location(ast.UnaryOp(ast.Not(), statement.test), statement.test)
+            yield from _tests(statement.orelse, [*path, otherwise])
             continue
         if isinstance(statement, ast.Match):
             for part in (part for case in statement.cases for part in ast.walk(case.pattern)):

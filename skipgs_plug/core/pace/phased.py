@@ -9,7 +9,7 @@ from typing import Any
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError, warn_of_release
 from skipgs_plug.core.facts import Densification, TrainerFacts
-from skipgs_plug.core.pace.base import NAMED, Always, Pace, Source, nothing_always
+from skipgs_plug.core.pace.base import NAMED, Always, Known, Pace, Source, nothing_always, nothing_known
 from skipgs_plug.core.pace.growing import Growing
 from skipgs_plug.core.pace.loop_finder import LoopFinder
 from skipgs_plug.core.pace.loop_range import LoopRange, line_of, require_planned
@@ -49,6 +49,8 @@ class Phased(Pace):
         self._hidden: Always = nothing_always
         self._chosen = frozenset(config.always or ())
         self._pure: tuple[str, ...] = ()
+        self._known: Known = nothing_known
+        self._required: set[int] = set()
         self._conditions: tuple[dict[str, set[int]], dict[str, set[int]]] | None = None  # of both phases
         self._left_out = 0
         self._attached = False  # by an adapter
@@ -71,9 +73,16 @@ class Phased(Pace):
         always: Always = nothing_always,
         pure: Iterable[str] = (),
         densification: Densification | None = None,
+        known: Known = nothing_known,
     ) -> None:
-        self._hidden, self._pure, self._densification = always, tuple(pure), densification
+        self._hidden, self._pure, self._densification, self._known = always, tuple(pure), densification, known
         self._attached = True
+
+    def require(self, number: int) -> None:
+        self._required.add(number)
+        self.refining.require(number)
+        if self.growing is not None:
+            self.growing.require(number)
 
     def follow(
         self,
@@ -194,22 +203,24 @@ class Phased(Pace):
         found: list[dict[str, set[int]]] = [{}, {}]
         if loop.source is not None and self._config.always is None:
             code, names = loop.source
-            line = line_of(code)
+            line, known = line_of(code), self._known(names)
             found = [
-                milestones(code, line, numbers, names, self._pure) if numbers else {} for numbers in (grown, refined)
+                milestones(code, line, numbers, names, self._pure, known) if numbers else {}
+                for numbers in (grown, refined)
             ]
         elif self._conditions is not None:
             found = list(self._conditions)  # of this loop, in which a state is loaded
         loop.source = None
-        hidden = {n for n in (*self._hidden(refined), *self._chosen) if n in refined}
+        hidden = {n for n in (*self._hidden(refined), *self._chosen, *self._required) if n in refined}
         if hidden:
             found[1][NAMED] = hidden
         self._conditions = found[0], found[1]
         epoch = self._epoch or (None if self._views is None else len(self._views))
-        self.refining.begin(self._last, found[1], self._views, epoch, self._keeps_rates)
+        held = {reason: hits for reason, hits in found[1].items() if hits}
+        self.refining.begin(self._last, held, self._views, epoch, self._keeps_rates)
         if self.growing is not None and grown:
             assert self._densification is not None
-            hidden = {n for n in (*self._hidden(grown), *self._chosen) if n in grown}
+            hidden = {n for n in (*self._hidden(grown), *self._chosen, *self._required) if n in grown}
             if not self.growing.begin(grown, found[0], hidden, self._densification, epoch):
                 marks = ", ".join(self._densification.marks)
                 self._grow_whole(f"No condition of the loop that names {marks} holds before iteration {self._start}")
@@ -254,6 +265,7 @@ class Phased(Pace):
             "last": self._last,
             "keeps_rates": self._keeps_rates,
             "next": self._finder.expected,
+            "required": sorted(self._required),
             "refining": self.refining.state_dict(),
             "growing": None if self.growing is None else self.growing.state_dict(),
         }
@@ -267,6 +279,7 @@ class Phased(Pace):
                 f"grow_share={saved_growing!r}, not {self._config.refining!r} and {asked!r}; continue with those "
                 "settings, or start the gate afresh."
             )
+        self._required = set(state["required"])
         self.refining.load_state_dict(state["refining"])
         if self.growing is not None:
             self.growing.load_state_dict(state["growing"])

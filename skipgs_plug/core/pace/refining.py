@@ -114,6 +114,10 @@ class Refining:
         self._set_pace()
         return self.sampling.runs(number in self._must or number == self._last)
 
+    def require(self, number: int) -> None:
+        """Iteration `number` must run, which is only known now."""
+        self._must |= {number}
+
     def counts(self) -> None:
         """The present iteration began before the training loop was known: it counts as one that ran."""
         self.sampling.runs(must=True)

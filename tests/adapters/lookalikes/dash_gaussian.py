@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 SCRIPT = "train_dash.py"
 ADAPTER, FIRST, START, LAST = "dash_gaussian", 1, 20, 60
@@ -24,7 +24,7 @@ class GaussianModel(SplatModel):
         self.exposure_optimizer = torch.optim.Adam([self.exposure], lr=0.01)
 
     def prune_and_densify(self, min_opacity):
-        self._prune_gaussians(min_opacity, self.values["opacity"])
+        self._densify(min_opacity)
         return 0
 
 
@@ -50,6 +50,8 @@ def training(dataset, opt, pipe, checkpoint=None):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         gt_image = viewpoint_cam.original_image
         if render_scale > 1:
@@ -60,11 +62,15 @@ def training(dataset, opt, pipe, checkpoint=None):
         with torch.no_grad():
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
-                if iteration % 5 == 0:
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
                     gaussians.prune_and_densify(0.05)
                     render_scale = scheduler.get_res_scale(iteration)
-                if iteration % 8 == 0:
+                if iteration % opt.opacity_reset_interval == 0 or (
+                    dataset.white_background and iteration == opt.densify_from_iter
+                ):
                     gaussians.reset_opacity()
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 gaussians.exposure_optimizer.step()
                 gaussians.exposure_optimizer.zero_grad(set_to_none=True)
@@ -74,7 +80,6 @@ def training(dataset, opt, pipe, checkpoint=None):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given)
     return training(dataset(order), opt, None, checkpoint)

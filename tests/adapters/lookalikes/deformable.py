@@ -1,17 +1,16 @@
 """Look-alike of Deformable-3D-Gaussians' train.py: a network moves Gaussians with time; rates are set at the end."""
 
 import copy
-from types import SimpleNamespace
 
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 ADAPTER, FIRST, START, LAST = "deformable", 1, 20, 60
 
 
 class GaussianModel(SplatModel):
     def densify_and_prune(self, share):
-        self._prune_gaussians(share, self.values["opacity"])
+        self._densify(share)
 
 
 class DeformModel(torch.nn.Linear):
@@ -43,6 +42,8 @@ def training(dataset, opt, pipe, checkpoint=None):
     smooth_term = get_linear_noise_func()
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         positions = gaussians.values["xyz"].detach()
         noise = torch.randn(1, generator=torch.Generator().manual_seed(iteration)) * smooth_term(iteration)
@@ -56,10 +57,14 @@ def training(dataset, opt, pipe, checkpoint=None):
                 render(scene.getTrainCameras()[0], gaussians, pipe, None, 0.0)
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
-                if iteration % 5 == 0:
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
                     gaussians.densify_and_prune(0.05)
-                if iteration % 8 == 0:
+                if iteration % opt.opacity_reset_interval == 0 or (
+                    dataset.white_background and iteration == opt.densify_from_iter
+                ):
                     gaussians.reset_opacity()
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step([gaussians.optimizer, deform.optimizer])
                 gaussians.optimizer.step()
@@ -70,7 +75,6 @@ def training(dataset, opt, pipe, checkpoint=None):
     return (gaussians.capture(), deform), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20, warm_up=5)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given, warm_up=5)
     return training(dataset(order), opt, None, checkpoint)

@@ -1,9 +1,7 @@
 """Look-alike of FastGS: two optimizers that step every 8th iteration after densification, and late prunes."""
 
-from types import SimpleNamespace
-
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 ADAPTER, FIRST, START, LAST = "fastgs", 1, 20, 64
 PRUNES, STEP_EVERY = (32, 44), 8
@@ -53,6 +51,8 @@ def training(dataset, opt, pipe, checkpoint=None):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         render_pkg = render_fastgs(viewpoint_cam, gaussians, pipe, None, opt.mult)
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
@@ -60,18 +60,19 @@ def training(dataset, opt, pipe, checkpoint=None):
         with torch.no_grad():
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
-                if iteration % 5 == 0:
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
                     score = compute_gaussian_score_fastgs(scene.getTrainCameras()[:2], gaussians, pipe, None, opt)
-                    gaussians._prune_gaussians(0.05, score)
+                    gaussians._densify(0.05, score)
             if iteration in PRUNES:
                 score = compute_gaussian_score_fastgs(scene.getTrainCameras(), gaussians, pipe, None, opt)
                 gaussians.final_prune_fastgs(min_opacity=0.1, pruning_score=score)
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 gaussians.optimizer_step(iteration)
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20, mult=0.5)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given, mult=0.5)
     return training(dataset(order), opt, None, checkpoint)

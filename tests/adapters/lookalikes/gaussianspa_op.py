@@ -1,10 +1,8 @@
 """Look-alike of GaussianSpa's train_op.py: classic render, and a prune after the last ADMM iteration's step."""
 
-from types import SimpleNamespace
-
 import torch
 from lookalikes.gaussianspa import OptimizingSpa
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 SCRIPT = "train_op.py"
 ADAPTER, FIRST, START, LAST = "gaussianspa", 1, 41, 80
@@ -32,6 +30,8 @@ def training(dataset, opt, pipe, checkpoint=None):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration, opt)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         render_pkg = render(viewpoint_cam, gaussians, pipe, None)
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
@@ -42,10 +42,16 @@ def training(dataset, opt, pipe, checkpoint=None):
         with torch.no_grad():
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
-                if iteration % 8 == 0:
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+                    gaussians._densify(0.05)
+                if iteration % opt.opacity_reset_interval == 0 or (
+                    dataset.white_background and iteration == opt.densify_from_iter
+                ):
                     gaussians.reset_opacity()
             elif iteration == opt.optimizing_spa_start_iter:
                 optimizing_spa = OptimizingSpa(gaussians)
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step([gaussians.optimizer])
                 gaussians.optimizer.step()
@@ -55,7 +61,7 @@ def training(dataset, opt, pipe, checkpoint=None):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=15, optimizing_spa_interval=5)
-    opt.__dict__.update(optimizing_spa_start_iter=20, optimizing_spa_stop_iter=40, **options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    spa = {"optimizing_spa_interval": 5, "optimizing_spa_start_iter": 20, "optimizing_spa_stop_iter": 40}
+    opt = options(LAST, last, given, densify_until_iter=15, **spa)
     return training(dataset(order), opt, None, checkpoint)

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 ADAPTER, FIRST, START, LAST = "gns", 1, 31, 72
 
@@ -13,7 +13,7 @@ class GaussianModel(SplatModel):
         self.add_densification_stats(viewspace_points)
 
     def densify_and_prune_Improved(self, share):
-        self._prune_gaussians(share, self.values["opacity"])
+        self._densify(share)
 
     def only_prune(self, share):
         self._prune_gaussians(share, self.values["opacity"])
@@ -24,6 +24,7 @@ class GaussianModel(SplatModel):
     def update_opacity_lr(self, rate):
         for group in self.optimizer.param_groups:
             group["lr"] *= rate if group["name"] == "opacity" else 1
+        log.happened.append((log.now, f"opacity {rate}"))
 
 
 def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, override_color=None, pixel_weights=None):
@@ -43,23 +44,33 @@ def training(dataset, opt, pipe, checkpoint, args):
         model_params, first_iter = checkpoint
         gaussians.restore(model_params, opt)
     first_iter += 1
+    prune_iter = 99999999
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         render_pkg = render(viewpoint_cam, gaussians, pipe, None)
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
         if opt.prune_reg and opt.reg_end >= iteration >= opt.reg_start and (iteration - 1) % opt.reg_interval == 0:
+            log.happened.append((log.now, "selection"))
             loss += 0.01 * (gaussians.values["opacity"].mean() + 2) ** 2
         loss.backward()
         with torch.no_grad():
-            if 3 < iteration < opt.densify_until_iter:
+            if opt.densify_from_iter < iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats_abs(render_pkg["viewspace_points"])
-                if iteration % 5 == 0:
+                if iteration % opt.densification_interval == 0:
                     compute_edge_score(scene.getTrainCameras()[: args.cams], gaussians, pipe, None)
                     gaussians.densify_and_prune_Improved(0.05)
-                if iteration % 8 == 0:
+                if iteration % opt.opacity_reset_interval == 0 or (
+                    dataset.white_background and iteration == opt.densify_from_iter
+                ):
                     gaussians.reset_opacity()
+            if iteration > opt.reg_start and opt.prune_reg and len(gaussians.values["xyz"]) < opt.final_budget * 1.05:
+                gaussians.final_prune(opt.final_budget)
+                opt.prune_reg = False
+                prune_iter = iteration
             if opt.prune_reg and opt.reg_end > iteration >= opt.reg_start:
                 if iteration == opt.reg_start:
                     gaussians.update_opacity_lr(4)
@@ -68,7 +79,11 @@ def training(dataset, opt, pipe, checkpoint, args):
             elif opt.prune_reg and iteration == opt.reg_end:
                 gaussians.final_prune(opt.final_budget)
                 opt.prune_reg = False
+                prune_iter = iteration
+            if iteration == prune_iter + 7:
                 gaussians.update_opacity_lr(1 / 4)
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 if iteration <= 24:
                     step(gaussians)
@@ -87,8 +102,7 @@ def step(gaussians):
     gaussians.optimizer.zero_grad(set_to_none=True)
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20, optimizer_type="default")
-    opt.__dict__.update(prune_reg=True, reg_start=20, reg_end=30, reg_interval=3, final_budget=10)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    selection = {"prune_reg": True, "reg_start": 20, "reg_end": 30, "reg_interval": 3, "final_budget": 10}
+    opt = options(LAST, last, given, optimizer_type="default", **selection)
     return training(dataset(order), opt, None, checkpoint, SimpleNamespace(cams=2))

@@ -1,9 +1,7 @@
 """Look-alike of GOF's train.py: Mip-Splatting's 3D filter, and terms that join the loss at some iteration."""
 
-from types import SimpleNamespace
-
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 ADAPTER, FIRST, START, LAST = "gof", 1, 20, 60
 
@@ -37,7 +35,12 @@ def training(dataset, opt, pipe, checkpoint=None):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
+        is_save_images = True
+        if is_save_images and iteration % opt.densification_interval == 0:
+            log.pictures.append(iteration)
         render_pkg = render(viewpoint_cam, gaussians, pipe, None, kernel_size=0.1)
         lambda_distortion = 0.1 if iteration >= opt.distortion_from_iter else 0.0
         lambda_depth_normal = 0.05 if iteration >= opt.depth_normal_from_iter else 0.0
@@ -47,12 +50,15 @@ def training(dataset, opt, pipe, checkpoint=None):
         with torch.no_grad():
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
-                if iteration % 5 == 0:
-                    gaussians._prune_gaussians(0.05, gaussians.values["opacity"])
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+                    gaussians._densify(0.05)
                     gaussians.compute_3D_filter(cameras=trainCameras)
-            if iteration % 8 == 0 and opt.densify_until_iter < iteration < opt.iterations - 8:
-                gaussians.compute_3D_filter(cameras=trainCameras)
-                log.structure.append((log.now, "filter", len(gaussians.values["xyz"])))
+            if iteration % 8 == 0 and iteration > opt.densify_until_iter:
+                if iteration < opt.iterations - 8:
+                    gaussians.compute_3D_filter(cameras=trainCameras)
+                    log.structure.append((log.now, "filter", len(gaussians.values["xyz"])))
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
@@ -60,8 +66,6 @@ def training(dataset, opt, pipe, checkpoint=None):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20)
-    opt.__dict__.update(distortion_from_iter=20, depth_normal_from_iter=20)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given, distortion_from_iter=20, depth_normal_from_iter=20)
     return training(dataset(order), opt, None, checkpoint)

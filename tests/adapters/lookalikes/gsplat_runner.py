@@ -12,15 +12,29 @@ ADAPTER, FIRST, START, LAST = "gsplat", 0, 20, 59
 
 @dataclasses.dataclass
 class DefaultStrategy:
+    refine_start_iter: int = 2
     refine_stop_iter: int = START
     refine_every: int = 5
+    reset_every: int = 8
+    pause_refine_after_reset: int = 0
 
     def step_pre_backward(self, params, optimizers, state, step, info):
         info["means2d"].retain_grad()
 
     def step_post_backward(self, params, optimizers, state, step, info, packed=False):
-        if step < self.refine_stop_iter:
-            state["grad2d"] = state.get("grad2d", 0.0) + info["means2d"].grad.norm()
+        if step >= self.refine_stop_iter:
+            return
+        state["grad2d"] = state.get("grad2d", 0.0) + info["means2d"].grad.norm()
+        state["gathered"] = state.get("gathered", 0) + 1
+        if (
+            step > self.refine_start_iter
+            and step % self.refine_every == 0
+            and step % self.reset_every >= self.pause_refine_after_reset
+        ):
+            log.behind[step] = state.pop("gathered")
+            log.structure.append((step, "grow", len(params["xyz"])))
+        if step % self.reset_every == 0 and step > 0:
+            log.structure.append((step, "reset", len(params["xyz"])))
 
 
 @dataclasses.dataclass

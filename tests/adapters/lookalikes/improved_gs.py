@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 ADAPTER, FIRST, START, LAST = "improved_gs", 1, 20, 64
 
@@ -51,6 +51,8 @@ def training(dataset, opt, pipe, checkpoint, args):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         render_pkg = render(viewpoint_cam, gaussians, pipe, None)
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
@@ -58,13 +60,17 @@ def training(dataset, opt, pipe, checkpoint, args):
         with torch.no_grad():
             if iteration == 3:
                 gaussians.only_prune(0.05)
-            if 3 < iteration < opt.densify_until_iter:
+            if opt.densify_from_iter < iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats_abs(render_pkg["viewspace_points"])
-                if iteration % 5 == 0:
+                if iteration % opt.densification_interval == 0:
                     score = compute_edge_score(scene.getTrainCameras()[: args.cams], gaussians, pipe, None)
-                    gaussians._prune_gaussians(0.05, score)
-                if iteration % 8 == 0:
+                    gaussians._densify(0.05, score)
+                if iteration % opt.opacity_reset_interval == 0 or (
+                    dataset.white_background and iteration == opt.densify_from_iter
+                ):
                     gaussians.reset_opacity()
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 if iteration <= 20:
                     step(gaussians)
@@ -77,7 +83,6 @@ def training(dataset, opt, pipe, checkpoint, args):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20, optimizer_type="default")
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given, optimizer_type="default")
     return training(dataset(order), opt, None, checkpoint, SimpleNamespace(cams=2))

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 from tqdm import tqdm
 
 ADAPTER, FIRST, START, LAST = "inria", 1, 20, 60
@@ -11,7 +11,7 @@ ADAPTER, FIRST, START, LAST = "inria", 1, 20, 60
 
 class GaussianModel(SplatModel):
     def densify_and_prune(self, share):
-        self._prune_gaussians(share, self.values["opacity"])
+        self._densify(share)
 
 
 def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0):
@@ -34,6 +34,8 @@ def training(dataset, opt, pipe, checkpoint=None):
             render(SimpleNamespace(viewmat=viewers.viewmat), gaussians, pipe, None)
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         render_pkg = render(viewpoint_cam, gaussians, pipe, None)
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
@@ -48,10 +50,14 @@ def training(dataset, opt, pipe, checkpoint=None):
                 render(scene.getTrainCameras()[1], gaussians, pipe, None)
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
-                if iteration % 5 == 0:
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
                     gaussians.densify_and_prune(0.05)
-                if iteration % 8 == 0:
+                if iteration % opt.opacity_reset_interval == 0 or (
+                    dataset.white_background and iteration == opt.densify_from_iter
+                ):
                     gaussians.reset_opacity()
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step([gaussians.optimizer])
                 gaussians.optimizer.step()
@@ -59,8 +65,7 @@ def training(dataset, opt, pipe, checkpoint=None):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
+def train(checkpoint=None, last=LAST, order=0, **given):
     """Run like the script: what follows is what a command line gives."""
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20)
-    opt.__dict__.update(options)
+    opt = options(LAST, last, given)
     return training(dataset(order), opt, None, checkpoint)

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import torch
 from lookalikes.lightgaussian_prune_finetune import calculate_v_imp_score, prune_list
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 from torch.optim.lr_scheduler import ExponentialLR
 
 SCRIPT = "train_densify_prune.py"
@@ -32,6 +32,8 @@ def training(dataset, opt, pipe, checkpoint, args):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         render_pkg = render(viewpoint_cam, gaussians, pipe, None)
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
@@ -39,14 +41,18 @@ def training(dataset, opt, pipe, checkpoint, args):
         with torch.no_grad():
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
-                if iteration % 5 == 0:
-                    gaussians.prune_gaussians(0.05, gaussians.values["opacity"])
-                if iteration % 8 == 0:
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+                    gaussians._densify(0.05)
+                if iteration % opt.opacity_reset_interval == 0 or (
+                    dataset.white_background and iteration == opt.densify_from_iter
+                ):
                     gaussians.reset_opacity()
             if iteration in args.prune_iterations:
                 i = args.prune_iterations.index(iteration)
                 v_list = calculate_v_imp_score(gaussians, prune_list(gaussians, scene, pipe, None), args.v_pow)
                 gaussians.prune_gaussians(args.prune_decay**i * args.prune_percent, v_list)
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step([gaussians.optimizer])
                 gaussians.optimizer.step()
@@ -56,8 +62,7 @@ def training(dataset, opt, pipe, checkpoint, args):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given)
     args = SimpleNamespace(prune_iterations=[30, 45], prune_percent=0.3, prune_decay=0.8, v_pow=0.1)
     return training(dataset(order), opt, None, checkpoint, args)

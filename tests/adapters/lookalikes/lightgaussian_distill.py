@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import torch
 from lookalikes.lightgaussian_prune_finetune import calculate_v_imp_score, prune_list  # noqa: F401
-from lookalikes.splats import NAMES, Scene, SplatModel, dataset, draw, log, note_step, pick
+from lookalikes.splats import NAMES, Scene, SplatModel, dataset, draw, log, note_step, options, pick
 from torch.optim.lr_scheduler import ExponentialLR
 
 SCRIPT = "distill_train.py"
@@ -51,6 +51,8 @@ def training(args, dataset, opt, pipe, checkpoint):
         loss = (student_image - teacher_image).abs().mean()
         loss.backward()
         with torch.no_grad():
+            if iteration in opt.saving_iterations:
+                student_scene.save(iteration)
             if iteration < opt.iterations:
                 note_step([student_gaussians.optimizer])
                 student_gaussians.optimizer.step()
@@ -60,7 +62,6 @@ def training(args, dataset, opt, pipe, checkpoint):
     return student_gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, augmented_view=True, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, augmented_view=True, **given):
+    opt = options(LAST, last, given)
     return training(SimpleNamespace(augmented_view=augmented_view), dataset(order), opt, None, checkpoint)

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 from torch.optim.lr_scheduler import ExponentialLR
 
 SCRIPT = "prune_finetune.py"
@@ -42,6 +42,8 @@ def training(dataset, opt, pipe, checkpoint, args):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         render_pkg = render(viewpoint_cam, gaussians, pipe, None)
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
@@ -50,6 +52,8 @@ def training(dataset, opt, pipe, checkpoint, args):
             if iteration in args.prune_iterations:
                 v_list = calculate_v_imp_score(gaussians, prune_list(gaussians, scene, pipe, None), args.v_pow)
                 gaussians.prune_gaussians(args.prune_percent, v_list)
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step([gaussians.optimizer])
                 gaussians.optimizer.step()
@@ -59,8 +63,7 @@ def training(dataset, opt, pipe, checkpoint, args):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given)
     args = SimpleNamespace(start_pointcloud=None, prune_iterations=[31], prune_percent=0.5, v_pow=0.1)
     return training(dataset(order), opt, None, checkpoint, args)

@@ -1,9 +1,7 @@
 """Look-alike of 3dgs-mcmc's train.py: relocation until densification ends, position noise in every iteration."""
 
-from types import SimpleNamespace
-
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 ADAPTER, FIRST, START, LAST = "mcmc", 1, 20, 60
 
@@ -23,6 +21,7 @@ class GaussianModel(SplatModel):
         return build_scaling_rotation(torch.exp(self.values["scaling"]), self.values["rotation"])
 
     def relocate_gs(self, dead_mask):
+        self._use_up()
         with torch.no_grad():
             self.values["xyz"][dead_mask] = self.values["xyz"][~dead_mask][0]
         log.structure.append((log.now, "relocate", len(dead_mask)))
@@ -45,13 +44,21 @@ def training(dataset, opt, pipe, checkpoint=None):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         xyz_lr = gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         loss = photo_loss(render(viewpoint_cam, gaussians, pipe, None)["render"], viewpoint_cam)
         loss = loss + 0.01 * torch.sigmoid(gaussians.values["opacity"]).mean()
         loss.backward()
         with torch.no_grad():
-            if iteration < opt.densify_until_iter and iteration % 5 == 0:
+            if (
+                iteration < opt.densify_until_iter
+                and iteration > opt.densify_from_iter
+                and iteration % opt.densification_interval == 0
+            ):
                 gaussians.relocate_gs(dead_mask=gaussians.values["opacity"][:, 0] < 0.2)
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
@@ -63,7 +70,6 @@ def training(dataset, opt, pipe, checkpoint=None):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20, densify_from_iter=0)
-    opt.__dict__.update(densification_interval=5, **options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given)
     return training(dataset(order), opt, None, checkpoint)

@@ -3,18 +3,20 @@
 from types import SimpleNamespace
 
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 SCRIPT = "ms/train.py"
 ADAPTER, FIRST, START, LAST = "mini_splatting", 1, 31, 70
 
 
 class GaussianModel(SplatModel):
-    def densify_and_prune_split(self, share):
-        self._prune_gaussians(share, self.values["opacity"])
+    def densify_and_prune_split(self, share, mask):
+        assert len(mask) == len(self.values["xyz"])
+        self._densify(share)
 
     def reinitial_pts(self):
         self.values["opacity"] = torch.nn.Parameter(torch.full_like(self.values["opacity"], -1.0))
+        log.structure.append((log.now, "rebuilt", len(self.values["xyz"])))
 
 
 def render_imp(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0):
@@ -30,10 +32,16 @@ def training(dataset, opt, pipe, checkpoint, args):
         model_params, first_iter = checkpoint
         gaussians.restore(model_params, opt)
     first_iter += 1
+    mask_blur = torch.zeros(len(gaussians.values["xyz"]), dtype=torch.bool)
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
-        late = iteration >= args.simp_iteration1
-        gaussians.update_learning_rate(iteration - 10 if late else iteration)
+        simp_iteration1 = args.simp_iteration1
+        if iteration < simp_iteration1:
+            gaussians.update_learning_rate(iteration)
+        else:
+            gaussians.update_learning_rate(iteration - simp_iteration1 + 10)
+        if iteration % 9 == 0 and iteration > simp_iteration1:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         render_pkg = render_imp(viewpoint_cam, gaussians, pipe, None)
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
@@ -41,15 +49,29 @@ def training(dataset, opt, pipe, checkpoint, args):
         with torch.no_grad():
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
-                if iteration % 5 == 0 and iteration % 10 != 0 and len(gaussians.values["xyz"]) < args.num_max:
-                    gaussians.densify_and_prune_split(0.05)
-                if iteration % 10 == 0 and args.num_depth:
+                mask_blur = mask_blur | (gaussians.values["scaling"].detach().amax(dim=1) > -0.9)
+                if (
+                    iteration > opt.densify_from_iter
+                    and iteration % opt.densification_interval == 0
+                    and iteration % 12 != 0
+                    and len(gaussians.values["xyz"]) < args.num_max
+                ):
+                    gaussians.densify_and_prune_split(0.05, mask_blur)
+                    mask_blur = torch.zeros(len(gaussians.values["xyz"]), dtype=torch.bool)
+                if iteration % 12 == 0:
                     gaussians.reinitial_pts()
                     gaussians.training_setup(opt)
-            if iteration == args.simp_iteration1 or iteration == args.simp_iteration2:
+                    mask_blur = torch.zeros(len(gaussians.values["xyz"]), dtype=torch.bool)
+            if iteration == simp_iteration1:
                 render_imp(scene.getTrainCameras()[0], gaussians, pipe, None)
                 gaussians._prune_gaussians(0.1, gaussians.values["opacity"])
                 gaussians.training_setup(opt)
+            if iteration == args.simp_iteration2:
+                render_imp(scene.getTrainCameras()[0], gaussians, pipe, None)
+                gaussians._prune_gaussians(0.1, gaussians.values["opacity"])
+                gaussians.training_setup(opt)
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
@@ -57,8 +79,7 @@ def training(dataset, opt, pipe, checkpoint, args):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20)
-    opt.__dict__.update(options)
-    args = SimpleNamespace(simp_iteration1=20, simp_iteration2=30, num_max=10**6, num_depth=100)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given)
+    args = SimpleNamespace(simp_iteration1=20, simp_iteration2=30, num_max=10**6)
     return training(dataset(order), opt, None, checkpoint, args)

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 SCRIPT = "msv2/train.py"
 ADAPTER, FIRST, START, LAST = "mini_splatting2", 1, 51, 80
@@ -30,6 +30,9 @@ class GaussianModel(SplatModel):
         self._prune_gaussians(0.1, self.values["opacity"])
         self.culling = self.values["opacity"][:, 0] < self.values["opacity"].median()
 
+    def culling_with_clone(self):
+        log.happened.append((log.now, "cloned"))
+
     def depth_reinit(self):
         return self.values["xyz"].detach()
 
@@ -51,6 +54,8 @@ def training(dataset, opt, pipe, checkpoint, args):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         render_pkg = render_imp(viewpoint_cam, gaussians, pipe, None, culling=gaussians.culling)
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
@@ -58,14 +63,29 @@ def training(dataset, opt, pipe, checkpoint, args):
         with torch.no_grad():
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
+                if (
+                    iteration > opt.densify_from_iter
+                    and iteration % opt.densification_interval == 0
+                    and iteration != args.depth_reinit_iter
+                ):
+                    gaussians._densify(0.05)
+                    gaussians.init_culling(len(scene.getTrainCameras()))
                 if iteration == args.depth_reinit_iter:
                     gaussians.depth_reinit()
                     gaussians.training_setup(opt)
                     gaussians.init_culling(len(scene.getTrainCameras()))
+                if (
+                    iteration >= args.aggressive_clone_from_iter
+                    and iteration % args.aggressive_clone_interval == 0
+                    and iteration != args.depth_reinit_iter
+                ):
+                    gaussians.culling_with_clone()
             if iteration == args.simp_iteration2:
                 gaussians.culling_with_interesction_preserving()
             if iteration == (args.simp_iteration2 + opt.iterations) // 2:
                 gaussians.init_culling(len(scene.getTrainCameras()))
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step(gaussians._optimizers())
                 visible = torch.ones(len(gaussians.values["xyz"]), dtype=torch.bool)
@@ -74,8 +94,8 @@ def training(dataset, opt, pipe, checkpoint, args):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=10)
-    opt.__dict__.update(options)
-    args = SimpleNamespace(simp_iteration2=20, depth_reinit_iter=6)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given, densify_until_iter=19, densification_interval=3)
+    args = SimpleNamespace(simp_iteration2=20, depth_reinit_iter=7)
+    args.__dict__.update(aggressive_clone_from_iter=4, aggressive_clone_interval=8)
     return training(dataset(order), opt, None, checkpoint, args)

@@ -1,9 +1,7 @@
 """Look-alike of Octree-GS's train.py: anchors on levels, which are shown one after the other."""
 
-from types import SimpleNamespace
-
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 ADAPTER, FIRST, START, LAST = "octree_gs", 1, 26, 66
 
@@ -22,6 +20,7 @@ class GaussianModel(SplatModel):
         self.prune_points(mask)
 
     def adjust_anchor(self, min_opacity):
+        self._use_up()
         self.prune_anchor(self.values["opacity"][:, 0] < self.values["opacity"].quantile(min_opacity))
 
 
@@ -47,6 +46,8 @@ def training(dataset, opt, pipe, checkpoint=None):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         gaussians.set_anchor_mask(iteration)
         mask = prefilter_voxel(viewpoint_cam, gaussians, pipe, None)
@@ -55,10 +56,12 @@ def training(dataset, opt, pipe, checkpoint=None):
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
         loss.backward()
         with torch.no_grad():
-            if 2 < iteration < opt.update_until:
+            if iteration < opt.update_until and iteration > opt.start_stat:
                 gaussians.training_statis(render_pkg["viewspace_points"])
-                if iteration % opt.update_interval == 0:
+                if opt.update_anchor and iteration > opt.update_from and iteration % opt.update_interval == 0:
                     gaussians.adjust_anchor(0.05)
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
@@ -66,9 +69,9 @@ def training(dataset, opt, pipe, checkpoint=None):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, update_until=20, update_interval=5, coarse_iter=25)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    update = {"update_until": 20, "update_interval": 5, "update_from": 4, "update_anchor": True, "start_stat": 2}
+    opt = options(LAST, last, given, coarse_iter=25, **update)
     run = dataset(order)
     run.progressive = True
     for camera in run.cameras:

@@ -1,9 +1,7 @@
 """Look-alike of PGSR's train.py: a neighbouring view is rendered with gradients after the view of the iteration."""
 
-from types import SimpleNamespace
-
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 ADAPTER, FIRST, START, LAST = "pgsr", 1, 20, 60
 
@@ -32,6 +30,8 @@ def training(dataset, opt, pipe, checkpoint=None):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         cameras = scene.getTrainCameras()
         viewpoint_cam = pick(cameras, iteration)
         render_pkg = render(viewpoint_cam, gaussians, pipe, None, return_plane=iteration > 5)
@@ -45,10 +45,14 @@ def training(dataset, opt, pipe, checkpoint=None):
         with torch.no_grad():
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
-                if iteration % 5 == 0:
-                    gaussians._prune_gaussians(0.05, gaussians.values["opacity"])
-                if iteration % 8 == 0:
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+                    gaussians._densify(0.05)
+                if iteration % opt.opacity_reset_interval == 0 or (
+                    dataset.white_background and iteration == opt.densify_from_iter
+                ):
                     gaussians.reset_opacity()
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
@@ -56,7 +60,6 @@ def training(dataset, opt, pipe, checkpoint=None):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20, multi_view_weight_from_iter=10)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given, multi_view_weight_from_iter=10)
     return training(dataset(order), opt, None, checkpoint)

@@ -1,9 +1,7 @@
 """Look-alike of Pixel-GS's train.py: gradients weighted by pixels while it densifies, Inria's loop after."""
 
-from types import SimpleNamespace
-
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 ADAPTER, FIRST, START, LAST = "pixel_gs", 1, 20, 60
 
@@ -29,6 +27,8 @@ def training(dataset, opt, pipe, checkpoint=None):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         render_pkg = render(viewpoint_cam, gaussians, pipe, None, depth_threshold=opt.depth_threshold * 2)
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
@@ -36,10 +36,14 @@ def training(dataset, opt, pipe, checkpoint=None):
         with torch.no_grad():
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"], render_pkg["pixels"])
-                if iteration % 5 == 0:
-                    gaussians._prune_gaussians(0.05, gaussians.values["opacity"])
-                if iteration % 8 == 0:
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+                    gaussians._densify(0.05)
+                if iteration % opt.opacity_reset_interval == 0 or (
+                    dataset.white_background and iteration == opt.densify_from_iter
+                ):
                     gaussians.reset_opacity()
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
@@ -47,7 +51,6 @@ def training(dataset, opt, pipe, checkpoint=None):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20, depth_threshold=0.4)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given, depth_threshold=0.4)
     return training(dataset(order), opt, None, checkpoint)

@@ -1,9 +1,7 @@
 """Look-alike of Scaffold-GS's train.py: anchors that a network decodes, adjusted until `update_until`."""
 
-from types import SimpleNamespace
-
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 ADAPTER, FIRST, START, LAST = "scaffold_gs", 1, 20, 60
 
@@ -20,6 +18,7 @@ class GaussianModel(SplatModel):
 
     def training_statis(self, viewspace_points, visible_mask):
         self.offset_gradient_accum += float(viewspace_points.grad[0][visible_mask].norm())  # fails without a backward
+        self.gathered += 1
 
     def prune_anchor(self, mask):
         for group in self.optimizer.param_groups:
@@ -30,6 +29,7 @@ class GaussianModel(SplatModel):
         self.optimizer.param_groups += networks
 
     def adjust_anchor(self, min_opacity):
+        self._use_up()
         self.prune_anchor(self.values["opacity"][:, 0] < self.values["opacity"].quantile(min_opacity))
 
 
@@ -54,6 +54,8 @@ def training(dataset, opt, pipe, dataset_name, checkpoint=None):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         mask = prefilter_voxel(viewpoint_cam, gaussians, pipe, None)
         retain_grad = iteration < opt.update_until
@@ -64,10 +66,12 @@ def training(dataset, opt, pipe, dataset_name, checkpoint=None):
         with torch.no_grad():
             if iteration < opt.update_until and iteration > opt.start_stat:
                 gaussians.training_statis(render_pkg["viewspace_points"], mask)
-                if iteration % 5 == 0:
+                if iteration > opt.update_from and iteration % opt.update_interval == 0:
                     gaussians.adjust_anchor(min_opacity=0.05)
             elif iteration == opt.update_until:
                 del gaussians.offset_gradient_accum
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step(gaussians._optimizers())
                 gaussians.optimizer.step()
@@ -75,7 +79,6 @@ def training(dataset, opt, pipe, dataset_name, checkpoint=None):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, update_until=20, start_stat=2)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given, update_until=20, update_interval=5, update_from=4, start_stat=2)
     return training(dataset(order), opt, None, "scene", checkpoint)

@@ -1,9 +1,7 @@
 """Look-alike of Speedy-Splat: prunes by backwards of its own, from the end of densification to the very end."""
 
-from types import SimpleNamespace
-
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 ADAPTER, FIRST, START, LAST = "speedy_splat", 1, 21, 60
 
@@ -44,6 +42,8 @@ def training(dataset, opt, pipe, checkpoint=None):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         render_pkg = render(viewpoint_cam, gaussians, pipe, None)
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
@@ -51,18 +51,30 @@ def training(dataset, opt, pipe, checkpoint=None):
         with torch.no_grad():
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
-                if iteration % opt.prune_interval == 0:
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+                    gaussians._densify(0.05)
+                if (
+                    (iteration >= opt.prune_from_iter)
+                    and (iteration < opt.prune_until_iter)
+                    and (iteration % opt.prune_interval == 0)
+                ):
                     prune(scene, gaussians, pipe, None, 0.2)
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
                 note_step([gaussians.optimizer])
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
-            if iteration >= opt.densify_until_iter and iteration % opt.prune_interval == 0:
+            if (
+                (iteration >= opt.densify_until_iter)
+                and (iteration >= opt.prune_from_iter)
+                and (iteration < opt.prune_until_iter)
+                and (iteration % opt.prune_interval == 0)
+            ):
                 prune(scene, gaussians, pipe, None, 0.1)
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20, prune_interval=10)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, **given):
+    opt = options(LAST, last, given, prune_interval=10, prune_from_iter=6, prune_until_iter=61)
     return training(dataset(order), opt, None, checkpoint)

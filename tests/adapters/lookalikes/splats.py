@@ -22,6 +22,9 @@ class Log:
         self.backwards = []  # iterations in which a backward reached a training render
         self.other_backwards = 0  # of renders for other purposes
         self.structure = []  # (iteration, kind, Gaussians left)
+        self.happened = []  # (iteration, what): SH raises, saves, evaluations, terms of a loss
+        self.behind = {}  # iterations whose gradients stand behind a densification event, by its iteration
+        self.pictures = []  # iterations that write a picture to look at
         self.steps = []  # iterations in which an optimizer had something to step with
         self.values = {}  # parameters at the beginning of each iteration
         self.current = []  # parameters themselves, in the latest iteration
@@ -99,7 +102,10 @@ class SplatModel:
             "rotation": torch.rand(N, 4, generator=rng),
         }
         self.values = {name: torch.nn.Parameter(value) for name, value in start.items()}
-        self.gradients_read = 0.0
+        self.gradients_read, self.gathered = 0.0, 0
+
+    def oneupSHdegree(self):
+        log.happened.append((log.now, "SH"))
 
     def training_setup(self, opt=None):
         self.optimizer = self.adam([self.group(name) for name in self.rates], lr=0.0, eps=1e-15)
@@ -118,6 +124,7 @@ class SplatModel:
 
     def add_densification_stats(self, viewspace_points):
         self.gradients_read += float(viewspace_points.grad.norm())  # fails without a backward
+        self.gathered += 1
 
     def prune_points(self, mask):
         for optimizer in self._optimizers():
@@ -135,6 +142,15 @@ class SplatModel:
         mask = torch.ones(len(scores), dtype=torch.bool)
         mask[keep] = False
         self.prune_points(mask)
+
+    def _densify(self, share, scores=None):
+        """A densification event: what was gathered is used up."""
+        self._use_up()
+        self._prune_gaussians(share, self.values["opacity"] if scores is None else scores)
+
+    def _use_up(self):
+        log.behind[log.now] = self.gathered
+        self.gathered = 0
 
     prune_gaussians = _prune_gaussians  # the name that Speedy-Splat and LightGaussian have for it
 
@@ -190,9 +206,24 @@ class Scene:
     def getTrainCameras(self):
         return self.cameras
 
+    def save(self, iteration):
+        log.happened.append((iteration, "save"))
+
 
 def dataset(order=0):
-    return SimpleNamespace(model_path="output", cameras=make_cameras(order))
+    return SimpleNamespace(model_path="output", cameras=make_cameras(order), white_background=False)
+
+
+def options(iterations, last, given, **own):
+    """What a command line gives to `opt` in the Inria family; `last` is where the look-alike stops."""
+    all_have = {
+        "densify_from_iter": 2,
+        "densify_until_iter": 20,
+        "densification_interval": 5,
+        "opacity_reset_interval": 8,
+        "saving_iterations": [7, 26, iterations],
+    }
+    return SimpleNamespace(iterations=iterations, last=last, **{**all_have, **own, **given})
 
 
 def photo_loss(image, camera):

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 import torch
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, photo_loss, pick
+from lookalikes.splats import Scene, SplatModel, dataset, draw, log, note_step, options, photo_loss, pick
 
 ADAPTER, FIRST, START, LAST = "taming", 1, 20, 64
 STEP_EVERY = 8
@@ -52,6 +52,8 @@ def training(dataset, opt, pipe, checkpoint, args):
     for iteration in range(first_iter, opt.last + 1):
         log.begins(iteration, gaussians.values.values())
         gaussians.update_learning_rate(iteration)
+        if iteration % 9 == 0:
+            gaussians.oneupSHdegree()
         viewpoint_cam = pick(scene.getTrainCameras(), iteration)
         render_pkg = render(viewpoint_cam, gaussians, pipe, None)
         loss = photo_loss(render_pkg["render"], viewpoint_cam)
@@ -59,14 +61,20 @@ def training(dataset, opt, pipe, checkpoint, args):
         with torch.no_grad():
             if iteration < opt.densify_until_iter:
                 gaussians.add_densification_stats(render_pkg["viewspace_points"])
-                if iteration % 5 == 0:
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
                     score = compute_gaussian_score(scene, scene.getTrainCameras()[:2], gaussians, pipe, None)
-                    gaussians._prune_gaussians(0.05, score)
+                    gaussians._densify(0.05, score)
             if iteration == args.ho_iteration:
                 gaussians.modify_functions()
+            if iteration in opt.saving_iterations:
+                scene.save(iteration)
             if iteration < opt.iterations:
-                sh_due = not args.sh_lower or iteration % STEP_EVERY == 0
-                due = [gaussians.optimizer, gaussians.shoptimizer] if sh_due else [gaussians.optimizer]
+                due = [gaussians.optimizer]
+                if args.sh_lower:
+                    if iteration % STEP_EVERY == 0:
+                        due.append(gaussians.shoptimizer)
+                else:
+                    due.append(gaussians.shoptimizer)
                 note_step(due)
                 for optimizer in due:
                     optimizer.step()
@@ -74,8 +82,7 @@ def training(dataset, opt, pipe, checkpoint, args):
     return gaussians.capture(), iteration
 
 
-def train(checkpoint=None, last=LAST, order=0, sh_lower=False, **options):
-    opt = SimpleNamespace(iterations=LAST, last=last, densify_until_iter=20)
-    opt.__dict__.update(options)
+def train(checkpoint=None, last=LAST, order=0, sh_lower=False, **given):
+    opt = options(LAST, last, given)
     args = SimpleNamespace(ho_iteration=20, sh_lower=sh_lower)
     return training(dataset(order), opt, None, checkpoint, args)

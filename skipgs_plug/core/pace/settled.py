@@ -1,0 +1,76 @@
+"""Parts of a loop's conditions that have one value for the whole loop, known before it begins."""
+
+from __future__ import annotations
+
+import ast
+import types
+from collections.abc import Collection, Mapping
+from typing import Any
+
+
+class Settled:
+    """Knows the options of a run: what a function has names for before its loop, and the loop does not assign.
+
+    Only plain values count (numbers, text, flags, None and lists of them), in variables of the function itself or in
+    objects that have no methods, such as a namespace of options. What has methods, a model for one, may change in them.
+
+    Args:
+        code: Of the function that holds the loop.
+        source: Its syntax; of a module's code that of the whole module.
+        names: What it has names for before the loop.
+        changing: Places that the loop assigns to or changes.
+        pure: Functions that only look at their arguments.
+    """
+
+    def __init__(
+        self,
+        code: types.CodeType,
+        source: ast.AST,
+        names: Mapping[str, Any],
+        changing: Collection[str],
+        pure: Collection[str],
+    ) -> None:
+        own = {*code.co_varnames, *code.co_cellvars} if code.co_varnames or code.co_cellvars else set(code.co_names)
+        shared = (node.names for node in ast.walk(source) if isinstance(node, (ast.Global, ast.Nonlocal)))
+        self._own = own.difference(*shared)  # other functions may change those
+        self._names, self._changing, self._pure = names, changing, pure
+
+    def __contains__(self, node: object) -> bool:
+        """Whether an expression is made of nothing else."""
+        if isinstance(node, ast.Constant):
+            return True
+        if isinstance(node, (ast.Name, ast.Attribute)):
+            found, value = self._look_up(node)
+            return found and _is_plain(value)
+        if isinstance(node, ast.Call):
+            pure = isinstance(node.func, ast.Name) and node.func.id in self._pure and not node.keywords
+            return pure and all(argument in self for argument in node.args)
+        if isinstance(node, (ast.BoolOp, ast.BinOp, ast.UnaryOp, ast.Compare, ast.Tuple, ast.List, ast.Set)):
+            return all(part in self for part in ast.iter_child_nodes(node) if isinstance(part, ast.expr))
+        return False
+
+    def _look_up(self, node: ast.expr) -> tuple[bool, Any]:
+        """Whether a name or an attribute of options is known, and its value."""
+        if ast.unparse(node) in self._changing:
+            return False, None
+        if isinstance(node, ast.Name):
+            return node.id in self._own and node.id in self._names, self._names.get(node.id)
+        if isinstance(node, ast.Attribute):
+            found, holder = self._look_up(node.value)
+            if found and _only_holds(holder) and node.attr in vars(holder):
+                return True, vars(holder)[node.attr]
+        return False, None
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return all(_is_plain(one) for one in value)
+    return value is None or isinstance(value, (bool, int, float, str, range))
+
+
+def _only_holds(value: Any) -> bool:
+    """Whether an object holds values and does nothing."""
+    kind = type(value)
+    return hasattr(value, "__dict__") and not any(
+        callable(getattr(kind, name)) for name in dir(kind) if not name.startswith("_")
+    )

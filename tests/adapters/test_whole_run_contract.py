@@ -1,0 +1,165 @@
+"""What holds for every adapter when iterations are left out while the scene grows, too, on look-alikes."""
+
+import json
+
+import pytest
+from cases import CASES, run
+from lookalikes.splats import Log, log, new_log
+
+from skipgs_plug import SkipGate
+from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.pace import needs
+
+LOOPS = [case for case in CASES if case.leaves_out]
+each = pytest.mark.parametrize("case", LOOPS, ids=lambda case: case.name)
+# Budgets, constant shares and resolutions by event: all of their events are kept.
+KEEP_ALL_EVENTS = {"taming", "mcmc", "improved_gs", "gns", "dash_gaussian"}
+SHARE = 0.4
+# Of the views at each of these: a term of the loss, or what only the iterations before can make of the model.
+WHOLE = {"gns": range(20, 31), "gaussianspa": range(20, 41)}
+
+
+@pytest.fixture(scope="module")
+def alone():
+    """Log of each trainer when left alone."""
+    logs = {}
+
+    def get(case):
+        if case.name not in logs:
+            logs[case.name] = run(case)[0]
+        return logs[case.name]
+
+    return get
+
+
+@pytest.fixture(scope="module")
+def thinned():
+    """Log of each trainer with a share, and the numbers of the iterations that ran."""
+    logs = {}
+
+    def get(case):
+        if case.name not in logs:
+            gated = run(case, share=SHARE, pause_iters=0)[0]
+            logs[case.name] = gated, sorted(gated.values)
+        return logs[case.name]
+
+    return get
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Let "auto" find a share below 1 in runs as short as these."""
+    monkeypatch.setattr(needs, "LEAST_GROWING_STEPS", 6)
+    monkeypatch.setattr(needs, "LEAST_GROWING_STEPS_FULL_VIEWS", 6)
+    monkeypatch.setattr(needs, "GROWING_VISITS", 1.0)
+    monkeypatch.setattr(needs, "LEAST_STEPS", 8)
+
+
+@pytest.fixture
+def begun(monkeypatch):
+    """Numbers of the iterations that began."""
+    numbers = []
+    original = Log.begins
+
+    def begins(self, iteration, parameters):
+        numbers.append(iteration)
+        return original(self, iteration, parameters)
+
+    monkeypatch.setattr(Log, "begins", begins)
+    return numbers
+
+
+def beside(entries, events):
+    """What else happened to the model than densification events: when, and what."""
+    return [(step, kind) for step, kind, _ in entries if step not in events]
+
+
+@pytest.mark.parametrize("share", [SHARE, "auto"])
+@each
+def test_events_are_thinned_and_everything_else_happens_exactly_as_often(case, share, alone, begun, short):
+    plain = alone(case)
+    events = set(plain.behind)
+    begun.clear()
+    gated, gate = run(case, share=share, pause_iters=0)
+    report, start = gate.report(), case.module.START
+    grown = [n for n in begun if n < start]
+    assert begun == sorted(set(begun)) and begun[-1] == case.module.LAST
+    assert gated.happened == plain.happened  # SH, saves, ADMM and the like
+    assert beside(gated.structure, events) == beside(plain.structure, events)  # prunes, resets, new models
+    assert gated.other_backwards == plain.other_backwards
+    # Events that run have their number, and what was gathered since the one before.
+    assert set(gated.behind) == events & set(begun)
+    before = case.module.FIRST - 1
+    for event, gathered in gated.behind.items():
+        earliest = min(n for n in plain.values if n > before)
+        since = [n for n in begun if earliest <= n <= event]
+        assert gathered <= len(since) and len(since) - gathered <= start_of_gathering(plain, case)
+        before = event
+    growing = report["growing"]
+    if not events:
+        assert grown == list(range(case.module.FIRST, start))  # nothing grows in this script
+        return
+    assert growing["events_run"] == len(gated.behind)
+    assert growing["events_run"] + growing["events_skipped"] == len(events)
+    assert (
+        growing["iterations_run"] + growing["iterations_skipped"] == start - case.module.FIRST - 1
+    )  # all but the first
+    whole = WHOLE.get(case.module.ADAPTER, range(0))
+    assert set(whole) <= set(begun) and len(grown) < start - case.module.FIRST
+    if case.module.ADAPTER in KEEP_ALL_EVENTS or "mcmc" in case.name:
+        assert growing["events_skipped"] == 0
+    else:
+        assert growing["events_skipped"] > 0
+
+
+def start_of_gathering(plain, case):
+    """Iterations of the run before the first that gathers gradients for densification."""
+    first = min(plain.behind)
+    return first - case.module.FIRST + 1 - plain.behind[first]
+
+
+@pytest.mark.parametrize("settings", [{"share": 1.0}, {"share": 0.4, "enabled": False}], ids=["all", "off"])
+@each
+def test_leaving_out_nothing_leaves_the_whole_run_bit_identical(case, settings, alone):
+    plain = alone(case)
+    gated, _ = run(case, **settings)
+    assert plain.backwards == gated.backwards and same(plain.current, gated.current)
+    assert (plain.structure, plain.steps, plain.happened) == (gated.structure, gated.steps, gated.happened)
+
+
+def same(one, other):
+    return len(one) == len(other) and all(a.equal(b) for a, b in zip(one, other, strict=True))
+
+
+@pytest.mark.parametrize("grows", [True, False], ids=["growing", "refining"])
+@pytest.mark.parametrize("case", [case for case in LOOPS if case.resume], ids=lambda case: case.name)
+def test_interrupted_and_resumed_leaves_out_the_same(case, grows, thinned, begun, short):
+    settings = {"share": SHARE, "pause_iters": 0}
+    whole, numbers = thinned(case)
+    start, first, last = case.module.START, case.module.FIRST, case.module.LAST
+    there = [n for n in numbers if (first + 3 <= n < start - 3 if grows else last - 16 <= n < last)]
+    if not there:
+        pytest.skip("nothing grows in this script" if grows else "no iteration without pending gradients")
+    new_log()
+    begun.clear()
+    trainer, train = case.make()
+    with SkipGate(trainer, **settings) as one:
+        checkpoint = train(last=there[0])
+        state = json.loads(json.dumps(one.state_dict()))
+    trainer, train = case.resume(checkpoint)
+    with SkipGate(trainer, **settings) as other:
+        other.load_state_dict(state)
+        train()
+    assert begun == numbers
+    assert log.structure == whole.structure
+
+
+@pytest.mark.parametrize("share", [0.4, "auto"])
+@pytest.mark.parametrize(
+    "case", [case for case in CASES if not case.leaves_out and case.name != "step_trainer"], ids=lambda case: case.name
+)
+def test_a_loop_that_cannot_be_shortened_is_refused_before_anything_runs(case, share, begun):
+    trainer, _ = case.make()
+    with pytest.raises(SkipGSError, match="cannot leave out whole iterations"):
+        SkipGate(trainer, share=share)
+    assert begun == []
