@@ -171,7 +171,8 @@ def test_views_of_the_same_name_are_told_apart_by_position(monkeypatch):
     cameras = make_cameras()
     for camera in cameras:
         camera.image_name = camera.image_name.rsplit("/", 1)[1]
-    monkeypatch.setattr(inria, "dataset", lambda order: types.SimpleNamespace(model_path="output", cameras=cameras))
+    run_of = types.SimpleNamespace(model_path="output", cameras=cameras, white_background=False)
+    monkeypatch.setattr(inria, "dataset", lambda order: run_of)
     monkeypatch.setattr(inria, "pick", lambda cameras, iteration: cameras[iteration % len(cameras)])
     with pytest.warns(RuntimeWarning, match="same name"):
         _, gate = run(script("inria", inria), **RULE)

@@ -14,7 +14,7 @@ class GaussianModel(SplatModel):
         assert len(mask) == len(self.values["xyz"])
         self._densify(share)
 
-    def reinitial_pts(self):
+    def reinitial_pts(self, count):
         self.values["opacity"] = torch.nn.Parameter(torch.full_like(self.values["opacity"], -1.0))
         log.structure.append((log.now, "rebuilt", len(self.values["xyz"])))
 
@@ -59,7 +59,7 @@ def training(dataset, opt, pipe, checkpoint, args):
                     gaussians.densify_and_prune_split(0.05, mask_blur)
                     mask_blur = torch.zeros(len(gaussians.values["xyz"]), dtype=torch.bool)
                 if iteration % 12 == 0:
-                    gaussians.reinitial_pts()
+                    gaussians.reinitial_pts(args.num_depth)
                     gaussians.training_setup(opt)
                     mask_blur = torch.zeros(len(gaussians.values["xyz"]), dtype=torch.bool)
             if iteration == simp_iteration1:
@@ -81,5 +81,5 @@ def training(dataset, opt, pipe, checkpoint, args):
 
 def train(checkpoint=None, last=LAST, order=0, **given):
     opt = options(LAST, last, given)
-    args = SimpleNamespace(simp_iteration1=20, simp_iteration2=30, num_max=10**6)
+    args = SimpleNamespace(simp_iteration1=20, simp_iteration2=30, num_max=10**6, num_depth=100)
     return training(dataset(order), opt, None, checkpoint, args)

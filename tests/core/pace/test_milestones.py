@@ -321,7 +321,7 @@ def test_what_an_option_that_is_off_guards_is_irrelevant():
                 if views == -1:
                     views = len(stack)
             stack.pop()
-            done += 1
+            done += 2
             if step < opt.until and opt.prune:
                 if step % views / 2 == 0 and step % 30 > views:
                     print("prune")
