@@ -32,6 +32,7 @@ class AbstractAdapter(ABC):
         name: how users call it.
         project: its name and home, in Markdown, for docs/adapters.md; as are the next two.
         gated: from when on the gate decides, and what pauses it.
+        thinned: what `share` does to densification, or why nothing; empty where the declared events say it.
         left_alone: what else is done or left alone in skipped iterations, beyond what holds for every trainer.
         stand_ins: which of the stand-ins of `skipgs_plug.compat` serve the CUDA modules that its scripts import, for
             `--cpu`; empty where there are none.
@@ -48,6 +49,7 @@ class AbstractAdapter(ABC):
     checked: ClassVar[str]
     project: ClassVar[str] = ""
     gated: ClassVar[str] = ""
+    thinned: ClassVar[str] = ""
     left_alone: ClassVar[str] = ""
     stand_ins: ClassVar[str] = ""
     saved_state: Callable[[int], dict[str, Any] | None] | None = None

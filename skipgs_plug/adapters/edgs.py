@@ -30,6 +30,7 @@ class EDGS(AbstractAdapter):
     checked = "CompVis/EDGS eb21ad5 (its loop read, and a look-alike)"
     project = "[EDGS](https://github.com/CompVis/EDGS)"
     gated = "From `gs.opt.densify_until_iter` on: until then it densifies, or prunes after every iteration."
+    thinned = "Refused: whole iterations cannot be left out."
     left_alone = (
         "Whole iterations cannot be left out: its loop counts with tqdm's `trange`. Needs CUDA: its initialization "
         "matches images with a network."

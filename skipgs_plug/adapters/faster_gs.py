@@ -37,6 +37,7 @@ class FasterGS(AbstractAdapter):
         "From `DENSIFICATION_END_ITERATION` + 1 on. With Speedy-Splat's pruning each later prune pauses the gate. As "
         "in a shell: `skipgs-plug run faster_gs -- scripts/train.py -c config.yaml`, in the folder of NeRFICG."
     )
+    thinned = "Refused: whole iterations cannot be left out."
     left_alone = (
         "MCMC's position noise is left out where the gradient step is. Whole iterations cannot be left out: its "
         "callbacks hang on their numbers. Views are known by their frame's number. Needs CUDA: `--cpu` has no stand-in."

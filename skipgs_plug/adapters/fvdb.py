@@ -33,6 +33,7 @@ class FVDB(AbstractAdapter):
         "From epoch `refine_stop_epoch` on, or from `pose_opt_stop_epoch` on where camera poses are optimized. "
         "Opacities are reset every `reset_opacities_every_epoch` until the end, and each reset pauses the gate."
     )
+    thinned = "Refused: whole iterations cannot be left out."
     left_alone = (
         "Batches of several images have one joint loss and so one mean. Several crops per image are refused: each has "
         "a backward. Whole iterations cannot be left out: epochs iterate over a DataLoader. Needs CUDA."

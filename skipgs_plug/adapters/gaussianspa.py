@@ -21,6 +21,10 @@ class GaussianSpa(InriaFamily):
     checked = "noodle-lab/GaussianSpa abdfaf64 (its three scripts, run on the CPU)"
     project = "[GaussianSpa](https://github.com/noodle-lab/GaussianSpa)"
     gated = "From `optimizing_spa_stop_iter` + 1 on, after a pause for the prune in the iteration before."
+    thinned = (
+        "Densification events wait until Gaussians have been seen often enough. The sparsifying phase runs "
+        "whole: its terms pull at the model, and the iterations between them pull back."
+    )
     left_alone = (
         "A gate that you start earlier runs all iterations with the ADMM term and keeps their losses out of the means."
     )

@@ -31,6 +31,11 @@ class GNS(InriaFamily):
         "`train.py`: from `reg_end` + 1 (23,001) on, where selection by opacity has ended; without `prune_reg` from "
         "`densify_until_iter` on. `train-fast.py`: from `e2` + 1 (10,001) on."
     )
+    thinned = (
+        "All densification events are kept: each adds by a budget. The selection runs whole: its term would "
+        "act alone where the iterations between are left out. `train-fast.py` densifies whole, in iterations "
+        "500 to 7,000."
+    )
     left_alone = (
         "Both optimizers step every 5th and later every 20th iteration on what the backwards since then have left, in "
         "skipped iterations too."

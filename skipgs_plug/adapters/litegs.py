@@ -33,6 +33,7 @@ class LiteGS(AbstractAdapter):
     checked = "MooreThreads/LiteGS 004b952 (its loop read, and a look-alike: its rasterizer has no stand-in)"
     project = "[LiteGS](https://github.com/MooreThreads/LiteGS)"
     gated = "From the epoch `densify_until` on, after a pause for the opacity reset that usually ends the epoch before."
+    thinned = "Refused: whole iterations cannot be left out."
     left_alone = (
         "Gaussians are put in a new order now and then, which changes no image. Whole iterations cannot be left out: "
         "its loop is one over epochs and a DataLoader. Needs CUDA: `--cpu` has no stand-in for its rasterizer."

@@ -24,6 +24,11 @@ class MiniSplatting(InriaFamily):
         "`ms/train.py`: from `simp_iteration2` + 1 on, after a pause for the prune in that iteration. `ms_d/train.py`, "
         "which does not simplify: from `densify_until_iter` on."
     )
+    thinned = (
+        "Densification events wait until Gaussians have been seen often enough; views in which Gaussians are "
+        "blurred are gathered until the next event. Points are made anew from depths, and both "
+        "simplifications happen, as ever."
+    )
     left_alone = "Scores and depths for pruning are rendered without gradients and always run."
     stand_ins = "gaussianspa"
     mark = "num_depth"

@@ -22,6 +22,10 @@ class MiniSplatting2(InriaFamily):
         "From the iteration after (`simp_iteration2` + `iterations`) // 2 on, where culled Gaussians return to their "
         "views, after a pause for it."
     )
+    thinned = (
+        "Densification events wait until Gaussians have been seen often enough. Clones by importance every "
+        "250 iterations, points from depths and simplifications happen as ever."
+    )
     left_alone = "Its sparse Adam has no gradients in skipped iterations. Needs CUDA: its culling has no stand-in."
     mark = "depth_reinit"
     renders = ("render_imp",)

@@ -35,6 +35,7 @@ class Nerfstudio(AbstractAdapter):
     checked = "nerfstudio-project/nerfstudio 1.1.5 50e0e3c7 (ns-train, run on the CPU)"
     project = "[nerfstudio, splatfacto and splatfacto-mcmc](https://github.com/nerfstudio-project/nerfstudio)"
     gated = "As gsplat; decided on `main_loss`, since other terms appear in every tenth iteration only."
+    thinned = "As gsplat. Evaluations and the first and last of gathered gradients happen as often as ever."
     left_alone = (
         "An enabled loss scaler is not asked to update without a gradient. As in a shell: `skipgs-plug run nerfstudio "
         "-- ns-train splatfacto ...` (also `-m nerfstudio.scripts.train`). `skipgs.json` lies beside its "

@@ -21,6 +21,10 @@ class PerceptualGS(InriaFamily):
         "From `densify_until_iter` + 1 on, after a pause where that iteration rebuilds the model. With images that "
         "have alpha, prunes every hundredth iteration pause the gate until the end."
     )
+    thinned = (
+        "Densification events wait until Gaussians have been seen often enough. Those that read weights of "
+        "all views (every 1,000 and 1,500 iterations) happen as ever; with images that have alpha all do."
+    )
     left_alone = "Renders of sensitivity and alpha are of the same view, and belong to its loss."
     stand_ins = "gaussianspa"
     mark = "get_sensitivity"

@@ -37,6 +37,10 @@ class StepTrainer(AbstractAdapter):
         "From the latest of its inclusive bounds + 1 on, after a pause for the opacity reset that falls on that "
         "bound. Modes without densification need `--start-iter`."
     )
+    thinned = (
+        "Densification runs whole, since it is hidden in wrappers, unless a loop of yours names its events "
+        "(`gate.iterations(..., events=...)`). Refinement is thinned."
+    )
     left_alone = (
         "`before_optim_hook`, which reads gradients, is left out with the backward. Attach to the outermost trainer; "
         "wrappers added later are fine."

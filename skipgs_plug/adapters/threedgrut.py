@@ -47,6 +47,7 @@ class ThreeDGRUT(AbstractAdapter):
     checked = "nv-tlabs/3dgrut a37ef72 (its loop read, and a look-alike)"
     project = "[3DGRUT](https://github.com/nv-tlabs/3dgrut)"
     gated = "From the latest `end_iteration` of the strategy on, where nothing is densified, pruned or reset any more."
+    thinned = "Refused: whole iterations cannot be left out."
     left_alone = (
         "MCMC's position noise is left out where the gradient step is. Views are known by image path, or by frame "
         "where the dataset has no paths. Whole iterations cannot be left out: epochs iterate over a "
