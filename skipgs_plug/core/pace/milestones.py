@@ -153,8 +153,7 @@ class _Loop:
         self.body = self._spelled_out(statement.body, stored)
 
     def _spelled_out(self, body: list[ast.stmt], stored: list[str]) -> list[ast.stmt]:
-        """Replace names and attributes that stand for something of the number, `epoch_step = step % len(views)`, or
-        for an option, `end = args.end`."""
+        """Replace names that stand for something of the number, `place = step % len(views)`, or for an option."""
         for index in range(len(_assigned(body))):
             place, value = _assigned(body)[index]  # what came before it is spelled out in it
             text = ast.unparse(place)

@@ -339,7 +339,7 @@ def test_what_an_option_that_is_off_guards_is_irrelevant():
     on = SimpleNamespace(prune=True, until=80, reset_every=40)
     with (
         pytest.warns(RuntimeWarning, match="counts the iterations that run"),
-        pytest.raises(SkipGSError, match=r"cannot be foreseen \(step % views / 2 == 0"),
+        pytest.raises(SkipGSError, match=r"cannot be evaluated ahead \(step % views / 2 == 0"),
     ):
         found(lambda stop: loop(stop, on))
     with pytest.warns(RuntimeWarning, match="counts the iterations that run"):
