@@ -48,7 +48,7 @@ class Events:
 
     @property
     def end(self) -> int | None:
-        """Iteration at which one more event would follow the last one in the trainer's schedule; None without events."""
+        """Iteration at which one more event would follow the last one upstream; None without events."""
         return self._numbers[-1] + self._distance(self._numbers[-1]) if self._numbers else None
 
     def ran(self, number: int) -> None:
