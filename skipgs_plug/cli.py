@@ -51,6 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 done; 2 bad input, one sentence on stderr; 130 interrupted, 143 terminated, 141 nobody reads the output.
         `--debug` shows the traceback.
     """
+    if argv is None and sys.argv[1:2] != ["run"]:  # the script of another project runs as it would without us
+        speak_utf8()
     replace_closed_streams()
     print_any_name()
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -78,6 +80,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exc()
             return BAD_INPUT if sentence else 1
         return fail(sentence)
+
+
+def speak_utf8() -> None:
+    """Begin anew in UTF-8 mode where the locale has another encoding for file names.
+
+    Scenes and run folders name files in UTF-8, so a photograph called `Straße.jpg` could not be opened. Arguments reach
+    the new program byte by byte.
+    """
+    if sys.getfilesystemencoding() != "utf-8":
+        os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
 
 
 def expand_home(argument: str) -> str:

@@ -21,6 +21,11 @@ class WriteError(OSError):
     """A file that cannot be written: the disk is full, read-only, or out of reach. One sentence that says so."""
 
 
+def printable(name: str) -> str:
+    """Return a name as text that can be shown and written: bytes that are no UTF-8 become escapes such as \\xe9."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
+
+
 @contextlib.contextmanager
 def write_aside(path: str | Path, size: int | None = None) -> Iterator[Path]:
     """Yield a temporary path next to `path`. It is renamed to `path` on success and removed on failure.

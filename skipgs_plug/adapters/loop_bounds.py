@@ -35,7 +35,7 @@ def last_calls(function: ast.FunctionDef, names: Collection[str], values: Mappin
 def function_of(source: Path | Any, name: str) -> ast.FunctionDef | None:
     """Return the function of this name in a script, or the syntax of a function; None where there is no source."""
     try:
-        text = source.read_text() if isinstance(source, Path) else textwrap.dedent(inspect.getsource(source))
+        text = source.read_bytes() if isinstance(source, Path) else textwrap.dedent(inspect.getsource(source))
         tree = ast.parse(text)
     except (OSError, TypeError, ValueError, SyntaxError):
         return None

@@ -62,7 +62,7 @@ def compare(args: Args) -> list[Row]:
     write_json(folder.root / "bench.json", result)
     write_decisions(folder.root / DECISIONS, records)
     with write_aside(folder.root / "table.md") as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
     write_plots(folder.root, records, rows, result["view_names"], whole)
     page = next_command("report", folder.root)
     print(f"\n{text}\nTable, plots and bench.json: {folder.root}; {page} makes one page.")

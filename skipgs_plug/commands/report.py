@@ -15,6 +15,6 @@ def run(args: Args) -> int:
         raise SkipGSError("report needs at least one run folder.")
     page = build_page([read_source(run) for run in args.runs])
     with write_aside(args.out) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")
     print(args.out)
     return 0

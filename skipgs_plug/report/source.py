@@ -14,6 +14,7 @@ from skipgs_plug.bench.result import KIND
 from skipgs_plug.bench.result import SCHEMA_VERSION as BENCH_VERSION
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.report import SCHEMA_VERSION as RUN_VERSION
+from skipgs_plug.files import printable
 
 RUN_FIELDS = (
     "settings",
@@ -102,7 +103,7 @@ def read_source(path: str | Path) -> RunSource | BenchSource:
     else:
         folder = path
         file = folder / "bench.json" if (folder / "bench.json").is_file() else folder / "skipgs.json"
-    name = folder.resolve().name
+    name = printable(folder.resolve().name)
     if not file.is_file():
         if (folder / "settings.json").is_file() and (folder / "runs").is_dir():
             raise SkipGSError(f"{folder} holds a bench that has not finished; give its command again to continue it.")

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skipgs_plug.files import printable
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.frame import Frame
 
@@ -116,7 +117,7 @@ def assemble_scene(
             view.viewmat = frame.local_pose(view.viewmat)
     points = frame.to_local(points) if frame.moves else points
     return Scene(
-        name=name,
+        name=printable(name),
         train=train,
         test=test,
         points=torch.from_numpy(np.ascontiguousarray(points, dtype=np.float32)),

@@ -8,6 +8,7 @@ change their signs, and rotations and spherical harmonics change with them.
 from __future__ import annotations
 
 import gzip
+import logging
 import math
 import struct
 import zlib
@@ -22,6 +23,8 @@ from torch import Tensor
 from skipgs_plug.trainer.errors import InputError, reason
 from skipgs_plug.trainer.ply import renderable
 
+log = logging.getLogger(__name__)
+
 MAGIC, VERSION = 0x5053474E, 2
 HEADER = "<IIIBBBB"  # magic, version, Gaussians, SH degree, bits behind the point, flags, nothing
 ANTIALIASED, EXTENDED = 1, 2  # flags
@@ -31,6 +34,7 @@ COLOUR_SCALE = 0.15  # factor on constant SH coefficients before 0.5 is added, a
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}  # by number of coefficients beyond the constant one
 # Signs of the coefficients of bands 1 to 3 when y and z are turned: (y z x) (xy yz zz xz xx-yy) (...)
 SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)
+SCALES = (-10.0, 255 / 16 - 10.0)  # logarithms that a byte stands for
 FIRST_BAND_STEP, OTHER_BAND_STEP = 8, 16  # of 256: five and four bits
 
 
@@ -48,6 +52,11 @@ def to_spz(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
     rotations in a byte each; spherical harmonics in five bits for the first band and four for the others.
     """
     means, scales, colours = (splats[name].numpy().astype(np.float64) for name in ("means", "scales", "sh0"))
+    cut = int(((scales < SCALES[0]) | (scales > SCALES[1])).any(axis=1).sum())
+    if cut:
+        log.warning(
+            "SPZ holds scales of e^%.0f to e^%.0f: those of %d Gaussians are cut. A .ply keeps them.", *SCALES, cut
+        )
     n, rest = len(means), splats["shN"].numpy().astype(np.float32)
     largest = float(np.abs(means).max(initial=1e-9))
     bits = min(max(math.floor(math.log2((2**POSITION_BITS - 1) / largest)), 0), 24)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -138,3 +140,46 @@ def test_linked_folders_and_transparency(pattern, tmp_path):
     assert [path.name for path in gathered.masks.rglob("*.png")] == ["c.png.png"]
     mask = np.array(Image.open(gathered.masks / "day2" / "c.png.png"))
     np.testing.assert_array_equal(mask, alpha)
+
+
+def test_what_programs_leave_in_folders_is_no_photograph(pattern, tmp_path):
+    """Copies that Jupyter and file managers keep, and what macOS puts beside files on other disks."""
+    source = tmp_path / "source"
+    kept = ["front/0001.png", "back/0001.png", "back/0002.png"]  # cameras of a rig give the same names
+    left = [".ipynb_checkpoints/0001-checkpoint.png", "front/.thumbnails/0001.png", "front/._0001.png"]
+    for number, name in enumerate(kept + left):
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.roll(pattern, 4 * number, axis=0)).save(source / name)
+    gathered = gather(source, tmp_path / "photos", 10, lambda n: None)
+    assert gathered.names == sorted(kept)
+    for number, name in enumerate(kept):
+        assert np.array_equal(np.array(Image.open(gathered.folder / name)), np.roll(pattern, 4 * number, axis=0))
+
+
+@pytest.mark.filterwarnings(LEAVES_PIPES)
+@pytest.mark.parametrize("turn", [90, 180, 270])
+def test_a_video_that_was_held_upright(pattern, tmp_path, turn):
+    """Phones store the pixels as the sensor lies, and how they are to be turned."""
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    lying, stored = tmp_path / "lying.mp4", tmp_path / "stored.mp4"
+    iio.imwrite(lying, np.stack([pattern] * 4), plugin="FFMPEG", fps=10, quality=10, macro_block_size=2)
+    command = [
+        get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-display_rotation",
+        str(turn),
+        "-i",
+        str(lying),
+        "-c",
+        "copy",
+        str(stored),
+    ]
+    subprocess.run(command, check=True)
+    taken = [frame for _, frame in sharpest_frames(stored, 4)]
+    assert len(taken) == 4
+    upright = np.rot90(pattern, turn // 90).astype(float)
+    for frame in taken:
+        assert frame.shape == upright.shape
+        assert np.abs(frame - upright).mean() < 25

@@ -13,11 +13,13 @@ from plyfile import PlyData
 from scene_folders import write_colmap
 
 from skipgs_plug.cli import main
-from skipgs_plug.trainer import Scene, TrainConfig, Trainer, load_scene
+from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer, load_scene
+from skipgs_plug.trainer.errors import DamagedCheckpointError
 from skipgs_plug.trainer.frame import Frame
 from skipgs_plug.trainer.loaders.packed import save_packed
-from skipgs_plug.trainer.ply import read_ply
+from skipgs_plug.trainer.ply import read_ply, write_ply
 from skipgs_plug.trainer.scene import View, assemble_scene
+from skipgs_plug.view.gaussians import to_gaussians
 from skipgs_plug.view.model import open_model
 
 UTM = (500_000.0, 4_500_000.0, 120.0)
@@ -132,3 +134,69 @@ def move_text_model(root: Path, shift: tuple[float, float, float]) -> None:
     for row in rows:
         row[1:4] = [repr(float(value) + by) for value, by in zip(row[1:4], shift, strict=True)]
     points.write_text("\n".join(" ".join(row) for row in rows) + "\n")
+
+
+def utm_model(path: Path, n: int = 400) -> dict[str, torch.Tensor]:
+    """Write a PLY of a model in coordinates of a map; return it as it would be at the origin."""
+    generator = torch.Generator().manual_seed(0)
+    local = {
+        "means": torch.randn(n, 3, generator=generator, dtype=torch.float64),
+        "scales": torch.randn(n, 3, generator=generator) / 4 - 4,
+        "quats": torch.nn.functional.normalize(torch.randn(n, 4, generator=generator), dim=1),
+        "opacities": torch.randn(n, generator=generator),
+        "sh0": torch.randn(n, 1, 3, generator=generator),
+        "shN": torch.randn(n, 15, 3, generator=generator) / 8,
+    }
+    local["means"][0] = torch.tensor([900.0, 0, 0])  # one that is far off
+    write_ply({**local, "means": local["means"] + torch.tensor(UTM, dtype=torch.float64)}, path)
+    return local
+
+
+def test_a_model_of_a_map_is_shown_without_its_scene(tmp_path: Path) -> None:
+    local = utm_model(tmp_path / "model.ply")
+    model = open_model(tmp_path / "model.ply")
+    shown = model.load(model.snapshots[-1])
+    assert shown["means"].dtype == torch.float32
+    middle = torch.from_numpy(np.median(local["means"].numpy(), axis=0))
+    torch.testing.assert_close(shown["means"].double(), local["means"] - middle, rtol=0, atol=1e-4)
+    for name in ("scales", "quats", "opacities", "sh0", "shN"):
+        torch.testing.assert_close(shown[name], local[name])
+    on_page = to_gaussians(shown, 1.0)
+    assert np.abs(np.median(on_page.centers, axis=0)).max() < 0.01
+    # Without moving, float32 has steps of half a unit there.
+    assert len(np.unique(on_page.centers[:, 1].round(3))) > 350
+    # All snapshots of a model are moved alike.
+    assert torch.equal(model.load(model.snapshots[-1])["means"], shown["means"])
+
+
+def test_a_model_at_the_origin_stays(tmp_path: Path, tiny_scene: Scene) -> None:
+    trained(tiny_scene).export_ply(tmp_path / "model.ply")
+    model = open_model(tmp_path / "model.ply")
+    assert torch.equal(model.load(model.snapshots[-1])["means"], read_ply(tmp_path / "model.ply")["means"])
+
+
+def test_resuming_compares_coordinates_and_poses(tmp_path: Path, tiny_scene: Scene) -> None:
+    begun = trained(placed(tiny_scene, 1.0, UTM))
+    begun.save_checkpoint(tmp_path / "c.pt")
+
+    def resume(scene: Scene) -> None:
+        config = TrainConfig(max_steps=60, refine_start_iter=30_000, sh_degree_interval=5000)
+        Trainer(config, scene).load_checkpoint(tmp_path / "c.pt")
+
+    resume(placed(tiny_scene, 1.0, UTM))
+    resume(placed(tiny_scene, 1.0, tuple(value + 1e-7 for value in UTM)))  # rounded otherwise
+    for unit, shift in ((1.0, NOWHERE), (1.0, (500_010.0, *UTM[1:])), (1e-3, UTM)):
+        with pytest.raises(InputError, match="subtracted and divided by, which is"):
+            resume(placed(tiny_scene, unit, shift))
+    other = placed(tiny_scene, 1.0, UTM)
+    other.train[2].viewmat[:3, 3] += 0.01
+    with pytest.raises(InputError, match=r"other poses of 1 of its 8 cameras, such as 'view_003\.png'"):
+        resume(other)
+    content = torch.load(tmp_path / "c.pt", weights_only=True)
+    del content["scene"]["viewmats"]  # as of 0.1.0
+    torch.save(content, tmp_path / "c.pt")
+    resume(other)
+    content["scene"]["centre"] = "here"
+    torch.save(content, tmp_path / "c.pt")
+    with pytest.raises(DamagedCheckpointError):
+        resume(other)

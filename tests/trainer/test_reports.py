@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 from plyfile import PlyData
-from scene_folders import write_colmap
+from scene_folders import write_blender, write_colmap
 from test_properties import write_binary, write_cloud, write_nerfstudio
 from test_situations import gaussians, write_columns, write_model
 
@@ -377,3 +377,46 @@ def test_moving_scenes_are_named(nerf: Path, caplog: pytest.LogCaptureFixture) -
     change_frames(nerf, lambda number, frame: frame.update(time=number / 10))
     load_scene(nerf)
     assert "its frames have different times" in caplog.text
+
+
+def test_masks_of_transparency_and_of_lossy_formats(colmap: Path) -> None:
+    """Further members of the kind of LichtFeld-Studio#547: what a mask says is taken as it was meant."""
+    folder = colmap / "masks/cam"
+    folder.mkdir(parents=True)
+    half = np.zeros((24, 32), dtype=np.uint8)
+    half[:, 16:] = 255
+    white = np.full((24, 32, 3), 255, dtype=np.uint8)
+    Image.fromarray(np.dstack([white, half])).save(folder / "view_000.png")
+    Image.fromarray(half).save(folder / "view_001.jpg", quality=30)
+    Image.fromarray(half // 255).save(folder / "view_002.png")  # 0 and 1
+    Image.fromarray(half > 0).save(folder / "view_003.png")  # bits
+    palette = Image.fromarray(half // 255, mode="L").convert("P")
+    palette.putpalette([0, 0, 0, 255, 255, 255])
+    palette.save(folder / "view_004.png")
+    scene = load_scene(colmap)
+    masks = {view.name: view.mask for view in scene.train + scene.test}
+    for number in range(5):
+        mask = masks[f"cam/view_{number:03d}.png"]
+        assert mask is not None
+        assert torch.equal(mask, torch.from_numpy(half > 0)), number
+
+
+def test_a_text_model_beside_a_binary_one(tmp_path: Path, tiny_scene: Scene, caplog) -> None:
+    """A further member of "records that are never looked at": somebody edited images.txt, images.bin is read."""
+    root = write_colmap(tiny_scene, tmp_path / "text")
+    binary = write_binary(tiny_scene, tmp_path / "scene") / "sparse/0"
+    for path in (root / "sparse/0").iterdir():
+        shutil.copy(path, binary)
+    assert len(load_scene(tmp_path / "scene").train) == 8
+    assert not caplog.text
+    lines = (binary / "images.txt").read_text().splitlines()
+    (binary / "images.txt").write_text("\n".join(lines[:12]) + "\n")
+    load_scene(tmp_path / "scene")
+    assert "images.bin lists 10 images and is read, images.txt lists 6" in caplog.text
+
+
+def test_a_validation_file_is_held_out_where_there_is_no_other(tmp_path: Path, tiny_scene: Scene) -> None:
+    root = write_blender(tiny_scene, tmp_path / "scene")
+    (root / "transforms_test.json").rename(root / "transforms_val.json")
+    scene = load_scene(root)
+    assert (len(scene.train), len(scene.test)) == (8, 2)

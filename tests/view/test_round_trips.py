@@ -13,7 +13,8 @@ from plyfile import PlyData, PlyElement
 
 from skipgs_plug.cli import main
 from skipgs_plug.trainer.ply import PROPERTIES, read_ply, write_ply
-from skipgs_plug.view.model import open_snapshots
+from skipgs_plug.view.model import open_model, open_snapshots
+from skipgs_plug.view.spz import to_spz
 
 FORMATS = (".ply", ".compressed.ply", ".splat", ".spz")
 N = 300
@@ -135,3 +136,26 @@ def test_any_order_and_type_of_columns(splats: Splats, tmp_path: Path, order, ki
             torch.testing.assert_close(read[name], values, rtol=1e-6, atol=1e-9)
         else:
             assert torch.equal(read[name], values), name
+
+
+def test_scales_that_spz_does_not_hold_are_counted(splats: Splats, caplog: pytest.LogCaptureFixture) -> None:
+    to_spz(splats)
+    assert not caplog.text
+    scales = splats["scales"].clone()
+    scales[:7, 1] -= 9  # a scene in kilometres
+    scales[7:9] += 13
+    to_spz({**splats, "scales": scales})
+    assert "those of 9 Gaussians are cut" in caplog.text
+
+
+def test_antialiasing_travels_with_an_spz(splats: Splats, tmp_path: Path) -> None:
+    """It changes how opacities are to be drawn."""
+    run = tmp_path / "run"
+    (run / "ckpts").mkdir(parents=True)
+    torch.save({"splats": splats}, run / "ckpts/ckpt_9_rank0.pt")
+    for value in (False, True):
+        (run / "cfg.yml").write_text(f"antialiased: {str(value).lower()}\n")
+        assert main(["export", str(run), str(tmp_path / "one.spz")]) == 0
+        assert open_model(tmp_path / "one.spz").antialiased is value
+        assert main(["export", str(tmp_path / "one.spz"), str(tmp_path / "two.spz")]) == 0
+        assert open_model(tmp_path / "two.spz").antialiased is value

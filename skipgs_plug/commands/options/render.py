@@ -13,10 +13,10 @@ from skipgs_plug.commands.options.parse import parse_as
 
 @dataclass
 class Args:
-    """Render the last model of a run folder, or any 3DGS PLY, along a camera path or from the held-out cameras."""
+    """Render the last model of a run folder, or any 3DGS PLY, .splat or .spz, along a path or from held-out cameras."""
 
     model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
-    """Run folder or PLY."""
+    """Run folder, PLY, .splat or .spz."""
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PATH")]
     """Film to write (.mp4), or folder for PNG files."""
     scene: str | None = None

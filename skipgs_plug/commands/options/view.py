@@ -18,7 +18,7 @@ class Args:
     """
 
     model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
-    """Run folder or PLY."""
+    """Run folder, PLY, .splat or .spz."""
     scene: str | None = None
     """Scene with the photographs; default: the scene of the run folder. A PLY needs no scene."""
     data_factor: int | None = None

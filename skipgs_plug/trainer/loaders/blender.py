@@ -1,4 +1,4 @@
-"""Blender folders (NeRF-synthetic): transforms_train.json, transforms_test.json, RGBA images."""
+"""Blender folders (NeRF-synthetic): transforms_train.json, transforms_test.json (or _val), RGBA images."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
 from skipgs_plug.trainer.ply import read_points
 from skipgs_plug.trainer.scene import BLACK, WHITE, Scene, View, assemble_scene, split_views
 
+HELD_OUT = ("transforms_test.json", "transforms_val.json")  # the first of these
 BOX = 1.3  # half edge of the cube of initial points, as in 3DGS
 
 
@@ -37,8 +38,9 @@ def load_blender(
     Points are `cloud` (points, colours), else those of `ply_file_path` in transforms_train.json, else random.
     """
     train, any_alpha = read_transforms(path, "transforms_train.json", data_factor, images)
-    if (path / "transforms_test.json").is_file():
-        test, _ = read_transforms(path, "transforms_test.json", data_factor, images)
+    held_out = next((name for name in HELD_OUT if (path / name).is_file()), None)
+    if held_out is not None:
+        test, _ = read_transforms(path, held_out, data_factor, images)
         train, test = (sorted(views, key=lambda view: view.name) for views in (train, test))
     else:
         train, test = split_views(train, test_every)

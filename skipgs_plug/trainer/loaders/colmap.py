@@ -137,14 +137,32 @@ def find_model(path: Path) -> Path:
 
 def listed_images(model: Path) -> int:
     """Return how many images a model lists; 0 if that is unknown."""
+    return listed_in_binary(model) if (model / "images.bin").is_file() else listed_in_text(model)
+
+
+def listed_in_binary(model: Path) -> int:
     try:
-        if (model / "images.bin").is_file():
-            with open(model / "images.bin", "rb") as stream:
-                return int(struct.unpack("<Q", stream.read(8))[0])
+        with open(model / "images.bin", "rb") as stream:
+            return int(struct.unpack("<Q", stream.read(8))[0])
+    except (struct.error, OSError):
+        return 0
+
+
+def listed_in_text(model: Path) -> int:
+    try:
         cameras = {line.split()[0] for line in content_lines(model / "cameras.txt") if line.strip()}
         return len(image_records(model / "images.txt", cameras))
-    except (struct.error, OSError, InputError):
+    except InputError:
         return 0
+
+
+def say_if_both(model: Path) -> None:
+    """Say that a binary model is read where a text model beside it lists another number of images."""
+    if not (is_complete(model, ".bin") and is_complete(model, ".txt")):
+        return
+    binary, text = listed_in_binary(model), listed_in_text(model)
+    if binary != text:
+        log.warning("%s: images.bin lists %d images and is read, images.txt lists %d.", model, binary, text)
 
 
 def read_model(model: Path) -> tuple[Any, dict[int, str]]:
@@ -157,6 +175,7 @@ def read_model(model: Path) -> tuple[Any, dict[int, str]]:
     models = camera_models(pycolmap)
     check_lengths(model, {number: count for number, (_, count) in models.items()})
     try:
+        say_if_both(model)
         if is_complete(model, ".bin") and (model / "points3D.bin").is_file():
             return pycolmap.Reconstruction(str(model)), {}
         with tempfile.TemporaryDirectory() as folder:

@@ -15,6 +15,7 @@ from torch import Tensor
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.lfs import HINT, is_pointer
 
+LOSSY = (".jpg", ".jpeg", ".webp")
 ORIENTATION = 0x0112  # EXIF tag; 5 to 8 exchange width and height
 
 
@@ -42,7 +43,7 @@ def read_image(
         InputError: damaged, too large, of a kind whose range of values is unknown, or of another shape than `size`.
     """
     picture = upright(decode(source, label), label, size)
-    has_alpha = picture.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in picture.info
+    has_alpha = has_transparency(picture)
     picture = picture.convert("RGBA" if has_alpha else "RGB")
     alpha = None
     if has_alpha:
@@ -60,11 +61,22 @@ def read_image(
     return torch.from_numpy(np.array(picture)), None if alpha is None else torch.from_numpy(np.array(alpha))
 
 
+def has_transparency(picture: Image.Image) -> bool:
+    return picture.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in picture.info
+
+
 def read_mask(path: Path, image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return a mask [H, W] bool of the size of `image` [H, W, 3]: True where it is not black."""
-    picture = upright(decode(path, path), path, size).convert("L")
-    picture = picture.resize((image.shape[1], image.shape[0]), Image.Resampling.NEAREST)
-    return torch.from_numpy(np.array(picture)) > 0
+    """Return a mask [H, W] bool of the size of `image` [H, W, 3]: True where it is neither black nor transparent.
+
+    Formats that lose some of a picture leave grey around its edges: there white begins in the middle.
+    """
+    picture = upright(decode(path, path), path, size)
+    if has_transparency(picture):
+        picture = picture.convert("RGBA")
+        picture = Image.alpha_composite(Image.new("RGBA", picture.size, (0, 0, 0, 255)), picture)
+    picture = picture.convert("L").resize((image.shape[1], image.shape[0]), Image.Resampling.NEAREST)
+    least = 128 if path.suffix.lower() in LOSSY else 1
+    return torch.from_numpy(np.array(picture)) >= least
 
 
 def decode(source: Path | IO[bytes], label: Path | str) -> Image.Image:
