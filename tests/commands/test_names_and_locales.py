@@ -49,6 +49,7 @@ def write_colmap(root: Path, name: str = "view", binary: bool = False) -> Path:
     return root
 
 
+@pytest.mark.timeout(1800)  # five processes, each of which loads torch
 @pytest.mark.parametrize("strict", [False, True], ids=["POSIX", "ASCII"])
 def test_every_locale(tmp_path: Path, strict: bool) -> None:
     """`strict` is what Python does of itself under any other locale than C and POSIX, such as de_DE.ISO-8859-1."""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import os
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.scene import is_text
 
+SETTLED = 2_000_000_000  # ns
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
 
 
@@ -123,10 +126,10 @@ def in_any_case(folder: Path, name: PurePosixPath) -> Path | None:
     """Return the only file whose path differs from `name` by capital letters alone, image suffixes apart."""
     places = [folder]
     for part in name.parts[:-1]:
-        places = [Path(entry.path) for place in places for entry in entries(place, [part]) if entry.is_dir()]
+        places = [path for place in places for path in entries(place, [part]) if path.is_dir()]
     wanted = [spelling.name for spelling in spellings(PurePosixPath(name.name))]
-    found = [entry.path for place in places for entry in entries(place, wanted) if entry.is_file()]
-    return Path(found[0]) if len(found) == 1 else None
+    found = [path for place in places for path in entries(place, wanted) if path.is_file()]
+    return found[0] if len(found) == 1 else None
 
 
 def same_stem(path: Path) -> Path | None:
@@ -137,14 +140,25 @@ def same_stem(path: Path) -> Path | None:
         return None
 
 
-def entries(folder: Path, names: Sequence[str]) -> list[os.DirEntry[str]]:
+def entries(folder: Path, names: Sequence[str]) -> list[Path]:
     """Return the entries of a folder with one of these names, in any case."""
-    wanted = {name.casefold() for name in names}
     try:
-        with os.scandir(folder) as listing:
-            return [entry for entry in listing if entry.name.casefold() in wanted]
+        changed = os.stat(folder).st_mtime_ns
+        # Names may be added within the tick of the file system's clock in which the folder was listed.
+        list_of = listing if time.time_ns() - changed > SETTLED else listing.__wrapped__
+        known = list_of(str(folder), changed)
     except OSError:
         return []
+    return [folder / name for wanted in {name.casefold() for name in names} for name in known.get(wanted, ())]
+
+
+@functools.lru_cache(maxsize=64)
+def listing(folder: str, changed: int) -> dict[str, list[str]]:
+    """Return the names in a folder, which was last changed then (ns), by themselves without capital letters."""
+    result: dict[str, list[str]] = {}
+    for name in os.listdir(folder):
+        result.setdefault(name.casefold(), []).append(name)
+    return result
 
 
 def unlisted_images(folder: Path, listed: Sequence[Path]) -> list[str]:
