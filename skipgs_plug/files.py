@@ -22,7 +22,7 @@ class WriteError(OSError):
 
 
 def printable(name: str) -> str:
-    """Return a name as text that can be shown and written: bytes that are no UTF-8 become escapes such as \\xe9."""
+    """Return a name as text that can be shown and written: bytes that are not UTF-8 become hexadecimal escapes."""
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from skipgs_plug.trainer.errors import InputError, reason
+
+log = logging.getLogger(__name__)
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp")
 JUDGED_SIZE = 640  # longer side in pixels of the frames whose sharpness is compared: sensor noise does not count there
@@ -42,7 +45,7 @@ def sharpest_frames(path: Path, wanted: int) -> Iterator[tuple[int, np.ndarray]]
     if total == 0:
         raise InputError(f"Video {path} holds no frame; record it again.")
     borders = np.linspace(0, total, min(wanted, total) + 1).round().astype(int)[1:]
-    group, best = 0, (-1.0, 0, np.empty(0))
+    group, best, number = 0, (-1.0, 0, np.empty(0)), -1
     try:
         for number, frame in enumerate(iio.imiter(path, plugin="FFMPEG")):
             while group < len(borders) - 1 and number >= borders[group]:
@@ -54,6 +57,8 @@ def sharpest_frames(path: Path, wanted: int) -> Iterator[tuple[int, np.ndarray]]
     except (RuntimeError, OSError) as error:
         why = f"cannot be decoded to its end ({reason(error)})"
         raise InputError(f"Video {path} {why}; export it again as mp4 (H.264).") from error
+    if number + 1 < total:
+        log.warning("%s: %d of %d frames can be decoded; record or export it again.", path, number + 1, total)
     yield best[1], best[2]
 
 

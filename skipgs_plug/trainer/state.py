@@ -21,6 +21,7 @@ from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import DamagedCheckpointError, InputError, MissingFileError
 from skipgs_plug.trainer.frame import SAME, frame_of
+from skipgs_plug.trainer.ply import saturated
 from skipgs_plug.trainer.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -166,6 +167,8 @@ def read_checkpoint(path: str | Path, device: torch.device) -> dict[str, Any]:
         if isinstance(content, Mapping) and isinstance(content.get("version"), int) and content["version"] != VERSION:
             raise InputError(f"Checkpoint {path} has version {content['version']}, expected {VERSION}; start afresh.")
         schema.check(content, Checkpoint, "checkpoint")
+        if {"opacities", "scales"} <= content["splats"].keys():
+            content["splats"] = saturated(content["splats"], path)
         _check_tensors(content)
     except InputError:
         raise

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.packed import save_packed
+from skipgs_plug.trainer.ply import read_points
 from skipgs_plug.trainer.scene import BLACK, View, assemble_scene
 
 
@@ -191,3 +192,29 @@ def test_a_run_does_not_depend_on_the_world(tiny_scene: Scene, seed: int) -> Non
     other = moved(tiny_scene, rotation_of(seed), np.array([5e5, -4.5e6, 120.0]), 3.0)
     # Adam steps along axes, so a turned world takes other steps of the same length.
     assert psnr(other) == pytest.approx(psnr(tiny_scene), abs=0.15)
+
+
+NAMES = ["x", "y", "z", "red", "green", "blue", "nx", "quality"]
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    order=st.permutations(NAMES),
+    places=st.lists(st.sampled_from(["i1", "i2", "i4", "f4", "f8"]), min_size=3, max_size=3),
+    colours=st.sampled_from(["u1", "i2", "u2", "i4", "u4", "f4", "f8"]),
+    form=st.sampled_from(["<", ">", "text"]),
+)
+def test_any_order_and_type_of_the_columns_of_a_cloud(tmp_path: Path, order, places, colours, form: str) -> None:
+    kinds = dict(zip(NAMES, [*places, colours, colours, colours, "f4", "u1"], strict=True))
+    values = np.random.default_rng(0).integers(-100, 100, (20, 3))
+    rgb = np.random.default_rng(1).integers(0, 256, (20, 3))
+    rgb[0] = 255
+    rows = np.zeros(20, dtype=[(name, kinds[name]) for name in order])
+    for i, name in enumerate(NAMES[:6]):
+        rows[name] = (values if i < 3 else rgb)[:, i % 3]
+    text = form == "text"
+    data = PlyData([PlyElement.describe(rows, "vertex")], text=text, byte_order="=" if text else form)
+    data.write(str(tmp_path / "cloud.ply"))
+    positions, colour = read_points(tmp_path / "cloud.ply")
+    np.testing.assert_array_equal(positions, values)
+    np.testing.assert_array_equal(colour, rgb)

@@ -420,3 +420,12 @@ def test_a_validation_file_is_held_out_where_there_is_no_other(tmp_path: Path, t
     (root / "transforms_test.json").rename(root / "transforms_val.json")
     scene = load_scene(root)
     assert (len(scene.train), len(scene.test)) == (8, 2)
+
+
+def test_points_that_are_lost_are_counted(colmap: Path) -> None:
+    """A further member of "records lost": two points of one number, of which one is read."""
+    file = colmap / "sparse/0/points3D.txt"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([*lines, lines[0].replace(" 0.5", " 0.7")]) + "\n")
+    with pytest.raises(InputError, match=r"lists 161 points, and 160 can be read|cannot be read"):
+        load_scene(colmap)

@@ -193,3 +193,15 @@ def test_an_entry_that_is_missing_or_of_another_type_is_an_error_or_harmless(
             taken += 1
             trainer.train_step()
     assert refused > 200 and taken > 2
+
+
+def test_a_saturated_checkpoint_is_continued(trainer: Trainer, tmp_path: Path, caplog) -> None:
+    """An opacity of 1 is infinite as a logit, a flat Gaussian has a scale of e^-inf."""
+    with torch.no_grad():
+        trainer.splats["opacities"][3] = torch.inf
+        trainer.splats["scales"][4, 2] = -torch.inf
+    trainer.save_checkpoint(tmp_path / "c.pt")
+    trainer.load_checkpoint(tmp_path / "c.pt")
+    assert "1 opacities of infinite value are taken as finite" in caplog.text
+    assert all(bool(torch.isfinite(values).all()) for values in trainer.splats.values())
+    trainer.train(until=5, progress=False)

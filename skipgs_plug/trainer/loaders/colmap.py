@@ -182,13 +182,14 @@ def read_model(model: Path) -> tuple[Any, dict[int, str]]:
             if is_complete(model, ".bin"):
                 leave_out_points(model, Path(folder))
                 return pycolmap.Reconstruction(folder), {}
-            names = simplify(model, Path(folder), dict(models.values()))
+            names, points = simplify(model, Path(folder), dict(models.values()))
             reconstruction = pycolmap.Reconstruction(folder)
-        if len(reconstruction.images) != len(names):
-            raise InputError(
-                f"{model} lists {len(names)} images, but only {len(reconstruction.images)} can be read; "
-                "export it again."
-            )
+        for what, listed, read in (
+            ("images", len(names), len(reconstruction.images)),
+            ("points", points, len(reconstruction.points3D)),
+        ):
+            if listed != read:
+                raise InputError(f"{model} lists {listed} {what}, but only {read} can be read; export it again.")
         return reconstruction, names
     except InputError:
         raise

@@ -16,14 +16,14 @@ from skipgs_plug.trainer.errors import InputError, reason
 IMAGE_FIELDS = 9  # id, quaternion, translation, camera; then the name
 
 
-def simplify(model: Path, target: Path, camera_models: Mapping[str, int]) -> dict[int, str]:
+def simplify(model: Path, target: Path, camera_models: Mapping[str, int]) -> tuple[dict[int, str], int]:
     """Write a text model into `target` without observations, its images named by their numbers.
 
     Args:
         camera_models: number of parameters by name of the camera model.
 
     Returns:
-        The names of the images, by their ids.
+        The names of the images, by their ids, and the number of points.
 
     Raises:
         InputError: A file cannot be read, or one of its lines has the wrong form.
@@ -41,9 +41,9 @@ def simplify(model: Path, target: Path, camera_models: Mapping[str, int]) -> dic
         lines += [" ".join([*fields[:IMAGE_FIELDS], str(number)]), ""]
     (target / "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     listed = content_lines(model / "points3D.txt") if (model / "points3D.txt").is_file() else []
-    points = (" ".join(line.split()[:8]) for line in listed if line.strip())
+    points = [" ".join(line.split()[:8]) for line in listed if line.strip()]
     (target / "points3D.txt").write_text("\n".join(points) + "\n", encoding="utf-8")
-    return names
+    return names, len(points)
 
 
 def check_parameters(fields: list[str], camera_models: Mapping[str, int], path: Path) -> None:
