@@ -21,6 +21,7 @@ from skipgs_plug.core.errors import SkipGSError
 
 CYCLE_ENDS = (0.125, 0.25, 1.0)
 ONE_CYCLE = (1.0,)  # where nothing is to be foreseen: the share is given, or no view is watched
+LEAST_LOSS = 1e-5  # below, no picture differs
 WATCHED_SHARE = 1 / 12  # of the views
 LEAST_WATCHED, MOST_WATCHED = 3, 12  # fewer than three cannot tell a twentieth of a decibel: none then
 
@@ -143,7 +144,9 @@ def mean_gain(before: dict[str, float], after: dict[str, float]) -> tuple[float,
 
     Losses of 3DGS are mean absolute differences for the most part, so 20 log10 of their ratio is about what PSNR gains.
     """
-    gains = [20.0 * math.log10(before[view] / after[view]) for view in sorted(after) if view in before]
+    # A view of background alone has a loss of 0.
+    pairs = [(max(before[view], LEAST_LOSS), max(after[view], LEAST_LOSS)) for view in sorted(after) if view in before]
+    gains = [20.0 * math.log10(earlier / later) for earlier, later in pairs]
     if len(gains) < 2:
         return None
     mean = math.fsum(gains) / len(gains)

@@ -118,3 +118,9 @@ def test_a_state_of_other_cycles_is_refused():
     again = EarlyStopping(0.05)
     again.load_state_dict({**state, "cycle": 0})
     assert again.cycle == 0
+
+
+def test_views_without_loss_have_a_gain() -> None:
+    """Views of background alone."""
+    assert mean_gain({"a": 0.0, "b": 0.0}, {"a": 0.0, "b": 0.0}) == (0.0, 0.0)
+    assert mean_gain({"a": 0.1, "b": 0.1}, {"a": 0.0, "b": 0.0}) == pytest.approx((80.0, 0.0))
