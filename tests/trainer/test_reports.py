@@ -427,5 +427,5 @@ def test_points_that_are_lost_are_counted(colmap: Path) -> None:
     file = colmap / "sparse/0/points3D.txt"
     lines = file.read_text().splitlines()
     file.write_text("\n".join([*lines, lines[0].replace(" 0.5", " 0.7")]) + "\n")
-    with pytest.raises(InputError, match=r"lists 161 points, and 160 can be read|cannot be read"):
+    with pytest.raises(InputError, match=r"lists 161 points, but only 160 can be read|cannot be read"):
         load_scene(colmap)
