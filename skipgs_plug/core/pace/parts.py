@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ NAMED = {
     **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
+BESIDE = 0.25  # of the trainer's rate, at most, for what has no row for each Gaussian
 OF_A_GAUSSIAN = ((), (1,), (2,), (3,), (4,))  # shapes of its parameters beside colours [K, 3]
 
 
@@ -105,36 +106,78 @@ class GroupFacts:
         return self.short
 
 
+class Share(NamedTuple):
+    """What a group takes of the factor on learning rates, as long as the number of Gaussians stays.
+
+    Attributes:
+        group: one of an optimizer's `param_groups`.
+        times: of the factor.
+        raised: whether it takes the factor itself, or one of at most 1.
+        longer: facts about the group if its steps are larger; None if they are at most as long as the trainer's.
+    """
+
+    group: dict[str, Any]
+    times: float
+    raised: bool
+    longer: GroupFacts | None
+
+
 class OptimizerFacts:
     """Facts about an optimizer, valid while its groups hold the same parameters.
 
+    Args:
+        optimizer: They are about this one.
+        name: Of it, where its groups have none; None if unknown.
+
     Attributes:
         groups: of each of its groups.
+        name: as given.
         positions: parameters that may be positions [N, 3].
+        shares: of its groups, see `divide`.
     """
 
-    __slots__ = ("groups", "name", "positions")
+    __slots__ = ("_divided", "_only", "groups", "name", "positions", "shares")
 
     def __init__(self, optimizer: torch.optim.Optimizer, name: str | None) -> None:
         self.name = name
         self.groups = [GroupFacts(group, name) for group in optimizer.param_groups]
         self.positions = [param for group in self.groups for param in group.positions]
+        self.shares: list[Share] = []
+        self._divided: tuple[int, bool] | None = None
+        self._only = self.groups[0] if len(self.groups) == 1 and self.groups[0].first is not None else None
 
-    def fits(self, optimizer: torch.optim.Optimizer, name: str | None) -> bool:
+    def fits(self, optimizer: torch.optim.Optimizer) -> bool:
         """Whether they still hold."""
-        groups = optimizer.param_groups
-        if len(groups) != len(self.groups) or name != self.name:
-            return False
-        for facts, group in zip(self.groups, groups):  # noqa: B905 (as long, and this runs in every step)
-            if facts.group is not group:
-                return False
-            now, first = group["params"], facts.first
-            if first is None:
-                if not facts.fits(now):
-                    return False
-            elif len(now) != 1 or now[0] is not first:
-                return False
-        return True
+        groups, only = optimizer.param_groups, self._only
+        if only is not None and len(groups) == 1:  # as in most trainers
+            now = groups[0]["params"]
+            return groups[0] is only.group and len(now) == 1 and now[0] is only.first
+        return len(groups) == len(self.groups) and all(map(_is_about, self.groups, groups))
+
+    def divide(self, rows: int, evenly: bool) -> list[Share]:
+        """Return `shares` where there are `rows` Gaussians, 0 if their number is not known.
+
+        Args:
+            rows: Only what has a row for each Gaussian takes larger steps.
+            evenly: All that does takes the factor itself, with the trainer's memory; everything else is left alone.
+        """
+        if self._divided != (rows, evenly):
+            self._divided = rows, evenly
+            self.shares = [share for one in self.groups if (share := _share(one, rows, evenly)) is not None]
+        return self.shares
+
+
+def _share(facts: GroupFacts, rows: int, evenly: bool) -> Share | None:
+    longer = facts.of_gaussians(rows)
+    if evenly:
+        return Share(facts.group, 1.0, True, facts) if longer else None
+    if not longer:
+        return Share(facts.group, BESIDE, False, None)
+    return Share(facts.group, 1.0 if facts.part is None else facts.part, facts.part is not None, facts)
+
+
+def _is_about(facts: GroupFacts, group: dict[str, Any]) -> bool:
+    return facts.group is group and facts.fits(group["params"])
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import math
-import threading
 import warnings
 import weakref
 from collections.abc import Callable, Iterable, Mapping
+from threading import get_ident
 from typing import Any
 
 import torch
@@ -22,7 +22,6 @@ from skipgs_plug.core.pace.visibility import Visibility
 Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
 Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 
-BESIDE = 0.25  # of the trainer's rate, at most, for what has no row for each Gaussian
 LONGEST_AT = 0.25  # of the iterations; below, steps that are longer still lose more than the path gains
 SHOWN = 1 / 3  # of the Gaussians by a view, where it is not known: as in a room photographed from within
 # Of Adam's running mean of squares (beta2), at most. By the gradient of a single view a parameter can move its rate
@@ -83,11 +82,11 @@ class ScaledRates:
         self._factor: float | None = None
         self._evenly = False
         self._rows = self._rows_now = 0  # Gaussians in the iteration before and in this one; 0 where not known
-        self._thread = threading.get_ident()
-        self._under_way: dict[int, _Steps] = {}
+        self._thread = get_ident()
+        self._under_way: list[_Steps] = []  # each within the step of the one before
         self._handles: list[RemovableHandle] = []
         self._steps: dict[int, _Steps] = {}  # by id of the optimizer
-        self._own: dict[int, tuple[str | None, torch.optim.Optimizer]] = {}  # of this iteration, by id
+        self._foreign: set[int] = set()  # ids of optimizers that stepped in this iteration and are not meant
         self._unstepped = 0  # iterations in a row that ran without a step
         self._removed = False
 
@@ -105,7 +104,7 @@ class ScaledRates:
         self.rest()
         if self._removed:
             return
-        thread = threading.get_ident()
+        thread = get_ident()
         for other in _hooked:
             at_work = other is not self and other._factor is not None and other._thread == thread
             if at_work and (other.only is None or self.only is None):
@@ -127,12 +126,10 @@ class ScaledRates:
     def rest(self) -> None:
         """Touch nothing until the next `scale`."""
         self._factor = None
-        for step in self._under_way.values():  # one that raised had no end
-            step.put_back()
-            step.watched = None
-            step.longer.clear()
+        for step in self._under_way:  # one that raised had no end
+            step.drop()
         self._under_way.clear()
-        self._own.clear()
+        self._foreign.clear()
 
     def remove(self) -> None:
         """Take the hooks back, for good."""
@@ -165,115 +162,101 @@ class ScaledRates:
 
     def _scale(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         factor = self._factor
-        if factor is None or threading.get_ident() != self._thread:
+        if factor is None or get_ident() != self._thread:
             return
-        key = id(optimizer)
-        if key in self._under_way:
-            self._under_way[key].depth += 1  # a step can call the step of its base class
+        step = self._steps.get(id(optimizer)) or self._begin_with(optimizer)
+        if step is None:
             return
-        name = None
-        if self.only is not None:
-            found = self._own.get(key)
-            if found is None or found[1] is not optimizer:
-                found = self._find_own(optimizer)
-                if found is None:
-                    return
-            name = found[0]
-        self._unstepped = 0
+        step.depth += 1
+        if step.depth > 1:
+            return  # a step can call the step of its base class
         if self._under_way:
             self._pass_on(optimizer)
-        step = self._steps.get(key)
-        if step is None or step.optimizer() is not optimizer:
-            self._steps = {at: one for at, one in self._steps.items() if one.optimizer() is not None}
-            step = self._steps[key] = _Steps(optimizer, name, self._watch(optimizer))
-        elif not step.facts.fits(optimizer, name):
-            step.facts = OptimizerFacts(optimizer, name)
         facts = step.facts
-        groups = facts.groups
-        if self._under_way:  # an optimizer can be wrapped in another one, which has the same groups
-            scaled = {id(group) for other in self._under_way.values() for group, _, _ in other.before}
-            groups = [one for one in groups if id(one.group) not in scaled]
+        if not facts.fits(optimizer):
+            facts = step.facts = OptimizerFacts(optimizer, facts.name)
+        self._unstepped = 0
         if not self.shown.complete:
-            self.shown.see([one.group for one in groups], name)
+            self.shown.see(optimizer.param_groups, facts.name)
         # Without names a camera's position has the shape of a Gaussian's, but there are fewer.
         for param in facts.positions:
             if param.shape[0] > self._rows_now:
                 self._rows_now = param.shape[0]
-        rows = self._rows_now if self._rows_now > self._rows else self._rows
-        self._under_way[key] = step
-        step.depth = 1
-        capped = 1.0 if factor > 1.0 else factor
         evenly = self._evenly
-        for one in groups:
-            group = one.group
-            longer = one.of_gaussians(rows)
-            if evenly:
-                if not longer:
-                    continue
-                times = factor
-            elif longer:
-                times = capped if one.part is None else one.part * factor
-            else:
-                times = BESIDE * capped
+        shares = facts.divide(self._rows_now if self._rows_now > self._rows else self._rows, evenly)
+        if self._under_way:  # an optimizer can be wrapped in another one, which has the same groups
+            scaled = {id(group) for other in self._under_way for group, _, _ in other.before}
+            shares = [one for one in shares if id(one.group) not in scaled]
+        self._under_way.append(step)
+        capped = 1.0 if factor > 1.0 else factor
+        before = step.before
+        for group, part, raised, longer in shares:
+            times = part * (factor if raised else capped)
             rate, betas = group.get("lr"), group.get("betas")
-            step.before.append((group, rate, betas))
-            if betas is not None and longer and not evenly:
-                group["betas"] = one.short if betas is one.betas else one.shorter(betas, SQUARES_KEPT)
+            before.append((group, rate, betas))
+            if betas is not None and longer is not None and not evenly:
+                group["betas"] = longer.short if betas is longer.betas else longer.shorter(betas, SQUARES_KEPT)
                 if step.memory_stays:
-                    times = max(min(times, 1.0), times * shorter_memory(one.betas, SQUARES_KEPT))
+                    times = max(min(times, 1.0), times * shorter_memory(betas, SQUARES_KEPT))
             if rate is not None:
                 group["lr"] = rate * times
-            if longer and not step.judged and times != 1.0 and one.has_gradient():
+            if not step.judged and longer is not None and times != 1.0 and longer.has_gradient():
                 step.longer.append(group)
         if step.longer or step.literal is not None:
             step.prepare(optimizer)
 
-    def _find_own(self, optimizer: torch.optim.Optimizer) -> tuple[str | None, torch.optim.Optimizer] | None:
-        """Name of an optimizer among those that are meant, and itself; None if it is not meant."""
-        assert self.only is not None
-        own = self.only()
-        named = own.items() if isinstance(own, Mapping) else ((None, one) for one in own)
-        self._own = {id(one): (name, one) for name, one in reversed([*named])}
-        return self._own.get(id(optimizer))
+    def _begin_with(self, optimizer: torch.optim.Optimizer) -> _Steps | None:
+        """Make `_Steps` for an optimizer that was not seen before; None if it is not meant."""
+        key, name = id(optimizer), None
+        if self.only is not None:
+            if key in self._foreign:
+                return None
+            own = self.only()
+            named = own.items() if isinstance(own, Mapping) else ((None, one) for one in own)
+            names = [name for name, one in named if one is optimizer]
+            if not names:
+                self._foreign.add(key)
+                return None
+            name = names[0]
+        step = _Steps(optimizer, name, self._under_way)
+        step.handles = self._watch(optimizer, step)
+        self._steps[key] = step
+        # Its number is given to another optimizer once it is gone.
+        step.gone = weakref.ref(optimizer, lambda _, steps=self._steps: steps.pop(key, None))  # type: ignore[misc]
+        return step
 
     def _pass_on(self, optimizer: torch.optim.Optimizer) -> None:
         """An optimizer that is wrapped in another one steps inside its step, with the same groups."""
         own = {id(group) for group in optimizer.param_groups}
-        for other in self._under_way.values():
+        for other in self._under_way:
             if other.watched is not None and any(id(one) in own or id(one.group) in own for one in other.watched):
                 other.stop_watching()
 
-    def _put_back(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        step = self._under_way.get(id(optimizer))
-        if step is None:
-            return
-        step.depth -= 1
-        if step.depth == 0:
-            del self._under_way[id(optimizer)]
-            step.put_back()
-            if step.watched is not None:
-                step.judge(optimizer)
-
-    def _watch(self, optimizer: torch.optim.Optimizer) -> list[RemovableHandle]:
+    def _watch(self, optimizer: torch.optim.Optimizer, step: _Steps) -> list[RemovableHandle]:
         """Put the trainer's settings back before anybody else looks at them."""
-        ends = optimizer.register_step_post_hook(self._put_back)
+        ends = optimizer.register_step_post_hook(step.end)
         # The trainer's own hooks after a step, of a scheduler for example, find and set its rates.
         optimizer._optimizer_step_post_hooks.move_to_end(ends.id, last=False)  # type: ignore[attr-defined]
         # A checkpoint is written although a step raised: it holds the trainer's rates, too.
         return [ends, optimizer.register_state_dict_pre_hook(self._put_back_all)]
 
     def _put_back_all(self, _: torch.optim.Optimizer) -> None:
-        for step in self._under_way.values():
+        for step in self._under_way:
             step.put_back()
 
 
 class _Steps:
     """The steps of one optimizer: facts about its groups, and the settings that its trainer has while one is under way.
 
+    Args:
+        optimizer: It steps.
+        name: Of it, where its groups have none; None if unknown.
+        under_way: Steps that have begun and not ended, the outermost first.
+
     Attributes:
-        optimizer: a weak reference to it.
         facts: about its groups.
         handles: of hooks on it.
+        gone: forgets these steps with the optimizer.
         depth: calls of its `step` within each other.
         before: groups, and the rate and betas that the trainer has set there; None for a setting that it lacks.
         longer: groups with a gradient whose rates are other ones now; filled until it is judged.
@@ -284,14 +267,15 @@ class _Steps:
     """
 
     __slots__ = (
-        *("_until_end", "before", "depth", "facts", "handles", "judged", "literal"),
-        *("longer", "memory_stays", "optimizer", "watched"),
+        *("_under_way", "_until_end", "before", "depth", "facts", "gone", "handles", "judged", "literal"),
+        *("longer", "memory_stays", "watched"),
     )
 
-    def __init__(self, optimizer: torch.optim.Optimizer, name: str | None, handles: list[RemovableHandle]) -> None:
-        self.optimizer = weakref.ref(optimizer)
+    def __init__(self, optimizer: torch.optim.Optimizer, name: str | None, under_way: list[_Steps]) -> None:
         self.facts = OptimizerFacts(optimizer, name)
-        self.handles = handles
+        self.handles: list[RemovableHandle] = []
+        self.gone: Any = None
+        self._under_way = under_way
         self.depth = 0
         self.before: list[tuple[dict[str, Any], Any, Any]] = []
         self.longer: list[dict[str, Any]] = []
@@ -300,6 +284,24 @@ class _Steps:
         self.literal: LiteralBetas | None = None
         self.memory_stays = False
         self._until_end: contextlib.ExitStack | None = None
+
+    def end(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        """A step has ended; the settings are the trainer's again before anybody else looks."""
+        if self.depth > 1:
+            self.depth -= 1
+        elif self.depth == 1:
+            self.depth = 0
+            self._under_way.remove(self)
+            self.put_back()
+            if self.watched is not None:
+                self.judge(optimizer)
+
+    def drop(self) -> None:
+        """A step that has begun has no end: it raised."""
+        self.depth = 0
+        self.put_back()
+        self.watched = None
+        self.longer.clear()
 
     def prepare(self, optimizer: torch.optim.Optimizer) -> None:
         """See what the first longer step reads; replace literal betas, which it may pass on."""
