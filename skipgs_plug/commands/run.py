@@ -16,8 +16,7 @@ from skipgs_plug.adapters.registry import builtin_adapters, find_script_adapter,
 from skipgs_plug.commands.options.run import Args
 from skipgs_plug.compat import FAMILIES, serve
 from skipgs_plug.core.report import write_report
-from skipgs_plug.fallback_raster.training.optimizer import REPLACED as ADAM_REPLACED
-from skipgs_plug.fallback_raster.training.optimizer import instead_of_torchs_adam
+from skipgs_plug.fallback_raster import ADAM_REPLACED, instead_of_torchs_adam
 from skipgs_plug.scripts import spawned
 from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
 from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
     from .training.gradient_norms import sum_norms
     from .training.lazy_adam import LazyAdam
     from .training.loss import l1_ssim_loss
-    from .training.optimizer import Adam, instead_of_torchs_adam, moments
+    from .training.optimizer import ADAM_REPLACED, Adam, instead_of_torchs_adam, moments
 
 __all__ = [
+    "ADAM_REPLACED",
     "Adam",
     "LazyAdam",
     "adam_rows",
@@ -44,6 +45,7 @@ __all__ = [
 
 # Loaded on first use: a program that only asks for the number of threads should not load optimizers.
 _HOMES = {
+    "ADAM_REPLACED": "training.optimizer",
     "Adam": "training.optimizer",
     "LazyAdam": "training.lazy_adam",
     "adam_rows": "training.adam",

@@ -1,4 +1,4 @@
-"""Which rasterizer and loss a trainer runs on: gsplat on CUDA, Warp on CPU, one name for both."""
+"""Which rasterizer, loss and optimizers a trainer runs on: gsplat and torch on CUDA, this package's own on the CPU."""
 
 from __future__ import annotations
 
@@ -13,10 +13,15 @@ from torch import Tensor, nn
 from skipgs_plug.install import install_command
 from skipgs_plug.trainer.errors import InputError
 
+Optimizers = Mapping[str, torch.optim.Optimizer]  # by the names of the parameters, as `create_splats` has them
+
 
 @dataclass(frozen=True)
 class Backend:
-    """A renderer with gsplat's `rasterization` signature, and the loss that suits its device."""
+    """A renderer with gsplat's `rasterization` signature, and the loss and optimizers that suit its device.
+
+    This one suits gsplat; `CpuBackend` the rasterizer of this package.
+    """
 
     name: str
     device: torch.device
@@ -31,12 +36,10 @@ class Backend:
         background: Tensor | None,  # [3]
         antialiased: bool = False,
         with_rows: bool = True,
+        optimizers: Optimizers | None = None,
         **options: Any,
     ) -> tuple[Tensor, dict[str, Any]]:
         """Render raw parameters, as `create_splats` names them, into one camera.
-
-        The CPU rasterizer takes them as they are and touches only rows that are visible; its dictionary has a row for
-        each of these, as gsplat's packed mode.
 
         Args:
             splats: logarithms of scales, logits of opacities, SH coefficients in two parts.
@@ -45,31 +48,14 @@ class Backend:
             background: colour behind everything; None for black, which needs no compositing.
             antialiased: compensate opacities for the blur.
             with_rows: whether the dictionary has to hold rows of Gaussians.
-            options: `width height sh_degree near_plane far_plane absgrad` of `rasterization`, and
-                `lazy` of `rasterize_splats` on the CPU.
+            optimizers: of these parameters, which may be behind where no view showed a Gaussian; None if all are
+                up to date.
+            options: `width height sh_degree near_plane far_plane absgrad` of `rasterization`.
 
         Returns:
             Image [H, W, 3] and the dictionary of `rasterization`.
         """
         viewmat, K = (matrix.to(self.device, torch.float32) for matrix in (viewmat, K))
-        if self.name == "warp":
-            from skipgs_plug.fallback_raster import rasterize_splats
-
-            image, _, info = rasterize_splats(
-                splats["means"],
-                splats["quats"],
-                splats["scales"],
-                splats["opacities"],
-                splats["sh0"],
-                splats["shN"],
-                viewmat,
-                K,
-                background=background,
-                antialiased=antialiased,
-                with_rows=with_rows,
-                **options,
-            )
-            return image, info
         images, _, info = self.rasterization(
             means=splats["means"],
             quats=splats["quats"],
@@ -85,6 +71,16 @@ class Backend:
         )
         return images[0], info
 
+    def create_adam(self, name: str, param: nn.Parameter, rate: float, eps: float) -> torch.optim.Optimizer:
+        """Return an Adam for one parameter; its group is called `name`."""
+        return torch.optim.Adam([{"params": [param], "lr": rate, "name": name}], eps=eps, fused=True)
+
+    def catch_up(self, optimizers: Optimizers) -> None:
+        """Advance what the last views did not show, before somebody else looks at parameters or moments."""
+
+    def release_memory(self) -> None:
+        """Give back memory that is kept for the next iteration, before something else needs much."""
+
     @contextmanager
     def exclusive_cores(self) -> Iterator[None]:
         """Keep torch to one thread inside the block where the rasterizer has threads of its own.
@@ -99,6 +95,65 @@ class Backend:
             yield
         finally:
             torch.set_num_threads(before)
+
+
+class CpuBackend(Backend):
+    """The CPU rasterizer, which takes raw parameters as they are and touches only rows that are visible.
+
+    Its dictionary has a row for each of these, as gsplat's packed mode. Its Adam runs on all cores, and that of `shN`,
+    three quarters of all numbers, updates what views show.
+    """
+
+    def render(
+        self,
+        splats: Mapping[str, Tensor] | nn.ParameterDict,
+        viewmat: Tensor,  # [4, 4]
+        K: Tensor,  # [3, 3]
+        background: Tensor | None,  # [3]
+        antialiased: bool = False,
+        with_rows: bool = True,
+        optimizers: Optimizers | None = None,
+        **options: Any,
+    ) -> tuple[Tensor, dict[str, Any]]:
+        from skipgs_plug.fallback_raster import LazyAdam, rasterize_splats
+
+        behind = None if optimizers is None else optimizers.get("shN")
+        if isinstance(behind, LazyAdam):
+            options["lazy"] = behind
+        viewmat, K = (matrix.to(self.device, torch.float32) for matrix in (viewmat, K))
+        image, _, info = rasterize_splats(
+            splats["means"],
+            splats["quats"],
+            splats["scales"],
+            splats["opacities"],
+            splats["sh0"],
+            splats["shN"],
+            viewmat,
+            K,
+            background=background,
+            antialiased=antialiased,
+            with_rows=with_rows,
+            **options,
+        )
+        return image, info
+
+    def create_adam(self, name: str, param: nn.Parameter, rate: float, eps: float) -> torch.optim.Optimizer:
+        from skipgs_plug.fallback_raster import Adam, LazyAdam
+
+        kind = LazyAdam if name == "shN" and param.numel() else Adam
+        return kind([{"params": [param], "lr": rate, "name": name}], eps=eps)
+
+    def catch_up(self, optimizers: Optimizers) -> None:
+        from skipgs_plug.fallback_raster import LazyAdam
+
+        for optimizer in optimizers.values():
+            if isinstance(optimizer, LazyAdam):
+                optimizer.catch_up()
+
+    def release_memory(self) -> None:
+        from skipgs_plug.fallback_raster import release_memory
+
+        release_memory()
 
 
 @contextmanager
@@ -155,4 +210,4 @@ def _warp_backend() -> Backend:
         from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
     except ImportError as error:
         raise InputError(f"Backend warp cannot be imported ({error}); run: {install_command()}.") from error
-    return Backend("warp", torch.device("cpu"), rasterization, l1_ssim_loss)
+    return CpuBackend("warp", torch.device("cpu"), rasterization, l1_ssim_loss)

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from skipgs_plug.fallback_raster import LazyAdam, release_memory
 from skipgs_plug.host_copy import HostCopy
 from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend, single_precision
@@ -94,9 +93,7 @@ class Trainer:
         self.step = self.ran = 0
         self._since: int | None = None  # number after the previous iteration, set by `train`
         self._splats = create_splats(scene, config, self.backend.device, self.near_plane)
-        self._optimizers = create_optimizers(self._splats, config, scene.scene_scale)
-        lazy = self._optimizers["shN"]
-        self._lazy = lazy if isinstance(lazy, LazyAdam) else None
+        self._optimizers = create_optimizers(self._splats, config, scene.scene_scale, self.backend)
         self.mcmc = Mcmc(config, scene.scene_scale) if config.strategy == "mcmc" else None
         self.strategy: Any = None
         self.strategy_state: dict[str, Any] = {}
@@ -348,7 +345,6 @@ class Trainer:
     def _rasterize(
         self, view: View, degree: int, background: Tensor | None, with_rows: bool = False
     ) -> tuple[Tensor, dict[str, Any]]:
-        lazy = {} if self._lazy is None else {"lazy": self._lazy}
         return self.backend.render(
             self._splats,
             view.viewmat,
@@ -362,7 +358,7 @@ class Trainer:
             near_plane=self.near_plane,
             far_plane=self.far_plane,
             absgrad=self.config.absgrad,
-            **lazy,
+            optimizers=self._optimizers,
         )
 
     def _background(self) -> Tensor | None:
@@ -416,7 +412,7 @@ class Trainer:
         # The noise belongs to the update: alone it is a random walk.
         moves = mcmc.moves(step)
         if moves:
-            release_memory()  # as in `_densify`
+            self.backend.release_memory()  # gsplat's copies of all rows lie beside it
             self._catch_up()
         if updated or moves:
             rate = self._optimizers["means"].param_groups[0]["lr"] if updated else 0.0
@@ -427,8 +423,7 @@ class Trainer:
 
     def _catch_up(self) -> None:
         """Apply the missed updates of Gaussians that the last views did not show, before other code reads them."""
-        if self._lazy is not None:
-            self._lazy.catch_up()
+        self.backend.catch_up(self._optimizers)
 
     @contextmanager
     def _seeded(self, step: int) -> Iterator[None]:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from skipgs_plug.fallback_raster import Adam, LazyAdam
+from skipgs_plug.trainer.backend import Backend
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.near_plane import before_a_lens
@@ -72,12 +72,9 @@ def neighbour_distance(points: Tensor, scale: float = 1.0) -> Tensor:
 
 
 def create_optimizers(
-    splats: nn.ParameterDict, config: TrainConfig, scene_scale: float
+    splats: nn.ParameterDict, config: TrainConfig, scene_scale: float, backend: Backend
 ) -> dict[str, torch.optim.Optimizer]:
-    """Return one Adam per parameter, learning rates as in gsplat's simple_trainer.
-
-    On the CPU it runs on all cores, and that of `shN`, three quarters of all numbers, updates what views show.
-    """
+    """Return one Adam per parameter, learning rates as in gsplat's simple_trainer."""
     rates = {
         "means": config.means_lr * scene_scale,
         "scales": config.scales_lr,
@@ -86,15 +83,9 @@ def create_optimizers(
         "sh0": config.sh0_lr,
         "shN": config.shN_lr,
     }
-    optimizers: dict[str, torch.optim.Optimizer] = {}
-    for name, rate in rates.items():
-        group = [{"params": [splats[name]], "lr": rate, "name": name}]
-        if config.visible_adam:
-            optimizers[name] = SelectiveAdam(group, eps=ADAM_EPS)
-        elif splats[name].device.type != "cpu":
-            optimizers[name] = torch.optim.Adam(group, eps=ADAM_EPS, fused=True)
-        elif name == "shN" and splats[name].numel():
-            optimizers[name] = LazyAdam(group, eps=ADAM_EPS)
-        else:
-            optimizers[name] = Adam(group, eps=ADAM_EPS)
-    return optimizers
+    if config.visible_adam:
+        return {
+            name: SelectiveAdam([{"params": [splats[name]], "lr": rate, "name": name}], eps=ADAM_EPS)
+            for name, rate in rates.items()
+        }
+    return {name: backend.create_adam(name, splats[name], rate, ADAM_EPS) for name, rate in rates.items()}

@@ -14,6 +14,7 @@ from skipgs_plug import SkipGate
 from skipgs_plug.fallback_raster.training.lazy_adam import LazyAdam
 from skipgs_plug.fallback_raster.training.optimizer import Adam
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer
+from skipgs_plug.trainer.backend import CpuBackend
 from skipgs_plug.trainer.loop import Iteration
 from skipgs_plug.trainer.row_order import sort_rows
 from skipgs_plug.trainer.scene import View
@@ -53,7 +54,11 @@ def assert_same(one: Trainer, other: Trainer) -> None:
 def dense(monkeypatch: pytest.MonkeyPatch, config: TrainConfig, scene: Scene) -> Trainer:
     """A trainer that updates all rows in every iteration."""
     with monkeypatch.context() as context:
-        context.setattr("skipgs_plug.trainer.model.LazyAdam", Adam)
+        context.setattr(
+            CpuBackend,
+            "create_adam",
+            lambda _, name, param, rate, eps: Adam([{"params": [param], "lr": rate, "name": name}], eps=eps),
+        )
         return Trainer(config, scene)
 
 

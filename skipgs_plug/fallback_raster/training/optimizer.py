@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .adam import adam_step
 
-REPLACED = "torch.optim.adam.adam"  # the function that `torch.optim.Adam` steps with
+ADAM_REPLACED = "torch.optim.adam.adam"  # the function that `torch.optim.Adam` steps with
 MAX_NUMBERS = 2**30  # of one parameter, which kernels count in 32 bits
 # Options of torch's Adam that are left to torch, and all that a group of parameters has, but `betas`.
 _TORCHS = ("amsgrad", "maximize", "weight_decay", "capturable", "differentiable", "has_complex")
