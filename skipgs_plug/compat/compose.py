@@ -249,7 +249,7 @@ def _rgb(call: _Call, g: Splats) -> Tensor:
     """Colours as the renderer sees them. [N, 3]"""
     if g.colors is not None:
         return g.colors
-    from skipgs_plug.fallback_raster.oracle.torch_reference_projection import spherical_harmonics
+    from skipgs_plug.fallback_raster import spherical_harmonics
 
     assert g.shs is not None
     coefficients = g.shs if g.dc is None else torch.cat([g.dc, g.shs], dim=1)

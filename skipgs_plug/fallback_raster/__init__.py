@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .install import install_as_gsplat
+    from .oracle.torch_reference_projection import spherical_harmonics
     from .rasterize import rasterization
     from .runtime.buffers import release_memory
     from .runtime.cores import usable_cores
@@ -38,6 +39,7 @@ __all__ = [
     "rasterize_splats",
     "release_memory",
     "set_num_threads",
+    "spherical_harmonics",
     "sum_norms",
     "take_rows",
     "usable_cores",
@@ -58,6 +60,7 @@ _HOMES = {
     "rasterize_splats": "splats",
     "release_memory": "runtime.buffers",
     "set_num_threads": "runtime.threads",
+    "spherical_harmonics": "oracle.torch_reference_projection",
     "sum_norms": "training.gradient_norms",
     "take_rows": "stages.rows",
     "usable_cores": "runtime.cores",

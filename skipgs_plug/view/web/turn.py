@@ -52,7 +52,7 @@ def turned_harmonics(rotation: Tensor, k: int) -> Tensor:
 
 def basis(directions: Tensor, k: int) -> Tensor:
     """Return the K functions beyond the constant one along directions [M, 3], as [M, K]."""
-    from skipgs_plug.fallback_raster.oracle.torch_reference_projection import spherical_harmonics
+    from skipgs_plug.fallback_raster import spherical_harmonics
 
     degree = round((k + 1) ** 0.5) - 1
     ones = torch.eye(k + 1, dtype=directions.dtype)[1:, :, None].expand(k, k + 1, 3)
