@@ -19,7 +19,8 @@ from torch import Tensor
 from skipgs_plug.bench.provenance import commit, cpu_name, versions
 from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
 from skipgs_plug.fallback_raster.runtime.cores import usable_cores
-from skipgs_plug.fallback_raster.runtime.launch import FloatArray, Worker, worker
+from skipgs_plug.fallback_raster.runtime.launch import Worker, worker
+from skipgs_plug.fallback_raster.runtime.parameters import FloatOutput
 from skipgs_plug.trainer.files import write_aside
 
 RESULTS = Path(__file__).parent / "results"
@@ -119,10 +120,10 @@ def kernel_seconds() -> Iterator[dict[str, float]]:
     seconds: dict[str, float] = {}
     original = Worker.__call__
 
-    def timed(self: Worker, *arguments: Any) -> None:
+    def timed(self: Worker[Any], *arguments: Any, **named: Any) -> None:
         start = time.perf_counter()
-        original(self, *arguments)
-        seconds[self._name] = seconds.get(self._name, 0.0) + time.perf_counter() - start
+        original(self, *arguments, **named)
+        seconds[self.name] = seconds.get(self.name, 0.0) + time.perf_counter() - start
 
     Worker.__call__ = timed  # type: ignore[method-assign]
     try:
@@ -147,7 +148,7 @@ for (int item = first; item < last; ++item) {
     items="items",
     grain=1,
 )
-def multiply_add(out: FloatArray, factor: float, rounds: int, items: int) -> None: ...
+def multiply_add(out: FloatOutput, factor: float, rounds: int, items: int) -> None: ...
 
 
 def multiply_adds_per_second() -> float:

@@ -4,8 +4,8 @@
 
 One path after the other is switched on, from an exact one: 2^t in float64, the loss by PyTorch's convolutions, Adam.
 Errors are those of one pass over 10,000 random Gaussians against the exact path; fern at 252x189 is then trained with
-each, and its held-out PSNR stands beside the time. What the shortcuts of the rasterizer gain is in
-`raster.py --parts shortcuts`: they change no result. Writes `benchmarks/results/fast_paths.json`.
+each, and its held-out PSNR stands beside the time. What the optimizations of the rasterizer gain is in
+`raster.py --parts optimizations`: they change no result. Writes `benchmarks/results/fast_paths.json`.
 """
 
 from __future__ import annotations
@@ -54,18 +54,18 @@ EXACT_EXP2 = """auto exp2 = [](v16 t) -> v16 {
 @contextmanager
 def exact_exponential() -> Iterator[None]:
     """Blends with 2^t in float64 inside the block."""
-    workers = [*blend._FORWARD.values(), *blend._BACKWARD.values()]
-    kept = launch.PRELUDE, [(worker._name, worker._kernel) for worker in workers]
+    workers = [*blend.FORWARD.values(), *blend.ADJOINT.values()]
+    kept = launch.PRELUDE, [(worker.name, worker._kernel) for worker in workers]
     launch.PRELUDE = re.sub(r"auto exp2 = .*?\n};\n", EXACT_EXP2, launch.PRELUDE, flags=re.DOTALL)
     assert kept[0] != launch.PRELUDE
     for worker in workers:
-        worker._name, worker._kernel = f"{worker._name}_exact", None
+        worker.name, worker._kernel = f"{worker.name}_exact", None
     try:
         yield
     finally:
         launch.PRELUDE = kept[0]
         for worker, (name, command) in zip(workers, kept[1], strict=True):
-            worker._name, worker._kernel = name, command
+            worker.name, worker._kernel = name, command
 
 
 @dataclasses.dataclass

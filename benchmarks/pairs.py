@@ -5,7 +5,8 @@ from typing import Any
 import torch
 
 from skipgs_plug.fallback_raster import rasterization
-from skipgs_plug.fallback_raster.runtime.launch import FloatArray, worker
+from skipgs_plug.fallback_raster.runtime.launch import worker
+from skipgs_plug.fallback_raster.runtime.parameters import FloatArray, FloatOutput
 
 
 # Every tile looks at every Gaussian, nearest first; a box around its ellipse at alpha 1/255 decides only whether
@@ -43,7 +44,7 @@ for (int t = first; t < last; ++t) {
 )
 def count_tiles(
     rows: FloatArray,  # [N, 8] centre, conic, opacity, half width and half height of the box; nearest first
-    counts: FloatArray,  # out [tiles]
+    counts: FloatOutput,  # out [tiles]
     n: int,
     width: int,
     height: int,

@@ -1,4 +1,4 @@
-"""Speed of the CPU rasterizer: forward and backward pass, scaling, growth, memory, shortcuts, and the fused loss.
+"""Speed of the CPU rasterizer: forward and backward pass, scaling, growth, memory, optimizations, and the fused loss.
 
     python benchmarks/raster.py                        # everything, about five minutes on two cores
     python benchmarks/raster.py --parts scenes --quick
@@ -54,7 +54,7 @@ from skipgs_plug.trainer.row_order import morton_order
 from skipgs_plug.trainer.scalars import peak_memory
 
 FILE = RESULTS / "raster.json"
-Part = Literal["scenes", "threads", "gaussians", "pixels", "sh_terms", "order", "shortcuts", "loss"]
+Part = Literal["scenes", "threads", "gaussians", "pixels", "sh_terms", "order", "optimizations", "loss"]
 
 # Milliseconds of OpenSplat bd0400d's CPU rasterizer on one and on two cores of an AMD EPYC (Zen 5) for these scenes,
 # projection, forward, mean-L1 and backward; medians of 18 passes, three rounds. See docs/how_it_works/rasterizer.md.
@@ -86,8 +86,8 @@ PHASES = {
     "project": ("project_forward", "list_visible", "sh_forward"),
     "bin": ("pack_and_count", "scan_pairs", "fill_pairs"),
     "sort and blend": ("blend_forward_3",),
-    "blend backward": ("blend_backward_3", "reduce_pairs"),
-    "project backward": ("project_backward", "sh_backward"),
+    "blend backward": ("blend_adjoint_3", "reduce_pairs"),
+    "project backward": ("project_adjoint", "sh_adjoint"),
 }
 
 
@@ -312,8 +312,8 @@ def raw_pass(scene: dict[str, Any], seed: int) -> tuple[float, Tensor]:
     return time.perf_counter() - start, image.detach()
 
 
-def part_shortcuts(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
-    """Time with and without each shortcut, in turns, and by how much it changes the result."""
+def part_optimizations(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
+    """Time with and without each optimization, in turns, and by how much it changes the result."""
     scene = garden_scene(GARDEN_DOWNSCALE["324x210" if quick else "648x420"], 0, sh_degree=3)
     left = slice(0, scene["width"] // 2)  # half of the image has no gradient
     names: list[tuple[str, ...]] = [(name,) for name in OPTIMIZATIONS] + [tuple(OPTIMIZATIONS)]
@@ -332,7 +332,7 @@ def part_shortcuts(quick: bool, repeats: int, only: str | None) -> list[dict[str
         fast, slow = inputs[True], inputs[False]
         ratios = [one / other for one, other in zip(seconds[True], seconds[False], strict=True)]
         row = {
-            "shortcut": left_out[0] if len(left_out) == 1 else "all",
+            "optimization": left_out[0] if len(left_out) == 1 else "all",
             "ms": median_ms(seconds[True]),
             "ms_without": median_ms(seconds[False]),
             "saved": 1 - statistics.median(ratios),  # of neighbours in time, between which the machine changes little
@@ -342,7 +342,7 @@ def part_shortcuts(quick: bool, repeats: int, only: str | None) -> list[dict[str
         }
         rows.append(row)
         print(
-            f"{row['shortcut']:>18} {row['ms_without']:7.1f} {row['ms']:7.1f} "
+            f"{row['optimization']:>18} {row['ms_without']:7.1f} {row['ms']:7.1f} "
             f"{row['saved']:6.1%} +- {row['saved_error']:.1%} "
             f"{row['image_difference']:8.1e} {row['gradient_difference']:8.1e}",
             flush=True,
@@ -429,7 +429,7 @@ PARTS: dict[str, Callable[[bool, int, str | None], Any]] = {
     "pixels": part_pixels,
     "sh_terms": part_sh_terms,
     "order": part_order,
-    "shortcuts": part_shortcuts,
+    "optimizations": part_optimizations,
     "loss": part_loss,
 }
 
@@ -442,7 +442,7 @@ def plot(results: dict[str, Any]) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(2, 2, figsize=(12, 9), layout="constrained")
-    scenes, against, scaling, shortcuts = axes.flat
+    scenes, against, scaling, optimizations = axes.flat
     for axis in axes.flat:
         axis.grid(alpha=0.3)
     if "scenes" in results:
@@ -472,18 +472,27 @@ def plot(results: dict[str, Any]) -> None:
         scaling.plot(counts, counts, "--", color="gray", label="ideal")
         scaling.set(xlabel="threads", ylabel="times faster than one thread", xticks=counts)
         scaling.legend()
-    if "shortcuts" in results:
-        rows = results["shortcuts"]["rows"]
+    if "optimizations" in results:
+        rows = results["optimizations"]["rows"]
         # Each row was measured in turn with its own baseline, so only the share is comparable.
         saved = [100 * row["saved"] for row in rows]
         errors = [100 * row["saved_error"] for row in rows]
-        shortcuts.barh([row["shortcut"] for row in rows], saved, xerr=errors, ecolor="gray")
-        shortcuts.set(xlabel="time saved by the shortcut (%), and its standard error")
+        optimizations.barh([row["optimization"] for row in rows], saved, xerr=errors, ecolor="gray")
+        optimizations.set(xlabel="time saved by the optimization (%), and its standard error")
     figure.savefig(FILE.with_suffix(".png"), dpi=120)
 
 
 def main(
-    parts: tuple[Part, ...] = ("scenes", "threads", "gaussians", "pixels", "sh_terms", "order", "shortcuts", "loss"),
+    parts: tuple[Part, ...] = (
+        "scenes",
+        "threads",
+        "gaussians",
+        "pixels",
+        "sh_terms",
+        "order",
+        "optimizations",
+        "loss",
+    ),
     quick: bool = False,
     repeats: int = 7,
     only: str | None = None,

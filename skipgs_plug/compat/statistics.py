@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from skipgs_plug.fallback_raster.runtime.buffers import floats, ints, zeros
-from skipgs_plug.fallback_raster.runtime.constants import tiles
-from skipgs_plug.fallback_raster.runtime.launch import FloatArray, IntArray, worker
-from skipgs_plug.fallback_raster.runtime.source import read_kernel
 from skipgs_plug.fallback_raster.stages.binning import bin_gaussians
-
-SUMS = 8  # floats per (tile, Gaussian) pair; the kernel uses six
+from skipgs_plug.fallback_raster.stages.statistics import SUMS, SortedLists, StatisticsMaps, blend_statistics
+from skipgs_plug.fallback_raster.stages.structs import Splats
 
 
 class Footprint(NamedTuple):
@@ -44,23 +41,6 @@ class Statistics(NamedTuple):
     strongest: Tensor  # [H, W] int32, the one with the largest share, the front one of equals; -1 where there is none
 
 
-@worker(read_kernel("blend_statistics.h"), items="tiles_x * tiles_y", grain="2", constants={"SUMS": SUMS})
-def blend_statistics(
-    records: Annotated[FloatArray, "M, RECORD"],
-    tile_start: Annotated[IntArray, "tiles_x * tiles_y + 1"],
-    tile_list: Annotated[IntArray, "P"],
-    tile_rows: Annotated[IntArray, "P"],
-    values: Annotated[FloatArray, "height, width"],
-    pair_sums: Annotated[FloatArray, "P, 8"],  # out
-    contributions: Annotated[IntArray, "height, width"],  # out
-    strongest: Annotated[IntArray, "height, width"],  # out
-    width: int,
-    height: int,
-    tiles_x: int,
-    tiles_y: int,
-) -> None: ...
-
-
 @torch.no_grad()
 def gather(f: Footprint, values: Tensor | None = None) -> Statistics:
     """Walk through the blend of an image once more, and sum what is asked of it.
@@ -74,19 +54,20 @@ def gather(f: Footprint, values: Tensor | None = None) -> Statistics:
     sigmas = (torch.stack([c, a], dim=-1) / determinant[:, None]).clamp_min(0.0).sqrt()
     visible = f.drawn.nonzero()[:, 0].to(torch.int32)
     means2d, depths, conics, opacities = (t.contiguous() for t in (f.means2d, f.depths, f.conics, f.opacities))
-    bins = bin_gaussians(
-        visible, means2d, depths, conics, opacities, sigmas, zeros(len(f), 1), f.width, f.height
-    )  # fmt: skip
+    splats = Splats(means2d, depths, conics, opacities, sigmas)
+    bins = bin_gaussians(visible, splats, zeros(len(f), 1), f.width, f.height)
     bins.sort()
-    rows = visible[bins.listed[bins.tile_list]]
-    tiles_x, tiles_y = tiles(f.width, f.height)
+    rows = visible[bins.packed.listed[bins.tile_record]]
     size = (f.height, f.width)
     picture = zeros(*size) if values is None else values.detach().to(torch.float32).reshape(size).contiguous()
-    pair_sums, contributions, strongest = floats(len(bins.tile_list), SUMS), ints(*size), ints(*size)
+    pair_sums, maps = floats(len(rows), SUMS), StatisticsMaps(ints(*size), ints(*size))
     blend_statistics(
-        bins.records, bins.tile_start, bins.tile_list, rows, picture, pair_sums, contributions, strongest,
-        f.width, f.height, tiles_x, tiles_y,
-    )  # fmt: skip
+        lists=SortedLists(bins.packed.records, bins.tile_start, bins.tile_record, rows),
+        values=picture,
+        pair_sums=pair_sums,
+        maps=maps,
+        grid=bins.grid,
+    )
     total = zeros(len(f), SUMS).index_add_(0, rows, pair_sums)
     count, weight, light, value, weighted, distance = (column.contiguous() for column in total[:, :6].unbind(dim=1))
-    return Statistics(count.to(torch.int32), weight, light, value, weighted, distance, contributions, strongest)
+    return Statistics(count.to(torch.int32), weight, light, value, weighted, distance, *maps)

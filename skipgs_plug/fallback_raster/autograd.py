@@ -14,10 +14,21 @@ from torch.autograd.function import once_differentiable
 from .runtime.buffers import floats, ints, zeros
 from .runtime.constants import blocks
 from .runtime.optimizations import OPTIMIZATIONS, active_optimizations
-from .stages.project import project_backward, project_forward
-from .stages.rendering import blend, blend_adjoint
+from .stages.compose import compose, compose_adjoint
+from .stages.project import Limits, Projected, project_adjoint, project_forward
 from .stages.rows import all_rows, put_rows, take_rows, visible_rows
-from .stages.sh import sh_backward, sh_forward
+from .stages.sh import sh_adjoint, sh_forward
+from .stages.structs import (
+    BlockRows,
+    Camera,
+    GaussianGradients,
+    Gaussians,
+    Harmonics,
+    HarmonicsGradients,
+    ProjectedGradients,
+    RowList,
+    Splats,
+)
 
 
 def check_shapes(tensors: tuple[Tensor, ...], **shapes: torch.Size) -> tuple[Tensor, ...]:
@@ -63,15 +74,32 @@ class Project(torch.autograd.Function):
         antialiased: bool,
     ) -> tuple[Tensor, ...]:
         n = len(means)
-        means2d, sigmas, depths, conics = floats(1, n, 2), floats(1, n, 2), floats(1, n), floats(1, n, 3)
-        compensations, radii = floats(1, n if antialiased else 0), ints(1, n, 2)
-        seen, block_count = ints(n), ints(blocks(n))
+        projected = Projected(
+            means2d=floats(1, n, 2),
+            depths=floats(1, n),
+            conics=floats(1, n, 3),
+            sigmas=floats(1, n, 2),
+            compensations=floats(1, n if antialiased else 0),
+            radii=ints(1, n, 2),
+            opacities=floats(0),
+        )
+        found = BlockRows(ints(n), ints(blocks(n)))
         project_forward(
-            means, quats, scales, opacities, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
-            floats(0), seen, block_count, n, float(width), float(height), near_plane, far_plane, eps2d, radius_clip,
-            int(antialiased), 0, 1, 1, active_optimizations(),
-        )  # fmt: skip
-        visible, block_start = visible_rows(seen, block_count)
+            gaussians=Gaussians(means, quats, scales),
+            opacities=opacities,
+            camera=Camera(viewmat, K, float(width), float(height), eps2d),
+            limits=Limits(near_plane, far_plane, radius_clip),
+            projected=projected,
+            found=found,
+            n=n,
+            antialiased=int(antialiased),
+            raw=0,
+            dense=1,
+            with_radii=1,
+            optimizations=active_optimizations(),
+        )
+        visible, block_start = visible_rows(found)
+        means2d, depths, conics, sigmas, compensations, radii, _ = projected
         ctx.save_for_backward(means, quats, scales, viewmat, K, visible, block_start)
         ctx.shapes = {"means": means.shape, "quats": quats.shape, "scales": scales.shape, "viewmats": viewmat.shape}
         ctx.size = (width, height, eps2d)
@@ -92,39 +120,49 @@ class Project(torch.autograd.Function):
         means, quats, scales, viewmat, K, visible, block_start = check_shapes(ctx.saved_tensors, **ctx.shapes)
         width, height, eps2d = ctx.size
         with_pose = ctx.needs_input_grad[4]
-        v_means, v_quats, v_scales = (floats(*t.shape) for t in (means, quats, scales))
-        v_poses = zeros(blocks(len(means)) if with_pose else 0, 3, 4)
         n = len(means)
-        v_means2d = zeros(n, 2) if v_means2d is None else v_means2d.contiguous()
-        v_conics = zeros(n, 3) if v_conics is None else v_conics.contiguous()
-        v_depths, v_compensations = (
-            floats(0) if v is None else v.contiguous() for v in (v_depths, v_compensations)
-        )  # fmt: skip
-        project_backward(
-            means, quats, scales, viewmat, K, visible, block_start, v_means2d, v_depths, v_conics, v_compensations,
-            v_means, v_quats, v_scales, v_poses, n, float(width), float(height), eps2d,
-            int(v_depths.numel() > 0), int(v_compensations.numel() > 0), int(with_pose), active_optimizations(),
-        )  # fmt: skip
+        v_gaussians = GaussianGradients(*(floats(*t.shape) for t in (means, quats, scales)))
+        v_poses = zeros(blocks(n) if with_pose else 0, 3, 4)
+        v_projected = ProjectedGradients(
+            means2d=zeros(n, 2) if v_means2d is None else v_means2d.contiguous(),
+            depths=floats(0) if v_depths is None else v_depths.contiguous(),
+            conics=zeros(n, 3) if v_conics is None else v_conics.contiguous(),
+            compensations=floats(0) if v_compensations is None else v_compensations.contiguous(),
+            opacities=floats(0),
+        )
+        project_adjoint(
+            gaussians=Gaussians(means, quats, scales),
+            camera=Camera(viewmat, K, float(width), float(height), eps2d),
+            visible=RowList(visible, block_start),
+            v_projected=v_projected,
+            v_gaussians=v_gaussians,
+            v_poses=v_poses,
+            n=n,
+            with_depth=int(v_projected.depths.numel() > 0),
+            antialiased=int(v_projected.compensations.numel() > 0),
+            with_pose=int(with_pose),
+            optimizations=active_optimizations(),
+        )
         v_viewmat = None
         if with_pose:
             v_viewmat = zeros(1, 4, 4)
             v_viewmat[0, :3] = v_poses.sum(0)
-        return v_means, v_quats, v_scales, None, v_viewmat, *[None] * 8
+        return *v_gaussians, None, v_viewmat, *[None] * 8
 
 
 class SphericalHarmonics(torch.autograd.Function):
     """View-dependent colours [N, 3] of one camera.
 
-    The coefficients are `base` [N, K, 3] with `rest` None, or `base` [N, 1, 3] and `rest` [N, K - 1, 3].
+    The coefficients are `sh0` [N, K, 3] with `shN` None, or `sh0` [N, 1, 3] and `shN` [N, K - 1, 3].
     """
 
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any,
         means: Tensor,  # [N, 3]
-        camera: Tensor,  # [3]
-        base: Tensor,
-        rest: Tensor | None,
+        position: Tensor,  # [3], of the camera
+        sh0: Tensor,
+        shN: Tensor | None,
         visible: Tensor,  # [M]
         block_start: Tensor,  # [ceil(N / BLOCK) + 1]
         degree: int,
@@ -133,28 +171,44 @@ class SphericalHarmonics(torch.autograd.Function):
         colors = floats(n, 3)
         if not active_optimizations() & OPTIMIZATIONS["visible_only"]:
             visible, block_start = all_rows(n)
-        ctx.layout = (3 * base.shape[1], 3 * base.shape[1], 3) if rest is None else (3, 3 * rest.shape[1], 0)
-        ctx.degree = degree
-        ctx.joined = rest is None
-        rest = base if rest is None else rest
-        sh_forward(means, camera, base, rest, visible, block_start, colors, n, *ctx.layout, degree, 1)
-        ctx.save_for_backward(means, base, rest, camera, colors, visible, block_start)
-        ctx.shapes = {"means": means.shape, "colors": base.shape, "the higher bands of colors": rest.shape}
+        whole = 3 * sh0.shape[1]
+        strides = (whole, whole, 3) if shN is None else (whole, 3 * shN.shape[1], 0)
+        ctx.layout = dict(zip(("sh0_stride", "shN_stride", "shN_offset"), strides, strict=True)) | {"degree": degree}
+        ctx.joined = shN is None
+        shN = sh0 if shN is None else shN
+        sh_forward(
+            means=means,
+            sh=Harmonics(position, sh0, shN, **ctx.layout),
+            visible=RowList(visible, block_start),
+            colors=colors,
+            n=n,
+            dense=1,
+        )
+        ctx.save_for_backward(means, sh0, shN, position, colors, visible, block_start)
+        ctx.shapes = {"means": means.shape, "colors": sh0.shape, "the higher bands of colors": shN.shape}
         return colors
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> Any:  # type: ignore[override]
-        means, base, rest, camera, colors, visible, block_start = check_shapes(ctx.saved_tensors, **ctx.shapes)
-        v_means, v_base = floats(*means.shape), floats(*base.shape)
-        v_rest = v_base if ctx.joined else floats(*rest.shape)
-        v_cameras = zeros(blocks(len(means)), 3)
-        sh_backward(
-            means, camera, base, rest, visible, block_start, colors, v_colors.contiguous(), v_means, v_base, v_rest,
-            v_cameras, len(means), *ctx.layout, ctx.degree, active_optimizations(),
-        )  # fmt: skip
-        v_camera = v_cameras.sum(0) if ctx.needs_input_grad[1] else None
-        return v_means, v_camera, v_base, None if ctx.joined else v_rest, None, None, None
+        means, sh0, shN, position, colors, visible, block_start = check_shapes(ctx.saved_tensors, **ctx.shapes)
+        v_means, v_sh0 = floats(*means.shape), floats(*sh0.shape)
+        v_shN = v_sh0 if ctx.joined else floats(*shN.shape)
+        v_positions = zeros(blocks(len(means)), 3)
+        sh_adjoint(
+            means=means,
+            sh=Harmonics(position, sh0, shN, **ctx.layout),
+            visible=RowList(visible, block_start),
+            colors=colors,
+            v_colors=v_colors.contiguous(),
+            v_means=v_means,
+            v_sh=HarmonicsGradients(v_sh0, v_shN, factored=0),
+            v_positions=v_positions,
+            n=len(means),
+            optimizations=active_optimizations(),
+        )
+        v_position = v_positions.sum(0) if ctx.needs_input_grad[1] else None
+        return v_means, v_position, v_sh0, None if ctx.joined else v_shN, None, None, None
 
 
 class Pack(torch.autograd.Function):
@@ -170,7 +224,7 @@ class Pack(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, v_packed: Tensor) -> Any:  # type: ignore[override]
         visible, block_start = ctx.saved_tensors
-        return put_rows(v_packed, ctx.n, visible, block_start), None, None
+        return put_rows(v_packed, ctx.n, RowList(visible, block_start)), None, None
 
 
 class Blend(torch.autograd.Function):
@@ -196,8 +250,9 @@ class Blend(torch.autograd.Function):
         height: int,
         absolute: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        image, transmittance, alpha, ctx.blended = blend(
-            means2d, conics, opacities, colors, depths, sigmas, visible, block_start, width, height
+        splats = Splats(means2d, depths, conics, opacities, sigmas)
+        image, transmittance, alpha, ctx.composed = compose(
+            splats, colors, RowList(visible, block_start), width, height
         )
         ctx.save_for_backward(means2d, conics, opacities, colors, transmittance)
         ctx.shapes = {
@@ -207,7 +262,7 @@ class Blend(torch.autograd.Function):
             "colors": colors.shape,
         }
         ctx.absolute = absolute
-        tiles_per_gauss = ctx.blended.near.bins.tiles_per_gauss
+        tiles_per_gauss = ctx.composed.near.bins.tiles_per_gauss
         ctx.mark_non_differentiable(tiles_per_gauss)
         ctx.set_materialize_grads(False)  # no zeros for tiles_per_gauss, which has a number for each row
         return image, alpha, tiles_per_gauss
@@ -219,7 +274,7 @@ class Blend(torch.autograd.Function):
     ) -> Any:
         means2d, conics, opacities, colors, transmittance = check_shapes(ctx.saved_tensors, **ctx.shapes)
         v_transmittance = None if v_alpha is None else -v_alpha
-        gradients = blend_adjoint(
-            ctx.blended, means2d, conics, opacities, colors, transmittance, v_image, v_transmittance, ctx.absolute
+        gradients = compose_adjoint(
+            ctx.composed, means2d, conics, opacities, colors, transmittance, v_image, v_transmittance, ctx.absolute
         )
         return *gradients, *[None] * 7

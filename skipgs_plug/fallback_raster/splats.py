@@ -17,11 +17,22 @@ from .runtime.arguments import as_kernels_read, camera_centre, check_tensors, pl
 from .runtime.buffers import floats, ints, zeros
 from .runtime.constants import FACTOR, TILE, blocks, tiles
 from .runtime.optimizations import active_optimizations
-from .stages.project import project_forward
-from .stages.rendering import blend, pair_sums
+from .stages.compose import compose, pair_sums
+from .stages.project import Limits, Projected, project_forward
 from .stages.rows import take_rows, visible_rows
 from .stages.sh import sh_forward
-from .stages.splat_backward import splat_backward
+from .stages.splat_adjoint import CenterGradients, Rendered, splat_adjoint
+from .stages.structs import (
+    BlockRows,
+    Camera,
+    FactorOutput,
+    GaussianGradients,
+    Gaussians,
+    Harmonics,
+    HarmonicsGradients,
+    RowList,
+    Splats,
+)
 from .training.factored_gradient import Factors
 from .training.lazy_adam import LazyAdam
 
@@ -29,18 +40,19 @@ EPS2D = 0.3  # added to the 2D covariance's diagonal, square pixels
 
 
 @dataclass
-class _Projected:
-    """Rows [N, ...] of which only the visible ones are written, and which these are."""
+class _View:
+    """Raw Gaussians in one camera: rows [N, ...] of which only the visible ones are written, and which these are."""
 
-    means2d: Tensor
-    depths: Tensor
-    conics: Tensor
-    sigmas: Tensor
-    compensations: Tensor
-    radii: Tensor
-    opacities: Tensor
-    visible: Tensor
-    block_start: Tensor
+    camera: Camera
+    antialiased: bool
+    projected: Projected
+    visible: RowList
+
+    @property
+    def splats(self) -> Splats:
+        """What the blend reads."""
+        p = self.projected
+        return Splats(p.means2d, p.depths, p.conics, p.opacities, p.sigmas)
 
 
 def rasterize_splats(
@@ -105,12 +117,12 @@ def rasterize_splats(
     )  # fmt: skip
     near_plane, far_plane = planes(near_plane, far_plane)
     means, quats, log_scales, logits, sh0, shN, viewmat, K = as_kernels_read(*tensors, viewmat, K)
-    size = (width, height)
     with torch.no_grad():
-        projected = _project(
-            means, quats, log_scales, logits, viewmat, K, size, near_plane, far_plane, antialiased, with_rows
-        )
-    visible = projected.visible
+        camera = Camera(viewmat, K, float(width), float(height), EPS2D)
+        gaussians = Gaussians(means, quats, log_scales)
+        limits = Limits(near_plane, far_plane, radius_clip=0.0)
+        view = _project(gaussians, logits, camera, limits, antialiased, with_rows)
+    visible = view.visible.rows
     if lazy is not None and sh_degree > 0:
         lazy.catch_up(visible)
     tile_width, tile_height = tiles(width, height)
@@ -125,7 +137,7 @@ def rasterize_splats(
     centres = absolute = None
     if with_rows:
         # A leaf that goes in with the parameters, so that its gradient comes out with theirs.
-        centres = take_rows(projected.means2d, visible)
+        centres = take_rows(view.projected.means2d, visible)
         centres.requires_grad_(torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
         if absgrad:
             absolute = centres.absgrad = zeros(len(visible), 2)  # type: ignore[attr-defined]
@@ -133,13 +145,12 @@ def rasterize_splats(
         info |= {
             "camera_ids": torch.zeros_like(ids),
             "gaussian_ids": ids,
-            "radii": take_rows(projected.radii, visible),
+            "radii": take_rows(view.projected.radii, visible),
             "means2d": centres,
         }
     image, transmittance = _Render.apply(
-        means, quats, log_scales, logits, sh0, shN, centres, absolute, projected, viewmat, K, size, sh_degree,
-        antialiased, lazy,
-    )  # fmt: skip
+        means, quats, log_scales, logits, sh0, shN, centres, absolute, view, (width, height), sh_degree, lazy
+    )
     if background is not None:
         image = image + transmittance.unsqueeze(-1) * background.to(torch.float32)
     return image, transmittance, info
@@ -162,31 +173,25 @@ class _Render(torch.autograd.Function):
         shN: Tensor,
         centres: Tensor | None,
         absolute: Tensor | None,
-        projected: _Projected,
-        viewmat: Tensor,
-        K: Tensor,
+        view: _View,
         size: tuple[int, int],
         degree: int,
-        antialiased: bool,
         lazy: LazyAdam | None,
     ) -> tuple[Tensor, Tensor]:
-        p, n = projected, len(means)
-        camera = camera_centre(viewmat).contiguous()
-        colors = floats(n, 3)
-        layout = (3, 3 * shN.shape[1], 0)
-        sh_forward(means, camera, sh0, shN, p.visible, p.block_start, colors, n, *layout, degree, 0)
-        image, transmittance, _, ctx.blended = blend(
-            p.means2d, p.conics, p.opacities, colors, p.depths, p.sigmas, p.visible, p.block_start, *size, dense=False
-        )
+        position = camera_centre(view.camera.viewmat).contiguous()
+        layout = {"sh0_stride": 3, "shN_stride": 3 * shN.shape[1], "shN_offset": 0, "degree": degree}
+        colors, n = floats(len(means), 3), len(means)
+        sh = Harmonics(position, sh0, shN, **layout)
+        sh_forward(means=means, sh=sh, visible=view.visible, colors=colors, n=n, dense=0)
+        image, transmittance, _, ctx.composed = compose(view.splats, colors, view.visible, *size, dense=False)
         ctx.save_for_backward(means, quats, log_scales, logits, sh0, shN, transmittance)
         ctx.shapes = {
             name: tensor.shape
             for name, tensor in zip(("means", "quats", "scales", "opacities", "sh0", "shN"), ctx.to_save, strict=False)
         }
-        ctx.projected, ctx.colors, ctx.absolute = projected, colors, absolute
+        ctx.view, ctx.colors, ctx.absolute = view, colors, absolute
         ctx.with_centres = centres is not None
-        ctx.camera = camera, viewmat, K, size, antialiased
-        ctx.sh = layout, degree, lazy
+        ctx.sh = position, layout, lazy
         ctx.set_materialize_grads(False)  # the transmittance has a gradient where there is a background
         return image, transmittance
 
@@ -196,50 +201,75 @@ class _Render(torch.autograd.Function):
         ctx: Any, v_image: Tensor | None, v_transmittance: Tensor | None
     ) -> Any:
         means, quats, log_scales, logits, sh0, shN, transmittance = check_shapes(ctx.saved_tensors, **ctx.shapes)
-        p, n = ctx.projected, len(means)
-        camera, viewmat, K, size, antialiased = ctx.camera
-        layout, degree, lazy = ctx.sh
-        gradients = [floats(*t.shape) for t in (means, quats, log_scales, logits, sh0)]
-        rows = p.visible if lazy is not None and degree > 0 else p.visible[:0]
-        factors = Factors(rows, floats(len(rows), FACTOR), floats(len(rows), FACTOR), degree)
-        v_shN = floats(*shN.shape) if lazy is None else floats(0)
-        with_absolute = ctx.absolute is not None
-        absolute = ctx.absolute if with_absolute else floats(0)
-        v_centres = floats(len(p.visible) if ctx.with_centres else 0, 2)
+        view: _View = ctx.view
+        position, layout, lazy = ctx.sh
+        absolute, with_centres, degree = ctx.absolute, ctx.with_centres, layout["degree"]
         # Three channels are one pass.
-        ((_, _, sums),) = pair_sums(ctx.blended, ctx.colors, transmittance, v_image, v_transmittance, with_absolute)
-        splat_backward(
-            *sums, means, quats, log_scales, logits, sh0, shN, viewmat, K, camera, ctx.colors, p.conics, p.opacities,
-            *gradients, v_shN, factors.directions, factors.colors, v_centres, absolute,
-            n, *map(float, size), EPS2D, layout[1], degree, int(lazy is not None), int(antialiased),
-            int(ctx.with_centres), int(with_absolute), ctx.blended.parts, active_optimizations(),
-        )  # fmt: skip
+        passes = pair_sums(ctx.composed, ctx.colors, transmittance, v_image, v_transmittance, absolute is not None)
+        ((_, sums),) = passes
+        v_gaussians = GaussianGradients(floats(*means.shape), floats(*quats.shape), floats(*log_scales.shape))
+        v_logits, v_sh0 = floats(*logits.shape), floats(*sh0.shape)
+        v_shN = floats(*shN.shape) if lazy is None else floats(0)
+        rows = view.visible.rows if lazy is not None and degree > 0 else view.visible.rows[:0]
+        factors = FactorOutput(floats(len(rows), FACTOR), floats(len(rows), FACTOR))
+        v_centres = floats(len(sums.rows) if with_centres else 0, 2)
+        splat_adjoint(
+            sums=sums,
+            gaussians=Gaussians(means, quats, log_scales),
+            logits=logits,
+            camera=view.camera,
+            sh=Harmonics(position, sh0, shN, **layout),
+            rendered=Rendered(ctx.colors, view.projected.conics, view.projected.opacities),
+            v_gaussians=v_gaussians,
+            v_logits=v_logits,
+            v_sh=HarmonicsGradients(v_sh0, v_shN, factored=int(lazy is not None)),
+            factors=factors,
+            v_centers=CenterGradients(v_centres, floats(0) if absolute is None else absolute),
+            n=len(means),
+            antialiased=int(view.antialiased),
+            with_centers=int(with_centres),
+            absgrad=int(absolute is not None),
+            parts=ctx.composed.parts,
+            optimizations=active_optimizations(),
+        )
         if lazy is not None:
-            lazy.receive(factors)
-        return *gradients, v_shN if lazy is None else None, v_centres if ctx.with_centres else None, *[None] * 8
+            lazy.receive(Factors(rows, *factors, degree))
+        return (
+            *v_gaussians,
+            v_logits,
+            v_sh0,
+            v_shN if lazy is None else None,
+            v_centres if with_centres else None,
+            *[None] * 5,
+        )
 
 
 def _project(
-    means: Tensor,
-    quats: Tensor,
-    log_scales: Tensor,
-    logits: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    size: tuple[int, int],
-    near_plane: float,
-    far_plane: float,
-    antialiased: bool,
-    with_radii: bool,
-) -> _Projected:
-    n = len(means)
-    means2d, depths, conics, sigmas, opacities = floats(n, 2), floats(n), floats(n, 3), floats(n, 2), floats(n)
-    compensations, radii = floats(n if antialiased else 0), ints(n if with_radii else 0, 2)
-    seen, block_count = ints(n), ints(blocks(n))
+    gaussians: Gaussians, logits: Tensor, camera: Camera, limits: Limits, antialiased: bool, with_radii: bool
+) -> _View:
+    n = len(logits)
+    projected = Projected(
+        means2d=floats(n, 2),
+        depths=floats(n),
+        conics=floats(n, 3),
+        sigmas=floats(n, 2),
+        compensations=floats(n if antialiased else 0),
+        radii=ints(n if with_radii else 0, 2),
+        opacities=floats(n),
+    )
+    found = BlockRows(ints(n), ints(blocks(n)))
     project_forward(
-        means, quats, log_scales, logits, viewmat, K, means2d, depths, conics, sigmas, compensations, radii,
-        opacities, seen, block_count, n, *map(float, size), near_plane, far_plane, EPS2D, 0.0, int(antialiased),
-        1, 0, int(with_radii), active_optimizations(),
-    )  # fmt: skip
-    lists = visible_rows(seen, block_count)
-    return _Projected(means2d, depths, conics, sigmas, compensations, radii, opacities, *lists)
+        gaussians=gaussians,
+        opacities=logits,
+        camera=camera,
+        limits=limits,
+        projected=projected,
+        found=found,
+        n=n,
+        antialiased=int(antialiased),
+        raw=1,
+        dense=0,
+        with_radii=int(with_radii),
+        optimizations=active_optimizations(),
+    )
+    return _View(camera, antialiased, projected, visible_rows(found))

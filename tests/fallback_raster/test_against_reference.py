@@ -56,7 +56,7 @@ def test_image_and_gradients(case: str) -> None:
 
 
 @pytest.mark.parametrize("case", ["SH 3", "background, depth", "absgrad, packed", "5 features", "many Gaussians"])
-def test_shortcuts_change_nothing(case: str) -> None:
+def test_optimizations_change_nothing(case: str) -> None:
     """Without any of them the rasterizer is a second oracle: nothing is left out but by the definition of alpha."""
     scene, options = CASES[case]
     results = []
@@ -66,7 +66,7 @@ def test_shortcuts_change_nothing(case: str) -> None:
             image, alpha, info = rasterization(**inputs, **{"packed": False, **options})
             generator = torch.Generator().manual_seed(1)
             upstream = torch.randn(image.shape, generator=generator)
-            upstream[:, : image.shape[1] // 2] = 0.0  # for the shortcuts of the adjoint
+            upstream[:, : image.shape[1] // 2] = 0.0  # for the optimizations of the adjoint
             torch.autograd.backward([image, alpha], [upstream, upstream[..., :1]])
         gradients = [t.grad for t in inputs.values() if torch.is_tensor(t) and t.grad is not None]
         results.append(([image.detach(), alpha.detach()], gradients, info["tiles_per_gauss"].sum()))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import pytest
 import torch
@@ -13,31 +13,30 @@ from skipgs_plug.compat import statistics
 from skipgs_plug.compat.compose import render, splats
 from skipgs_plug.compat.inria import GaussianRasterizationSettings
 from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
+from skipgs_plug.fallback_raster.declarations import workers
 from skipgs_plug.fallback_raster.runtime import guard
-from skipgs_plug.fallback_raster.runtime.launch import ByteArray, FloatArray, IntArray, LongArray, Worker, worker
+from skipgs_plug.fallback_raster.runtime.launch import Worker, worker
+from skipgs_plug.fallback_raster.runtime.parameters import (
+    ArrayKind,
+    Field,
+    FloatArray,
+    FloatOutput,
+    IntArray,
+    IntOutput,
+)
 from skipgs_plug.fallback_raster.runtime.source import KERNELS, PRELUDE, read_kernel
 from skipgs_plug.fallback_raster.splats import rasterize_splats
-from skipgs_plug.fallback_raster.stages import binning, blend, project, rows, sh, splat_backward, two_pass
-from skipgs_plug.fallback_raster.training import adam, gradient_norms, lazy_adam, loss
+from skipgs_plug.fallback_raster.stages import project
+from skipgs_plug.fallback_raster.training import adam, gradient_norms, lazy_adam
 from skipgs_plug.fallback_raster.training.factored_gradient import FactoredGradient, Factors
 
-WORKERS = {
-    found._name: found
-    for module in (
-        *(adam, binning, blend, gradient_norms, lazy_adam, loss, two_pass),
-        *(project, rows, sh, splat_backward, statistics),
-    )
-    for value in vars(module).values()
-    for found in (value.values() if isinstance(value, dict) else [value])
-    if isinstance(found, Worker)
-}
-DTYPES = {FloatArray: torch.float32, IntArray: torch.int32, LongArray: torch.int64, ByteArray: torch.uint8}
-EXAMPLES: dict[type, Any] = {kind: torch.zeros(0, dtype=dtype) for kind, dtype in DTYPES.items()} | {int: 0, float: 0.0}
+WORKERS = workers()
+DTYPES = (torch.float32, torch.int32, torch.int64, torch.uint8)
 
 
 def test_every_kernel_file_is_used_and_tested() -> None:
     texts = [PRELUDE, read_kernel("pool_serve.h"), read_kernel("pool_run.h")]
-    texts += [found._code for found in WORKERS.values()]
+    texts += [found.text for found in WORKERS.values()]
     files = [path.relative_to(KERNELS).as_posix() for path in KERNELS.rglob("*.h")]
     unused = [file for file in files if not any(f'kernels/{file}"' in text for text in texts)]
     assert not unused
@@ -45,7 +44,7 @@ def test_every_kernel_file_is_used_and_tested() -> None:
 
 
 @worker("out[0] = small; out[1] = large; numbers[0] = 2 * number; numbers[1] = most;", items="1", grain="1")
-def _echo(out: FloatArray, numbers: IntArray, small: float, number: int, large: float, most: int) -> None: ...
+def _echo(out: FloatOutput, numbers: IntOutput, small: float, number: int, large: float, most: int) -> None: ...
 
 
 @pytest.mark.parametrize("large", [1e39, -1e39, float("inf"), 3e38, 1e-50])
@@ -56,25 +55,124 @@ def test_numbers_arrive_as_they_are_and_beyond_float32_as_infinity(large: float)
     assert numbers.tolist() == [-14, 2**31 - 1]
 
 
+class Camera(NamedTuple):
+    matrix: Annotated[FloatArray, "4, 4"]
+    width: int
+
+
+class Rows(NamedTuple):
+    rows: Annotated[IntArray, "M"]
+    block_start: Annotated[IntArray, "blocks + 1"]
+
+
+# The first number of each list, and the numbers of the camera.
+@worker(
+    "out[0] = near.rows[0]; out[1] = far.rows[0]; out[2] = (int)camera.matrix[0]; out[3] = camera.width;",
+    items="1",
+    grain="1",
+)
+def _echo_structs(
+    *,
+    camera: Camera,
+    near: Rows,
+    far: Rows,
+    image: Annotated[FloatArray, "camera.width"],
+    taken: Annotated[FloatArray, "near.M"],
+    out: Annotated[IntOutput, "4"],
+    blocks: int,
+) -> None: ...
+
+
+def structs() -> dict[str, Any]:
+    lists = [Rows(torch.full((m,), m, dtype=torch.int32), torch.zeros(3, dtype=torch.int32)) for m in (5, 7)]
+    return {
+        "camera": Camera(torch.full((4, 4), 3.0), 6),
+        "near": lists[0],
+        "far": lists[1],
+        "image": torch.zeros(6),
+        "taken": torch.zeros(5),
+        "out": torch.zeros(4, dtype=torch.int32),
+        "blocks": 2,
+    }
+
+
+def test_structs_arrive_field_by_field_whatever_the_order_of_the_names() -> None:
+    for names in (structs(), dict(reversed(structs().items()))):
+        _echo_structs(**names)
+        assert names["out"].tolist() == [5, 7, 3, 6]
+
+
+def test_arguments_are_checked_by_name() -> None:
+    with pytest.raises(TypeError, match=r"_echo_structs\(\) missing 1 required keyword-only argument: 'far'"):
+        _echo_structs(**{name: value for name, value in structs().items() if name != "far"})
+    with pytest.raises(TypeError, match=r"_echo_structs\(\) got an unexpected keyword argument 'further'"):
+        _echo_structs(**structs(), further=1)
+    with pytest.raises(TypeError, match=r"_echo_structs\(\) takes 0 positional arguments but 7 were given"):
+        _echo_structs(*structs().values())
+    for wrong in (None, tuple(structs()["near"]), structs()["camera"]):
+        with pytest.raises(TypeError, match=r"^_echo_structs: near must be a Rows, got "):
+            _echo_structs(**structs() | {"near": wrong})
+    with pytest.raises(TypeError, match=r"^_echo_structs: camera.matrix must be a contiguous tensor of torch.float32"):
+        _echo_structs(**structs() | {"camera": Camera(torch.zeros(4, 4).t().double(), 6)})
+    with pytest.raises(TypeError, match=r"^_echo_structs: camera.width must be a int, got float 6.0"):
+        _echo_structs(**structs() | {"camera": Camera(torch.zeros(4, 4), 6.0)})  # type: ignore[arg-type]
+
+
+def test_each_struct_has_its_own_sizes_and_parameters_may_name_them() -> None:
+    ints = torch.zeros(3, dtype=torch.int32)
+    for name, wrong, message in (
+        ("camera", Camera(torch.zeros(3, 4), 6), r"camera.matrix holds 12 numbers, but \[4, 4\] makes 16"),
+        ("far", Rows(ints, ints[:2]), r"far.block_start holds 2 numbers, but \[blocks \+ 1\] makes 3"),
+        ("image", torch.zeros(5), r"image holds 5 numbers, but \[camera.width\] makes 6"),
+        ("taken", torch.zeros(7), r"taken holds 7 numbers, but \[near.M\] makes 5"),
+    ):
+        with pytest.raises(ValueError, match=f"^_echo_structs: {message}"):
+            _echo_structs(**structs() | {name: wrong})
+
+
+def test_what_a_kernel_reads_it_cannot_write(capfd: pytest.CaptureFixture[str]) -> None:
+    @worker("source[0] = 1.0f;", items="1", grain="1")
+    def overwrites(source: FloatArray) -> None: ...
+
+    with pytest.raises(Exception, match="build failed"):
+        overwrites(torch.zeros(1))
+    assert "cannot assign to variable 'source' with const-qualified" in capfd.readouterr().err
+
+
+def example(field: Field) -> Any:
+    return torch.zeros(0, dtype=field.kind.dtype) if isinstance(field.kind, ArrayKind) else field.kind(0)
+
+
+def examples(found: Worker[Any], /, **fields: Any) -> dict[str, Any]:
+    """Arguments of the declared kinds, of which some fields, by path, are replaced."""
+    arguments = {}
+    for parameter in found._parameters:
+        values = [fields.get(field.path, example(field)) for field in parameter.fields]
+        arguments[parameter.name] = parameter.struct(*values) if parameter.struct else values[0]
+    return arguments
+
+
 @pytest.mark.parametrize("name", WORKERS)
 def test_misuse_is_an_error_that_names_kernel_and_argument(name: str) -> None:
     found = WORKERS[name]
-    valid = [EXAMPLES[kind] for kind in found._kinds.values()]
-    for wrong in (valid[:-1], [*valid, 0], []):
-        with pytest.raises(TypeError, match=f"{name} takes {len(valid)} arguments, got {len(wrong)}"):
-            found(*wrong)
-    for place, (parameter, kind) in enumerate(found._kinds.items()):
+    valid = examples(found)
+    for missing in valid:
+        with pytest.raises(TypeError, match=rf"{name}\(\) missing 1 required .*argument: '{missing}'"):
+            found(**{other: value for other, value in valid.items() if other != missing})
+    with pytest.raises(TypeError, match=rf"{name}\(\) got an unexpected keyword argument 'further'"):
+        found(**valid, further=0)
+    for field in found._fields:
         wrong_values: list[Any] = [None, "1", [1.0]]
-        if kind in DTYPES:
-            square = torch.zeros(3, 3, dtype=DTYPES[kind])
+        if isinstance(field.kind, ArrayKind):
+            square = torch.zeros(3, 3, dtype=field.kind.dtype)
             wrong_values += [1, 0.0, square.t(), square.to("meta"), square.numpy()]
             wrong_values += [square.to(dtype) for dtype in (torch.float64, torch.int16, torch.bool)]
-            wrong_values += [square.to(dtype) for dtype in DTYPES.values() if dtype is not DTYPES[kind]]
+            wrong_values += [square.to(dtype) for dtype in DTYPES if dtype is not field.kind.dtype]
         else:
-            wrong_values += [square_one(kind), True, 1.0 if kind is int else 1]
+            wrong_values += [square_one(field.kind), True, 1.0 if field.kind is int else 1]
         for value in wrong_values:
-            with pytest.raises(TypeError, match=f"{name}: {parameter} must be a "):
-                found(*valid[:place], value, *valid[place + 1 :])
+            with pytest.raises(TypeError, match=f"{name}: {field.path} must be a "):
+                found(**examples(found, **{field.path: value}))
 
 
 def square_one(kind: type) -> torch.Tensor:
@@ -83,16 +181,18 @@ def square_one(kind: type) -> torch.Tensor:
 
 def test_a_number_beyond_32_bits_is_refused() -> None:
     with pytest.raises(OverflowError, match="list_visible: blocks = 2147483648"):
-        project.list_visible(*[EXAMPLES[kind] for kind in project.list_visible._kinds.values()][:-1], 2**31)
+        project.list_visible(**examples(project.list_visible, blocks=2**31))
 
 
-def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker, list[Any]]]:
-    calls: dict[str, tuple[Worker, list[Any]]] = {}
+def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker[Any], dict[str, Any]]]:
+    """Workers that ran, and the fields of their arguments by path."""
+    calls: dict[str, tuple[Worker[Any], dict[str, Any]]] = {}
     original = Worker.__call__
 
-    def record(self: Worker, *arguments: Any) -> None:
-        calls[self._name] = self, list(arguments)
-        original(self, *arguments)
+    def record(self: Worker[Any], *arguments: Any, **named: Any) -> None:
+        values = self._flatten(*arguments, **named)
+        calls[self.name] = self, {field.path: value for field, value in zip(self._fields, values, strict=True)}
+        original(self, *arguments, **named)
 
     with monkeypatch.context() as patch:
         patch.setattr(Worker, "__call__", record)
@@ -129,22 +229,22 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker, list[A
 
 def test_a_tensor_of_another_size_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = recorded_calls(monkeypatch)
-    assert {found._name for found, _ in calls} == set(WORKERS)
+    assert {found.name for found, _ in calls} == set(WORKERS)
     # Sizes that nothing else in a call tells, or only up to a whole vector.
-    free = {("project_backward", "visible"), ("sh_forward", "visible"), ("sh_backward", "visible")}
-    free |= {("reduce_pairs", "pair_slot"), ("splat_backward", "pair_slot")}
+    free = {(name, "visible.rows") for name in ("project_adjoint", "sh_forward", "sh_adjoint", "_list_open")}
+    free |= {("reduce_pairs", "sums.pair_slot"), ("splat_adjoint", "sums.pair_slot")}
     for found, arguments in calls:
-        for place, (parameter, kind) in enumerate(found._kinds.items()):
-            if kind not in DTYPES or not arguments[place].numel() or (found._name, parameter) in free:
+        for path, value in arguments.items():
+            if not isinstance(value, torch.Tensor) or not value.numel() or (found.name, path) in free:
                 continue
-            flat = arguments[place].detach().flatten()
+            flat = value.detach().flatten()
             for wrong in (flat[:-1], torch.cat([flat, flat[:1]])):
-                with pytest.raises(ValueError, match=f"^{found._name}: "):
-                    found(*arguments[:place], wrong, *arguments[place + 1 :])
+                with pytest.raises(ValueError, match=f"^{found.name}: "):
+                    found(**examples(found, **arguments | {path: wrong}))
 
 
 @worker("for (int i = first; i < last; ++i) out[i + offset] = 1.0f;", items="n", grain=4)
-def leaky_fill(out: FloatArray, n: int, offset: int) -> None: ...
+def leaky_fill(out: FloatOutput, n: int, offset: int) -> None: ...
 
 
 @pytest.mark.parametrize(
@@ -161,7 +261,7 @@ def test_guard_zones_find_what_is_written_outside(offset: int, message: str) -> 
 
 
 @worker("out[0] = source[at];", items="1", grain=1)
-def peek(source: FloatArray, out: FloatArray, at: int) -> None: ...
+def peek(source: FloatArray, out: FloatOutput, at: int) -> None: ...
 
 
 def test_guard_zones_find_what_is_read_outside() -> None:
@@ -174,15 +274,10 @@ def test_guard_zones_find_what_is_read_outside() -> None:
 
 
 def test_messages_of_the_compiler_name_our_file(capfd: pytest.CaptureFixture[str]) -> None:
-    text = read_kernel("list_visible.h")
-    broken = text.replace("int m = 0;", "int m = nothing;")
-    assert text != broken
-    kinds = project.list_visible._kinds
-
-    def stub(seen: IntArray, block_count: IntArray, visible: IntArray, block_start: IntArray, blocks: int) -> None: ...
-
-    found = worker(broken, items="1", grain=1, name="broken")(stub)
+    text = (KERNELS / "list_visible.h").read_text(encoding="utf-8")
+    broken = read_kernel("list_visible.h").replace("int m = 0;", "int m = nothing;")
+    found = worker(broken, items="1", grain=1, name="broken")(lambda: None)
     with pytest.raises(Exception, match="build failed"):
-        found(*[EXAMPLES[kind] for kind in kinds.values()])
-    line = text.splitlines().index("int m = 0;")
+        found()
+    line = text.splitlines().index("    int m = 0;") + 1
     assert f"skipgs_plug/fallback_raster/kernels/list_visible.h:{line}:" in capfd.readouterr().err

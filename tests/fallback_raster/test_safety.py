@@ -17,6 +17,7 @@ from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
 from skipgs_plug.fallback_raster.runtime.cache import load_or_rebuild, say_unwritable
 from skipgs_plug.fallback_raster.runtime.constants import SPARE_COUNTS
 from skipgs_plug.fallback_raster.stages import binning
+from skipgs_plug.fallback_raster.stages.structs import grid
 from skipgs_plug.fallback_raster.training.adam import adam_rows
 from skipgs_plug.files import WriteError
 
@@ -139,13 +140,18 @@ def test_defaults_of_the_process_change_nothing(default: Any) -> None:
 def test_pairs_are_counted_beyond_32_bits() -> None:
     counts = torch.full((2, 4 + SPARE_COUNTS), 2**30, dtype=torch.int32)
     totals = torch.tensor([2**32, 2**32, 0])
-    binning.scan_pairs(counts, totals, torch.zeros(5, dtype=torch.int32), 2, 4)
+    binning.scan_pairs(
+        counts=binning.PairCounts(counts, totals),
+        tile_start=torch.zeros(5, dtype=torch.int32),
+        grid=grid(32, 32),
+        slices=2,
+    )
     assert totals.tolist() == [0, 2**32, 2**33]
 
 
 def test_too_many_pairs_are_one_sentence_before_anything_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(binning, "MAX_PAIRS", 100)
-    monkeypatch.setattr(binning, "fill_pairs", lambda *_: pytest.fail("wrote"))
+    monkeypatch.setattr(binning, "fill_pairs", lambda **_: pytest.fail("wrote"))
     with pytest.raises(
         ValueError, match=r"\d+ visible.* cover [0-9,]+ tiles of an image of 44x37 .* at most 100"
     ) as caught:
@@ -221,7 +227,7 @@ from skipgs_plug.fallback_raster.stages.project import list_visible
 
 seen, block_count = torch.tensor([0, 2, 7], dtype=torch.int32), torch.tensor([2], dtype=torch.int32)
 visible, block_start = torch.empty(3, dtype=torch.int32), torch.empty(2, dtype=torch.int32)
-list_visible(seen, block_count, visible, block_start, 1)
+list_visible(found=seen, block_count=block_count, visible=visible, block_start=block_start, blocks=1)
 assert visible[:2].tolist() == [0, 2] and block_start.tolist() == [0, 2]
 """
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from skipgs_plug.fallback_raster.stages.binning import bin_gaussians
 from skipgs_plug.fallback_raster.stages.rows import all_rows
+from skipgs_plug.fallback_raster.stages.structs import Splats
 
 DEPTHS = {
     "spread": lambda n, g: 1.0 + 9.0 * torch.rand(n, generator=g),
@@ -30,13 +31,11 @@ def test_order(case: str, n: int) -> None:
     generator = torch.Generator().manual_seed(n)
     depths: Tensor = DEPTHS[case](n, generator)
     one = torch.ones(n, 2)
-    visible, _ = all_rows(n)
     conics = torch.tensor([1.0, 0.0, 1.0]).expand(n, 3).contiguous()
     # All in one tile of an image of two.
-    bins = bin_gaussians(
-        visible, 6.0 * one, depths, conics, torch.full((n,), 0.9), one, torch.zeros(n, 3), width=32, height=16
-    )
+    splats = Splats(6.0 * one, depths, conics, torch.full((n,), 0.9), sigmas=one)
+    bins = bin_gaussians(all_rows(n).rows, splats, torch.zeros(n, 3), width=32, height=16)
     bins.sort()
     assert bins.tile_start.tolist() == [0, n, n]
-    assert torch.equal(bins.tile_list.long(), torch.argsort(depths, stable=True))
-    assert torch.equal(bins.tile_place, bins.tile_list)  # one pair each
+    assert torch.equal(bins.tile_record.long(), torch.argsort(depths, stable=True))
+    assert torch.equal(bins.tile_pair, bins.tile_record)  # one pair each

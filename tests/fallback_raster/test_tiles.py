@@ -12,11 +12,12 @@ from skipgs_plug.fallback_raster.runtime.constants import ALPHA_MIN, TILE, tiles
 from skipgs_plug.fallback_raster.runtime.optimizations import without_optimizations
 from skipgs_plug.fallback_raster.runtime.threads import get_num_threads, set_num_threads
 from skipgs_plug.fallback_raster.stages.binning import Bins, bin_gaussians
+from skipgs_plug.fallback_raster.stages.structs import Splats
 
 SIZE = 330, 300  # 21 x 19 tiles: more rows than a vector has lanes, cut off on the right and below
 
 
-def ellipses(n: int, seed: int) -> tuple[Tensor, ...]:
+def ellipses(n: int, seed: int) -> Splats:
     """Centres, depths, conics, opacities and sigmas of points, discs and needles, from a pixel to the whole image."""
     generator = torch.Generator().manual_seed(seed)
     draw = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
@@ -29,7 +30,7 @@ def ellipses(n: int, seed: int) -> tuple[Tensor, ...]:
     conics = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], 1)
     sigmas = torch.diagonal(covariances, dim1=1, dim2=2).sqrt()
     given = centres, 1.0 + draw(n), conics, 0.9 * draw(n) + 0.005, sigmas
-    return tuple(t.to(torch.float32) for t in given)
+    return Splats(*(t.to(torch.float32) for t in given))
 
 
 def listed_tiles(bins: Bins, n: int) -> Tensor:
@@ -37,7 +38,7 @@ def listed_tiles(bins: Bins, n: int) -> Tensor:
     bins.sort()
     count = len(bins.tile_start) - 1
     tile = torch.repeat_interleave(torch.arange(count), bins.tile_start.diff().long())
-    row = bins.visible[bins.listed[bins.tile_list.long()].long()].long()
+    row = bins.visible[bins.packed.listed[bins.tile_record.long()].long()].long()
     return torch.zeros(n, count, dtype=torch.int64).index_put_((row, tile), torch.tensor(1), accumulate=True)
 
 
@@ -70,10 +71,10 @@ def least_in_tiles(centres: Tensor, conics: Tensor, margin: float) -> Tensor:
 @pytest.mark.parametrize("seed", range(4))
 def test_tiles_of_ellipses(seed: int) -> None:
     n, (width, height) = 300, SIZE
-    rows = ellipses(n, seed)
-    centres, depths, conics, opacities, sigmas = rows
+    splats = ellipses(n, seed)
+    centres, conics, opacities = splats.means2d, splats.conics, splats.opacities
     every = torch.arange(n, dtype=torch.int32)
-    bins = bin_gaussians(every, centres, depths, conics, opacities, sigmas, torch.rand(n, 3), width, height)
+    bins = bin_gaussians(every, splats, torch.rand(n, 3), width, height)
     found = listed_tiles(bins, n)
 
     x, y = torch.arange(width, dtype=torch.float64) + 0.5, torch.arange(height, dtype=torch.float64) + 0.5
@@ -86,15 +87,14 @@ def test_tiles_of_ellipses(seed: int) -> None:
     least = least_in_tiles(centres.double(), conics.double(), margin=0.1)
     assert not ((found > 0) & (least > 2.0 * torch.log(opacities.double() / ALPHA_MIN)[:, None])).any()
     assert torch.equal(bins.tiles_per_gauss.long(), found.sum(1))
-    assert torch.equal(bins.pair_start.diff().long(), found.sum(1))
+    assert torch.equal(bins.pairs.start.diff().long(), found.sum(1))
     large = found.view(n, -1, tiles(width, height)[0]).any(2).sum(1)
     assert (large > 16).any() and (large == 3).any() and (found.sum(1) == 1).any()
 
 
 def test_without_the_test_of_ellipses_whole_boxes_are_listed() -> None:
     n, (width, height) = 300, SIZE
-    centres, depths, conics, opacities, sigmas = ellipses(n, 9)
-    rows = (torch.arange(n, dtype=torch.int32), centres, depths, conics, opacities, sigmas, torch.rand(n, 3))
+    rows = torch.arange(n, dtype=torch.int32), ellipses(n, 9), torch.rand(n, 3)
     exact = listed_tiles(bin_gaussians(*rows, width, height), n)
     with without_optimizations("exact_tiles"):
         boxes = listed_tiles(bin_gaussians(*rows, width, height), n)
@@ -106,13 +106,13 @@ def test_without_the_test_of_ellipses_whole_boxes_are_listed() -> None:
 def test_slices_of_threads_list_the_same() -> None:
     n, (width, height) = 3600, SIZE  # 1,200 are visible: fewer than 1,024 are one slice
     before, lists = get_num_threads(), []
-    centres, depths, conics, opacities, sigmas = ellipses(n, 10)
+    splats = ellipses(n, 10)
     visible = torch.arange(0, n, 3, dtype=torch.int32)
     try:
         for threads in (1, 3):
             set_num_threads(threads)
-            bins = bin_gaussians(visible, centres, depths, conics, opacities, sigmas, torch.rand(n, 3), width, height)
-            lists.append((listed_tiles(bins, n), bins.tile_list.clone(), bins.tiles_per_gauss))
+            bins = bin_gaussians(visible, splats, torch.rand(n, 3), width, height)
+            lists.append((listed_tiles(bins, n), bins.tile_record.clone(), bins.tiles_per_gauss))
     finally:
         set_num_threads(before)
     assert torch.equal(lists[0][0], lists[1][0]) and torch.equal(lists[0][2], lists[1][2])

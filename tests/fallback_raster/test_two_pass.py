@@ -14,7 +14,7 @@ from skipgs_plug.fallback_raster.runtime.constants import tiles
 from skipgs_plug.fallback_raster.runtime.optimizations import without_optimizations
 from skipgs_plug.fallback_raster.runtime.threads import get_num_threads
 from skipgs_plug.fallback_raster.splats import rasterize_splats
-from skipgs_plug.fallback_raster.stages import binning, rendering, two_pass
+from skipgs_plug.fallback_raster.stages import binning, compose, two_pass
 
 
 def rendered(scene: dict[str, Any], **options: Any) -> tuple[list[Tensor], list[Tensor]]:
@@ -42,18 +42,18 @@ def ending_at(monkeypatch: pytest.MonkeyPatch, depths: Any) -> list[int]:
     """Let first lists end at `depths(tiles)`; the numbers of second lists are appended to what is returned."""
     lists: list[int] = []
 
-    def ranges(visible: Tensor, *rest: Any) -> Tensor:
-        tiles_x, tiles_y = tiles(*rest[-2:])
+    def ranges(visible: Tensor, splats: Any, *size: int) -> Tensor:
+        tiles_x, tiles_y = tiles(*size)
         ends = depths(tiles_x * tiles_y).to(torch.float32).contiguous()
         return torch.stack([torch.full_like(ends, -1e30).view(torch.int32), ends.view(torch.int32)], dim=1)
 
-    def bin_the_rest(*args: Any) -> Any:
-        found = two_pass.bin_the_rest(*args)
-        lists.append(0 if found is None else len(found[0].tile_list))
+    def bin_behind(*args: Any) -> Any:
+        found = two_pass.bin_behind(*args)
+        lists.append(0 if found is None else len(found[0].tile_record))
         return found
 
-    monkeypatch.setattr(rendering, "near_ranges", ranges)
-    monkeypatch.setattr(rendering, "bin_the_rest", bin_the_rest)
+    monkeypatch.setattr(compose, "near_ranges", ranges)
+    monkeypatch.setattr(compose, "bin_behind", bin_behind)
     return lists
 
 
@@ -114,13 +114,13 @@ def test_deep_scenes_are_listed_in_part(monkeypatch: pytest.MonkeyPatch) -> None
         listed.append(original(*args))
         return listed[-1]
 
-    original = rendering.bin_gaussians
-    monkeypatch.setattr(rendering, "bin_gaussians", bin_gaussians)
+    original = compose.bin_gaussians
+    monkeypatch.setattr(compose, "bin_gaussians", bin_gaussians)
     part = rendered(scene)
     with without_optimizations("two_pass"):
         whole = rendered(scene)
     assert_same(part, whole)
-    near, everything = (len(bins.tile_list) for bins in listed)
+    near, everything = (len(bins.tile_record) for bins in listed)
     assert near < 0.8 * everything
 
 
@@ -139,10 +139,10 @@ def test_both_lists_together_are_no_longer_than_their_places_can_count(monkeypat
 
     def bin_gaussians(*args: Any) -> Any:
         bins = binning.bin_gaussians(*args)
-        listed.append(len(bins.tile_list))
+        listed.append(len(bins.tile_record))
         return bins
 
-    monkeypatch.setattr(rendering, "bin_gaussians", bin_gaussians)
+    monkeypatch.setattr(compose, "bin_gaussians", bin_gaussians)
     lists = ending_at(monkeypatch, lambda count: torch.full((count,), 3.0))
     rendered(scene)
     monkeypatch.setattr(binning, "MAX_PAIRS", listed[0] + lists[0])

@@ -1,39 +1,45 @@
-// One step for all rows, or for those that are seen.
+// One step for all rows, or for those that are wanted.
+//
+// Reads `gradient`. Changes the parameter and its moments, of its own rows; nobody else writes there.
+#pragma once
 #include "lib/adam_step.h"
-for (int row = first; row < last;) {
-    if (only_seen && !seen[row]) {
-        ++row;
-        continue;
+static constexpr auto adam = [](const int* wanted, const float* gradient, const Moments& parameter, const Decay& decay,
+                                int n, int width, int only_some, float rate, float root, int first, int last) INLINE {
+    for (int row = first; row < last;) {
+        if (only_some && !wanted[row]) {
+            ++row;
+            continue;
+        }
+        // A run of rows is one line of floats.
+        const long long begin = (long long)row * width;
+        if (only_some) while (row < last && wanted[row]) ++row;
+        else row = last;
+        const long long end = (long long)row * width, whole = begin + (end - begin) / 16 * 16;
+        for (long long i = begin; i < whole; i += 16) {
+            const v16 g = load(gradient + i);
+            v16 m = load(parameter.mean + i), s = load(parameter.square + i);
+            // Nothing changes where there never was a gradient: without writing it takes two thirds of the time.
+            if (!bits((g != 0.0f) | (m != 0.0f) | (s != 0.0f)) && decay.eps > 0.0f) continue;
+            v16 x = load(parameter.values + i);
+            adam_step(decay, g, m, s, x, rate, root);
+            store(parameter.mean + i, m);
+            store(parameter.square + i, s);
+            store(parameter.values + i, x);
+        }
+        if (whole == end) continue;
+        v16 g = (v16)0.0f, m = g, s = g, x = g;
+        const int tail = end - whole;
+        for (int j = 0; j < tail; ++j) {
+            g[j] = gradient[whole + j];
+            m[j] = parameter.mean[whole + j];
+            s[j] = parameter.square[whole + j];
+            x[j] = parameter.values[whole + j];
+        }
+        adam_step(decay, g, m, s, x, rate, root);
+        for (int j = 0; j < tail; ++j) {
+            parameter.mean[whole + j] = m[j];
+            parameter.square[whole + j] = s[j];
+            parameter.values[whole + j] = x[j];
+        }
     }
-    // A run of rows is one line of floats.
-    const long long begin = (long long)row * width;
-    if (only_seen) while (row < last && seen[row]) ++row;
-    else row = last;
-    const long long end = (long long)row * width, whole = begin + (end - begin) / 16 * 16;
-    for (long long i = begin; i < whole; i += 16) {
-        const v16 g = load(gradient + i);
-        v16 m = load(mean + i), s = load(square + i);
-        // Nothing changes where there never was a gradient: without writing it takes two thirds of the time.
-        if (!bits((g != 0.0f) | (m != 0.0f) | (s != 0.0f)) && eps > 0.0f) continue;
-        v16 x = load(values + i);
-        advance(g, m, s, x, rate, root);
-        store(mean + i, m);
-        store(square + i, s);
-        store(values + i, x);
-    }
-    if (whole == end) continue;
-    v16 g = (v16)0.0f, m = g, s = g, x = g;
-    const int rest = end - whole;
-    for (int j = 0; j < rest; ++j) {
-        g[j] = gradient[whole + j];
-        m[j] = mean[whole + j];
-        s[j] = square[whole + j];
-        x[j] = values[whole + j];
-    }
-    advance(g, m, s, x, rate, root);
-    for (int j = 0; j < rest; ++j) {
-        mean[whole + j] = m[j];
-        square[whole + j] = s[j];
-        values[whole + j] = x[j];
-    }
-}
+};

@@ -1,56 +1,64 @@
 // What the forks of Inria's rasterizer count inside their blend, one tile at a time, without the colours.
+//
+// Reads records and sorted lists of its own tiles. Writes the sums of their pairs and the maps of their pixels; nobody else
+// writes there.
+#pragma once
 #include "lib/blend_tile.h"
-#include "lib/pixels.h"
-for (int t = first; t < last; ++t) {
-    const Tile tile(t, tile_start, tiles_x, width, height);
-    vblock T[BLOCKS], value[BLOCKS], most[BLOCKS];
-    iblock count[BLOCKS], who[BLOCKS];
-    unsigned open = 0;  // blocks with an unfinished pixel
-    for (int b = 0; b < BLOCKS; ++b) {
-        const iblock inside = tile.inside(b);
-        // The sign of T marks pixels that take no more: finished ones and those outside the image.
-        T[b] = inside ? (vblock)1.0f : (vblock)-1.0f;
-        value[b] = most[b] = (vblock)0.0f;
-        count[b] = (iblock)0;
-        who[b] = (iblock)-1;
-        if (any(inside)) open |= 1u << b;
-    }
-    for (int q = 0; q < QUADS; ++q) {
-        const Quad quad(tile, q, width);
-        read_blocks(values, quad, 1, 1, value, 1);
-    }
-
-    for (int k = tile.begin; k < tile.end; ++k) {
-        vblock sums[SUMS];
-        for (int s = 0; s < SUMS; ++s) sums[s] = (vblock)0.0f;
-        for (unsigned todo = open; todo; todo &= todo - 1) {
-            const int b = __builtin_ctz(todo);
-            const Falloff seen(tile, b, records + (long long)RECORD * tile_list[k]);
-            const vblock light = T[b];
-            const iblock taken = (seen.log2_alpha >= LOG2_ALPHA_MIN) & (light > 0.0f);
-            if (!any(taken)) continue;
-            const vblock weight = vmin((vblock)ALPHA_MAX, exp2(seen.log2_alpha)) * light;
-            const iblock finished = taken & (light - weight <= TRANSMITTANCE_MIN);
-            const iblock hit = taken & ~finished;
-            T[b] = hit ? light - weight : (finished ? -light : light);
-            const vblock one = hit ? (vblock)1.0f : (vblock)0.0f;
-            sums[0] += one;
-            sums[1] += one * weight;
-            sums[2] += one * light;
-            sums[3] += one * value[b];
-            sums[4] += one * weight * value[b];
-            sums[5] += one * vsqrt(seen.dx * seen.dx + seen.dy * seen.dy);
-            count[b] += hit & 1;
-            const iblock leads = hit & (weight > most[b]);
-            most[b] = leads ? weight : most[b];
-            who[b] = leads ? (iblock)tile_rows[k] : who[b];
-            if (any(finished) && !any(T[b] > 0.0f)) open &= ~(1u << b);
+#include "lib/patches.h"
+static constexpr auto blend_statistics = [](const SortedLists& lists, const float* values, float* pair_sums,
+                                            const StatisticsMaps& maps, const Grid& grid, int first, int last) INLINE {
+    const Record* const records = (const Record*)lists.records;
+    for (int t = first; t < last; ++t) {
+        const Tile tile(t, lists.tile_start, grid);
+        vpatch T[PATCHES], value[PATCHES], most[PATCHES];
+        ipatch count[PATCHES], who[PATCHES];
+        unsigned open = 0;  // patches with an unfinished pixel
+        for (int b = 0; b < PATCHES; ++b) {
+            const ipatch inside = tile.inside(b);
+            // The sign of T marks pixels that take no more: finished ones and those outside the image.
+            T[b] = inside ? (vpatch)1.0f : (vpatch)-1.0f;
+            value[b] = most[b] = (vpatch)0.0f;
+            count[b] = (ipatch)0;
+            who[b] = (ipatch)-1;
+            if (any(inside)) open |= 1u << b;
         }
-        *(v8*)(pair_sums + (long long)SUMS * k) = sum8(sums);
+        for (int q = 0; q < QUADS; ++q) {
+            const Quad quad(tile, q, grid.width);
+            read_patches(values, quad, 1, 1, value, 1);
+        }
+
+        for (int k = tile.begin; k < tile.end; ++k) {
+            vpatch sums[SUMS];
+            for (int s = 0; s < SUMS; ++s) sums[s] = (vpatch)0.0f;
+            for (unsigned todo = open; todo; todo &= todo - 1) {
+                const int b = __builtin_ctz(todo);
+                const Falloff falloff(tile, b, records[lists.tile_record[k]]);
+                const vpatch light = T[b];
+                const ipatch taken = (falloff.log2_alpha >= LOG2_ALPHA_MIN) & (light > 0.0f);
+                if (!any(taken)) continue;
+                const vpatch weight = vmin((vpatch)ALPHA_MAX, exp2(falloff.log2_alpha)) * light;
+                const ipatch finished = taken & (light - weight <= TRANSMITTANCE_MIN);
+                const ipatch hit = taken & ~finished;
+                T[b] = hit ? light - weight : (finished ? -light : light);
+                const vpatch one = hit ? (vpatch)1.0f : (vpatch)0.0f;
+                sums[0] += one;
+                sums[1] += one * weight;
+                sums[2] += one * light;
+                sums[3] += one * value[b];
+                sums[4] += one * weight * value[b];
+                sums[5] += one * vsqrt(falloff.dx * falloff.dx + falloff.dy * falloff.dy);
+                count[b] += hit & 1;
+                const ipatch leads = hit & (weight > most[b]);
+                most[b] = leads ? weight : most[b];
+                who[b] = leads ? (ipatch)lists.tile_row[k] : who[b];
+                if (any(finished) && !any(T[b] > 0.0f)) open &= ~(1u << b);
+            }
+            *(v8*)(pair_sums + (long long)SUMS * k) = sum8(sums);
+        }
+        for (int q = 0; q < QUADS; ++q) {
+            const Quad quad(tile, q, grid.width);
+            write_patches((float*)maps.contributions, quad, 1, 1, (const vpatch*)count, 1);
+            write_patches((float*)maps.strongest, quad, 1, 1, (const vpatch*)who, 1);
+        }
     }
-    for (int q = 0; q < QUADS; ++q) {
-        const Quad quad(tile, q, width);
-        write_blocks((float*)contributions, quad, 1, 1, (const vblock*)count, 1);
-        write_blocks((float*)strongest, quad, 1, 1, (const vblock*)who, 1);
-    }
-}
+};

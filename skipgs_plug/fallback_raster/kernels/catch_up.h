@@ -3,24 +3,28 @@
 // To the bit what `adam.h` makes of the same steps. Its two divisions and its square root take 35 cycles for 16 floats.
 // Where nothing comes near underflow, multiply-adds give the same correctly rounded results (Markstein, IBM J. Res. Dev.
 // 34, 1990) in 15.
+//
+// Reads the missed steps and the factors of the gradient. Changes `done`, parameter and moments of the named rows; no row
+// comes twice, so nobody else writes there.
+#pragma once
 #include "lib/adam_step.h"
 #include "lib/harmonics.h"
 #if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
-constexpr bool fused = true;
+static constexpr bool fused = true;
 #else
-constexpr bool fused = false;  // what follows would be function calls
+static constexpr bool fused = false;  // what follows would be function calls
 #endif
-const auto fma = [](v16 a, v16 b, v16 c) INLINE -> v16 { return __builtin_elementwise_fma(a, b, c); };
+static constexpr auto fma = [](v16 a, v16 b, v16 c) INLINE -> v16 { return __builtin_elementwise_fma(a, b, c); };
 // Half the inverse of a square root, to 5e-6.
-const auto half_inverse_root = [&](v16 s) INLINE -> v16 {
+static constexpr auto half_inverse_root = [](v16 s) INLINE -> v16 {
     v16 y = (v16)(0x5f3759df - ((i16)s >> 1));
     for (int k = 0; k < 2; ++k) y = y * fma(-0.5f * s * y, y, (v16)1.5f);
     return 0.5f * y;
 };
 // How far a step without a gradient goes, given half the inverse of the root to 1e-5.
-const auto distance = [&](v16 m, v16 s, v16 half, int step) INLINE -> v16 {
+static constexpr auto distance = [](const MissedSteps& missed, float eps, v16 m, v16 s, v16 half, int step) INLINE -> v16 {
 #pragma clang fp contract(off)
-    const v16 moved = -rates[step] * m;
+    const v16 moved = -missed.rates[step] * m;
     // The root and its inverse: one Newton step for both, then the rounding.
     v16 root = (s + s) * half;
     const v16 error = fma(-root, half, (v16)0.5f);
@@ -28,113 +32,120 @@ const auto distance = [&](v16 m, v16 s, v16 half, int step) INLINE -> v16 {
     root = fma(root, error, root);
     root = fma(fma(-root, root, s), half, root);
     // Divided by the root of the bias correction, whose inverse is known.
-    const v16 inverse_correction = (v16)inverse_roots[step];
+    const v16 inverse_correction = (v16)missed.inverse_roots[step];
     v16 below = root * inverse_correction;
-    below = fma(fma((v16)-roots[step], below, root), inverse_correction, below) + eps;
+    below = fma(fma((v16)-missed.roots[step], below, root), inverse_correction, below) + eps;
     // Two Newton steps make an inverse that is correctly rounded, which the last line asks for.
-    v16 inverse = half * (2.0f * roots[step]);
+    v16 inverse = half * (2.0f * missed.roots[step]);
     for (int k = 0; k < 2; ++k) inverse = fma(inverse, fma(-below, inverse, (v16)1.0f), inverse);
     const v16 quotient = moved * inverse;
     return fma(fma(-below, quotient, moved), inverse, quotient);
 };
-constexpr int VECTORS = 3;
+static constexpr int VECTORS = 3;  // in a row of a whole gradient
 static_assert(VECTORS * 16 == 3 * (BANDS + 1) && FACTOR == 4, "an outer product fills a row");
-alignas(64) float bands[16][16];  // of the next rows, beside the constant one
-for (int i = first; i < last; ++i) {
-    if (with_gradient && (i - first) % 16 == 0) {
-        int next[16];
-        for (int l = 0; l < 16; ++l) next[l] = smaller(i + l, last - 1);
-        v16 direction[4], basis[17];
-        gather4(directions, next, direction);
-        for (int band = 1; band < 17; ++band) basis[band] = (v16)0.0f;
-        harmonics(direction[0], direction[1], direction[2], degree, basis);
-        transpose(basis + 1);
-        for (int l = 0; l < 16; ++l) store(bands[l], basis[1 + l]);
-    }
-    const int row = rows[i], begin = done[row];
-    if (begin == now && !with_gradient) continue;
-    done[row] = now + with_gradient;
-    const long long at = (long long)row * width;
-    float *m_row = mean + at, *s_row = square + at, *x_row = values + at;
-    alignas(64) v16 product[VECTORS];
-    if (with_gradient) {
-        const v4 color = *(const v4*)(colors + (long long)FACTOR * i);
-        const bool received = color.x != 0.0f || color.y != 0.0f || color.z != 0.0f;
-        const v16 basis = received ? load(bands[(i - first) % 16]) : (v16)0.0f;
-        interleave3(basis * color.x, basis * color.y, basis * color.z, (float*)product);  // channel by channel
-    }
-    const float* g_row = (const float*)product;
-    float padded[4][16];
-    if (width < 16) {
-        for (int j = 0; j < 16; ++j) {
-            const bool inside = j < width;
-            padded[0][j] = inside ? m_row[j] : 0.0f;
-            padded[1][j] = inside ? s_row[j] : 0.0f;
-            padded[2][j] = inside ? x_row[j] : 0.0f;
-            padded[3][j] = inside && with_gradient ? g_row[j] : 0.0f;
+static constexpr auto catch_up = [](const int* rows, int* done, const GradientFactors& factors, const Moments& parameter,
+                                    const MissedSteps& missed, const Decay& decay, const SafeRange& safe, int m, int n, int width,
+                                    int now, int with_gradient, int first, int last) INLINE {
+    alignas(64) float bands[16][16];  // of the next rows, beside the constant one
+    for (int i = first; i < last; ++i) {
+        if (with_gradient && (i - first) % 16 == 0) {
+            int next[16];
+            for (int l = 0; l < 16; ++l) next[l] = smaller(i + l, last - 1);
+            v16 direction[4], basis[17];
+            gather4(factors.directions, next, direction);
+            for (int band = 1; band < 17; ++band) basis[band] = (v16)0.0f;
+            harmonics(direction[0], direction[1], direction[2], factors.degree, basis);
+            transpose(basis + 1);
+            for (int l = 0; l < 16; ++l) store(bands[l], basis[1 + l]);
         }
-        m_row = padded[0], s_row = padded[1], x_row = padded[2], g_row = padded[3];
-    }
-    // The last vectors overlap those before them: what lies in two is computed twice, and read before it is written.
-    v16 m[VECTORS], s[VECTORS], x[VECTORS], g[VECTORS], half[VECTORS];
-    i16 zero[VECTORS], some = (i16)0;
-    int offset[VECTORS];
-    for (int v = 0; v < VECTORS; ++v) {
-        offset[v] = larger(smaller(16 * v, width - 16), 0);
-        m[v] = load(m_row + offset[v]);
-        s[v] = load(s_row + offset[v]);
-        x[v] = load(x_row + offset[v]);
-        g[v] = with_gradient ? load(g_row + offset[v]) : (v16)0.0f;
-        // What two stores wrote cannot be loaded before they are through.
-        if (width == 45 && v == 2 && with_gradient)
-            g[v] = __builtin_shufflevector(product[1], product[2], 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28);
-        some |= (m[v] != 0.0f) | (s[v] != 0.0f) | (g[v] != 0.0f);
-    }
-    if (!bits(some)) continue;  // never trained: nothing changes
-    for (int step = begin; step < now;) {
-#pragma clang fp contract(off)
-        const int end = smaller(step + CHUNK, now);
-        i16 moving = (i16)0, extreme = (i16)0;
+        const int row = rows[i], begin = done[row];
+        if (begin == now && !with_gradient) continue;
+        done[row] = now + with_gradient;
+        const long long at = (long long)row * width;
+        float *m_row = parameter.mean + at, *s_row = parameter.square + at, *x_row = parameter.values + at;
+        alignas(64) v16 product[VECTORS];
+        if (with_gradient) {
+            const v4 color = *(const v4*)(factors.colors + (long long)FACTOR * i);
+            const bool received = color.x != 0.0f || color.y != 0.0f || color.z != 0.0f;
+            const v16 basis = received ? load(bands[(i - first) % 16]) : (v16)0.0f;
+            interleave3(basis * color.x, basis * color.y, basis * color.z, (float*)product);  // channel by channel
+        }
+        const float* g_row = (const float*)product;
+        float padded[4][16];
+        if (width < 16) {
+            for (int j = 0; j < 16; ++j) {
+                const bool inside = j < width;
+                padded[0][j] = inside ? m_row[j] : 0.0f;
+                padded[1][j] = inside ? s_row[j] : 0.0f;
+                padded[2][j] = inside ? x_row[j] : 0.0f;
+                padded[3][j] = inside && with_gradient ? g_row[j] : 0.0f;
+            }
+            m_row = padded[0], s_row = padded[1], x_row = padded[2], g_row = padded[3];
+        }
+        // The last vectors overlap those before them: what lies in two is computed twice, and read before it is written.
+        v16 m[VECTORS], s[VECTORS], x[VECTORS], g[VECTORS], half[VECTORS];
+        i16 zero[VECTORS], some = (i16)0;
+        int offset[VECTORS];
         for (int v = 0; v < VECTORS; ++v) {
-            const v16 size = vabs(m[v]);
-            zero[v] = m[v] == 0.0f;
-            extreme |= ~zero[v] & ~((size >= least_mean) & (size <= most_mean) & (s[v] >= least_square) & (s[v] <= 0x1p20f));
-            // A step shorter than a quarter of the distance to the next float changes nothing, nor do those that follow.
-            const v16 longest = 0x1p20f * (longest_rate * size), least = 0x1p-7f * x[v];
-            moving |= ~zero[v] & ~(longest * longest < s[v] * (least * least));
+            offset[v] = larger(smaller(16 * v, width - 16), 0);
+            m[v] = load(m_row + offset[v]);
+            s[v] = load(s_row + offset[v]);
+            x[v] = load(x_row + offset[v]);
+            g[v] = with_gradient ? load(g_row + offset[v]) : (v16)0.0f;
+            // What two stores wrote cannot be loaded before they are through.
+            if (width == 45 && v == 2 && with_gradient)
+                g[v] = __builtin_shufflevector(product[1], product[2], 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28);
+            some |= (m[v] != 0.0f) | (s[v] != 0.0f) | (g[v] != 0.0f);
         }
-        if (!bits(moving)) {
-            for (; step < end; ++step)
-                for (int v = 0; v < VECTORS; ++v) {
-                    v16 unmoved = (v16)0.0f;
-                    advance((v16)0.0f, m[v], s[v], unmoved, 0.0f, 1.0f);
-                }
-        } else if (!fused || bits(extreme) || end - step == 1) {
-            for (; step < end; ++step)
-                for (int v = 0; v < VECTORS; ++v) advance((v16)0.0f, m[v], s[v], x[v], rates[step], roots[step]);
-        } else {
-            for (int v = 0; v < VECTORS; ++v) half[v] = half_inverse_root(s[v]);
-            for (; step < end; ++step)
-                for (int v = 0; v < VECTORS; ++v) {
-                    m[v] = fma((v16)take1, -m[v], m[v]);
-                    s[v] = keep2 * s[v];
-                    half[v] = half[v] * grow;
-                    const v16 moved = x[v] + distance(m[v], s[v], half[v], step);
-                    x[v] = zero[v] ? x[v] : moved;
-                }
+        if (!bits(some)) continue;  // never trained: nothing changes
+        for (int step = begin; step < now;) {
+#pragma clang fp contract(off)
+            const int end = smaller(step + STEPS_PER_CHECK, now);
+            i16 moving = (i16)0, extreme = (i16)0;
+            for (int v = 0; v < VECTORS; ++v) {
+                const v16 size = vabs(m[v]);
+                zero[v] = m[v] == 0.0f;
+                extreme |=
+                    ~zero[v] & ~((size >= safe.least_mean) & (size <= safe.most_mean) & (s[v] >= safe.least_square) & (s[v] <= 0x1p20f));
+                // A step shorter than a quarter of the distance to the next float changes nothing, nor do those that follow.
+                const v16 longest = 0x1p20f * (safe.longest_rate * size), least = 0x1p-7f * x[v];
+                moving |= ~zero[v] & ~(longest * longest < s[v] * (least * least));
+            }
+            if (!bits(moving)) {
+                for (; step < end; ++step)
+                    for (int v = 0; v < VECTORS; ++v) {
+                        v16 unmoved = (v16)0.0f;
+                        adam_step(decay, (v16)0.0f, m[v], s[v], unmoved, 0.0f, 1.0f);
+                    }
+            } else if (!fused || bits(extreme) || end - step == 1) {
+                for (; step < end; ++step)
+                    for (int v = 0; v < VECTORS; ++v)
+                        adam_step(decay, (v16)0.0f, m[v], s[v], x[v], missed.rates[step], missed.roots[step]);
+            } else {
+                for (int v = 0; v < VECTORS; ++v) half[v] = half_inverse_root(s[v]);
+                for (; step < end; ++step)
+                    for (int v = 0; v < VECTORS; ++v) {
+                        m[v] = fma((v16)decay.take1, -m[v], m[v]);
+                        s[v] = decay.keep2 * s[v];
+                        half[v] = half[v] * safe.grow;
+                        const v16 moved = x[v] + distance(missed, decay.eps, m[v], s[v], half[v], step);
+                        x[v] = zero[v] ? x[v] : moved;
+                    }
+            }
+        }
+        if (with_gradient)
+            for (int v = 0; v < VECTORS; ++v)
+                adam_step(decay, g[v], m[v], s[v], x[v], missed.rates[now], missed.roots[now]);
+        for (int v = 0; v < VECTORS; ++v) {
+            store(m_row + offset[v], m[v]);
+            store(s_row + offset[v], s[v]);
+            store(x_row + offset[v], x[v]);
+        }
+        if (width >= 16) continue;
+        for (int j = 0; j < width; ++j) {
+            parameter.mean[at + j] = m_row[j];
+            parameter.square[at + j] = s_row[j];
+            parameter.values[at + j] = x_row[j];
         }
     }
-    if (with_gradient)
-        for (int v = 0; v < VECTORS; ++v) advance(g[v], m[v], s[v], x[v], rates[now], roots[now]);
-    for (int v = 0; v < VECTORS; ++v) {
-        store(m_row + offset[v], m[v]);
-        store(s_row + offset[v], s[v]);
-        store(x_row + offset[v], x[v]);
-    }
-    if (width >= 16) continue;
-    for (int j = 0; j < width; ++j) {
-        mean[at + j] = m_row[j];
-        square[at + j] = s_row[j];
-        values[at + j] = x_row[j];
-    }
-}
+};

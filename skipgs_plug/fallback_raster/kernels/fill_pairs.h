@@ -1,39 +1,53 @@
 // Lists the pairs of each tile, as yet in the order of the rows: depth in the upper half, number of the pair in the lower.
 // Pairs are numbered by row and tile. Depths are positive, so their bits sort like integers.
-#include "lib/box_tiles.h"
+//
+// Reads records and footprints of its own slices. Writes `pairs` where `scan_pairs` made room for them, and moves the next
+// free places in `counts`; nobody else writes there.
+#pragma once
 #include "lib/ellipse.h"
-#include "lib/slice_begin.h"
-#include "lib/tile_ranges.h"
-for (int s = first; s < last; ++s) {
-    int* next = counts + (long long)s * (tiles_x * tiles_y + SPARE_COUNTS);
-    int pair = (int)totals[s];
-    const int begin = slice_begin(s, n, slices), end = slice_begin(s + 1, n, slices);
-    // Not inlined: few are large, and the loop of the others has registers enough without it.
-    const auto list_larger = [=](int k, int* next, long long key, int pair) __attribute__((noinline)) -> int {
-        const bool all = !(optimizations & EXACT_TILES);
-        each_tile(records + (long long)RECORD * k, boxes + (long long)BOX * k, width, tiles_x, all, [&](int tile) INLINE {
-            if (limited && !in_range(ranges, tile, (int)(key >> 32))) return;
-            pair_record[pair] = k;
-            unsorted[next[tile]++] = key | (unsigned)pair++;
-        });
-        return pair;
-    };
-    int i = begin;
-    for (int k = begin; k < begin + listed_count[s]; ++k) {
-        while (i <= listed[k]) pair_start[i++] = pair;
-        const int meets = places[(long long)PLACE * k + 1];
-        const int depth = ((const int*)depths)[visible[listed[k]]];
-        const long long key = (long long)depth << 32;
-        if (meets >= 0) {
-            int* corner = next + places[(long long)PLACE * k];
-            for (int rest = meets; rest; rest &= rest - 1) {
+#include "lib/tile_lists.h"
+static constexpr auto fill_pairs = [](const int* visible, const float* splat_depths, const RecordList& packed,
+                                      const Footprints& footprints, const DepthRanges& depths, const PairCounts& counts,
+                                      const Pairs& pairs, const Grid& grid, int m, int n, int slices, int optimizations,
+                                      int first, int last) INLINE {
+    const int tiles_x = grid.tiles_x;
+    const float width = grid.width;
+    const BoxTiles tile_of(tiles_x);
+    const Record* const records = (const Record*)packed.records;
+    const TileBox* const boxes = (const TileBox*)footprints.boxes;
+    int* const pair_record = pairs.record;
+    long long* const unsorted = pairs.unsorted;
+    for (int s = first; s < last; ++s) {
+        int* next = counts.of_tiles + (long long)s * (tiles_x * grid.tiles_y + SPARE_COUNTS);
+        int pair = (int)counts.of_slices[s];
+        const int begin = slice_begin(s, m, slices), end = slice_begin(s + 1, m, slices);
+        // Not inlined: few are large, and the loop of the others has registers enough without it.
+        const auto list_larger = [=](int k, int* next, long long key, int pair) __attribute__((noinline)) -> int {
+            const bool all = !(optimizations & EXACT_TILES);
+            each_tile(records[k], boxes[k], width, tiles_x, all, [&](int tile) INLINE {
+                if (depths.limited && !in_range(depths.ranges, tile, (int)(key >> 32))) return;
                 pair_record[pair] = k;
-                unsorted[corner[offset[__builtin_ctz(rest)]]++] = key | (unsigned)pair++;
+                unsorted[next[tile]++] = key | (unsigned)pair++;
+            });
+            return pair;
+        };
+        int i = begin;
+        for (int k = begin; k < begin + packed.listed_count[s]; ++k) {
+            while (i <= packed.listed[k]) pairs.start[i++] = pair;
+            const int meets = footprints.tiles[(long long)FOOTPRINT * k + 1];
+            const int depth = ((const int*)splat_depths)[visible[packed.listed[k]]];
+            const long long key = (long long)depth << 32;
+            if (meets >= 0) {
+                int* corner = next + footprints.tiles[(long long)FOOTPRINT * k];
+                for (int remaining = meets; remaining; remaining &= remaining - 1) {
+                    pair_record[pair] = k;
+                    unsorted[corner[tile_of.offset[__builtin_ctz(remaining)]]++] = key | (unsigned)pair++;
+                }
+                continue;
             }
-            continue;
+            pair = list_larger(k, next, key, pair);
         }
-        pair = list_larger(k, next, key, pair);
+        while (i < end) pairs.start[i++] = pair;
+        if (s == slices - 1) pairs.start[m] = pair;
     }
-    while (i < end) pair_start[i++] = pair;
-    if (s == slices - 1) pair_start[n] = pair;
-}
+};

@@ -1,144 +1,160 @@
-// Records of the visible rows that have pairs, one after the other, their places among the tiles, and the number of pairs
-// of each tile, by slice of the rows. Where `limited`, only pairs whose depths lie in the range of their tile count.
-#include "lib/box_tiles.h"
+// Records of the visible rows that have pairs, one after the other, their footprints on the tiles, and the number of pairs of
+// each tile, by slice of the rows. Where `depths` are limited, only pairs whose depths lie in the range of their tile count.
+//
+// Reads the projected splats and `colors`. Writes records, footprints and counts of its own slices, and `tiles_per_gauss` of
+// their rows; nobody else writes there.
+#pragma once
 #include "lib/ellipse.h"
-#include "lib/slice_begin.h"
-#include "lib/tile_ranges.h"
-const int tiles = tiles_x * tiles_y;
-const auto add_two = [](int* to, const int* numbers) INLINE {
-    typedef int two __attribute__((ext_vector_type(2), aligned(4)));
-    *(two*)to += *(const two*)numbers;
-};
-int least = limited ? NO_DEPTH : -NO_DEPTH, most = limited ? -NO_DEPTH : NO_DEPTH;
-for (int t = 0; limited && t < tiles; ++t) least = smaller(least, ranges[2 * t]), most = larger(most, ranges[2 * t + 1]);
-for (int s = first; s < last; ++s) {
-    int* count = counts + (long long)s * (tiles + SPARE_COUNTS);
-    for (int t = 0; t < tiles + SPARE_COUNTS; ++t) count[t] = 0;
-    long long of_slice = 0;
-    int found = 0;
-    const int begin = slice_begin(s, n, slices), end = slice_begin(s + 1, n, slices);
-    if (dense) {
-        const int row_begin = s > 0 ? visible[begin] : 0, row_end = s < slices - 1 ? visible[end] : rows;
-        clear((float*)tiles_per_gauss + row_begin, row_end - row_begin);
+#include "lib/tile_lists.h"
+static constexpr auto pack_and_count =
+    [](const int* visible, const Splats& splats, const float* colors, const Channels& channels, const DepthRanges& depths,
+       const RecordList& packed, const Footprints& footprints, const PairCounts& counts, int* tiles_per_gauss,
+       const Grid& grid, int m, int n, int slices, int dense, int optimizations, int first, int last) INLINE {
+    const int tiles_x = grid.tiles_x, tiles = tiles_x * grid.tiles_y;
+    const float width = grid.width, height = grid.height;
+    const bool limited = depths.limited;
+    const BoxTiles tile_of(tiles_x);
+    Record* const records = (Record*)packed.records;
+    TileBox* const boxes = (TileBox*)footprints.boxes;
+    const auto add_two = [](int* to, const int* numbers) INLINE {
+        typedef int two __attribute__((ext_vector_type(2), aligned(4)));
+        *(two*)to += *(const two*)numbers;
+    };
+    int least = limited ? NO_DEPTH : -NO_DEPTH, most = limited ? -NO_DEPTH : NO_DEPTH;
+    for (int t = 0; limited && t < tiles; ++t) {
+        least = smaller(least, depths.ranges[2 * t]);
+        most = larger(most, depths.ranges[2 * t + 1]);
     }
-    for (int i = begin; i < end; i += 16) {
-        const int lanes = smaller(16, end - i);
-        int row[16];
-        take_rows(visible + i, lanes, row);
-        const i16 depth = (i16)gather(depths, row, 1, 0);
-        const i16 near = (depth >= least) & (depth < most);
-        if (!dense && !any(near)) continue;
-        v16 conic[3], sigma[2], centre[2];
-        gather3(conics, row, rows, conic);
-        gather2(sigmas, row, sigma);
-        gather2(means2d, row, centre);
-        const v16 a = conic[0], b = conic[1], c = conic[2], mx = centre[0], my = centre[1];
-        v16 log2_opacity = log2(vmax(gather(opacities, row, 1, 0), (v16)1e-20f));
-        v16 reach = log2_opacity - LOG2_ALPHA_MIN;
-        // a dx^2 + 2 b dx dy + c dy^2 = a (dx + b / a dy)^2 + dy^2 / sigma_y^2: no needle rounds to a negative value.
-        v16 along = vsqrt(0.5f * LOG2_E * a), across = vsqrt((v16)(0.5f * LOG2_E)) / sigma[1];
-        // Half axes of the box around alpha >= ALPHA_MIN, a hair wider than exact: the blend tests every pixel itself.
-        v16 half = vsqrt(vmax(2.0f * reach / LOG2_E, (v16)0.0f)) * 1.0001f + 1e-3f;
-        const v16 half_w = half * sigma[0], half_h = half * sigma[1];
-        const v16 slope = b / a, steepness = b / c;
-
-        // Pixels whose centres the box holds.
-        const i16 left = clamped(__builtin_elementwise_ceil(mx - half_w - 0.5f), 0.0f, width);
-        const i16 right = clamped(__builtin_elementwise_floor(mx + half_w - 0.5f), -1.0f, width - 1.0f);
-        const i16 top = clamped(__builtin_elementwise_ceil(my - half_h - 0.5f), 0.0f, height);
-        const i16 bottom = clamped(__builtin_elementwise_floor(my + half_h - 0.5f), -1.0f, height - 1.0f);
-        static_assert(TILE == 16, "pixels to tiles");
-        const i16 empty = (left > right) | (top > bottom);
-        alignas(64) int box[BOX][16];
-        const i16 first_column = left >> 4, last_column = right >> 4, first_row = top >> 4, last_row = bottom >> 4;
-        *(i16*)box[0] = first_column, *(i16*)box[1] = last_column, *(i16*)box[2] = first_row;
-        *(i16*)box[3] = last_row;
-        // Which tiles of a small box the ellipse meets.
-        const i16 columns = last_column - first_column, lines = last_row - first_row;
-        const i16 small = (columns < BOX_COLUMNS) & (lines < BOX_ROWS);
-        const Ellipses ellipses(mx, my, along, half_h, half_w, -slope, -steepness, reach);
-        i16 meets = (i16)0, met = (i16)0;
-        const int deepest = __builtin_reduce_max(small ? lines : (i16)0);
-        for (int r = 0; r <= deepest; ++r) {
-            i16 left = first_column, right = last_column;
-            if (optimizations & EXACT_TILES) ellipses.columns(first_row + r, width, left, right);
-            left = vmax(left - first_column, (i16)0);
-            right = vmin(right - first_column, vmin(columns, (i16)(BOX_COLUMNS - 1)));
-            const i16 hit = small & (r <= lines) & (left <= right);
-            left = hit ? left : (i16)0, right = hit ? right : (i16)0;  // no number is shifted by less than 0
-            meets |= hit & ((((i16)2 << right) - ((i16)1 << left)) << BOX_COLUMNS * r);
-            met += hit & (right - left + 1);
+    for (int s = first; s < last; ++s) {
+        int* count = counts.of_tiles + (long long)s * (tiles + SPARE_COUNTS);
+        for (int t = 0; t < tiles + SPARE_COUNTS; ++t) count[t] = 0;
+        long long of_slice = 0;
+        int found = 0;
+        const int begin = slice_begin(s, m, slices), end = slice_begin(s + 1, m, slices);
+        if (dense) {
+            const int row_begin = s > 0 ? visible[begin] : 0, row_end = s < slices - 1 ? visible[end] : n;
+            clear((float*)tiles_per_gauss + row_begin, row_end - row_begin);
         }
-        meets = empty ? (i16)0 : (small ? meets : (i16)-1);
-        met = meets > 0 ? met : (i16)0;
-        const i16 corner = first_row * tiles_x + first_column;
+        for (int i = begin; i < end; i += 16) {
+            const int lanes = smaller(16, end - i);
+            int row[16];
+            next_rows(visible + i, lanes, row);
+            const i16 depth = (i16)gather(splats.depths, row, 1, 0);
+            const i16 near = (depth >= least) & (depth < most);
+            if (!dense && !any(near)) continue;
+            v16 conic[3], sigma[2], centre[2];
+            gather3(splats.conics, row, n, conic);
+            gather2(splats.sigmas, row, sigma);
+            gather2(splats.means2d, row, centre);
+            const v16 a = conic[0], b = conic[1], c = conic[2], mx = centre[0], my = centre[1];
+            v16 log2_opacity = log2(vmax(gather(splats.opacities, row, 1, 0), (v16)1e-20f));
+            v16 reach = log2_opacity - LOG2_ALPHA_MIN;
+            // a dx^2 + 2 b dx dy + c dy^2 = a (dx + b / a dy)^2 + dy^2 / sigma_y^2: no needle rounds to a negative value.
+            v16 along = vsqrt(0.5f * LOG2_E * a), across = vsqrt((v16)(0.5f * LOG2_E)) / sigma[1];
+            // Half axes of the box around alpha >= ALPHA_MIN, a hair wider than exact: the blend tests every pixel itself.
+            v16 half = vsqrt(vmax(2.0f * reach / LOG2_E, (v16)0.0f)) * 1.0001f + 1e-3f;
+            const v16 half_w = half * sigma[0], half_h = half * sigma[1];
+            const v16 slope = b / a, steepness = b / c;
 
-        // All tiles of a large ellipse are found with its record, to count them where `dense`.
-        const i16 wanted = (meets != 0) & (near | ((meets < 0) & (dense ? -1 : 0)));
-        if (dense) scatter((float*)tiles_per_gauss, row, (v16)met, lanes);
-        const unsigned chosen = bits(wanted) & ((1u << lanes) - 1);
-        if (!chosen) continue;
-        v16 record[RECORD] = {mx, my, along, along * slope, across, log2_opacity, half_h, half_w, {}, {}, {}, {},
-                              -slope, -steepness, reach, 1.0f / along};
-        if (stride == 3 && channels == 3) gather3(colors, row, rows, record + 8);
-        else
-            for (int k = 0; k < channels; ++k) record[8 + k] = gather(colors, row, stride, k);
-        transpose(record);
-        // By lane: first tile and tiles met; pairs in the upper two tiles, and in the lower two, wherever these are.
-        alignas(64) int place[16][PLACE], upper[16][2], lower[16][2], below[16], key[16];
-        interleave2((v16)corner, (v16)meets, (float*)place[0]);
-        interleave2((v16)(meets & 1), (v16)(meets >> 1 & 1), (float*)upper[0]);
-        interleave2((v16)(meets >> BOX_COLUMNS & 1), (v16)(meets >> (BOX_COLUMNS + 1) & 1), (float*)lower[0]);
-        *(i16*)below = last_row > first_row ? corner + tiles_x : (i16)tiles;
-        *(i16*)key = depth;
-        const unsigned tiny = bits((meets & ~TWO_BY_TWO) == 0);  // a tile of each or two, in both directions
-        if (chosen == 0xffff && tiny == 0xffff && !limited) {
-            int* own = places + (long long)PLACE * (begin + found);
-            for (int l = 0; l < 16; ++l) {
-                *(v2*)(own + PLACE * l) = *(const v2*)place[l];
-                store(records + (long long)RECORD * (begin + found + l), record[l]);
-                listed[begin + found + l] = i + l;
-                // Two counters at a time: a branch for each would often be taken the wrong way.
-                add_two(count + place[l][0], upper[l]);
-                add_two(count + below[l], lower[l]);
+            // Pixels whose centres the box holds.
+            const i16 left = clamped(__builtin_elementwise_ceil(mx - half_w - 0.5f), 0.0f, width);
+            const i16 right = clamped(__builtin_elementwise_floor(mx + half_w - 0.5f), -1.0f, width - 1.0f);
+            const i16 top = clamped(__builtin_elementwise_ceil(my - half_h - 0.5f), 0.0f, height);
+            const i16 bottom = clamped(__builtin_elementwise_floor(my + half_h - 0.5f), -1.0f, height - 1.0f);
+            static_assert(TILE == 16, "pixels to tiles");
+            const i16 empty = (left > right) | (top > bottom);
+            alignas(64) int box[BOX][16];  // by field of a TileBox
+            const i16 first_column = left >> 4, last_column = right >> 4, first_row = top >> 4, last_row = bottom >> 4;
+            *(i16*)box[0] = first_column, *(i16*)box[1] = last_column, *(i16*)box[2] = first_row;
+            *(i16*)box[3] = last_row;
+            // Which tiles of a small box the ellipse meets.
+            const i16 columns = last_column - first_column, lines = last_row - first_row;
+            const i16 small = (columns < BOX_COLUMNS) & (lines < BOX_ROWS);
+            Records16 record = {mx, my, along, along * slope, across, log2_opacity, half_h, half_w, {}, -slope, -steepness, reach,
+                                1.0f / along};
+            const Ellipses ellipses(record);
+            i16 meets = (i16)0, met = (i16)0;
+            const int deepest = __builtin_reduce_max(small ? lines : (i16)0);
+            for (int r = 0; r <= deepest; ++r) {
+                i16 left = first_column, right = last_column;
+                if (optimizations & EXACT_TILES) ellipses.columns(first_row + r, width, left, right);
+                left = vmax(left - first_column, (i16)0);
+                right = vmin(right - first_column, vmin(columns, (i16)(BOX_COLUMNS - 1)));
+                const i16 hit = small & (r <= lines) & (left <= right);
+                left = hit ? left : (i16)0, right = hit ? right : (i16)0;  // no number is shifted by less than 0
+                meets |= hit & ((((i16)2 << right) - ((i16)1 << left)) << BOX_COLUMNS * r);
+                met += hit & (right - left + 1);
             }
-            of_slice += __builtin_reduce_add(met);
-            found += 16;
-            continue;
-        }
-        for (unsigned rest = chosen; rest; rest &= rest - 1) {
-            const int l = __builtin_ctz(rest), corner = place[l][0];
-            int own_meets = place[l][1], pairs = 0;
-            float* own_record = records + (long long)RECORD * (begin + found);  // the next one's where this has no pairs
-            store(own_record, record[l]);
-            if (!limited && (tiny >> l & 1)) {
-                add_two(count + corner, upper[l]);
-                add_two(count + below[l], lower[l]);
-                pairs = __builtin_popcount(own_meets);
-            } else if (own_meets >= 0) {
-                for (int todo = limited ? own_meets : 0; todo; todo &= todo - 1) {
-                    const int j = __builtin_ctz(todo);
-                    if (!in_range(ranges, corner + offset[j], key[l])) own_meets &= ~(1 << j);
+            meets = empty ? (i16)0 : (small ? meets : (i16)-1);
+            met = meets > 0 ? met : (i16)0;
+            const i16 corner = first_row * tiles_x + first_column;
+
+            // All tiles of a large ellipse are found with its record, to count them where `dense`.
+            const i16 wanted = (meets != 0) & (near | ((meets < 0) & (dense ? -1 : 0)));
+            if (dense) scatter((float*)tiles_per_gauss, row, (v16)met, lanes);
+            const unsigned chosen = bits(wanted) & ((1u << lanes) - 1);
+            if (!chosen) continue;
+            if (channels.stride == 3 && channels.number == 3) gather3(colors, row, n, record.color);
+            else
+                for (int k = 0; k < channels.number; ++k) record.color[k] = gather(colors, row, channels.stride, k);
+            v16* const by_lane = (v16*)&record;
+            transpose(by_lane);
+            // By lane: first tile and tiles met; pairs in the upper two tiles, and in the lower two, wherever these are.
+            alignas(64) int footprint[16][FOOTPRINT], upper[16][2], lower[16][2], below[16], key[16];
+            interleave2((v16)corner, (v16)meets, (float*)footprint[0]);
+            interleave2((v16)(meets & 1), (v16)(meets >> 1 & 1), (float*)upper[0]);
+            interleave2((v16)(meets >> BOX_COLUMNS & 1), (v16)(meets >> (BOX_COLUMNS + 1) & 1), (float*)lower[0]);
+            *(i16*)below = last_row > first_row ? corner + tiles_x : (i16)tiles;
+            *(i16*)key = depth;
+            const unsigned tiny = bits((meets & ~TWO_BY_TWO) == 0);  // a tile of each or two, in both directions
+            if (chosen == 0xffff && tiny == 0xffff && !limited) {
+                int* own = footprints.tiles + (long long)FOOTPRINT * (begin + found);
+                for (int l = 0; l < 16; ++l) {
+                    *(v2*)(own + FOOTPRINT * l) = *(const v2*)footprint[l];
+                    store((float*)(records + begin + found + l), by_lane[l]);
+                    packed.listed[begin + found + l] = i + l;
+                    // Two counters at a time: a branch for each would often be taken the wrong way.
+                    add_two(count + footprint[l][0], upper[l]);
+                    add_two(count + below[l], lower[l]);
                 }
-                for (int todo = own_meets; todo; todo &= todo - 1) ++count[corner + offset[__builtin_ctz(todo)]];
-                pairs = __builtin_popcount(own_meets);
-            } else {
-                int met = 0;
-                int* own = boxes + (long long)BOX * (begin + found);
-                for (int j = 0; j < BOX; ++j) own[j] = box[j][l];
-                each_tile(own_record, own, width, tiles_x, !(optimizations & EXACT_TILES), [&](int tile) INLINE {
-                    ++met;
-                    if (!limited || in_range(ranges, tile, key[l])) ++count[tile], ++pairs;
-                });
-                if (dense) tiles_per_gauss[row[l]] = met;
+                of_slice += __builtin_reduce_add(met);
+                found += 16;
+                continue;
             }
-            of_slice += pairs;
-            places[(long long)PLACE * (begin + found)] = corner;
-            places[(long long)PLACE * (begin + found) + 1] = own_meets;
-            listed[begin + found] = i + l;
-            found += pairs > 0;
+            for (unsigned remaining = chosen; remaining; remaining &= remaining - 1) {
+                const int l = __builtin_ctz(remaining), corner = footprint[l][0];
+                int own_meets = footprint[l][1], pairs = 0;
+                Record& own_record = records[begin + found];  // the next one's where this has no pairs
+                store((float*)&own_record, by_lane[l]);
+                if (!limited && (tiny >> l & 1)) {
+                    add_two(count + corner, upper[l]);
+                    add_two(count + below[l], lower[l]);
+                    pairs = __builtin_popcount(own_meets);
+                } else if (own_meets >= 0) {
+                    for (int todo = limited ? own_meets : 0; todo; todo &= todo - 1) {
+                        const int j = __builtin_ctz(todo);
+                        if (!in_range(depths.ranges, corner + tile_of.offset[j], key[l])) own_meets &= ~(1 << j);
+                    }
+                    for (int todo = own_meets; todo; todo &= todo - 1) ++count[corner + tile_of.offset[__builtin_ctz(todo)]];
+                    pairs = __builtin_popcount(own_meets);
+                } else {
+                    int met = 0;
+                    TileBox& own = boxes[begin + found];
+                    own = {box[0][l], box[1][l], box[2][l], box[3][l]};
+                    each_tile(own_record, own, width, tiles_x, !(optimizations & EXACT_TILES), [&](int tile) INLINE {
+                        ++met;
+                        if (!limited || in_range(depths.ranges, tile, key[l])) ++count[tile], ++pairs;
+                    });
+                    if (dense) tiles_per_gauss[row[l]] = met;
+                }
+                of_slice += pairs;
+                footprints.tiles[(long long)FOOTPRINT * (begin + found)] = corner;
+                footprints.tiles[(long long)FOOTPRINT * (begin + found) + 1] = own_meets;
+                packed.listed[begin + found] = i + l;
+                found += pairs > 0;
+            }
         }
+        packed.listed_count[s] = found;
+        counts.of_slices[s] = of_slice;
     }
-    listed_count[s] = found;
-    totals[s] = of_slice;
-}
+};

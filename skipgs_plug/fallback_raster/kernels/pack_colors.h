@@ -1,8 +1,16 @@
-// Puts further channels of colour into the records.
-#include "lib/slice_begin.h"
-for (int s = first; s < last; ++s) {
-    const int begin = slice_begin(s, n, slices);
-    for (int k = begin; k < begin + listed_count[s]; ++k)
-        for (int c = 0; c < channels; ++c)
-            records[(long long)RECORD * k + 8 + c] = colors[(long long)visible[listed[k]] * stride + channel + c];
-}
+// Puts the channels of a pass over the colours into the records.
+//
+// Reads `colors` of the listed rows. Writes the colours of the records of its own slices; nobody else writes there.
+#pragma once
+#include "lib/record.h"
+#include "lib/tile_lists.h"
+static constexpr auto pack_colors = [](const int* visible, const RecordList& packed, const float* colors,
+                                       const Channels& channels, int m, int n, int slices, int first, int last) INLINE {
+    for (int s = first; s < last; ++s) {
+        const int begin = slice_begin(s, m, slices);
+        for (int k = begin; k < begin + packed.listed_count[s]; ++k) {
+            const float* color = colors + (long long)visible[packed.listed[k]] * channels.stride + channels.first;
+            for (int c = 0; c < channels.number; ++c) ((Record*)packed.records)[k].color[c] = color[c];
+        }
+    }
+};

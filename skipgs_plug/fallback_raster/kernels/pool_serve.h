@@ -1,34 +1,38 @@
 // What a helper does until it is dismissed.
+//
+// Reads the launch in `pool`. Writes its own line there, the number of helpers that finished, and, as all threads do, the state.
+#pragma once
 #include "lib/thread_pool.h"
-ThreadPool& pool = *(ThreadPool*)pool_address;
-ThreadPool::Helper& own = pool.helpers[number];
-unsigned last = 0;
-for (;;) {
-    unsigned long long state;
-    for (int spins = 0;; ++spins) {
-        state = __atomic_load_n(&pool.state, __ATOMIC_SEQ_CST);
-        if ((unsigned)(state >> 32) != last || __atomic_load_n(&pool.stop, __ATOMIC_SEQ_CST)) break;
-        if (spins < patience) {
-            PAUSE();
-            continue;
+static constexpr auto pool_serve = [](ThreadPool& pool, int number, int patience) INLINE {
+    ThreadPool::Helper& own = pool.helpers[number];
+    unsigned last = 0;
+    for (;;) {
+        unsigned long long state;
+        for (int spins = 0;; ++spins) {
+            state = __atomic_load_n(&pool.state, __ATOMIC_SEQ_CST);
+            if ((unsigned)(state >> 32) != last || __atomic_load_n(&pool.stop, __ATOMIC_SEQ_CST)) break;
+            if (spins < patience) {
+                PAUSE();
+                continue;
+            }
+            // The caller announces a launch before it looks who sleeps: one of both sees what the other did.
+            __atomic_store_n(&own.sleeps, 1, __ATOMIC_SEQ_CST);
+            const bool called = (unsigned)(__atomic_load_n(&pool.state, __ATOMIC_SEQ_CST) >> 32) != last
+                             || __atomic_load_n(&pool.stop, __ATOMIC_SEQ_CST);
+            if (!called || !__atomic_exchange_n(&own.sleeps, 0, __ATOMIC_SEQ_CST)) own.lock.acquire(own.lock.lock, 1);
+            spins = 0;
         }
-        // The caller announces a launch before it looks who sleeps: one of both sees what the other did.
-        __atomic_store_n(&own.sleeps, 1, __ATOMIC_SEQ_CST);
-        const bool called = (unsigned)(__atomic_load_n(&pool.state, __ATOMIC_SEQ_CST) >> 32) != last
-                         || __atomic_load_n(&pool.stop, __ATOMIC_SEQ_CST);
-        if (!called || !__atomic_exchange_n(&own.sleeps, 0, __ATOMIC_SEQ_CST)) own.lock.acquire(own.lock.lock, 1);
-        spins = 0;
+        if (__atomic_load_n(&pool.stop, __ATOMIC_SEQ_CST)) break;
+        last = (unsigned)(state >> 32);
+        while ((state & OPEN) && (unsigned)(state >> 32) == last) {
+            if (!__atomic_compare_exchange_n(&pool.state, &state, state + 1, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST))
+                continue;
+            pool.function(pool.bounds, pool.arguments);
+            __atomic_fetch_add(&pool.finished, 1, __ATOMIC_SEQ_CST);
+            if (__atomic_load_n(&pool.caller_sleeps, __ATOMIC_SEQ_CST)
+                && __atomic_exchange_n(&pool.caller_sleeps, 0, __ATOMIC_SEQ_CST))
+                pool.caller.release(pool.caller.lock);
+            break;
+        }
     }
-    if (__atomic_load_n(&pool.stop, __ATOMIC_SEQ_CST)) break;
-    last = (unsigned)(state >> 32);
-    while ((state & OPEN) && (unsigned)(state >> 32) == last) {
-        if (!__atomic_compare_exchange_n(&pool.state, &state, state + 1, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST))
-            continue;
-        pool.function(pool.bounds, pool.block);
-        __atomic_fetch_add(&pool.finished, 1, __ATOMIC_SEQ_CST);
-        if (__atomic_load_n(&pool.caller_sleeps, __ATOMIC_SEQ_CST)
-            && __atomic_exchange_n(&pool.caller_sleeps, 0, __ATOMIC_SEQ_CST))
-            pool.caller.release(pool.caller.lock);
-        break;
-    }
-}
+};

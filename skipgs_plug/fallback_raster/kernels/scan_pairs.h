@@ -1,20 +1,28 @@
-// Counts become places: where each tile's list begins, where each slice begins in it, where each slice's pairs begin.
-// The total is counted in 64 bits; where 32 do not hold it, the places mean nothing and must not be used.
-long long all = 0;
-for (int t = 0; t < tiles; ++t) {
-    tile_start[t] = (int)all;
-    for (int s = 0; s < slices; ++s) {
-        int& slice = counts[(long long)s * (tiles + SPARE_COUNTS) + t];
-        const int count = slice;
-        slice = (int)all;
-        all += count;
+// Counts become starts: where each tile's list begins, where each slice begins in it, where each slice's pairs begin.
+// The total is counted in 64 bits; where 32 do not hold it, the starts mean nothing and must not be used.
+//
+// Reads and overwrites `counts`, and writes `tile_start`, alone.
+#pragma once
+#include "lib/simd.h"
+static constexpr auto scan_pairs = [](const PairCounts& counts, int* tile_start, const Grid& grid, int slices, int first,
+                                      int last) INLINE {
+    const int tiles = grid.tiles_x * grid.tiles_y;
+    long long all = 0;
+    for (int t = 0; t < tiles; ++t) {
+        tile_start[t] = (int)all;
+        for (int s = 0; s < slices; ++s) {
+            int& slice = counts.of_tiles[(long long)s * (tiles + SPARE_COUNTS) + t];
+            const int count = slice;
+            slice = (int)all;
+            all += count;
+        }
     }
-}
-tile_start[tiles] = (int)all;
-long long before = 0;
-for (int s = 0; s < slices; ++s) {
-    const long long pairs = totals[s];
-    totals[s] = before;
-    before += pairs;
-}
-totals[slices] = before;
+    tile_start[tiles] = (int)all;
+    long long before = 0;
+    for (int s = 0; s < slices; ++s) {
+        const long long pairs = counts.of_slices[s];
+        counts.of_slices[s] = before;
+        before += pairs;
+    }
+    counts.of_slices[slices] = before;
+};

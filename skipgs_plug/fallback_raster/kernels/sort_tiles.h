@@ -1,6 +1,11 @@
 // Sorts whole lists.
+//
+// Reads and reorders the unsorted pairs of its own tiles, and writes their sorted lists; nobody else writes there.
+#pragma once
 #include "lib/sorted_tile.h"
-for (int t = first; t < last; ++t) {
-    SortedTile sorted(tile_start[t], tile_start[t + 1], unsorted, buffer, tile_list, tile_place, pair_record);
-    sorted.sort(sorted.count);
-}
+static constexpr auto sort_tiles = [](const TileLists& lists, const Grid& grid, int first, int last) INLINE {
+    for (int t = first; t < last; ++t) {
+        SortedTile list(lists.tile_start[t], lists.tile_start[t + 1], lists);
+        list.sort(list.count);
+    }
+};

@@ -2,42 +2,42 @@
 
 import math
 
-# Pixels along the side of a tile, which is blocks of 4 x 4 or 4 x 2 pixels (`kernels/lib/blend_tile.h`).
+# Pixels along the side of a tile, as in gsplat and Inria's rasterizer. A tile is patches of 4 x 4 or 4 x 2 pixels
+# (`kernels/lib/blend_tile.h`).
 TILE = 16
 
-# Rows that one core clears and fills at a time, and that one partial sum of the camera's gradients covers.
+# Rows of a block: Gaussians whose gradients one core clears and fills at a time, so that they are still in its cache
+# when they are filled, and which one partial sum of the camera's gradients covers.
 BLOCK = 512
 
-# Floats of a Gaussian as the blend reads it: centre x, y; the conic as a sum of squares, so that with
-# p = r[2] dx + r[3] dy and w = r[4] dy, alpha = exp2(r[5] - p^2 - w^2); half height and half width in pixels of the
-# ellipse at ALPHA_MIN; up to four channels of colour; where p^2 + w^2 is least, dx / dy along a row and dy / dx along a
-# column; p^2 + w^2 at ALPHA_MIN; 1 / r[2]. Together a cache line.
+# Floats of a `Record`: a Gaussian as the blend reads it, one cache line (`kernels/lib/record.h`).
 RECORD = 16
 
-# Numbers of the place of a Gaussian among the tiles: the first tile of the box around it, and which of its tiles it
-# meets, as bits, where they are few (`kernels/lib/box_tiles.h`); -1 where they are more.
-PLACE = 2
+# Ints of a Gaussian's footprint on the tiles: the first tile of the box around it, and which tiles of the box it meets,
+# as bits, where these are few (`kernels/lib/tile_lists.h`); -1 where they are more.
+FOOTPRINT = 2
 
-# Numbers of the box of tiles around a larger one: its first and last column, its first and last row.
+# Ints of a `TileBox`, the box of tiles around a larger Gaussian (`kernels/lib/ellipse.h`).
 BOX = 4
 
-# Counters of a slice that belong to no tile, so that tiles can be counted two at a time.
+# Counters of a slice that belong to no tile: tiles are counted two at a time, the last of them with one of these.
 SPARE_COUNTS = 2
 
-# Sums of a (tile, Gaussian) pair in the adjoint: the six moments; up to four channels of colour; |v_x|, |v_y|; the rest
-# makes it a cache line.
+# Floats of a `PairSum`: what one tile adds to a Gaussian's gradient, one cache line (`kernels/lib/record.h`).
 PAIR = 16
 
 # Bands of SH of degree 3 beside the constant one.
 BANDS = 15
 
-# Numbers of a row of either factor of an `FactoredGradient`: of a direction or a colour, and one that nobody reads.
+# Floats of a row of either factor of a `FactoredGradient`: three of a direction or a colour, and one that nobody reads,
+# so that rows move as vectors.
 FACTOR = 4
 
-# Most ranges of depth into which a tile deals its pairs before it sorts one after the other.
+# Buckets of equal ranges of depth into which a tile deals its pairs at most before it sorts them. It takes two for each
+# pair; the ends of 8192 fill a first-level cache of 32 KiB.
 BUCKETS = 8192
 
-# Channels that one pass blends; wider colours take several passes.
+# Channels that one pass blends, the room for colours in a record; wider colours take several passes.
 MAX_CHANNELS = 4
 
 # Cut-offs of gsplat and of Inria's rasterizer: alpha is clamped at the first, a contribution under the second is
@@ -47,11 +47,14 @@ ALPHA_MIN = 1.0 / 255.0
 TRANSMITTANCE_MIN = 1e-4
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 
-# The loss: pixels of the window of SSIM; rows and vectors of 16 floats of a tile; channels that the buffers which
-# extend a row beyond the image have room for.
+# Pixels along the side of SSIM's window, as in its paper and in all trainers.
 WINDOW = 11
-BAND = 128
-CHUNK = 16
+
+# Rows, and vectors of 16 floats in a row, of a tile of the loss at most. Its buffers stay in the first two caches.
+LOSS_ROWS = 128
+LOSS_VECTORS = 16
+
+# Most channels of an image that the loss takes: its buffers have room for a window of as many beside a tile.
 LOSS_CHANNELS = 32
 
 

@@ -9,9 +9,9 @@ Calls take several times as long.
 import ast
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from types import CodeType
+from types import CodeType, SimpleNamespace
 from typing import Any
 
 import torch
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from . import constants
 from .constants import blocks
+from .parameters import Field
 
 OFF, SIZES, ZONES = range(3)
 
@@ -49,39 +50,52 @@ def at_least(wanted: int) -> Iterator[None]:
 class Sizes:
     """Sizes of a kernel's tensors, as its stub declares them.
 
-    A shape is a list of expressions of the kernel's numbers, of `constants.py` and of `blocks`. A name that is none of
-    these stands for one size throughout the call: the first tensor that has it decides.
+    A shape is a list of expressions of the kernel's numbers, its constants and `blocks`. In a struct, its own
+    numbers come first. A name that is none of these stands for one size throughout the struct, or throughout the
+    kernel's other parameters, which know it as `struct.name`: the first tensor that has it decides.
     """
 
-    def __init__(self, kernel: str, shapes: dict[str, str]):
+    def __init__(self, kernel: str, fields: Sequence[Field], own_constants: dict[str, int | float]):
         self._kernel = kernel
-        self._shapes = shapes
-        self._parsed: dict[str, list[tuple[str | None, CodeType]]] = {}
-        for name, shape in shapes.items():
-            expressions = ast.parse(f"({shape},)", mode="eval").body
+        self._constants = {"blocks": blocks, **vars(constants), **own_constants}
+        self._parsed: list[tuple[Field, list[tuple[str | None, CodeType]]]] = []
+        for field in fields:
+            if field.shape is None:
+                continue
+            expressions = ast.parse(f"({field.shape},)", mode="eval").body
             assert isinstance(expressions, ast.Tuple)
-            self._parsed[name] = [
-                (e.id if isinstance(e, ast.Name) else None, compile(ast.Expression(e), shape, "eval"))
+            dimensions = [
+                (e.id if isinstance(e, ast.Name) else None, compile(ast.Expression(e), field.shape, "eval"))
                 for e in expressions.elts
             ]
+            self._parsed.append((field, dimensions))
 
     def check(self, arguments: dict[str, Any]) -> None:
         """Compares the tensors of a call with what is declared.
 
+        Args:
+            arguments: Fields by path.
+
         Raises:
             ValueError: A tensor has another size.
         """
-        known: dict[str, Any] = {"blocks": blocks, **vars(constants)}
-        known |= {name: value for name, value in arguments.items() if not isinstance(value, Tensor)}
-        for name, dimensions in self._parsed.items():
-            size = arguments[name].numel()
-            unknown = {symbol for symbol, _ in dimensions if symbol is not None and symbol not in known}
-            rest = math.prod(eval(code, known) for symbol, code in dimensions if symbol not in unknown)
+        shared: dict[str, Any] = dict(self._constants)
+        for path, value in arguments.items():
+            struct, _, name = path.rpartition(".")
+            own = vars(shared.setdefault(struct, SimpleNamespace())) if struct else shared
+            if not isinstance(value, Tensor):
+                own[name] = value
+        for field, dimensions in self._parsed:
+            struct, _, name = field.path.rpartition(".")
+            own = vars(shared[struct]) if struct else shared
+            size = arguments[field.path].numel()
+            unknown = {name for name, _ in dimensions if name is not None and name not in own and name not in shared}
+            rest = math.prod(eval(code, shared, own) for name, code in dimensions if name not in unknown)
             if len(unknown) == 1 and rest and size % rest == 0:
-                known[unknown.pop()] = size // rest
+                own[unknown.pop()] = size // rest
             elif unknown or size != rest:
                 raise ValueError(
-                    f"{self._kernel}: {name} holds {size} numbers, but [{self._shapes[name]}] makes {rest}."
+                    f"{self._kernel}: {field.path} holds {size} numbers, but [{field.shape}] makes {rest}."
                 )
 
 

@@ -5,24 +5,24 @@ to a few seconds each). Nothing of them is written in Warp's Python dialect, who
 across pixels.
 
 Warp executes a CPU launch on the calling thread, but it releases the interpreter lock while the kernel runs.
-Every kernel here is therefore a worker: it takes one block of items after the other from shared atomic counters until
-none is left, and calling it starts one worker per thread. Blocks are handed out dynamically, so a busy core or
-an expensive tile delays nobody, and since no two blocks write to one location the result does not depend on
+Every kernel here is therefore a worker: it takes a few items after the other from shared atomic counters until
+none is left, and calling it starts one worker per thread. Items are handed out dynamically, so a busy core or
+an expensive tile delays nobody, and since no two items write to one location the result does not depend on
 the number of threads.
 """
 
 import ctypes
 import inspect
 from collections.abc import Callable
-from typing import Annotated, Any, NamedTuple, get_args, get_origin
+from typing import Any, Generic, ParamSpec
 
-import torch
 from torch import Tensor
 
 from . import guard
 from .guard import Sizes
 from .native import Kernel, load_kernel
-from .source import PRELUDE, SHARED, declare
+from .parameters import ArrayKind, Parameter, declare_struct, flattener, parameters_of, structs_of
+from .source import PRELUDE, SHARED, declare, read_kernel
 from .threads import LOCK, get_num_threads, on_threads
 
 # Sections of the items for each thread. Neighbouring items write to the same cache lines: threads that took items in
@@ -30,106 +30,97 @@ from .threads import LOCK, get_num_threads, on_threads
 _SECTIONS = 4
 _LINE = 64  # bytes; the counter of each section has a cache line of its own
 
-
-class FloatArray:
-    """Marks a worker's parameter as a contiguous float32 tensor, passed flat."""
+P = ParamSpec("P")
 
 
-class IntArray:
-    """Marks a worker's parameter as a contiguous int32 tensor, passed flat."""
+class Worker(Generic[P]):
+    """A kernel made of C++; call it with the arguments of its stub to run it on every thread. See `worker`.
 
-
-class LongArray:
-    """Marks a worker's parameter as a contiguous int64 tensor, passed flat."""
-
-
-class ByteArray:
-    """Marks a worker's parameter as a contiguous uint8 tensor, passed flat."""
-
-
-class _Kind(NamedTuple):
-    """What a parameter is in Python, in Warp and in C++."""
-
-    dtype: torch.dtype | None  # of a tensor
-    warp: str
-    pointer: str
-
-
-# Arrays travel as addresses: describing them to Warp takes longer than some kernels run.
-_KINDS: dict[type, _Kind] = {
-    FloatArray: _Kind(torch.float32, "wp.uint64", "float"),
-    IntArray: _Kind(torch.int32, "wp.uint64", "int"),
-    LongArray: _Kind(torch.int64, "wp.uint64", "long long"),
-    ByteArray: _Kind(torch.uint8, "wp.uint64", "unsigned char"),
-    int: _Kind(None, "wp.int32", ""),
-    float: _Kind(None, "wp.float32", ""),
-}
-
-
-class Worker:
-    """A kernel made of C++; call it with its parameters to run it on every thread. See `worker`.
-
-    A call checks the number of arguments and the type, layout, dtype and device of each; what Warp and the kernel get
-    are bare addresses. Sizes are checked where `guard.py` is on.
+    A call checks the names of the arguments, and type, layout, dtype and device of each field; what Warp and the kernel
+    get are bare addresses. Sizes are checked where `guard.py` is on.
 
     Raises:
         TypeError: Arguments are missing, too many, or not of the declared kind.
     """
 
-    def __init__(self, name: str, kinds: dict[str, type], shapes: dict[str, str], code: str, alone: bool):
-        self._name = name
-        self._kinds = kinds
-        self._sizes = Sizes(name, shapes)
+    def __init__(
+        self,
+        name: str,
+        stub: Callable[P, None],
+        code: str,
+        file: str | None,
+        structs: tuple[type, ...],
+        constants: dict[str, int | float],
+        alone: bool,
+    ) -> None:
+        self.name = name
+        self.file = file
+        self._parameters: tuple[Parameter, ...] = parameters_of(stub)
+        self.structs = tuple(dict.fromkeys((*structs_of(self._parameters), *structs)))
+        self.constants = constants  # of this kernel alone
+        self._fields = [field for parameter in self._parameters for field in parameter.fields]
+        self._flatten = flattener(name, stub, self._parameters, self._refuse)
+        self._sizes = Sizes(name, self._fields, constants)
         self._code = code
         self._alone = alone  # on this thread
         self._kernel: Kernel | None = None
-        self._checks = [(parameter, kind, _KINDS[kind].dtype) for parameter, kind in kinds.items()]
+        self._checks = [
+            (field.path, field.kind, field.kind.dtype if isinstance(field.kind, ArrayKind) else None)
+            for field in self._fields
+        ]
 
-    def __call__(self, *arguments: Tensor | int | float) -> None:
+    @property
+    def parameter_names(self) -> list[str]:
+        """Names of the parameters, of which a struct is one."""
+        return [parameter.name for parameter in self._parameters]
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> None:
+        arguments = self._flatten(*args, **kwargs)
         values = self._values(arguments)
         if guard.level() == guard.OFF:
             self._run(values)
             return
-        named = dict(zip(self._kinds, arguments, strict=True))
+        named = dict(zip((field.path for field in self._fields), arguments, strict=True))
         self._sizes.check(named)
         if guard.level() == guard.SIZES:
             self._run(values)
         else:
-            guard.run_between_zones(self._name, named, lambda inside: self._run(self._values(inside)))
+            guard.run_between_zones(self.name, named, lambda inside: self._run(self._values(inside)))
 
     def _values(self, arguments: tuple[Any, ...]) -> list[int | float]:
-        """Addresses of tensors, and numbers, in the order of the parameters."""
+        """Addresses of tensors, and numbers, in the order of the fields."""
         values: list[int | float] = []
         try:
             checks: Any = zip(self._checks, arguments, strict=True)
-            for (parameter, kind, dtype), argument in checks:
+            for (path, kind, dtype), argument in checks:
                 if dtype is None:
                     if type(argument) is not kind:
-                        raise TypeError(self._wrong(parameter, argument))
+                        self._refuse(path, argument)
                     if kind is int and not -0x80000000 <= argument <= 0x7FFFFFFF:
-                        raise OverflowError(f"{self._name}: {parameter} = {argument} does not fit into 32 bits.")
+                        raise OverflowError(f"{self.name}: {path} = {argument} does not fit into 32 bits.")
                     values.append(argument)
                 else:
                     if argument.dtype is not dtype or not argument.is_cpu or not argument.is_contiguous():
-                        raise TypeError(self._wrong(parameter, argument))
+                        self._refuse(path, argument)
                     address = argument.data_ptr()
                     if not address and argument.numel():  # a tensor by name, which keeps its numbers elsewhere
-                        raise TypeError(self._wrong(parameter, argument))
+                        self._refuse(path, argument)
                     values.append(address)
-        except ValueError:
-            raise TypeError(f"{self._name} takes {len(self._checks)} arguments, got {len(arguments)}.") from None
         except AttributeError:
-            raise TypeError(self._wrong(parameter, argument)) from None
+            self._refuse(path, argument)
         return values
 
-    def _wrong(self, parameter: str, argument: Any) -> str:
-        kind = self._kinds[parameter]
-        dtype = _KINDS[kind].dtype
-        wanted = kind.__name__ if dtype is None else f"contiguous tensor of {dtype} on the CPU"
-        if not isinstance(argument, Tensor):
-            return f"{self._name}: {parameter} must be a {wanted}, got {type(argument).__name__} {argument!r:.40}."
-        layout = "contiguous" if argument.is_contiguous() else f"strides {argument.stride()}"
-        return f"{self._name}: {parameter} must be a {wanted}, got {argument.dtype} on {argument.device}, {layout}."
+    def _refuse(self, path: str, argument: Any) -> None:
+        """Raise TypeError for a parameter or a field of one."""
+        structs = {parameter.name: parameter.struct for parameter in self._parameters}
+        kind: Any = structs.get(path) or next(field.kind for field in self._fields if field.path == path)
+        is_array = isinstance(kind, ArrayKind)
+        wanted = f"contiguous tensor of {kind.dtype} on the CPU" if is_array else kind.__name__
+        got = f"{type(argument).__name__} {argument!r:.40}"
+        if is_array and isinstance(argument, Tensor):
+            layout = "contiguous" if argument.is_contiguous() else f"strides {argument.stride()}"
+            got = f"{argument.dtype} on {argument.device}, {layout}"
+        raise TypeError(f"{self.name}: {path} must be a {wanted}, got {got}.") from None
 
     def _run(self, values: list[int | float]) -> None:
         with LOCK:
@@ -139,48 +130,56 @@ class Worker:
             sections = _SECTIONS * threads if threads > 1 else 1
             counters = (ctypes.c_int32 * (_LINE // 4 * (sections + 2)))()
             counters[_LINE // 4] = sections
-            # Every call fills a block of parameters of its own, which the threads share.
-            block = kernel.block(ctypes.addressof(counters) + _LINE, *values)
-            on_threads(threads, kernel, block)
+            # The threads share the arguments of one call.
+            on_threads(threads, kernel, kernel.pack(ctypes.addressof(counters) + _LINE, *values))
 
     def _load(self) -> Kernel:
-        parameters = {"counters_address": "wp.uint64"}
-        pointers = "int* counters = (int*)counters_address;\n"
-        for name, kind in self._kinds.items():
-            _, type_in_warp, pointer = _KINDS[kind]
-            if pointer:
-                parameters[f"{name}_address"] = type_in_warp
-                pointers += f"{pointer}* __restrict {name} = ({pointer}*){name}_address;\n"
-            else:
-                parameters[name] = type_in_warp
-        return load_kernel(self._name, parameters, PRELUDE + pointers + self._code)
+        parameters = {"counters_address": "wp.uint64"} | {field.symbol: field.warp for field in self._fields}
+        return load_kernel(self.name, parameters, self.text)
+
+    @property
+    def text(self) -> str:
+        """All of its C++."""
+        declared = declare(SHARED | self.constants) + "".join(map(declare_struct, self.structs))
+        functions = "" if self.file is None else read_kernel(self.file)
+        definitions = "".join(parameter.definition for parameter in self._parameters)
+        definitions += "int* const counters = (int*)counters_address;\n"
+        return f"{PRELUDE}{declared}{functions}{definitions}{self._code}"
 
 
 def worker(
-    code: str,
+    code: str = "",
     *,
     items: str,
     grain: str | int,
+    file: str | None = None,
+    structs: tuple[type, ...] = (),
     name: str | None = None,
     constants: dict[str, int | float] | None = None,
-) -> Callable[[Callable[..., None]], Worker]:
+) -> Callable[[Callable[P, None]], Worker[P]]:
     """Turns a stub function into a `Worker`.
 
-    The stub's parameters are annotated `FloatArray`, `IntArray`, `LongArray`, `ByteArray`, `int` or `float`; arrays
-    also `Annotated[FloatArray, "n, 3"]` with the sizes that `guard.Sizes` checks.
+    The stub's parameters are annotated with the arrays of `parameters.py`, `int`, `float`, or a struct of these. C++
+    knows them by their names, what `simd.h` defines, the constants of `constants.py` and the optimizations by name.
 
     Args:
-        code: C++ that handles items `[first, last)`; array parameters of the stub are pointers of their name. It knows
-            what `simd.h` defines, the constants of `constants.py` and the optimizations by name.
+        code: C++ that handles items `[first, last)`.
         items: C++ expression for the number of items, in terms of the stub's parameters.
         grain: Items taken at a time, a number or C++.
+        file: In place of `code`, a file in `kernels/` that defines a function of its name. It takes the stub's
+            parameters in their order, and then `first` and `last`.
+        structs: More that the file's functions pass to one another.
         name: Name of the kernel where the stub's own is not unique.
         constants: More of them, of this kernel alone.
     """
-    # A thread takes its own sections in their order, then the others' from behind, where their owner comes last. Names
-    # end in an underscore so that they hide none of the stub's.
-    loop = f"""{declare(SHARED | (constants or {}))}
-const int sections_ = counters[0], thread_ = __atomic_fetch_add(counters + 1, 1, __ATOMIC_RELAXED);
+
+    def build(stub: Callable[P, None]) -> Worker[P]:
+        own = code
+        if file is not None:
+            own = f"{file.removesuffix('.h')}({', '.join([*inspect.signature(stub).parameters, 'first', 'last'])});"
+        # A thread takes its own sections in their order, then the others' from behind, where their owner comes last.
+        # Names end in an underscore so that they hide none of the stub's.
+        loop = f"""const int sections_ = counters[0], thread_ = __atomic_fetch_add(counters + 1, 1, __ATOMIC_RELAXED);
 const long long step_ = {grain}, steps_ = (({items}) + step_ - 1) / step_;
 for (int turn_ = 0; turn_ < sections_; ++turn_) {{
     const int ahead_ = turn_ < {_SECTIONS} ? turn_ : sections_ + {_SECTIONS} - 1 - turn_;
@@ -190,18 +189,10 @@ for (int turn_ = 0; turn_ < sections_; ++turn_) {{
         const int at_ = begin_ + __atomic_fetch_add(counters + {_LINE // 4} * (section_ + 1), 1, __ATOMIC_RELAXED);
         if (at_ >= end_) break;
         const int first = (int)(at_ * step_), last = smaller(first + (int)step_, {items});
-{code}
+{own}
     }}
 }}
 """
-
-    def build(stub: Callable[..., None]) -> Worker:
-        kinds, shapes = {}, {}
-        for parameter in inspect.signature(stub, eval_str=True).parameters.values():
-            kind = parameter.annotation
-            if get_origin(kind) is Annotated:
-                kind, shapes[parameter.name] = get_args(kind)
-            kinds[parameter.name] = kind
-        return Worker(name or stub.__name__, kinds, shapes, loop, alone=items == "1")
+        return Worker(name or stub.__name__, stub, loop, file, structs, constants or {}, alone=items == "1")
 
     return build

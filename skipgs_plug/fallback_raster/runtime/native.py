@@ -21,17 +21,17 @@ from .cache import load_or_rebuild, say_unwritable
 
 
 class Kernel(NamedTuple):
-    """A loaded kernel: `kernel(kernel.block(*values))` runs it on this thread, without the interpreter lock."""
+    """A loaded kernel: `kernel(kernel.pack(*values))` runs it on this thread, without the interpreter lock."""
 
     run: Callable[..., None]
     bounds: Any
-    block: Callable[..., ctypes.Structure]  # of its parameters, in their order
+    pack: Callable[..., ctypes.Structure]  # makes the structure of its arguments, from these in their order
     addresses: tuple[int, int]  # of the function and of the bounds
     command: Any  # of Warp; the code stays loaded as long as it lives
 
-    def __call__(self, block: ctypes.Structure) -> None:
-        """Run it with the parameters in `block`."""
-        self.run(self.bounds, ctypes.byref(block))
+    def __call__(self, arguments: ctypes.Structure) -> None:
+        """Run it with these arguments."""
+        self.run(self.bounds, ctypes.byref(arguments))
 
 
 def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:
@@ -67,25 +67,25 @@ def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:
 
     command = load_or_rebuild(folder, load, kernel.module.unload)
     bounds, *values = command.params
-    block = _block(f"{name}_parameters", dict(zip(parameters, map(type, values), strict=True)))
+    pack = _packer(f"{name}_arguments", dict(zip(parameters, map(type, values), strict=True)))
     run = command.hooks.forward
     addresses = ctypes.cast(run, ctypes.c_void_p).value or 0, ctypes.addressof(bounds)
-    return Kernel(run, ctypes.byref(bounds), block, addresses, command)
+    return Kernel(run, ctypes.byref(bounds), pack, addresses, command)
 
 
-def _block(name: str, kinds: dict[str, Any]) -> Callable[..., ctypes.Structure]:
+def _packer(name: str, kinds: dict[str, Any]) -> Callable[..., ctypes.Structure]:
     """Makes structures of these fields, of the simple types of ctypes, from their values."""
     structure = type(name, (ctypes.Structure,), {"_fields_": list(kinds.items())})
     # ctypes looks for the names of fields one by one, far from the caches.
     layout = struct.Struct("".join(kind._type_ for kind in kinds.values()))
 
     def fill(*values: int | float) -> ctypes.Structure:
-        block = structure()
+        packed = structure()
         try:
-            layout.pack_into(block, 0, *values)
+            layout.pack_into(packed, 0, *values)
         except OverflowError:  # beyond float32, which is infinite to ctypes
             return structure(*values)
-        return block
+        return packed
 
     return fill
 

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 # Each has a bit of the int that kernels read from their parameter `optimizations`; there its name is in capitals.
 OPTIMIZATIONS = {
     "exact_tiles": 1,  # list a Gaussian only in tiles that its ellipse at alpha 1/255 crosses, not in its whole box
-    "block_bounds": 2,  # visit only the blocks of a tile that the ellipse reaches
-    "saturation": 4,  # leave blocks and tiles whose pixels are all finished
-    "zero_gradient": 8,  # leave blocks and tiles whose incoming gradient is zero in the backward pass
+    "patch_bounds": 2,  # visit only the patches of a tile that the ellipse reaches
+    "saturation": 4,  # leave patches and tiles whose pixels are all finished
+    "zero_gradient": 8,  # leave patches and tiles whose incoming gradient is zero in the backward pass
     "visible_only": 16,  # evaluate SH and its adjoint only for Gaussians on screen
     "contributed_only": 32,  # run the adjoint of SH and projection only for Gaussians that received a gradient
     "spheres": 64,  # leave out 16 Gaussians at once that lie outside the image even as spheres

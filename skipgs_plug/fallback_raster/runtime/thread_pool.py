@@ -11,7 +11,7 @@ import time
 
 from .cores import usable_cores
 from .native import Kernel, load_kernel
-from .source import read_kernel
+from .source import PRELUDE, read_kernel
 
 # How often a thread looks for what it waits for before it sleeps: for 100 to 200 microseconds on x86. Looking longer
 # takes processor time from others, looking less makes launches late.
@@ -39,8 +39,9 @@ class ThreadPool:
         self._count = count
         # With more threads than cores, one that looks keeps another from its work.
         self._patience = _PATIENCE if count < usable_cores() else 0
-        self._server = _load("pool_serve", ["pool_address"], ["number", "patience"])
-        launch = ["pool_address", "function_address", "bounds_address", "block_address"]
+        pool = {"pool": "*(ThreadPool*)"}
+        self._server = _load("pool_serve", pool, ["number", "patience"])
+        launch = pool | {"function": "(void (*)(void*, void*))", "bounds": "(void*)", "arguments": "(void*)"}
         self._launcher = _load("pool_run", launch, ["helpers", "patience"])
         self._memory = (ctypes.c_char * (_LINE * (_HELPERS + count + 1)))()
         self._address = -(-ctypes.addressof(self._memory) // _LINE) * _LINE
@@ -49,9 +50,9 @@ class ThreadPool:
         for number in range(count):
             _thread.start_new_thread(self._serve, (number,))
 
-    def run(self, kernel: Kernel, block: ctypes.Structure) -> None:
+    def run(self, kernel: Kernel, arguments: ctypes.Structure) -> None:
         """Run it on all of them and here; none of them is at it any more when this returns."""
-        self._launch(*kernel.addresses, ctypes.addressof(block))
+        self._launch(*kernel.addresses, ctypes.addressof(arguments))
 
     def dismiss(self) -> None:
         """Wait until all are gone; may be called again when an exception ended it."""
@@ -62,24 +63,28 @@ class ThreadPool:
             _free(self._locks.pop())
 
     def _put_lock(self, line: int) -> int:
-        """A lock that is held, and the functions to use it, at its place in a line."""
+        """A lock that is held, and the functions to use it, written into a line."""
         lock: int = _allocate()
         _acquire(lock, 1)
         functions = (ctypes.cast(function, ctypes.c_void_p).value for function in (_acquire, _release))
-        place = (ctypes.c_void_p * 3).from_address(self._address + _LINE * line + _LOCK)
-        place[:] = [lock, *functions]
+        written = (ctypes.c_void_p * 3).from_address(self._address + _LINE * line + _LOCK)
+        written[:] = [lock, *functions]
         return lock
 
     def _launch(self, *addresses: int) -> None:
-        self._launcher(self._launcher.block(self._address, *addresses, self._count, self._patience))
+        self._launcher(self._launcher.pack(self._address, *addresses, self._count, self._patience))
 
     def _serve(self, number: int) -> None:
         try:
-            self._server(self._server.block(self._address, number, self._patience))
+            self._server(self._server.pack(self._address, number, self._patience))
         finally:
             self._alive.remove(number)
 
 
-def _load(name: str, addresses: list[str], numbers: list[str]) -> Kernel:
-    parameters = dict.fromkeys(addresses, "wp.uint64") | dict.fromkeys(numbers, "wp.int32")
-    return load_kernel(name, parameters, read_kernel(f"{name}.h"))
+def _load(name: str, pointers: dict[str, str], numbers: list[str]) -> Kernel:
+    """The kernel of a name, which takes pointers, each with the C++ cast that makes it of an address, and ints."""
+    parameters = dict.fromkeys((f"{pointer}_address" for pointer in pointers), "wp.uint64")
+    given = [f"{cast}{pointer}_address" for pointer, cast in pointers.items()]
+    call = f"{name}({', '.join([*given, *numbers])});\n"
+    text = PRELUDE + read_kernel(f"{name}.h") + call
+    return load_kernel(name, parameters | dict.fromkeys(numbers, "wp.int32"), text)

@@ -44,17 +44,17 @@ def set_num_threads(n: int) -> None:
         _dismiss()
 
 
-def on_threads(count: int, kernel: Kernel, block: ctypes.Structure) -> None:
+def on_threads(count: int, kernel: Kernel, arguments: ctypes.Structure) -> None:
     """Runs a kernel on one thread, this one, or on all, and returns when it is done. The caller holds `LOCK`."""
     global _pool
     if _forked:
         _warn_after_fork()
     if count == 1:
-        kernel(block)
+        kernel(arguments)
         return
     if _pool is None:
         _pool = ThreadPool(_num_threads - 1)
-    _pool.run(kernel, block)
+    _pool.run(kernel, arguments)
 
 
 @atexit.register

@@ -7,119 +7,138 @@ ellipse at alpha = 1/255 really crosses it (exact bounds per row of tiles, `kern
 """
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from torch import Tensor
 
 from ..runtime.buffers import floats, ints, longs
-from ..runtime.constants import BOX, MAX_CHANNELS, PLACE, RECORD, SPARE_COUNTS, tiles
-from ..runtime.launch import FloatArray, IntArray, LongArray, worker
+from ..runtime.constants import BOX, FOOTPRINT, MAX_CHANNELS, RECORD, SPARE_COUNTS
+from ..runtime.launch import worker
 from ..runtime.optimizations import active_optimizations
-from ..runtime.source import read_kernel
+from ..runtime.parameters import FloatArray, FloatOutput, IntArray, IntOutput, LongOutput
 from ..runtime.threads import get_num_threads
+from .structs import Channels, Grid, Splats, grid
 
-# What 32-bit places in a list of pairs can count.
+# Pairs that a list can hold: they are numbered in 32 bits.
 MAX_PAIRS = 2**31 - 1
 
-# Slices of the rows that each thread counts and lists.
+# Slices of the rows that each thread counts and lists: a few, so that none waits for another's expensive rows.
 SLICES = 4
 
 
-@worker(read_kernel("pack_colors.h"), items="slices", grain="1")
+class RecordList(NamedTuple):
+    """What the blend reads of each of `m` visible Gaussians that has pairs, by slice of these Gaussians."""
+
+    records: Annotated[FloatOutput, "m, RECORD"]  # a `Record` each, from where their slice begins
+    listed: Annotated[IntOutput, "m"]  # index of each among the visible Gaussians
+    listed_count: Annotated[IntOutput, "slices"]  # records of each slice
+
+
+class Footprints(NamedTuple):
+    """Which tiles each record covers, as far as its box tells."""
+
+    tiles: Annotated[IntOutput, "m, FOOTPRINT"]
+    boxes: Annotated[IntOutput, "m, BOX"]  # a `TileBox`, only of larger ones
+
+
+class PairCounts(NamedTuple):
+    """Numbers of pairs, which `scan_pairs` turns into where they begin."""
+
+    of_tiles: Annotated[IntOutput, "slices, grid.tiles_x * grid.tiles_y + SPARE_COUNTS"]
+    of_slices: Annotated[LongOutput, "slices + 1"]
+
+
+class DepthRanges(NamedTuple):
+    """Depths, as bits of float32, that each tile lists."""
+
+    ranges: Annotated[IntArray, "grid.tiles_x * grid.tiles_y if limited else 0, 2"]  # the first, and the first beyond
+    limited: int  # whether there are ranges; all depths otherwise
+
+
+class Pairs(NamedTuple):
+    """(tile, Gaussian) pairs, numbered by row and tile."""
+
+    start: Annotated[IntOutput, "m + 1"]  # number of the first pair of each visible Gaussian
+    record: Annotated[IntOutput, "P"]
+    unsorted: Annotated[LongOutput, "P"]  # depth and number of the pairs of each tile
+
+
+class TileLists(NamedTuple):
+    """Pairs of each tile, to be sorted front to back, all or as far as the pixels take them."""
+
+    tile_start: Annotated[IntArray, "grid.tiles_x * grid.tiles_y + 1"]
+    pair_record: Annotated[IntArray, "P"]
+    unsorted: Annotated[LongOutput, "P"]
+    buffer: Annotated[LongOutput, "0 if sorted else P"]  # scratch
+    tile_record: Annotated[IntOutput, "P"]  # out, record of each pair, in the order of the tiles
+    tile_pair: Annotated[IntOutput, "P"]  # out, its number
+    sorted: int  # whether they are
+
+
+@worker(file="pack_colors.h", items="slices", grain="1")
 def _pack_colors(
-    visible: Annotated[IntArray, "n"],
-    listed: Annotated[IntArray, "n"],
-    listed_count: Annotated[IntArray, "slices"],
-    colors: Annotated[FloatArray, "R, stride"],
-    records: Annotated[FloatArray, "n, RECORD"],  # the channels are replaced
+    *,
+    visible: Annotated[IntArray, "m"],
+    packed: RecordList,  # the channels are replaced
+    colors: Annotated[FloatArray, "n, channels.stride"],
+    channels: Channels,
+    m: int,
     n: int,
     slices: int,
-    stride: int,
-    channel: int,
-    channels: int,
 ) -> None: ...
 
 
-@worker(read_kernel("pack_and_count.h"), items="slices", grain="1")
+@worker(file="pack_and_count.h", items="slices", grain="1")
 def pack_and_count(
-    visible: Annotated[IntArray, "n"],
-    means2d: Annotated[FloatArray, "R, 2"],
-    depths: Annotated[FloatArray, "R"],
-    conics: Annotated[FloatArray, "R, 3"],
-    opacities: Annotated[FloatArray, "R"],
-    sigmas: Annotated[FloatArray, "R, 2"],
-    colors: Annotated[FloatArray, "R, stride"],
-    ranges: Annotated[IntArray, "tiles_x * tiles_y if limited else 0, 2"],
-    records: Annotated[FloatArray, "n, RECORD"],  # out, of rows that have pairs, from where their slice begins
-    listed: Annotated[IntArray, "n"],  # out, places in `visible` of those
-    listed_count: Annotated[IntArray, "slices"],  # out
-    places: Annotated[IntArray, "n, PLACE"],  # out, as the next
-    boxes: Annotated[IntArray, "n, BOX"],  # out, only of larger ones
-    counts: Annotated[IntArray, "slices, tiles_x * tiles_y + SPARE_COUNTS"],  # out
-    totals: Annotated[LongArray, "slices + 1"],  # out, pairs of each slice
-    tiles_per_gauss: Annotated[IntArray, "R if dense else 0"],  # out
+    *,
+    visible: Annotated[IntArray, "m"],
+    splats: Splats,
+    colors: Annotated[FloatArray, "n, channels.stride"],
+    channels: Channels,
+    depths: DepthRanges,
+    packed: RecordList,
+    footprints: Footprints,
+    counts: PairCounts,
+    tiles_per_gauss: Annotated[IntOutput, "n if dense else 0"],
+    grid: Grid,
+    m: int,
     n: int,
-    rows: int,
-    stride: int,
-    channels: int,
     slices: int,
-    width: float,
-    height: float,
-    tiles_x: int,
-    tiles_y: int,
     dense: int,
-    limited: int,
     optimizations: int,
 ) -> None: ...
 
 
-@worker(read_kernel("scan_pairs.h"), items="1", grain="1")
+@worker(file="scan_pairs.h", items="1", grain="1")
 def scan_pairs(
-    # In: counts; out: where each slice starts in each tile's list.
-    counts: Annotated[IntArray, "slices, tiles + SPARE_COUNTS"],
-    totals: Annotated[LongArray, "slices + 1"],  # in: pairs of each slice; out: running sum
-    tile_start: Annotated[IntArray, "tiles + 1"],  # out
+    *,
+    counts: PairCounts,  # in: numbers of pairs; out: where each slice begins in each tile's list, and its first pair
+    tile_start: Annotated[IntOutput, "grid.tiles_x * grid.tiles_y + 1"],
+    grid: Grid,
     slices: int,
-    tiles: int,
 ) -> None: ...
 
 
-@worker(read_kernel("fill_pairs.h"), items="slices", grain="1")
+@worker(file="fill_pairs.h", items="slices", grain="1")
 def fill_pairs(
-    visible: Annotated[IntArray, "n"],
-    depths: Annotated[FloatArray, "rows"],
-    records: Annotated[FloatArray, "n, RECORD"],
-    listed: Annotated[IntArray, "n"],
-    listed_count: Annotated[IntArray, "slices"],
-    places: Annotated[IntArray, "n, PLACE"],
-    boxes: Annotated[IntArray, "n, BOX"],
-    ranges: Annotated[IntArray, "tiles_x * tiles_y if limited else 0, 2"],
-    counts: Annotated[IntArray, "slices, tiles_x * tiles_y + SPARE_COUNTS"],  # next free place
-    totals: Annotated[LongArray, "slices + 1"],
-    pair_start: Annotated[IntArray, "n + 1"],  # out
-    pair_record: Annotated[IntArray, "P"],  # out
-    unsorted: Annotated[LongArray, "P"],  # out, depth and number of each pair
+    *,
+    visible: Annotated[IntArray, "m"],
+    splat_depths: Annotated[FloatArray, "n"],
+    packed: RecordList,
+    footprints: Footprints,
+    depths: DepthRanges,
+    counts: PairCounts,  # the next free place in each tile's list
+    pairs: Pairs,
+    grid: Grid,
+    m: int,
     n: int,
-    rows: int,
     slices: int,
-    width: float,
-    tiles_x: int,
-    tiles_y: int,
-    limited: int,
     optimizations: int,
 ) -> None: ...
 
 
-@worker(read_kernel("sort_tiles.h"), items="tiles", grain="2")
-def sort_tiles(
-    tile_start: Annotated[IntArray, "tiles + 1"],
-    pair_record: Annotated[IntArray, "P"],
-    unsorted: Annotated[LongArray, "P"],
-    buffer: Annotated[LongArray, "P"],  # scratch
-    tile_list: Annotated[IntArray, "P"],  # out
-    tile_place: Annotated[IntArray, "P"],  # out
-    tiles: int,
-) -> None: ...
+@worker(file="sort_tiles.h", items="grid.tiles_x * grid.tiles_y", grain="2")
+def sort_tiles(*, lists: TileLists, grid: Grid) -> None: ...
 
 
 @dataclass
@@ -128,53 +147,57 @@ class Bins:
 
     Attributes:
         visible: [M] int32, rows of the visible Gaussians.
-        listed: [M] int32, place in `visible` of each record.
-        listed_count: [slices] int32, records of each slice of `visible`, which lie where the slice begins.
-        records: [M, RECORD] float32, what the blend reads of each of them that has pairs.
+        packed: Records of each of them that has pairs.
         tile_start: [tiles + 1] int32, begin of each tile's part of the lists, row-major.
-        tile_list: [P] int32, records, front to back in every tile as far as it is sorted.
-        tile_place: [P] int32, number of the pair; pairs are numbered by row and tile.
-        pair_start: [M + 1] int32, number of each visible Gaussian's first pair.
-        pair_record: [P] int32, record of each pair.
-        unsorted: [P] int64, depth and number of the pairs of each tile.
+        tile_record: [P] int32, records, front to back in every tile as far as it is sorted.
+        tile_pair: [P] int32, number of the pair; pairs are numbered by row and tile.
+        pairs: First pairs of Gaussians; records and depths of pairs, which go once the lists are sorted.
         tiles_per_gauss: [R] int32, number of tiles of every row.
+        grid: The tiles.
     """
 
     visible: Tensor
-    listed: Tensor
-    listed_count: Tensor
-    records: Tensor
+    packed: RecordList
     tile_start: Tensor
-    tile_list: Tensor
-    tile_place: Tensor
-    pair_start: Tensor
-    pair_record: Tensor
-    unsorted: Tensor
+    tile_record: Tensor
+    tile_pair: Tensor
+    pairs: Pairs
     tiles_per_gauss: Tensor
+    grid: Grid
+
+    def lists(self, sorted: bool) -> TileLists:
+        """The lists as kernels take them, with room to sort them unless they are sorted."""
+        buffer = longs(0 if sorted else len(self.tile_record))
+        return TileLists(
+            tile_start=self.tile_start,
+            pair_record=self.pairs.record,
+            unsorted=self.pairs.unsorted,
+            buffer=buffer,
+            tile_record=self.tile_record,
+            tile_pair=self.tile_pair,
+            sorted=int(sorted),
+        )
 
     def sort(self) -> None:
         """Sorts the lists of all tiles to their ends."""
-        buffer = longs(len(self.unsorted))
-        sort_tiles(
-            self.tile_start, self.pair_record, self.unsorted, buffer, self.tile_list, self.tile_place,
-            len(self.tile_start) - 1,
-        )  # fmt: skip
+        sort_tiles(lists=self.lists(sorted=False), grid=self.grid)
 
-    def pack_colors(self, colors: Tensor, first: int, count: int) -> None:
-        """Puts `count` channels of `colors` [R, D], from `first` on, into the records."""
+    def pack_colors(self, colors: Tensor, channels: Channels) -> None:
+        """Puts some channels of `colors` [R, D] into the records."""
         _pack_colors(
-            self.visible, self.listed, self.listed_count, colors, self.records,
-            len(self.visible), len(self.listed_count), colors.shape[1], first, count,
-        )  # fmt: skip
+            visible=self.visible,
+            packed=self.packed,
+            colors=colors,
+            channels=channels,
+            m=len(self.visible),
+            n=len(colors),
+            slices=len(self.packed.listed_count),
+        )
 
 
 def bin_gaussians(
     visible: Tensor,  # [M] int32
-    means2d: Tensor,  # [R, 2]
-    depths: Tensor,  # [R]
-    conics: Tensor,  # [R, 3]
-    opacities: Tensor,  # [R]
-    sigmas: Tensor,  # [R, 2]
+    splats: Splats,
     colors: Tensor,  # [R, D]
     width: int,
     height: int,
@@ -190,37 +213,56 @@ def bin_gaussians(
     Raises:
         ValueError: There are more (tile, Gaussian) pairs than can be listed.
     """
-    n = visible.numel()
-    tiles_x, tiles_y = tiles(width, height)
-    rows, channels = colors.shape
+    m = visible.numel()
+    tiling = grid(width, height)
+    n, channels = colors.shape
     # Any number of slices gives the same lists; some per thread keep all busy.
-    slices = 1 if n < 1024 or get_num_threads() == 1 else SLICES * get_num_threads()
-    limited = ranges is not None
-    ranges = ints(0) if ranges is None else ranges
-    records, listed, listed_count = floats(n, RECORD), ints(n), ints(slices)
-    places, boxes, counts = ints(n, PLACE), ints(n, BOX), ints(slices, tiles_x * tiles_y + SPARE_COUNTS)
-    tile_start, pair_start = ints(tiles_x * tiles_y + 1), ints(n + 1)
-    tiles_per_gauss, totals = ints(rows if dense else 0), longs(slices + 1)
+    slices = 1 if m < 1024 or get_num_threads() == 1 else SLICES * get_num_threads()
+    depths = DepthRanges(ints(0) if ranges is None else ranges, int(ranges is not None))
+    packed = RecordList(floats(m, RECORD), ints(m), ints(slices))
+    footprints = Footprints(ints(m, FOOTPRINT), ints(m, BOX))
+    tile_count = tiling.tiles_x * tiling.tiles_y
+    counts = PairCounts(ints(slices, tile_count + SPARE_COUNTS), longs(slices + 1))
+    tile_start, pair_start = ints(tile_count + 1), ints(m + 1)
+    tiles_per_gauss = ints(n if dense else 0)
     pack_and_count(
-        visible, means2d, depths, conics, opacities, sigmas, colors, ranges, records, listed, listed_count, places,
-        boxes, counts, totals, tiles_per_gauss,
-        n, rows, channels, min(channels, MAX_CHANNELS), slices, float(width), float(height), tiles_x, tiles_y,
-        int(dense), int(limited), active_optimizations(),
-    )  # fmt: skip
-    scan_pairs(counts, totals, tile_start, slices, tiles_x * tiles_y)
-    pairs = totals.tolist()[-1]
-    covered = before + pairs
+        visible=visible,
+        splats=splats,
+        colors=colors,
+        channels=Channels(channels, 0, min(channels, MAX_CHANNELS)),
+        depths=depths,
+        packed=packed,
+        footprints=footprints,
+        counts=counts,
+        tiles_per_gauss=tiles_per_gauss,
+        grid=tiling,
+        m=m,
+        n=n,
+        slices=slices,
+        dense=int(dense),
+        optimizations=active_optimizations(),
+    )
+    scan_pairs(counts=counts, tile_start=tile_start, grid=tiling, slices=slices)
+    total = counts.of_slices.tolist()[-1]
+    covered = before + total
     if covered > MAX_PAIRS:
         raise ValueError(
-            f"{n:,} visible Gaussians cover {covered:,} tiles of an image of {width}x{height} pixels in all, at most "
+            f"{m:,} visible Gaussians cover {covered:,} tiles of an image of {width}x{height} pixels in all, at most "
             f"{MAX_PAIRS:,} can be listed: render a smaller image, or fewer or smaller Gaussians."
         )
-    pair_record, unsorted = ints(pairs), longs(pairs)
+    pairs = Pairs(pair_start, ints(total), longs(total))
     fill_pairs(
-        visible, depths, records, listed, listed_count, places, boxes, ranges, counts, totals, pair_start, pair_record,
-        unsorted, n, rows, slices, float(width), tiles_x, tiles_y, int(limited), active_optimizations(),
-    )  # fmt: skip
-    lists = ints(pairs), ints(pairs)
-    return Bins(
-        visible, listed, listed_count, records, tile_start, *lists, pair_start, pair_record, unsorted, tiles_per_gauss
+        visible=visible,
+        splat_depths=splats.depths,
+        packed=packed,
+        footprints=footprints,
+        depths=depths,
+        counts=counts,
+        pairs=pairs,
+        grid=tiling,
+        m=m,
+        n=n,
+        slices=slices,
+        optimizations=active_optimizations(),
     )
+    return Bins(visible, packed, tile_start, ints(total), ints(total), pairs, tiles_per_gauss, tiling)

@@ -8,27 +8,29 @@ from torch import Tensor
 
 from ..runtime.buffers import floats, ints
 from ..runtime.constants import BLOCK, blocks
-from ..runtime.launch import FloatArray, IntArray, worker
-from ..runtime.source import read_kernel
+from ..runtime.launch import worker
+from ..runtime.parameters import FloatArray, FloatOutput, IntArray
 from .project import list_visible
+from .structs import BlockRows, RowList
 
 
-@worker(read_kernel("take_rows.h"), items="n", grain="4096")
+@worker(file="take_rows.h", items="n", grain="4096")
 def _take_rows(
+    *,
     rows: Annotated[IntArray, "n"],
     source: Annotated[FloatArray, "R, width"],
-    taken: Annotated[FloatArray, "n, width"],  # out
+    taken: Annotated[FloatOutput, "n, width"],
     n: int,
     width: int,
 ) -> None: ...
 
 
-@worker(read_kernel("put_rows.h"), items="(n + BLOCK - 1) / BLOCK", grain="1")
+@worker(file="put_rows.h", items="(n + BLOCK - 1) / BLOCK", grain="1")
 def _put_rows(
-    rows: Annotated[IntArray, "M"],
-    block_start: Annotated[IntArray, "blocks(n) + 1"],
-    packed: Annotated[FloatArray, "M, width"],
-    put: Annotated[FloatArray, "n, width"],  # out
+    *,
+    visible: RowList,
+    packed: Annotated[FloatArray, "visible.M, width"],
+    put: Annotated[FloatOutput, "n, width"],
     n: int,
     width: int,
 ) -> None: ...
@@ -41,31 +43,37 @@ def take_rows(
     """`source[rows]`, on all cores; torch's takes as long as some kernels."""
     shape = len(rows), *source.shape[1:]
     taken = floats(*shape)
-    _take_rows(rows, source.contiguous().view(torch.float32), taken, len(rows), math.prod(shape[1:]))
+    source_floats = source.contiguous().view(torch.float32)
+    _take_rows(rows=rows, source=source_floats, taken=taken, n=len(rows), width=math.prod(shape[1:]))
     return taken.view(source.dtype)
 
 
 def put_rows(
     packed: Tensor,  # [M, ...] float32
     n: int,
-    rows: Tensor,  # [M] int32, ascending
-    block_start: Tensor,  # [ceil(n / BLOCK) + 1], where each block of the `n` rows begins in `rows`
+    visible: RowList,
 ) -> Tensor:
-    """The adjoint of `take_rows`: `n` rows, zeros but for `rows`."""
+    """The adjoint of `take_rows`: `n` rows, zeros but for the listed ones."""
     shape = n, *packed.shape[1:]
     put = floats(*shape)
-    _put_rows(rows, block_start, packed.contiguous(), put, n, math.prod(shape[1:]))
+    _put_rows(visible=visible, packed=packed.contiguous(), put=put, n=n, width=math.prod(shape[1:]))
     return put
 
 
-def visible_rows(seen: Tensor, block_count: Tensor) -> tuple[Tensor, Tensor]:
-    """The rows that `project_forward` found visible."""
-    visible, block_start = ints(len(seen)), ints(len(block_count) + 1)
-    list_visible(seen, block_count, visible, block_start, len(block_count))
-    return visible[: int(block_start[-1])], block_start
+def visible_rows(found: BlockRows) -> RowList:
+    """The rows that a kernel found in each block, one after the other."""
+    visible, block_start = ints(len(found.rows)), ints(len(found.counts) + 1)
+    list_visible(
+        found=found.rows,
+        block_count=found.counts,
+        visible=visible,
+        block_start=block_start,
+        blocks=len(found.counts),
+    )
+    return RowList(visible[: int(block_start[-1])], block_start)
 
 
-def all_rows(n: int) -> tuple[Tensor, Tensor]:
+def all_rows(n: int) -> RowList:
     """All of `n` rows."""
     starts = torch.arange(0, BLOCK * (blocks(n) + 1), BLOCK, dtype=torch.int32, device="cpu").clamp(max=n)
-    return torch.arange(n, dtype=torch.int32, device="cpu"), starts
+    return RowList(torch.arange(n, dtype=torch.int32, device="cpu"), starts)

@@ -12,126 +12,120 @@ import torch
 from torch import Tensor
 
 from ..runtime.buffers import floats, ints
-from ..runtime.constants import tiles
-from ..runtime.launch import FloatArray, IntArray, worker
+from ..runtime.launch import worker
 from ..runtime.optimizations import OPTIMIZATIONS, active_optimizations
-from ..runtime.source import read_kernel
+from ..runtime.parameters import FloatOutput, IntArray, IntOutput
 from .binning import Bins, bin_gaussians
 from .rows import visible_rows
+from .structs import BlockRows, Grid, RowList, Splats, grid
 
-ROWS_PER_TILE = 128  # visible Gaussians for each tile of the image, below which all are listed at once
-WORTH = 0.7  # share of the rows in the first lists above which all are listed at once
-NO_DEPTH = 0x7FFFFFFF  # beyond the bits of every float
+# Visible Gaussians for each tile of the image, below which all are listed at once: sampling costs more than it saves.
+ROWS_PER_TILE = 128
+# Share of the rows in the first lists above which all are listed at once: a second pass would cost more than it saves.
+WORTH = 0.7
+NO_DEPTH = 0x7FFFFFFF  # as bits of a depth, beyond every float
 
-_CELL = 4
-_LAYERS = 64
+# Tiles along the side of a cell, over which the light that Gaussians take is averaged.
+CELL = 4
+# Ranges of depth of a cell.
+LAYERS = 64
 _SAMPLING = {
-    "CELL": _CELL,  # tiles along the side of a cell, over which light is averaged
-    "LAYERS": _LAYERS,  # ranges of depth
-    "SAMPLES": 16384,  # rows at least, where there are as many
-    # What one pixel has to lose before its list may end, in units of its light: it is finished at 9.2 on average.
+    "CELL": CELL,
+    "LAYERS": LAYERS,
+    # Rows that are looked at, at least, where there are as many.
+    "SAMPLES": 16384,
+    # What one pixel has to lose before its list may end, in units of its light. It is finished at 9.2 on average,
+    # -ln(TRANSMITTANCE_MIN).
     "ENOUGH": 20.0,
 }
 
 
-@worker(read_kernel("near_ranges.h"), items="1", grain="1", constants=_SAMPLING)
+@worker(file="near_ranges.h", items="1", grain="1", constants=_SAMPLING)
 def _near_ranges(
-    visible: Annotated[IntArray, "n"],
-    means2d: Annotated[FloatArray, "R, 2"],
-    depths: Annotated[FloatArray, "R"],
-    conics: Annotated[FloatArray, "R, 3"],
-    opacities: Annotated[FloatArray, "R"],
-    taken: Annotated[FloatArray, "cells, layers"],  # scratch
-    ranges: Annotated[IntArray, "tiles_x * tiles_y, 2"],  # out
-    share: Annotated[FloatArray, "1"],  # out, of the rows that the ranges hold
+    *,
+    visible: Annotated[IntArray, "m"],
+    splats: Splats,
+    taken: Annotated[FloatOutput, "-(-grid.tiles_x // CELL) * -(-grid.tiles_y // CELL), LAYERS"],  # scratch
+    ranges: Annotated[IntOutput, "grid.tiles_x * grid.tiles_y, 2"],
+    share: Annotated[FloatOutput, "1"],  # of the rows that the ranges hold
+    grid: Grid,
+    m: int,
     n: int,
-    cells: int,
-    layers: int,
-    width: float,
-    height: float,
-    tiles_x: int,
-    tiles_y: int,
 ) -> None: ...
 
 
-@worker(read_kernel("list_open.h"), items="blocks", grain="1")
+@worker(file="list_open.h", items="(n + BLOCK - 1) / BLOCK", grain="1")
 def _list_open(
-    visible: Annotated[IntArray, "n"],
-    block_start: Annotated[IntArray, "blocks + 1"],
-    means2d: Annotated[FloatArray, "R, 2"],
-    depths: Annotated[FloatArray, "R"],
-    opacities: Annotated[FloatArray, "R"],
-    sigmas: Annotated[FloatArray, "R, 2"],
-    open_before: Annotated[IntArray, "tiles_y + 1, tiles_x + 1"],
-    seen: Annotated[IntArray, "R"],  # out, rows from where their block begins
-    block_count: Annotated[IntArray, "blocks"],  # out, their number in each block
+    *,
+    visible: RowList,
+    splats: Splats,
+    open_before: Annotated[IntArray, "grid.tiles_y + 1, grid.tiles_x + 1"],
+    found: BlockRows,
+    grid: Grid,
     n: int,
-    blocks: int,
     least: int,  # of the depths that were left out in open tiles
-    tiles_x: int,
-    tiles_y: int,
 ) -> None: ...
 
 
 def near_ranges(
     visible: Tensor,  # [M]
-    means2d: Tensor,  # [R, 2]
-    depths: Tensor,  # [R]
-    conics: Tensor,  # [R, 3]
-    opacities: Tensor,  # [R]
+    splats: Splats,  # R rows
     width: int,
     height: int,
 ) -> Tensor | None:
-    """Depths [tiles, 2] that the first lists hold; None where they had better hold all."""
-    tiles_x, tiles_y = tiles(width, height)
+    """Depths [tiles, 2] that the first lists hold; None if a single pass is faster."""
+    tiling = grid(width, height)
+    tiles = tiling.tiles_x * tiling.tiles_y
     wanted = OPTIMIZATIONS["two_pass"] | OPTIMIZATIONS["saturation"]
-    if active_optimizations() & wanted != wanted or len(visible) < ROWS_PER_TILE * tiles_x * tiles_y:
+    if active_optimizations() & wanted != wanted or len(visible) < ROWS_PER_TILE * tiles:
         return None
-    cells = -(-tiles_x // _CELL) * -(-tiles_y // _CELL)
-    ranges, share = ints(tiles_x * tiles_y, 2), floats(1)
+    cells = -(-tiling.tiles_x // CELL) * -(-tiling.tiles_y // CELL)
+    ranges, share = ints(tiles, 2), floats(1)
     _near_ranges(
-        visible, means2d, depths, conics, opacities, floats(cells, _LAYERS), ranges, share,
-        len(visible), cells, _LAYERS, float(width), float(height), tiles_x, tiles_y,
-    )  # fmt: skip
+        visible=visible,
+        splats=splats,
+        taken=floats(cells, LAYERS),
+        ranges=ranges,
+        share=share,
+        grid=tiling,
+        m=len(visible),
+        n=splats.depths.numel(),
+    )
     return ranges if share.item() < WORTH else None
 
 
-def bin_the_rest(
+def bin_behind(
     near: Bins,
     ranges: Tensor,  # [tiles, 2] of the first lists
     still_open: Tensor,  # [tiles], not zero where a pixel is not finished
     block_start: Tensor,  # [blocks + 1]
-    means2d: Tensor,  # [R, 2], as the next ones as for `bin_gaussians`
-    depths: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    sigmas: Tensor,
-    colors: Tensor,
-    width: int,
-    height: int,
+    splats: Splats,  # R rows, as for `bin_gaussians`
+    colors: Tensor,  # [R, D]
 ) -> tuple[Bins, Tensor] | None:
-    """Lists of what lies behind the first lists in tiles that are still open, and where blocks of rows begin in them.
+    """Lists of Gaussians behind the first lists in tiles that are still open, and where blocks of rows begin in them.
 
-    None where there is nothing.
+    None if there are none.
     """
-    tiles_x, tiles_y = tiles(width, height)
+    tiling = near.grid
     is_open = (still_open != 0) & (ranges[:, 1] < NO_DEPTH)
     if not bool(is_open.any()):
         return None
     behind = torch.full_like(ranges, NO_DEPTH)
     behind[is_open, 0] = ranges[is_open, 1]
-    open_before = torch.zeros(tiles_y + 1, tiles_x + 1, dtype=torch.int32, device="cpu")
-    open_before[1:, 1:] = is_open.view(tiles_y, tiles_x).cumsum(0).cumsum(1)
-    count = len(block_start) - 1
-    seen, block_count = ints(len(colors)), ints(count)
+    open_before = torch.zeros(tiling.tiles_y + 1, tiling.tiles_x + 1, dtype=torch.int32, device="cpu")
+    open_before[1:, 1:] = is_open.view(tiling.tiles_y, tiling.tiles_x).cumsum(0).cumsum(1)
+    found = BlockRows(ints(len(colors)), ints(len(block_start) - 1))
     _list_open(
-        near.visible, block_start, means2d, depths, opacities, sigmas, open_before, seen, block_count,
-        len(near.visible), count, int(behind[:, 0].min()), tiles_x, tiles_y,
-    )  # fmt: skip
-    rows, starts = visible_rows(seen, block_count)
+        visible=RowList(near.visible, block_start),
+        splats=splats,
+        open_before=open_before,
+        found=found,
+        grid=tiling,
+        n=len(colors),
+        least=int(behind[:, 0].min()),
+    )
+    rows, starts = visible_rows(found)
     if len(rows) == 0:
         return None
-    rest = bin_gaussians(
-        rows, means2d, depths, conics, opacities, sigmas, colors, width, height, False, behind, len(near.tile_list)
-    )
-    return rest, starts
+    before = len(near.tile_record)
+    return bin_gaussians(rows, splats, colors, tiling.width, tiling.height, False, behind, before), starts

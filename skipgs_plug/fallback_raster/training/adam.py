@@ -1,37 +1,55 @@
 """One step of Adam on all cores, for whole parameters or for some rows of them."""
 
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..runtime.launch import FloatArray, IntArray, worker
-from ..runtime.source import read_kernel
+from ..runtime.launch import worker
+from ..runtime.parameters import FloatArray, FloatOutput, IntArray
 
 _ALL = torch.empty(0, dtype=torch.int32, device="cpu")  # in place of a mask
 
 
-@worker(read_kernel("adam.h"), items="n", grain="larger(1, 16384 / width)")
+class Moments(NamedTuple):
+    """A parameter and the running means that Adam keeps of its gradient, all changed by a step."""
+
+    values: Annotated[FloatOutput, "n, width"]
+    mean: Annotated[FloatOutput, "n, width"]  # of the gradient
+    square: Annotated[FloatOutput, "n, width"]  # of its square
+
+
+class Decay(NamedTuple):
+    """The numbers of Adam that stay the same from step to step."""
+
+    take1: float  # 1 - the decay of the mean, which loses digits when it is computed in float32
+    keep2: float  # decay of the mean of the squares
+    take2: float  # 1 - keep2
+    eps: float
+
+
+def decay(betas: tuple[float, float], eps: float) -> Decay:
+    """The numbers of these decays of the two means."""
+    return Decay(float(1 - betas[0]), float(betas[1]), float(1 - betas[1]), float(eps))
+
+
+@worker(file="adam.h", items="n", grain="larger(1, 16384 / width)")
 def _adam(
-    seen: Annotated[IntArray, "n if only_seen else 0"],
+    *,
+    wanted: Annotated[IntArray, "n if only_some else 0"],  # rows that get a step
     gradient: Annotated[FloatArray, "n, width"],
-    values: Annotated[FloatArray, "n, width"],  # updated, as the next two
-    mean: Annotated[FloatArray, "n, width"],  # running mean of the gradient
-    square: Annotated[FloatArray, "n, width"],  # running mean of its square
+    parameter: Moments,
+    decay: Decay,
     n: int,
     width: int,
-    only_seen: int,
-    rate: float,
+    only_some: int,
+    rate: float,  # divided by the bias correction of the mean
     root: float,  # divides the root of the squares
-    take1: float,  # 1 - the decay of the mean, which loses digits when it is computed in float32
-    keep2: float,
-    take2: float,
-    eps: float,
 ) -> None: ...
 
 
 def adam_step(
-    seen: Tensor | None,  # [N], all rows without
+    wanted: Tensor | None,  # [N], all rows without
     values: Tensor,
     gradient: Tensor,
     mean: Tensor,
@@ -48,7 +66,7 @@ def adam_step(
     rounding in one number of a thousand: its square root is not the nearest float.
 
     Args:
-        seen: Rows to update, not zero; all without.
+        wanted: Rows to update, not zero; all without.
         values: The parameter, changed as the next but `gradient`.
         gradient: Of the same shape, as the next two.
         mean: Running mean of the gradient.
@@ -60,10 +78,18 @@ def adam_step(
     """
     if values.numel() == 0:
         return
-    n = values.numel() if seen is None else len(seen)
-    numbers = map(float, (rate, root, 1 - betas[0], betas[1], 1 - betas[1], eps))
-    mask = _ALL if seen is None else seen
-    _adam(mask, gradient, values, mean, square, n, values.numel() // n, int(seen is not None), *numbers)
+    n = values.numel() if wanted is None else len(wanted)
+    _adam(
+        wanted=_ALL if wanted is None else wanted,
+        gradient=gradient,
+        parameter=Moments(values, mean, square),
+        decay=decay(betas, eps),
+        n=n,
+        width=values.numel() // n,
+        only_some=int(wanted is not None),
+        rate=float(rate),
+        root=float(root),
+    )
     # Past torch's count of changes, by which it knows what is out of date in a backward pass.
     torch.autograd.graph.increment_version(values)
 

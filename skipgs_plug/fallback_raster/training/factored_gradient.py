@@ -57,7 +57,7 @@ class FactoredGradient(Tensor):
             return content
         rows, directions, colors, degree = content
         bands = floats(len(rows), BANDS)
-        sh_bands(directions, bands, len(rows), degree)
+        sh_bands(directions=directions, bands=bands, n=len(rows), degree=degree)
         product = bands[:, : self.shape[1], None] * colors[:, None, :3]
         product = torch.where((colors[:, :3] != 0).any(1)[:, None, None], product, 0.0)
         return zeros(*self.shape).index_copy_(0, rows.long(), product)
@@ -77,5 +77,5 @@ class FactoredGradient(Tensor):
 
 
 def plain(value: Any) -> Any:
-    """What is dense of an `FactoredGradient`, and all else as it is."""
+    """What is dense of a `FactoredGradient`, and all else as it is."""
     return value.dense() if isinstance(value, FactoredGradient) else value

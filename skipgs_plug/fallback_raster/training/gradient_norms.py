@@ -4,16 +4,17 @@ from typing import Annotated
 
 from torch import Tensor
 
-from ..runtime.launch import FloatArray, IntArray, worker
-from ..runtime.source import read_kernel
+from ..runtime.launch import worker
+from ..runtime.parameters import FloatArray, FloatOutput, IntArray
 
 
-@worker(read_kernel("sum_norms.h"), items="n", grain="4096")
+@worker(file="sum_norms.h", items="n", grain="4096")
 def _sum_norms(
+    *,
     rows: Annotated[IntArray, "n"],  # none of them twice
     gradient: Annotated[FloatArray, "n, 2"],
-    norms: Annotated[FloatArray, "R"],  # added to, as the next
-    counts: Annotated[FloatArray, "R"],
+    norms: Annotated[FloatOutput, "R"],  # added to, as the next
+    counts: Annotated[FloatOutput, "R"],
     n: int,
     scale_x: float,
     scale_y: float,
@@ -28,4 +29,12 @@ def sum_norms(
     counts: Tensor,  # [N] float32
 ) -> None:
     """Add the norms of gradients to `norms` and 1 to `counts`, for the rows that an image shows."""
-    _sum_norms(rows, gradient.contiguous(), norms, counts, len(rows), *map(float, scale))
+    _sum_norms(
+        rows=rows,
+        gradient=gradient.contiguous(),
+        norms=norms,
+        counts=counts,
+        n=len(rows),
+        scale_x=float(scale[0]),
+        scale_y=float(scale[1]),
+    )

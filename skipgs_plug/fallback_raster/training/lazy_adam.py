@@ -1,7 +1,7 @@
 """Adam for a parameter of many rows of which few are needed at a time: the others are caught up when they are."""
 
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from numpy import float32
@@ -9,41 +9,59 @@ from torch import Tensor
 
 from ..runtime.buffers import floats, zeros
 from ..runtime.constants import BANDS
-from ..runtime.launch import FloatArray, IntArray, worker
-from ..runtime.source import read_kernel
+from ..runtime.launch import worker
+from ..runtime.parameters import FloatArray, IntArray, IntOutput
+from .adam import Decay, Moments, decay
 from .factored_gradient import FactoredGradient, Factors, plain
 from .optimizer import Adam, moments, next_step
 
-STEPS = 1024  # that a row may miss, for which rates are kept
-CHUNK = 32  # steps of a row between two looks at how small its numbers have become
+# Steps that a row may miss before all rows are caught up: their rates are kept, 12 bytes a step.
+STEPS = 1024
+# Steps of a row between two looks at how small its numbers have become.
+STEPS_PER_CHECK = 32
 
 
-@worker(read_kernel("catch_up.h"), items="n", grain=256, constants={"CHUNK": CHUNK})
+class GradientFactors(NamedTuple):
+    """A gradient as outer products, see `Factors`."""
+
+    directions: Annotated[FloatArray, "m if with_gradient else 0, FACTOR"]
+    colors: Annotated[FloatArray, "m if with_gradient else 0, FACTOR"]
+    degree: int
+
+
+class MissedSteps(NamedTuple):
+    """What `adam_step` takes as `rate` and `root` in each of the steps."""
+
+    rates: Annotated[FloatArray, "steps"]
+    roots: Annotated[FloatArray, "steps"]
+    inverse_roots: Annotated[FloatArray, "steps"]
+
+
+class SafeRange(NamedTuple):
+    """Between which sizes of a row's numbers nothing comes near underflow or overflow in STEPS_PER_CHECK steps."""
+
+    grow: float  # 1 / sqrt(keep2)
+    longest_rate: float  # of all steps; infinite where decay makes steps longer
+    least_mean: float
+    most_mean: float
+    least_square: float
+
+
+@worker(file="catch_up.h", items="m", grain=256, constants={"STEPS_PER_CHECK": STEPS_PER_CHECK})
 def _catch_up(
-    rows: Annotated[IntArray, "n"],  # none of them twice
-    done: Annotated[IntArray, "R"],  # steps that each row has, updated, as `values`, `mean` and `square`
-    directions: Annotated[FloatArray, "n if with_gradient else 0, FACTOR"],  # of the gradient, as the next
-    colors: Annotated[FloatArray, "n if with_gradient else 0, FACTOR"],
-    values: Annotated[FloatArray, "R, width"],
-    mean: Annotated[FloatArray, "R, width"],  # as `adam_step` has it, as all that follow
-    square: Annotated[FloatArray, "R, width"],
-    rates: Annotated[FloatArray, "steps"],
-    roots: Annotated[FloatArray, "steps"],
-    inverse_roots: Annotated[FloatArray, "steps"],
+    *,
+    rows: Annotated[IntArray, "m"],  # none of them twice
+    done: Annotated[IntOutput, "n"],  # steps that each row has
+    factors: GradientFactors,
+    parameter: Moments,
+    missed: MissedSteps,
+    decay: Decay,
+    safe: SafeRange,
+    m: int,
     n: int,
     width: int,
-    now: int,  # steps that rows get before that with a gradient
+    now: int,  # steps that rows get before the one with a gradient
     with_gradient: int,
-    degree: int,
-    take1: float,
-    keep2: float,
-    take2: float,
-    eps: float,
-    grow: float,  # 1 / sqrt(keep2)
-    longest_rate: float,  # of all steps; infinite where decay makes steps longer
-    least_mean: float,  # from here to there nothing comes near underflow or overflow in a chunk of steps
-    most_mean: float,
-    least_square: float,
 ) -> None: ...
 
 
@@ -72,17 +90,30 @@ class _Missed:
 
     def advance(self, rows: Tensor, gradient: Factors | None, state: dict[str, Tensor]) -> None:
         """Bring rows [n] to `now`, and on by the step that was noted last where there is a gradient of them."""
-        *factors, degree = (floats(0), floats(0), 0) if gradient is None else gradient[1:]
+        directions, colors, degree = (floats(0), floats(0), 0) if gradient is None else gradient[1:]
         beta1, beta2 = self.betas
-        smallest = self._least * beta1 ** (CHUNK + 1)
-        longest = self._most if beta1**2 <= beta2 else math.inf
+        smallest = self._least * beta1 ** (STEPS_PER_CHECK + 1)
+        safe = SafeRange(
+            grow=beta2**-0.5,
+            longest_rate=self._most if beta1**2 <= beta2 else math.inf,
+            least_mean=2.0**-100 / smallest if smallest else math.inf,
+            most_mean=2.0**60 / self._most if self._most else math.inf,
+            least_square=max(2.0**-74, (2.0**13 * self.eps) ** 2) / beta2 ** (STEPS_PER_CHECK + 1),
+        )
         _catch_up(
-            rows, self.done, *factors, self.param.detach(), state["exp_avg"], state["exp_avg_sq"],
-            self.rates, self.roots, self.inverse_roots, len(rows), self.param[0].numel(), self.now,
-            int(gradient is not None), degree, 1 - beta1, beta2, 1 - beta2, self.eps, beta2**-0.5, longest,
-            2.0**-100 / smallest if smallest else math.inf, 2.0**60 / self._most if self._most else math.inf,
-            max(2.0**-74, (2.0**13 * self.eps) ** 2) / beta2 ** (CHUNK + 1),
-        )  # fmt: skip
+            rows=rows,
+            done=self.done,
+            factors=GradientFactors(directions, colors, degree),
+            parameter=Moments(self.param.detach(), state["exp_avg"], state["exp_avg_sq"]),
+            missed=MissedSteps(self.rates, self.roots, self.inverse_roots),
+            decay=decay(self.betas, self.eps),
+            safe=safe,
+            m=len(rows),
+            n=len(self.done),
+            width=self.param[0].numel(),
+            now=self.now,
+            with_gradient=int(gradient is not None),
+        )
         # Past torch's count of changes, by which it knows what is out of date in a backward pass.
         torch.autograd.graph.increment_version(self.param)
 
@@ -90,7 +121,7 @@ class _Missed:
 class LazyAdam(Adam):
     """`Adam` for one parameter [N, K, 3], to the bit, that advances only those rows that are asked for.
 
-    Rows that an `FactoredGradient` does not name miss the step: with a gradient of zero their moments decay and the
+    Rows that a `FactoredGradient` does not name miss the step: with a gradient of zero their moments decay and the
     parameter moves on. `catch_up` makes up for that, whenever it is called and for whatever rows, with the same result.
     Before a row of the parameter is used, or anything of the optimizer's `state`, it has to be called.
 
@@ -141,7 +172,7 @@ class LazyAdam(Adam):
 
     @torch.no_grad()
     def receive(self, gradient: Factors) -> None:
-        """Add to the gradient of the parameter, which is an `FactoredGradient` unless it has one already."""
+        """Add to the gradient of the parameter, which is a `FactoredGradient` unless it has one already."""
         (param,) = self.param_groups[0]["params"]
         more = FactoredGradient(param.shape, [gradient])
         param.grad = more if param.grad is None else plain(param.grad) + plain(more)

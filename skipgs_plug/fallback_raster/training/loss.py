@@ -19,7 +19,7 @@ for another pass: no core reads what another one wrote.
 """
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,30 +27,43 @@ from torch.autograd.function import once_differentiable
 
 from ..runtime.arguments import as_kernels_read
 from ..runtime.buffers import floats
-from ..runtime.constants import BAND, CHUNK, LOSS_CHANNELS, WINDOW
-from ..runtime.launch import ByteArray, FloatArray, Worker, worker
-from ..runtime.source import read_kernel
+from ..runtime.constants import LOSS_CHANNELS, LOSS_ROWS, LOSS_VECTORS, WINDOW
+from ..runtime.launch import Worker, worker
+from ..runtime.parameters import ByteArray, FloatArray, FloatOutput
 
-# Columns of float32 count no further exactly, and kernels find them in it.
+# Numbers in a row of an image: kernels find columns in float32, which counts no further exactly.
 MAX_ROW = 2**24
 
 
-def _loss_tiles(name: str, pixels: type) -> Worker:
-    @worker(read_kernel("loss_tiles.h"), items="tiles", grain="1", name=name)
+class ImageSize(NamedTuple):
+    """Size of a batch of images."""
+
+    images: int
+    height: int
+    width: int
+    channels: int
+
+
+class LossWeights(NamedTuple):
+    """What |image - target| and 1 - SSIM of each number count in the loss."""
+
+    l1: float
+    ssim: float
+
+
+def _loss_tiles(name: str, pixels: Any) -> Worker[...]:
+    @worker(file="loss_tiles.h", items="tiles", grain="1", name=name)
     def loss_tiles(
-        image: Annotated[FloatArray, "images, height, width, channels"],
-        target: Annotated[pixels, "images, height, width, channels"],  # type: ignore[valid-type]
-        gradient: Annotated[FloatArray, "images if with_gradient else 0, height, width, channels"],  # out
-        sums: Annotated[FloatArray, "tiles, 2"],  # out, |image - target| and 1 - SSIM summed over each tile
+        *,
+        image: Annotated[FloatArray, "size.images, size.height, size.width, size.channels"],
+        target: Annotated[pixels, "size.images, size.height, size.width, size.channels"],
+        gradient: Annotated[FloatOutput, "size.images if with_gradient else 0, size.height, size.width, size.channels"],
+        sums: Annotated[FloatOutput, "tiles, 2"],  # |image - target| and 1 - SSIM summed over each tile
+        size: ImageSize,
+        weights: LossWeights,
         tiles: int,
-        images: int,
-        height: int,
-        width: int,
-        channels: int,
         valid: int,
         with_gradient: int,
-        l1_weight: float,
-        ssim_weight: float,
     ) -> None: ...
 
     return loss_tiles
@@ -67,19 +80,28 @@ class _L1Ssim(torch.autograd.Function):
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_lambda: float, valid: bool) -> Tensor:  # type: ignore[override]
         height, width, channels = image.shape[-3:]
         images = image.numel() // (height * width * channels)
-        size = (images, height, width, channels)
+        size = ImageSize(images, height, width, channels)
         with_gradient = ctx.needs_input_grad[0]
-        tiles = images * -(-height // BAND) * -(-width * channels // (16 * CHUNK))
+        tiles = images * -(-height // LOSS_ROWS) * -(-width * channels // (16 * LOSS_VECTORS))
         border = WINDOW - 1 if valid else 0
         windows = images * (height - border) * (width - border) * channels
-        weights = ((1.0 - ssim_lambda) / image.numel(), ssim_lambda / windows)
+        weights = LossWeights((1.0 - ssim_lambda) / image.numel(), ssim_lambda / windows)
         gradient, sums = floats(*image.shape) if with_gradient else floats(0), floats(tiles, 2)
-        loss_tiles = _LOSS_TILES[target.dtype]
-        loss_tiles(image, target, gradient, sums, tiles, *size, int(valid), int(with_gradient), *weights)
+        _LOSS_TILES[target.dtype](
+            image=image,
+            target=target,
+            gradient=gradient,
+            sums=sums,
+            size=size,
+            weights=weights,
+            tiles=tiles,
+            valid=int(valid),
+            with_gradient=int(with_gradient),
+        )
         ctx.save_for_backward(gradient)
         # Tiles were summed in float32; adding them in float64, in a fixed order, keeps the last digits of the mean.
         l1, unlike = map(math.fsum, zip(*sums.tolist(), strict=True))
-        return torch.tensor(weights[0] * l1 + weights[1] * unlike, dtype=torch.float32, device="cpu")
+        return torch.tensor(weights.l1 * l1 + weights.ssim * unlike, dtype=torch.float32, device="cpu")
 
     @staticmethod
     @once_differentiable

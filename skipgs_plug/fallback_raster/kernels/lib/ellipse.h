@@ -2,15 +2,21 @@
 //
 // Two kernels ask, one to count and one to write where that count made room: they must find the same tiles to the last
 // bit. No multiplication and addition are fused here, because Clang may fuse them differently in two places.
+#pragma once
+#include "record.h"
 struct Ellipses {
     v16 mx, my, half_h;  // centres and half heights of their boxes, pixels
     v16 slope, extreme;  // dx / dy of the line of the outermost points in a row; dy of the outermost of all
     v16 inverse_h, chord;
 
-    // The last six as in a record, see `constants.RECORD`.
-    Ellipses(v16 mx, v16 my, v16 along, v16 half_h, v16 half_w, v16 slope, v16 steepness, v16 reach)
-        : mx(mx), my(my), half_h(half_h), slope(slope), extreme(steepness * half_w), inverse_h(1.0f / half_h),
-          chord(vsqrt(vmax(reach, (v16)0.0f)) / along) {}
+    // Of the ellipses of 16 records.
+    explicit Ellipses(const Records16& r)
+        : mx(r.x), my(r.y), half_h(r.half_height), slope(r.row_slope), extreme(r.column_slope * r.half_width),
+          inverse_h(1.0f / r.half_height), chord(vsqrt(vmax(r.reach, (v16)0.0f)) / r.along) {}
+    // 16 times that of one.
+    explicit Ellipses(const Record& r)
+        : mx(r.x), my(r.y), half_h(r.half_height), slope(r.row_slope), extreme((v16)r.column_slope * (v16)r.half_width),
+          inverse_h(1.0f / (v16)r.half_height), chord(vsqrt(vmax((v16)r.reach, (v16)0.0f)) / (v16)r.along) {}
 
     // x of the edges on one side (-1 left, 1 right), `dy` below the centres:
     // x(dy) = mx + dy slope +- chord sqrt(1 - (dy / half_h)^2), farthest out at dy = -+extreme.
@@ -34,17 +40,23 @@ struct Ellipses {
     }
 };
 
-// Tells `take` the tiles of `box` (first and last column, first and last row) that the ellipse of record `r` crosses, row by
-// row, or all of them.
-static constexpr auto each_tile = [](const float* r, const int* box, float width, int tiles_x, bool all, auto take) INLINE {
-    const Ellipses ellipse(r[0], r[1], r[2], r[6], r[7], r[12], r[13], r[14]);
-    for (int row = box[2]; row <= box[3]; row += 16) {
+// The box of tiles around a large ellipse.
+struct TileBox {
+    int first_column, last_column, first_row, last_row;
+};
+static_assert(sizeof(TileBox) == sizeof(int) * BOX, "constants.BOX");
+
+// Tells `take` the tiles of a box that the ellipse of record `r` crosses, row by row, or all of them.
+static constexpr auto each_tile = [](const Record& r, const TileBox& box, float width, int tiles_x, bool all,
+                                     auto take) INLINE {
+    const Ellipses ellipse(r);
+    for (int row = box.first_row; row <= box.last_row; row += 16) {
         i16 left, right;
         ellipse.columns(row + __builtin_convertvector(lane, i16), width, left, right);
         alignas(64) int from[16], to[16];
-        *(i16*)from = all ? (i16)box[0] : vmax(left, (i16)box[0]);
-        *(i16*)to = all ? (i16)box[1] : vmin(right, (i16)box[1]);
-        for (int l = 0; l < 16 && row + l <= box[3]; ++l)
+        *(i16*)from = all ? (i16)box.first_column : vmax(left, (i16)box.first_column);
+        *(i16*)to = all ? (i16)box.last_column : vmin(right, (i16)box.last_column);
+        for (int l = 0; l < 16 && row + l <= box.last_row; ++l)
             for (int column = from[l]; column <= to[l]; ++column) take((row + l) * tiles_x + column);
     }
 };

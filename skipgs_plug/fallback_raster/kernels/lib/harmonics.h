@@ -1,5 +1,7 @@
 // Real spherical harmonics up to degree 3 with the signs of 3DGS (Kerbl et al. 2023), in 16 unit directions. Rounded
 // operation by operation, so that every kernel finds the same numbers.
+#pragma once
+#include "simd.h"
 static constexpr float CONSTANT = 0.28209479177387814f;
 static constexpr auto harmonics = [](v16 x, v16 y, v16 z, int degree, v16* basis) INLINE {
 #pragma clang fp contract(off)

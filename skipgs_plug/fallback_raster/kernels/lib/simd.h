@@ -3,10 +3,12 @@
 // Warp compiles kernels with its own Clang, also on machines without a compiler, and takes C++ that may use Clang's
 // vector extension. A value of `v16` holds 16 Gaussians (or 16 neighbouring pixels); arithmetic on it reads like scalar
 // code and becomes one AVX-512 instruction, two of AVX2 or four of SSE or NEON. Scalar Warp code does not vectorise
-// across pixels. The blends keep most values in registers and use as many floats as these hold (`vblock`).
+// across pixels. The blends keep most values in registers and use as many floats as these hold (`vpatch`).
 //
-// A kernel is the body of one function, where C++ allows no other: functions are lambdas without captures. The text of
-// this file comes first in every kernel, the constants of `constants.py` follow by name.
+// Warp puts a kernel's text into the body of one function, where C++ allows no other: functions are lambdas without
+// captures, which an editor reads as a file of its own. The text of this file comes first in every kernel, then follow the
+// constants of `constants.py` and the structs that the kernel takes, by name.
+#pragma once
 
 // Lets Clang fuse a * b + c into one instruction, which is faster and rounds once; Warp leaves it off. It reaches into
 // lambdas but not into member functions, which say it again.
@@ -121,7 +123,7 @@ static constexpr auto interleave3 = [](v16 x, v16 y, v16 z, float* to) INLINE {
 static constexpr auto in_a_row = [](const int* row) INLINE -> bool { return row[15] - row[0] == 15 && row[14] < row[15]; };
 // 16 rows of a list of which `lanes` are left, the last one repeated; and those of the lanes that `mask` has a bit of, put
 // behind the `count` rows of a list.
-static constexpr auto take_rows = [](const int* list, int lanes, int* row) INLINE {
+static constexpr auto next_rows = [](const int* list, int lanes, int* row) INLINE {
     for (int l = 0; l < 16; ++l) row[l] = list[smaller(l, lanes - 1)];
 };
 static constexpr auto append_rows = [](int* list, int& count, const int* row, unsigned mask) INLINE {
@@ -149,7 +151,22 @@ static constexpr auto scatter = [](float* p, const int* row, v16 a, int lanes) {
 // rows lie one after the other it is a quarter of these.
 typedef float v4 __attribute__((ext_vector_type(4), aligned(4)));
 typedef float v2 __attribute__((ext_vector_type(2), aligned(4)));
-static constexpr auto quarters = [](const v16* a, v16* b) INLINE {
+// A row of a few numbers: what the compiler knows the width of needs no loop.
+static constexpr auto copy_row = [](float* to, const float* from, int width) INLINE {
+    switch (width) {
+        case 1: *to = *from; return;
+        case 2: *(v2*)to = *(const v2*)from; return;
+        case 3:
+            *(v2*)to = *(const v2*)from;
+            to[2] = from[2];
+            return;
+        case 4: *(v4*)to = *(const v4*)from; return;
+        default:
+            for (int j = 0; j < width; ++j) to[j] = from[j];
+    }
+};
+// 4 x 4 numbers of each quarter of four vectors.
+static constexpr auto transpose_quarters = [](const v16* a, v16* b) INLINE {
     v16 low[2], high[2];
     for (int i = 0; i < 2; ++i) {
         low[i] = SHUFFLE_QUARTERS(a[2 * i], a[2 * i + 1], 0, 4, 1, 5);
@@ -166,20 +183,20 @@ static constexpr auto join = [](const v4* r) INLINE -> v16 {
     const auto high = __builtin_shufflevector(r[2], r[3], 0, 1, 2, 3, 4, 5, 6, 7);
     return __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
 };
-static constexpr auto fours = [](const float* p, const int* row, int width, v16* columns) INLINE {
+static constexpr auto gather_four_columns = [](const float* p, const int* row, int width, v16* columns) INLINE {
     v16 a[4];
     for (int i = 0; i < 4; ++i) {
         v4 r[4];
         for (int k = 0; k < 4; ++k) r[k] = *(const v4*)(p + row[4 * k + i] * width);
         a[i] = join(r);
     }
-    quarters(a, columns);
+    transpose_quarters(a, columns);
 };
 static constexpr auto gather4 = [](const float* p, const int* row, v16* columns) INLINE {
-    if (!in_a_row(row)) return fours(p, row, 4, columns);
+    if (!in_a_row(row)) return gather_four_columns(p, row, 4, columns);
     v16 rows[4], a[4];
     for (int i = 0; i < 4; ++i) rows[i] = load(p + 4 * row[0] + 16 * i);
-    quarters(rows, a);  // lane 4 q + i has row 4 i + q
+    transpose_quarters(rows, a);  // lane 4 q + i has row 4 i + q
     for (int c = 0; c < 4; ++c)
         columns[c] = __builtin_shufflevector(a[c], a[c], 0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
 };
@@ -197,7 +214,7 @@ static constexpr auto gather3 = [](const float* p, const int* row, int n, v16* c
     }
     if (row[15] + 1 < n) {
         v16 all[4];
-        fours(p, row, 3, all);
+        gather_four_columns(p, row, 3, all);
         for (int c = 0; c < 3; ++c) columns[c] = all[c];
         return;
     }
@@ -221,7 +238,7 @@ static constexpr auto gather2 = [](const float* p, const int* row, v16* columns)
 };
 static constexpr auto scatter_rows = [](float* p, const int* row, int width, const v16* columns, int lanes) INLINE {
     alignas(64) v16 a[4];
-    quarters(columns, a);
+    transpose_quarters(columns, a);
     const float* moved = (const float*)a;
     for (int l = 0; l < lanes; ++l) {
         const float* from = moved + 16 * (l & 3) + 4 * (l >> 2);
@@ -283,7 +300,7 @@ static constexpr auto transpose = [](v16* a) INLINE {
 static constexpr auto exp2 = [](auto t) INLINE {
     using V = decltype(t);
     using I = decltype(t < t);
-    const auto rest = [](V f) INLINE -> V {
+    const auto fraction = [](V f) INLINE -> V {
         V p = 1.327645461e-3f * f + 9.675540368e-3f;
         p = p * f + 5.550713310e-2f;
         p = p * f + 2.402211974e-1f;
@@ -294,13 +311,13 @@ static constexpr auto exp2 = [](auto t) INLINE {
     if constexpr (sizeof(V) == 64) {
         typedef float whole __attribute__((vector_size(64)));
         const V n = __builtin_elementwise_roundeven(t);
-        return (V)__builtin_ia32_scalefps512_mask((whole)rest(t - n), (whole)n, (whole)t, (unsigned short)-1, 4);
+        return (V)__builtin_ia32_scalefps512_mask((whole)fraction(t - n), (whole)n, (whole)t, (unsigned short)-1, 4);
     }
 #endif
     // Adding 1.5 * 2^23 leaves the rounded integer in the low mantissa bits.
     const V magic = (V)12582912.0f;
     const V r = t + magic;
-    return (V)((I)rest(t - (r - magic)) + ((I)r << 23));
+    return (V)((I)fraction(t - (r - magic)) + ((I)r << 23));
 };
 // e^x, with the product by log2(e) in two parts; saturates where float's range ends.
 static constexpr auto vexp = [](v16 x) INLINE -> v16 {

@@ -2,8 +2,10 @@
 //
 // Pairs are dealt into buckets of equal ranges of the depth's bits, and buckets are sorted when their turn comes. Equal
 // depths keep the order of the rows, which is that of the numbers in the lower half.
+#pragma once
+#include "simd.h"
 
-// Pairs in a bucket above which it is dealt again.
+// Pairs in a bucket above which it is dealt again: sorting a bucket takes as many rounds as it has pairs.
 #ifdef __AVX2__
 static constexpr int LARGE = 16;
 #else
@@ -11,15 +13,14 @@ static constexpr int LARGE = 8;  // registers hold two pairs, so that rounds tak
 #endif
 struct SortedTile {
     long long *dealt, *other;  // the tile's pairs in buckets, and as much room again
-    int *records, *places;     // out: record and number of each pair
+    int *record, *pair;        // out: record and number of each pair
     const int* pair_record;
     int count, done, next, shift;  // pairs, those that are sorted, the next bucket, and bits of depth in one
     int bound[BUCKETS + 2];        // where each bucket begins, and the last one ends
 
-    SortedTile(int begin, int end, long long* unsorted, long long* buffer, int* tile_list, int* tile_place,
-               const int* pair_record)
-        : dealt(buffer + begin), other(unsorted + begin), records(tile_list + begin), places(tile_place + begin),
-          pair_record(pair_record), count(end - begin), done(0), next(0) {
+    SortedTile(int begin, int end, const TileLists& lists)
+        : dealt(lists.buffer + begin), other(lists.unsorted + begin), record(lists.tile_record + begin),
+          pair(lists.tile_pair + begin), pair_record(lists.pair_record), count(end - begin), done(0), next(0) {
         // Twice as many buckets as pairs: most of them hold one or none.
         int buckets = 64;
         while (buckets < 2 * count && buckets < BUCKETS) buckets *= 2;
@@ -43,8 +44,8 @@ struct SortedTile {
         const int end = bound[next];
         // A full bucket that was not dealt again holds one depth, in order.
         settle(done, end, smaller(longest, LARGE));
-        for (int i = done; i < end; ++i) places[i] = (int)dealt[i];
-        for (int i = done; i < end; ++i) records[i] = pair_record[places[i]];
+        for (int i = done; i < end; ++i) pair[i] = (int)dealt[i];
+        for (int i = done; i < end; ++i) record[i] = pair_record[pair[i]];
         done = end;
     }
 

@@ -1,5 +1,7 @@
 // What the thread that calls kernels and its helpers share. No line of memory is written to by both at a time, but for
 // `state`, on which they agree.
+#pragma once
+#include "simd.h"
 #if defined(__x86_64__) || defined(__i386__)
 #define PAUSE() __builtin_ia32_pause()
 #elif defined(__aarch64__)
@@ -8,7 +10,7 @@
 #define PAUSE()
 #endif
 
-constexpr unsigned long long OPEN = 1u << 31;  // of a state; below it the helpers that joined, above it the launch
+static constexpr unsigned long long OPEN = 1u << 31;  // of a state; below it the helpers that joined, above it the launch
 
 struct Lock {  // of Python, and its functions, which need no interpreter lock
     void* lock;
@@ -19,7 +21,7 @@ struct Lock {  // of Python, and its functions, which need no interpreter lock
 struct ThreadPool {
     alignas(64) unsigned long long state;
     alignas(64) void (*function)(void*, void*);
-    void *bounds, *block;
+    void *bounds, *arguments;
     int stop;
     alignas(64) int finished;
     int caller_sleeps;

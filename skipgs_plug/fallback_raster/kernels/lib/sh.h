@@ -1,27 +1,36 @@
+// Spherical harmonics of 16 Gaussians: directions, and the coefficients on their way to and from memory.
+#pragma once
 #include "harmonics.h"
-// Unit directions x, y, z from the camera to the Gaussians of 16 rows; norm * shrink is what the distances were multiplied
-// with.
-static constexpr auto directions = [](const float* means, const int* row, int n, const float* camera, v16& x, v16& y,
-                                      v16& z, v16& norm, v16& shrink) INLINE {
+#include "simd.h"
+
+// Unit directions from the camera to the Gaussians of 16 rows; norm * shrink is what the distances were multiplied with.
+struct Directions {
+    v16 x, y, z, norm, shrink;
+};
+static constexpr auto directions = [](const float* means, const int* row, int n, const float* position) INLINE -> Directions {
     v16 mean[3];
     gather3(means, row, n, mean);
-    const v16 dx = mean[0] - camera[0], dy = mean[1] - camera[1], dz = mean[2] - camera[2];
+    const v16 dx = mean[0] - position[0], dy = mean[1] - position[1], dz = mean[2] - position[2];
     // Scaled by the longest side first: the square of a tiny or huge distance would leave float's range.
     const v16 longest = vmax(vabs(dx), vmax(vabs(dy), vabs(dz)));
-    shrink = longest > 1e-30f ? 1.0f / longest : (v16)0.0f;
-    x = dx * shrink, y = dy * shrink, z = dz * shrink;
+    Directions d;
+    d.shrink = longest > 1e-30f ? 1.0f / longest : (v16)0.0f;
+    d.x = dx * d.shrink, d.y = dy * d.shrink, d.z = dz * d.shrink;
     v16 square;
     {
         // Fused by hand, so that both passes get one direction: Clang's choice depends on what stands around.
 #pragma clang fp contract(off)
-        square = __builtin_elementwise_fma(x, x, y * y) + z * z;
+        square = __builtin_elementwise_fma(d.x, d.x, d.y * d.y) + d.z * d.z;
     }
-    norm = 1.0f / vsqrt(vmax(square, (v16)1e-30f));
-    x *= norm, y *= norm, z *= norm;
+    d.norm = 1.0f / vsqrt(vmax(square, (v16)1e-30f));
+    d.x *= d.norm, d.y *= d.norm, d.z *= d.norm;
+    return d;
 };
-// Fetches `count` numbers of row g ahead of their use.
-static constexpr auto fetch_bands = [](const float* p, int g, int stride, int count) INLINE {
-    for (int k = 0; k < count; k += 16) __builtin_prefetch(p + (long long)stride * g + k);
+
+// Fetches the higher bands of row g ahead of their use.
+static constexpr auto fetch_bands = [](const Harmonics& sh, int g) INLINE {
+    const int count = 3 * ((sh.degree + 1) * (sh.degree + 1) - 1);
+    for (int k = 0; k < count; k += 16) __builtin_prefetch(sh.shN + sh.shN_offset + (long long)sh.shN_stride * g + k);
 };
 // `count` numbers of 16 rows, those of row g from p + stride g on, as columns. Rows move as a whole, 16 numbers to a vector,
 // of which the last overlap those before them.
@@ -54,7 +63,7 @@ static constexpr auto put_bands = [](float* p, const int* row, int stride, int c
     }
 };
 // The constant band of 16 rows of `n`.
-static constexpr auto take_constants = [](const float* p, const int* row, int n, int stride, v16* columns) INLINE {
-    if (stride == 3) gather3(p, row, n, columns);
-    else take_bands(p, row, stride, 3, columns);
+static constexpr auto take_constants = [](const Harmonics& sh, const int* row, int n, v16* columns) INLINE {
+    if (sh.sh0_stride == 3) gather3(sh.sh0, row, n, columns);
+    else take_bands(sh.sh0, row, sh.sh0_stride, 3, columns);
 };

@@ -1,21 +1,23 @@
-// The blocks of a tile that the ellipses at ALPHA_MIN of some Gaussians reach, as bits; a little more than exact, because
+// The patches of a tile that the ellipses at ALPHA_MIN of some Gaussians reach, as bits; a little more than exact, because
 // every pixel is tested again.
 //
-// A lane is a Gaussian and a line of blocks. The part of an ellipse inside a line is convex, so it meets the columns between
+// A lane is a Gaussian and a line of patches. The part of an ellipse inside a line is convex, so it meets the columns between
 // its leftmost and its rightmost point: that of the whole ellipse, or as near to it as the line allows.
+#pragma once
+#include "blend_tile.h"
 static constexpr int TESTED = 16 / LINES;  // Gaussians at a time
 #ifdef __AVX512F__
 static constexpr v16 line = {0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f};
 #else
 static constexpr v16 line = {0.f, 1.f, 2.f, 3.f, 4.f, 5.f, 6.f, 7.f, 0.f, 1.f, 2.f, 3.f, 4.f, 5.f, 6.f, 7.f};
 #endif
-static constexpr auto reached_blocks = [](const float* const* r, int x0, int y0, unsigned* reached) INLINE {
+static constexpr auto reached_patches = [](const Record* const* r, int x0, int y0, unsigned* reached) INLINE {
 #pragma clang fp contract(fast)
-    // One value of each record, once for each line.
+    // One field of each record, once for each line.
     auto column = [r](int c) INLINE -> v16 {
 #ifdef __AVX512F__
         v4 of[4];
-        for (int g = 0; g < 4; ++g) of[g] = *(const v4*)(r[g] + c / 4 * 4);
+        for (int g = 0; g < 4; ++g) of[g] = *(const v4*)((const float*)r[g] + c / 4 * 4);
         const v16 all = join(of);
         switch (c % 4) {
             case 0: return __builtin_shufflevector(all, all, 0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12);
@@ -24,20 +26,21 @@ static constexpr auto reached_blocks = [](const float* const* r, int x0, int y0,
             default: return __builtin_shufflevector(all, all, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11, 11, 15, 15, 15, 15);
         }
 #else
-        return __builtin_shufflevector((v8)r[0][c], (v8)r[1][c], 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+        return __builtin_shufflevector((v8)((const float*)r[0])[c], (v8)((const float*)r[1])[c], 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
 #endif
     };
-    const v16 half_h = column(6), slope = column(12), across = column(4), chord = column(15);
-    const v16 extreme = column(13) * column(7), reach = column(14) + 0.01f;
+#define FIELD(name) column(__builtin_offsetof(Record, name) / sizeof(float))
+    const v16 half_h = FIELD(half_height), slope = FIELD(row_slope), across = FIELD(across), chord = FIELD(inverse_along);
+    const v16 extreme = FIELD(column_slope) * FIELD(half_width), reach = FIELD(reach) + 0.01f;
     // From the centre to the first and to the last row of pixels.
-    const v16 first = (float)ROWS * line + (y0 + 0.5f) - column(1);
+    const v16 first = (float)ROWS * line + (y0 + 0.5f) - FIELD(y);
     const v16 low = vmax(first, -half_h), high = vmin(first + (ROWS - 1.0f), half_h);
     const v16 dy_left = vmin(vmax(-extreme, low), high), dy_right = vmin(vmax(extreme, low), high);
     const v16 w_left = across * dy_left, w_right = across * dy_right;
     const v16 half_left = vsqrt(vmax(reach - w_left * w_left, (v16)0.0f));
     const v16 half_right = vsqrt(vmax(reach - w_right * w_right, (v16)0.0f));
-    // In columns of blocks, whose first pixels have their centres at whole numbers.
-    const v16 centre = column(0) - (x0 + 0.5f);
+    // In columns of patches, whose first pixels have their centres at whole numbers.
+    const v16 centre = FIELD(x) - (x0 + 0.5f);
     const v16 left = 0.25f * (centre + slope * dy_left - chord * half_left) - (0.75f + 0.005f);
     const v16 right = 0.25f * (centre + slope * dy_right + chord * half_right) + 0.005f;
     const v16 begin = __builtin_elementwise_ceil(vmax(vmin(left, (v16)4.0f), (v16)0.0f));

@@ -1,0 +1,110 @@
+// Adjoint of blend_forward, back to front, one tile at a time.
+//
+// Reads the lists of its own tiles as far as they were blended, and the gradients of their pixels. Writes the sums of each
+// pair that was blended to a slot of its own, and the number of the slot; nobody else writes there.
+#pragma once
+#include "lib/blend_tile.h"
+#include "lib/patches.h"
+// A Gaussian in a patch on the way back.
+struct Visit : Falloff {
+    vpatch full;  // alpha before it is clamped
+    Visit(const Tile& tile, int patch, const Record& r) : Falloff(tile, patch, r), full(exp2(log2_alpha)) {}
+};
+// A product that Clang does not fuse with the sum around it.
+static constexpr auto rounded_product = [](float a, vpatch b) INLINE -> vpatch {
+#pragma clang fp contract(off)
+    return a * b;
+};
+static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedList& far, const BackwardPairs& pairs,
+                                         const FinalPixels& pixels, const PixelGradients& v_pixels, const PairSlots& slots,
+                                         const Grid& grid, const Channels& channels, int with_transmittance, int parts,
+                                         int optimizations, int first, int last) INLINE {
+    for (int t = first; t < last; ++t) {
+        const Tile tile(t, near.tile_start, grid);
+
+        // behind = (the colour one would see without the current Gaussian and those before it) . v_image, so that it is not
+        // divided by 1 - alpha; at the end of the list that is what alpha and background receive. All are 0 outside the image,
+        // where no list has a Gaussian before its first.
+        alignas(64) vpatch T[PATCHES], behind[PATCHES], v[PATCHES][D];
+        alignas(64) ipatch stop[PATCHES];
+        for (int b = 0; b < PATCHES; ++b) behind[b] = (vpatch)0.0f;
+        for (int q = 0; q < QUADS; ++q) {
+            const Quad quad(tile, q, grid.width);
+            read_patches(v_pixels.image + channels.first, quad, channels.stride, channels.number, v[0], D);
+            read_patches(pixels.transmittance, quad, 1, 1, T, 1);
+            if (with_transmittance) read_patches(v_pixels.transmittance, quad, 1, 1, behind, 1);
+            read_patches((const float*)pixels.pixel_stop, quad, 1, 1, (vpatch*)stop, 1);
+        }
+        unsigned open = 0;  // patches with incoming gradient
+        for (int b = 0; b < PATCHES; ++b) {
+            ipatch wanted = behind[b] != 0.0f;
+            for (int c = 0; c < D; ++c) wanted |= v[b][c] != 0.0f;
+            // A patch without incoming gradient adds exact zeros.
+            if (any(wanted) || !(optimizations & ZERO_GRADIENT)) open |= 1u << b;
+        }
+        // The part of the list that was blended last comes first.
+        for (int part = parts - 1; part >= 0; --part) {
+            const BlendedList& own = part ? far : near;
+            const Record* const records = (const Record*)own.records;
+            const int begin = own.tile_start[t], tile_end = own.tile_stop[t];
+            int slot = pairs.slot_end[part * grid.tiles_x * grid.tiles_y + t];
+            for (int k = tile_end - 1; k >= begin; --k) {
+                __builtin_prefetch(records + pairs.tile_record[larger(k - 8, begin)]);
+                if (!pairs.pair_patches[k]) continue;
+                const Record& r = records[pairs.tile_record[k]];
+                vpatch m[8], abs_x = (vpatch)0.0f, abs_y = (vpatch)0.0f, v_color[D];
+                for (int j = 0; j < 8; ++j) m[j] = (vpatch)0.0f;
+                for (int c = 0; c < D; ++c) v_color[c] = (vpatch)0.0f;
+                unsigned todo = pairs.pair_patches[k] & open;
+                // What the next patch sees is on its way while this one's chain of instructions waits for itself.
+                int b = todo ? __builtin_ctz(todo) : 0;
+                Visit visit(tile, b, r);
+                while (todo) {
+                    todo &= todo - 1;
+                    const int following = todo ? __builtin_ctz(todo) : b;
+                    Visit then = visit;
+                    if (todo) then = Visit(tile, following, r);
+
+                    const ipatch hit = (visit.log2_alpha >= LOG2_ALPHA_MIN) & (stop[b] > k);
+                    const vpatch alpha = hit ? vmin((vpatch)ALPHA_MAX, visit.full) : (vpatch)0.0f;
+                    vpatch shade = r.color[0] * v[b][0];
+                    for (int c = 1; c < D; ++c) shade += r.color[c] * v[b][c];
+                    const vpatch before = T[b] / (1.0f - alpha);  // from behind the Gaussian to before it
+                    // Zero where it was not blended: a store of some lanes only takes long on some processors.
+                    const vpatch weight = alpha * before, less = hit ? behind[b] - shade : (vpatch)0.0f;
+                    T[b] = before;
+                    behind[b] = behind[b] - alpha * less;
+                    // Where alpha is clamped, neither opacity nor shape moves it.
+                    const vpatch v_sigma = visit.full <= ALPHA_MAX ? weight * less : (vpatch)0.0f;
+                    for (int c = 0; c < D; ++c) v_color[c] += weight * v[b][c];
+                    const vpatch v_x = v_sigma * visit.dx, v_y = v_sigma * visit.dy;
+                    m[0] += v_sigma;
+                    m[1] += v_x;
+                    m[2] += v_y;
+                    m[3] += v_x * visit.dx;
+                    m[4] += v_x * visit.dy;
+                    m[5] += v_y * visit.dy;
+                    if (ABSGRAD) {
+                        abs_x += vabs(v_sigma * visit.p);
+                        // One of the products is rounded by itself, with one channel the other than with more: Clang's
+                        // choice of old, kept so that gradients stay equal to the bit.
+                        const vpatch along_y = D == 1 ? r.slant * visit.p + rounded_product(r.across, visit.w)
+                                                      : rounded_product(r.slant, visit.p) + r.across * visit.w;
+                        abs_y += vabs(v_sigma * along_y);
+                    }
+                    visit = then;
+                    b = following;
+                }
+                slots.pair_slot[pairs.tile_pair[k]] = slot--;
+                PairSum& out = ((PairSum*)slots.sums)[slot];
+                // The moments and two channels in one go.
+                static_assert(__builtin_offsetof(PairSum, color) == 6 * sizeof(float), "the channels follow the moments");
+                for (int c = 0; c < D && c < 2; ++c) m[6 + c] = v_color[c];
+                *(v8*)out.moment = sum8(m);
+                for (int c = 2; c < 4; ++c) out.color[c] = c < D ? sum(v_color[c < D ? c : 0]) : 0.0f;
+                out.absolute[0] = ABSGRAD ? r.along * sum(abs_x) : 0.0f;
+                out.absolute[1] = ABSGRAD ? sum(abs_y) : 0.0f;
+            }
+        }
+    }
+};

@@ -1,0 +1,12 @@
+// Gradients of means, rotations, scales and the camera.
+//
+// Reads the gradients of visible rows. Writes `v_gaussians` and the sum `v_poses` of its own block; nobody else writes there.
+#pragma once
+#include "lib/project_adjoint.h"
+static constexpr auto project_adjoint = [](const Gaussians& gaussians, const Camera& camera, const RowList& visible,
+                                           const ProjectedGradients& v_projected, const GaussianGradients& v_gaussians,
+                                           float* v_poses, int n, int with_depth, int antialiased, int with_pose,
+                                           int optimizations, int first, int last) INLINE {
+    project_block_adjoint(first, gaussians, nullptr, camera, visible, v_projected, v_gaussians, nullptr, v_poses, n,
+                          /* raw */ 0, with_depth, antialiased, with_pose, optimizations);
+};

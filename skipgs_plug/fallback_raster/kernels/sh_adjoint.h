@@ -1,0 +1,13 @@
+// Gradients of means, all bands and the camera's position.
+//
+// Reads the gradients of the colours of visible rows. Writes `v_means`, `v_sh` and the sum `v_positions` of its own block;
+// nobody else writes there.
+#pragma once
+#include "lib/sh_adjoint.h"
+static constexpr auto sh_adjoint = [](const float* means, const Harmonics& sh, const RowList& visible, const float* colors,
+                                      const float* v_colors, float* v_means, const HarmonicsGradients& v_sh,
+                                      float* v_positions, int n, int optimizations, int first, int last) INLINE {
+    const FactorOutput no_factors = {nullptr, nullptr};
+    sh_block_adjoint(first, means, sh, visible, colors, v_colors, v_means, v_sh, no_factors, v_positions + 3 * first, n,
+                     /* factored */ 0, /* with_position */ 1, optimizations);
+};

@@ -1,0 +1,40 @@
+// Gradients of raw parameters from the sums of pairs, for one block of rows: what lies between stays in the cache.
+//
+// Reads the slots of the pairs, and parameters and results of the forward pass of visible rows. Writes all gradients of its
+// own block, and adds to `v_centers.absolute`; nobody else writes there.
+#pragma once
+#include "lib/project_adjoint.h"
+#include "lib/reduce_pairs.h"
+#include "lib/sh_adjoint.h"
+static constexpr auto splat_adjoint =
+    [](const PairSums& sums, const Gaussians& gaussians, const float* logits, const Camera& camera, const Harmonics& sh,
+       const Rendered& rendered, const GaussianGradients& v_gaussians, float* v_logits, const HarmonicsGradients& v_sh,
+       const FactorOutput& factors, const CenterGradients& v_centers, int n, int antialiased,
+       int with_centers, int absgrad, int parts, int optimizations, int first, int last) INLINE {
+        // Kernels count rows from the first of all; what a vector reads behind the last one does not matter.
+        alignas(64) float center[2 * BLOCK], conic[3 * BLOCK + 16], alpha[BLOCK], color[3 * BLOCK + 16], magnitude[2 * BLOCK];
+        const auto counted = [=](float* p, int width) INLINE -> float* {
+            return (float*)((unsigned long long)p - sizeof(float) * width * BLOCK * first);
+        };
+        const SplatGradients v_splats = {counted(center, 2), counted(conic, 3), counted(alpha, 1), counted(magnitude, 2),
+                                         counted(color, 3)};
+        if (absgrad) clear(magnitude, 2 * BLOCK);
+        const Channels channels = {/* stride */ 3, /* first */ 0, /* number */ 3};
+        reduce_block_pairs(first, sums, rendered.conics, rendered.opacities, v_splats, n, channels, /* dense */ 0, absgrad,
+                           parts);
+        for (int i = sums.block_start[first]; i < sums.block_start[first + 1]; ++i)
+            for (int j = 0; j < 2; ++j) {
+                if (with_centers) v_centers.centers[2 * i + j] = v_splats.means2d[2 * sums.rows[i] + j];
+                if (absgrad) v_centers.absolute[2 * i + j] += v_splats.absolute[2 * sums.rows[i] + j];
+            }
+        const RowList visible = {sums.rows, sums.block_start};
+        // The layout of raw parameters, in constants.
+        const Harmonics raw_sh = {sh.position, sh.sh0, sh.shN, /* sh0_stride */ 3, sh.shN_stride, /* shN_offset */ 0, sh.degree};
+        sh_block_adjoint(first, gaussians.means, raw_sh, visible, rendered.colors, v_splats.colors, v_gaussians.means, v_sh,
+                         factors, /* v_position */ nullptr, n, v_sh.factored, /* with_position */ 0, optimizations);
+        const ProjectedGradients v_projected = {v_splats.means2d, /* depths */ nullptr, v_splats.conics,
+                                                /* compensations */ nullptr, v_splats.opacities};
+        project_block_adjoint(first, gaussians, logits, camera, visible, v_projected, v_gaussians, v_logits,
+                              /* v_poses */ nullptr, n, /* raw */ 1, /* with_depth */ 0, antialiased, /* with_pose */ 0,
+                              optimizations);
+    };
