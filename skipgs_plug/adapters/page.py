@@ -1,4 +1,4 @@
-"""docs/adapters.md, made of what the adapters say of themselves: `python -m skipgs_plug.adapters.page`."""
+"""docs/adapters.md, made from the declarations of the adapters: `python -m skipgs_plug.adapters.page`."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.registry import builtin_adapters
 from skipgs_plug.core.facts import Densification
 
-HEAD = """# Trainers
+HEAD = """# Supported trainers
 
 *Made by `python -m skipgs_plug.adapters.page > docs/adapters.md` from the adapters' own declarations; a test compares.*
 
-In every trainer only the training backward is gated. Learning rates, SH degree, view order, logging, evaluation,
-saving, prunes and optimizer calls go on in skipped iterations; an optimizer without a gradient does nothing by itself.
-Views are known by image name. A gate that would start while densification still reads gradients is refused.
+In every trainer, only the training backward pass is gated. Learning rates, SH degree, view order, logging, evaluation,
+saving, prunes and optimizer calls continue in skipped iterations. An optimizer without gradients does nothing. Views
+are known by image name. A gate that would start while densification still reads gradients is refused.
 
-`skipgs-plug run NAME -- SCRIPT ...` takes the name, or `auto`, which reads the script and finds it. How each was
-checked beyond its last line stands in [examples/README.md](../examples/README.md).
+`skipgs-plug run NAME -- SCRIPT ...` takes the name, or `auto`, which reads the script and finds the name. The checks
+are described in [examples/README.md](../examples/README.md).
 
-Trainers with a compiled core offer no place to attach to, since loss and backward never pass through Python: Brush
-(Rust), LichtFeld Studio and OpenSplat (C++) and Postshot (closed). The gate cannot be attached to them.
+The gate cannot attach to trainers with a compiled core, because their loss and backward pass never go through Python:
+Brush (Rust), LichtFeld Studio and OpenSplat (C++), and Postshot (closed).
 """
 
-# What `share` does to the densification events of a trainer, by what they need (`Densification.needs`).
+# Effect of `share` on the densification events of a trainer, by their requirement (`Densification.needs`).
 THINNED = {
-    "visits": "Densification events wait until Gaussians have been seen often enough since the one before.",
-    "iterations": "Densification events keep the number of iterations behind them that their thresholds count.",
+    "visits": "Densification events with too few visits of the Gaussians before them are left out.",
+    "iterations": "Densification events keep the number of iterations before them that their thresholds count.",
     "nothing": "All densification events are kept: each adds by a budget, a constant share or a resolution.",
 }
 
@@ -34,13 +34,13 @@ _WRAP = textwrap.TextWrapper(118, subsequent_indent="  ", break_long_words=False
 
 
 def adapters_page() -> str:
-    """The page: for each trainer what is gated, from when on, what is left alone, and with what it was checked."""
+    """Return the page: for each trainer, from when on the gate acts, special behaviour, and the version checked."""
     parts = [HEAD]
     for adapter in builtin_adapters():
         facts = {
             "Gated": adapter.gated,
             "With `share`": adapter.thinned or THINNED.get(getattr(densification(adapter), "needs", ""), ""),
-            "Beside that": adapter.left_alone,
+            "Also": adapter.left_alone,
             "Checked with": f"{adapter.checked}.",
         }
         lines = [_WRAP.fill(f"- **{what}.** {text}") for what, text in facts.items() if text]
@@ -49,7 +49,7 @@ def adapters_page() -> str:
 
 
 def densification(adapter: type[AbstractAdapter]) -> Densification | None:
-    """How the adapter declares densification events, where it does so without a trainer."""
+    """Return how the adapter declares densification events, if it does so without a trainer."""
     return getattr(adapter, "densification", None)
 
 
