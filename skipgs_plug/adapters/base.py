@@ -1,4 +1,4 @@
-"""What an adapter is: one trainer's answers."""
+"""The base class of adapters: one trainer's answers."""
 
 from __future__ import annotations
 
@@ -17,32 +17,33 @@ from skipgs_plug.core.hooks import Hooks
 
 
 class AbstractAdapter(ABC):
-    """Knows one trainer: what its iteration, view, backward and end of densification are called.
+    """Knows one trainer: the names of its iteration, view, backward pass and end of densification.
 
-    It holds no loop and decides nothing. It tells the gate through `Hooks`
-    - once, `ready(TrainerFacts(start_iter, ...))`, at attach or at the latest before the first iteration;
-    - per iteration `iteration(step)`, `view(key)`, and the backward (`gate_tensor_backward`, or a wrapped
+    An adapter has no loop and makes no decisions. It reports to the gate through `Hooks`:
+
+    - once: `ready(TrainerFacts(start_iter, ...))`, at attach, or at the latest before the first iteration;
+    - in each iteration: `iteration(step)`, `view(key)`, and the backward pass (`gate_tensor_backward`, or a wrapped
       method that calls `backward(loss, run)`);
-    - per structural change `event(kind)`.
+    - for each structural change: `event(kind)`.
 
     Args:
         trainer: The object, module or function to attach to; None for a script that is about to run.
 
     Attributes:
-        name: how users call it.
-        project: its name and home, in Markdown, for docs/adapters.md; as are the next two.
-        gated: from when on the gate decides, and what pauses it.
-        thinned: what `share` does to densification, or why nothing; empty where the declared events say it.
-        left_alone: what else is done or left alone in skipped iterations, beyond what holds for every trainer.
-        stand_ins: which of the stand-ins of `skipgs_plug.compat` serve the CUDA modules that its scripts import, for
-            `--cpu`; empty where there are none.
-        checked: upstream version or commit that it was checked with, and in brackets how; part of error messages.
-        saved_state: gives the state of the gate that belongs to the checkpoint which the trainer goes on from,
-            if any; called once, with the first iteration. Set before the gate is made.
-        output_folder: where the trainer writes, as far as it is known.
-        released: why the gate let go of a run that then trained on without it; None where it did not.
-        replaced: names that whoever runs the trainer has replaced around it, for `SkipGate.patched`. Set before the
-            gate is made.
+        name: The name by which users choose the adapter.
+        project: Name and home of the trainer, in Markdown. This and the next three are text of docs/adapters.md.
+        gated: From when on the gate decides, and which changes pause it.
+        thinned: Effect of `share` on densification, or why there is none; empty if the declared events imply it.
+        left_alone: Behaviour in skipped iterations, beyond the rules for every trainer.
+        stand_ins: Family of stand-ins in `skipgs_plug.compat` for the CUDA modules that its scripts import, for
+            `--cpu`; empty if there are none.
+        checked: Upstream version or commit that it was checked with and, in brackets, how. Part of error messages.
+        saved_state: Returns the gate's state of the checkpoint from which the trainer continues, if any. It is called
+            once, with the first iteration. Set it before the gate is created.
+        output_folder: The trainer's output folder, if known.
+        released: Why the gate let go of a run, which then continued without it; None if it did not.
+        replaced: Names that the launcher has replaced around the trainer, for `SkipGate.patched`. Set it before the
+            gate is created.
     """
 
     name: ClassVar[str]
@@ -63,28 +64,28 @@ class AbstractAdapter(ABC):
     @classmethod
     @abstractmethod
     def matches(cls, trainer: Any) -> bool:
-        """Whether this is the trainer that the adapter knows. Imports nothing of it."""
+        """Return whether this is the trainer that the adapter knows, without importing the trainer."""
 
     @classmethod
     def recognises_script(cls, code: LoopCode) -> bool:
-        """Whether a training script with these names is of the trainer that the adapter knows."""
+        """Return whether a training script with these names belongs to the trainer that the adapter knows."""
         return False
 
     @classmethod
     def stand_ins_for(cls, command: Sequence[str]) -> str:
-        """Which stand-ins serve a script with this command line; see `stand_ins`."""
+        """Return the family of stand-ins for a script with this command line; see `stand_ins`."""
         return cls.stand_ins
 
     @abstractmethod
     def attach(self, hooks: Hooks) -> None:
-        """Hold on to `self.trainer`, which exists and has not begun training.
+        """Attach to `self.trainer`, which has not begun training.
 
         Raises:
             AdapterMismatchError: An expected name is missing.
         """
 
     def attach_script(self, hooks: Hooks) -> None:
-        """Hold on to a training script that is about to run in this process.
+        """Attach to a training script that is about to run in this process.
 
         Its file is `sys.argv[0]`, its folder is first on `sys.path`, and none of its modules is imported yet.
         """
@@ -102,20 +103,20 @@ class AbstractAdapter(ABC):
         hooks.wrap(owner, method, begins)
 
     def must_run(self, step: int) -> bool:
-        """Whether skipping is forbidden in this iteration, whose loss is not to be recorded either."""
+        """Return whether this iteration must not be skipped. Its loss is not recorded either."""
         return False
 
     def optimizers(self) -> Iterable[torch.optim.Optimizer]:
-        """Optimizers whose learning rates may be scaled, where the trainer knows them; see `Hooks.own_loop`."""
+        """Return the optimizers whose learning rates may be scaled, if the trainer knows them; see `Hooks.own_loop`."""
         return ()
 
     def timing(self) -> Times | None:
-        """Seconds of training, when the trainer keeps them itself."""
+        """Return the seconds of training, if the trainer measures them itself."""
         return None
 
 
 def gate_backwards_only(hooks: Hooks, adapter: AbstractAdapter) -> None:
-    """Refuse settings that leave out whole iterations, for a trainer whose loop is not counted with a range.
+    """Refuse settings that leave out whole iterations, for a trainer whose loop does not count with a range.
 
     Raises:
         SkipGSError: There are such settings.
@@ -128,7 +129,7 @@ def gate_backwards_only(hooks: Hooks, adapter: AbstractAdapter) -> None:
 
 
 def release(hooks: Hooks, adapter: AbstractAdapter, reason: str) -> None:
-    """Take the gate off a run that goes on without it, and say why: an error would throw away what was trained."""
+    """Take the gate off a run, which continues without it, and warn why. An error would lose the trained model."""
     hooks.restore()
     adapter.released = reason
     warnings.warn(reason, RuntimeWarning, stacklevel=3)
@@ -136,9 +137,9 @@ def release(hooks: Hooks, adapter: AbstractAdapter, reason: str) -> None:
 
 @contextmanager
 def released_on_error(hooks: Hooks, adapter: AbstractAdapter) -> Iterator[None]:
-    """Release the gate when the adapter's own code fails, so that no run is lost to it.
+    """Release the gate when the adapter's own code fails, so that no run is lost to the gate.
 
-    A refusal ends the script, as long as nothing is trained; of a gate that is off, it ends nothing at all.
+    A refusal ends the script only while nothing is trained. A gate that is off never ends a script.
 
     Raises:
         SkipGSError: The gate is on, and refuses this run in its first iteration.

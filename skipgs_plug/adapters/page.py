@@ -16,6 +16,10 @@ In every trainer, only the training backward pass is gated. Learning rates, SH d
 saving, prunes and optimizer calls continue in skipped iterations. An optimizer without gradients does nothing. Views
 are known by image name. A gate that would start while densification still reads gradients is refused.
 
+With `share`, densification events are left out *by visits*, when the Gaussians were seen too seldom before them, or *by
+iterations*, when fewer iterations ran before them than their thresholds count. All events are kept where each one adds
+by a budget, a constant share or a resolution.
+
 `skipgs-plug run NAME -- SCRIPT ...` takes the name, or `auto`, which reads the script and finds the name. The checks
 are described in [examples/README.md](../examples/README.md).
 
@@ -24,11 +28,7 @@ Brush (Rust), LichtFeld Studio and OpenSplat (C++), and Postshot (closed).
 """
 
 # Effect of `share` on the densification events of a trainer, by their requirement (`Densification.needs`).
-THINNED = {
-    "visits": "Densification events with too few visits of the Gaussians before them are left out.",
-    "iterations": "Densification events keep the number of iterations before them that their thresholds count.",
-    "nothing": "All densification events are kept: each adds by a budget, a constant share or a resolution.",
-}
+THINNED = {"visits": "By visits.", "iterations": "By iterations.", "nothing": "All events are kept."}
 
 _WRAP = textwrap.TextWrapper(118, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 

@@ -1,4 +1,4 @@
-"""Which adapters there are, and which one fits a trainer."""
+"""The registry of adapters, and the choice of the one that fits a trainer."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _registered: dict[str, type[AbstractAdapter]] = {}
 
 
 def register_adapter(adapter: type[AbstractAdapter]) -> type[AbstractAdapter]:
-    """Add an adapter of your own; works as a class decorator. It is asked before the built-in ones.
+    """Add an adapter of your own, as a class decorator. It is tried before the built-in adapters.
 
     Raises:
         SkipGSError: It has no name, or the name is taken.
@@ -67,15 +67,15 @@ def register_adapter(adapter: type[AbstractAdapter]) -> type[AbstractAdapter]:
 
 
 def adapter_names() -> list[str]:
-    """Names of all adapters, those of users first."""
+    """Return the names of all adapters, those of users first."""
     return [*_registered, *BUILTIN]
 
 
 def get_adapter(name: str) -> type[AbstractAdapter]:
-    """Return the adapter class of that name.
+    """Return the adapter class with that name.
 
     Raises:
-        UnknownTrainerError: There is none.
+        UnknownTrainerError: No adapter has that name.
     """
     if name in _registered:
         return _registered[name]
@@ -88,12 +88,12 @@ def get_adapter(name: str) -> type[AbstractAdapter]:
 
 
 def builtin_adapters() -> Iterator[type[AbstractAdapter]]:
-    """The adapters of this package, in the order in which they are asked."""
+    """Return the adapters of this package, in the order in which they are tried."""
     return map(_load, BUILTIN.values())
 
 
 def find_adapter(trainer: Any, name: str | None = None) -> AbstractAdapter:
-    """Return the adapter for a trainer (None: for a script), by name or by asking all in order.
+    """Return the adapter for a trainer (None: for a script), by name or by trying all in order.
 
     Raises:
         UnknownTrainerError: No adapter knows it.
@@ -111,7 +111,7 @@ def find_adapter(trainer: Any, name: str | None = None) -> AbstractAdapter:
 
 
 def find_script_adapter(script: Path) -> type[AbstractAdapter]:
-    """Return the adapter for a training script, by the names in it; the script is not run.
+    """Return the adapter for a training script, by the names in its source. The script does not run.
 
     Raises:
         UnknownTrainerError: No adapter knows it.

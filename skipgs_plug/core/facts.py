@@ -10,16 +10,16 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class Densification:
-    """How a trainer's densification events are told from other iterations, and what they need behind them.
+    """How to recognise a trainer's densification events, and how many iterations they need before them.
 
     Args:
-        marks: Names in a condition of the loop on its number that make it the condition of densification, such as
+        marks: Names that identify the condition of densification among the loop's conditions on its number, such as
             `densification_interval`.
-        numbers: Gives the iterations with an event, of a range of them, where a strategy object decides by itself.
-        needs: What must stand behind an event that is kept. "visits": enough visits of each Gaussian for a mean over
-            them, or as many iterations as in the trainer's own schedule; events with less behind them are left out.
-            "iterations": as many iterations as in the trainer's own schedule, for thresholds on counts of visits.
-            "nothing": every event is kept, for growth by a budget or by a constant share per event.
+        numbers: Returns the iterations with an event out of a range, if a strategy object decides by itself.
+        needs: Requirement for an event to be kept. "visits": enough visits of each Gaussian before it for a mean over
+            them, or as many iterations as in the trainer's own schedule; other events are left out. "iterations": as
+            many iterations as in the trainer's own schedule, for thresholds on counts of visits. "nothing": every
+            event is kept, for growth by a budget or by a constant share per event.
     """
 
     marks: tuple[str, ...] = ()
@@ -29,21 +29,22 @@ class Densification:
 
 @dataclass(frozen=True)
 class TrainerFacts:
-    """What an adapter tells through `Hooks.ready`; everything but the first may stay unknown.
+    """Facts that an adapter passes to `Hooks.ready`. All but the first may stay unknown.
 
     Args:
-        start_iter: First iteration after densification, in the trainer's counting; None when it has no
-            densification to end. Used when the settings give none.
+        start_iter: First iteration after densification, counted like the trainer does; None if it does not densify.
+            It is used if the settings do not give one.
         view_names: Keys of all training views, checked for uniqueness.
         epoch: Number of iterations in which every view comes up once; None if an iteration shows one of `view_names`.
-        max_steps: Last iteration; a gate that starts after it is worth a warning.
-        world_size: Number of processes, when the trainer knows better than WORLD_SIZE.
-        gradients_read_until: Before this iteration more than the optimizers reads gradients, densification
-            say, so that a gate which the user starts earlier is refused.
-        accumulates: Optimizers step every so many iterations on what gathered in between, however many of
-            these ran: nothing is to be made up for.
-        densification: Its events, for a growing phase with fewer iterations; None if growth must run whole.
-        defaults: Settings that suit this trainer, used where the user gave none.
+        max_steps: Last iteration. A gate that starts after it gives a warning.
+        world_size: Number of processes, if the trainer knows better than WORLD_SIZE.
+        gradients_read_until: Until this iteration, code other than the optimizers reads gradients, such as
+            densification. A gate that the user starts earlier is refused.
+        accumulates: Optimizers step on gradients that are accumulated over a fixed number of iterations. The number
+            of steps does not change when iterations are left out, so steps are not made larger.
+        densification: The densification events, for a growing phase with fewer iterations; None if that phase must
+            run whole.
+        defaults: Settings that suit this trainer. They are used where the user gave none.
     """
 
     start_iter: int | None

@@ -59,14 +59,13 @@ class Adapter(Protocol):
 
 
 class Hooks:
-    """Tells a gate what a trainer does: iterations, views, backwards, structural changes.
+    """Reports to a gate what a trainer does: iterations, views, backward passes, structural changes.
 
-    An iteration opens a window, the first training backward in it is gated, and any further one passes
-    through and counts as a mismatch.
+    The first training backward pass of an iteration is gated. Any further one runs and counts as a mismatch.
     """
 
     def __init__(self, engine: Engine, adapter: Adapter, given: frozenset[str]) -> None:
-        """Make hooks for an adapter; `given` names the settings that the user gave."""
+        """Create hooks for an adapter; `given` has the names of the settings that the user gave."""
         self._engine = engine
         self._adapter = adapter
         self._given = given
@@ -77,15 +76,15 @@ class Hooks:
         self._iteration = engine.iteration
         self._iterations = 0
         self._backwards = 0
-        self._odd_iterations = 0  # those with another number of backwards than one, so far
+        self._odd_iterations = 0  # iterations with a number of backward passes other than one, so far
 
-    # What the adapter learns, at attach or when training begins.
+    # Facts, at attach or when training begins.
 
     def ready(self, facts: TrainerFacts) -> None:
-        """Give what must be known before the first iteration.
+        """Pass on the facts that must be known before the first iteration.
 
         Raises:
-            SkipGSError: As `Engine.configure`.
+            SkipGSError: The settings do not fit the trainer; see `Engine.configure`.
         """
         with self._releasing_on_error(None):
             self._engine.configure(facts, self._given)
@@ -95,10 +94,10 @@ class Hooks:
                 self.on_detach("torch.optim.Optimizer.step (hooks)", self._engine.release)
             self._ready = True
 
-    # What the trainer does.
+    # Reports during training.
 
     def iteration(self, step: int) -> None:
-        """Iteration `step` begins: its first training backward will be gated."""
+        """Begin iteration `step`: its first training backward pass will be gated."""
         if self._released:
             return
         step = int(step)  # a NumPy number would get into saved states
@@ -112,26 +111,26 @@ class Hooks:
             self._engine.open_iteration(step)
 
     def view(self, key: Any) -> None:
-        """The present iteration renders this view for training; the last one before the backward counts.
+        """Report the view that the present iteration trains on. The last report before the backward pass counts.
 
         Args:
-            key: As for `SkipGate.backward`; or a function that gives it, called in gated iterations only, for
-                a key that has to be read from the device.
+            key: A key as for `SkipGate.backward`, or a function that returns it. The function is called in gated
+                iterations only, for a key that must be read from the device.
         """
         self._iteration.view = key
 
     def signal(self, value: float | torch.Tensor) -> None:
-        """Decide on this value in the present iteration, instead of on the loss that is backpropagated."""
+        """Decide by this value in the present iteration, instead of by the loss."""
         self._iteration.signal = value
 
     def event(self, kind: str) -> None:
-        """A structural change (prune, opacity reset, optimizer rebuild) happens now; before training none counts."""
+        """Report a structural change (prune, opacity reset, new optimizer). Changes before training do not count."""
         step = self._iteration.step
         if self._engine.policy is not None and step is not None:
             self._engine.notify_event(kind, step)
 
     def backward(self, loss: torch.Tensor, run: Callable[[], Any], view: Any = None) -> Any:
-        """Gate a training backward: `run()` is the real one, and is called unless it is skipped."""
+        """Gate a training backward pass: call `run()`, which runs it, unless it is skipped."""
         if self._released:
             return run()
         call = _Call(run)
@@ -139,7 +138,7 @@ class Hooks:
             if not self._is_training_backward():
                 return call()
             self._gate(loss, view, call)
-        # A gate that gave up before it decided owes the trainer its backward.
+        # If the gate let go before it decided, the backward pass must still run.
         return call() if self._released and not (call.made or self._iteration.skipped) else None
 
     def _is_training_backward(self) -> bool:
@@ -166,7 +165,7 @@ class Hooks:
             view = view() if self._engine.active else "not read"
         self._engine.gate(view_key(view), loss if now.signal is None else now.signal, call, loss, alone=True)
 
-    # How to hold on to the trainer.
+    # Ways to attach to the trainer.
 
     def wrap(self, owner: Any, name: str, around: Around) -> None:
         """Call `around(original, *args, **kwargs)` in place of `owner.name`; see `Patches.wrap`."""
@@ -182,12 +181,12 @@ class Hooks:
         self.wrap(owner, name, around)
 
     def events(self, owner: Any, *names: str) -> None:
-        """Report each call of these methods as a structural change of that name."""
+        """Report each call of these methods as a structural change with the method's name."""
         for name in names:
             self.before(owner, name, lambda *args, _kind=name, **kwargs: self.event(_kind))
 
     def suppress_on_skip(self, owner: Any, *names: str) -> None:
-        """Leave out calls of these methods in iterations whose backward was skipped.
+        """Suppress calls of these methods in iterations whose backward pass was skipped.
 
         For side effects that belong to a gradient step but need no gradient, such as position noise.
         """
@@ -207,19 +206,19 @@ class Hooks:
         densification: Densification | None = None,
         known: Known | None = None,
     ) -> None:
-        """The training loop counts with `range` in one of these functions: iterations can be left out there.
+        """Name the functions whose loop over `range` may be the training loop, so that iterations can be left out.
 
         Iterations that the loop's own conditions name (`if iteration % 1000 == 0`) always run.
 
         Args:
             names: Global names of the functions' module; `script_globals` for a script that is about to run.
             functions: Names of the functions.
-            always: Gives further iterations, of a range of them, that must run: what depends on their numbers
-                in functions that the loop calls.
-            pure: Functions that only look at numbers, and may stand in the loop's conditions.
-            densification: How its densification events are told, where `ready` comes after the loop has begun.
-            known: Is given all that the loop's function has names for, right before its conditions are read; gives the
-                values of names that the loop assigns, where they are known before.
+            always: Returns further iterations out of a range that must run, because functions that the loop calls
+                depend on their numbers.
+            pure: Functions that only read numbers, and may occur in the loop's conditions.
+            densification: How to recognise densification events, if `ready` comes after the loop has begun.
+            known: Receives all names of the loop's function right before its conditions are read, and returns values
+                of names that the loop assigns, if they are known before.
         """
         pace = self._engine.pace
         if isinstance(pace, Phased):
@@ -227,7 +226,7 @@ class Hooks:
             replace_range(self._patches, names, functions, pace)
 
     def always(self, always: Always) -> None:
-        """Iterations that must run, as for `loop`, where the loop is the user's own."""
+        """Name iterations that must run, as for `loop`, if the loop is the user's own."""
         self._engine.pace.describe(always)
 
     def require(self, number: int) -> None:
@@ -238,16 +237,16 @@ class Hooks:
         self._engine.pace.require(number)
 
     def optimizer_names(self, named: Named) -> None:
-        """`named` gives the trainer's optimizers by name, which tell parameters apart where groups have no names.
+        """Set the function that returns the trainer's optimizers by name. Names identify groups that have none.
 
-        The learning rates of these are scaled, and of no others.
+        Only the learning rates of these optimizers are scaled.
         """
         self._engine.rates.only = named
 
     def own_loop(self, owner: Any, name: str, always: Always | None = None) -> None:
-        """`owner.name(...)` gives the range that the training loop counts with; `always` gives those that must run.
+        """Use the range that `owner.name(...)` returns as that of the training loop; `always` as for `loop`.
 
-        The learning rates of the adapter's `optimizers` are scaled, and of no others.
+        Only the learning rates of the adapter's `optimizers` are scaled.
         """
         self._engine.rates.only = self._adapter.optimizers
         pace = self._engine.pace
