@@ -16,6 +16,7 @@ PAGES = (
     "examples/*.md",
     "examples/*.py",
     "tests/SITUATIONS.md",
+    "benchmarks/*.py",
     "benchmarks/notes/*.md",
     "benchmarks/results/**/table.md",
     "benchmarks/results/**/*.png",
