@@ -22,7 +22,7 @@ class GaussianSpa(InriaFamily):
     project = "[GaussianSpa](https://github.com/noodle-lab/GaussianSpa)"
     gated = "From `optimizing_spa_stop_iter` + 1 on, after a pause for the prune in the iteration before."
     thinned = (
-        "Densification events wait until Gaussians have been seen often enough. The sparsifying phase runs "
+        "By visits. The sparsifying phase runs "
         "whole: its terms pull at the model, and the iterations between them pull back."
     )
     left_alone = (

@@ -32,7 +32,7 @@ class GNS(InriaFamily):
         "`densify_until_iter` on. `train-fast.py`: from `e2` + 1 (10,001) on."
     )
     thinned = (
-        "All densification events are kept: each adds by a budget. The selection runs whole: its term would "
+        "All events are kept. The selection runs whole: its term would "
         "act alone where the iterations between are left out. `train-fast.py` densifies whole, in iterations "
         "500 to 7,000."
     )

@@ -16,10 +16,7 @@ class GOF(InriaFamily):
     checked = "autonomousvision/gaussian-opacity-fields 5245b20 (its loop read, and a look-alike: no stand-in)"
     project = "[GOF](https://github.com/autonomousvision/gaussian-opacity-fields)"
     gated = "From `densify_until_iter` on; decided on the whole loss, with normals and distortion."
-    thinned = (
-        "Densification events wait until Gaussians have been seen often enough. Pictures for inspection, "
-        "which come with them every 100 iterations, are left out with them."
-    )
+    thinned = "By visits. Pictures for inspection, which come with them every 100 iterations, are left out with them."
     left_alone = (
         "The 3D filter is computed anew every hundredth iteration, skipped or not: where nothing moved it is what it "
         "was. Needs CUDA: `--cpu` has no stand-in for its rasterizer."

@@ -37,10 +37,7 @@ class GsplatRunner(AbstractAdapter):
     checked = "nerfstudio-project/gsplat v1.5.3 and v1.6.0 90d7b4b3 (its script, run on the CPU)"
     project = "[gsplat, `examples/simple_trainer.py`](https://github.com/nerfstudio-project/gsplat)"
     gated = "From `strategy.refine_stop_iter` on (15,000, for MCMC 25,000)."
-    thinned = (
-        "Densification events wait until Gaussians have been seen often enough; those of MCMC are all kept. "
-        "Opacity resets happen as often as ever."
-    )
+    thinned = "By visits; those of MCMC are all kept. Opacity resets happen as often as ever."
     left_alone = (
         "MCMC's position noise is left out where the gradient step is: alone it is a random walk. Batches of several "
         "images have one joint loss and so one mean. Once `--post_processing ppisp` freezes the Gaussians, every "

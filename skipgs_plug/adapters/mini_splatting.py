@@ -25,7 +25,7 @@ class MiniSplatting(InriaFamily):
         "which does not simplify: from `densify_until_iter` on."
     )
     thinned = (
-        "Densification events wait until Gaussians have been seen often enough; views in which Gaussians are "
+        "By visits; views in which Gaussians are "
         "blurred are gathered until the next event. Points are made anew from depths, and both "
         "simplifications happen, as ever."
     )

@@ -23,8 +23,7 @@ class MiniSplatting2(InriaFamily):
         "views, after a pause for it."
     )
     thinned = (
-        "Densification events wait until Gaussians have been seen often enough. Clones by importance every "
-        "250 iterations, points from depths and simplifications happen as ever."
+        "By visits. Clones by importance every 250 iterations, points from depths and simplifications happen as ever."
     )
     left_alone = "Its sparse Adam has no gradients in skipped iterations. Needs CUDA: its culling has no stand-in."
     mark = "depth_reinit"

@@ -22,7 +22,7 @@ class PerceptualGS(InriaFamily):
         "have alpha, prunes every hundredth iteration pause the gate until the end."
     )
     thinned = (
-        "Densification events wait until Gaussians have been seen often enough. Those that read weights of "
+        "By visits. Events that read weights of "
         "all views (every 1,000 and 1,500 iterations) happen as ever; with images that have alpha all do."
     )
     left_alone = "Renders of sensitivity and alpha are of the same view, and belong to its loss."

@@ -26,7 +26,7 @@ class ReferenceTrainer(AbstractAdapter):
     checked = "the trainer of this package (itself, on the CPU, by the tests)"
     project = "this package's own trainer"
     gated = "From the end of densification on."
-    thinned = "Densification events wait until Gaussians have been seen often enough; those of MCMC are all kept."
+    thinned = "By visits; those of MCMC are all kept."
     left_alone = "Gate state travels in its snapshots and checkpoints."
 
     @classmethod
