@@ -68,12 +68,14 @@ HOOKS = {
     "iteration": "(self, step: 'int') -> 'None'",
     "loop": (
         "(self, names: 'dict[str, Any]', *functions: 'str', always: 'Always | None' = None, "
-        "pure: 'Iterable[str]' = (), densification: 'Densification | None' = None) -> 'None'"
+        "pure: 'Iterable[str]' = (), densification: 'Densification | None' = None, "
+        "known: 'Known | None' = None) -> 'None'"
     ),
     "number": "(self, counted: 'int') -> 'int'",
     "on_detach": "(self, label: 'str', undo: 'Callable[[], None]') -> 'None'",
     "own_loop": "(self, owner: 'Any', name: 'str', always: 'Always | None' = None) -> 'None'",
     "optimizer_names": "(self, named: 'Named') -> 'None'",
+    "require": "(self, number: 'int') -> 'None'",
     "ready": "(self, facts: 'TrainerFacts') -> 'None'",
     "restore": "(self) -> 'None'",
     "signal": "(self, value: 'float | torch.Tensor') -> 'None'",
@@ -154,6 +156,7 @@ def test_what_adapters_are_written_with() -> None:
         "project",
         "gated",
         "left_alone",
+        "thinned",
         "saved_state",
         "output_folder",
         "released",
