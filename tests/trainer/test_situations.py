@@ -146,7 +146,11 @@ def test_camera_keys(keys: dict, model: str, parameters: list[float]) -> None:
 
 
 @pytest.mark.parametrize(
-    "keys", [{"rolling_shutter": [0, 0, 0.1, 0]}, {"latlong": True}, {"ftheta_p1": 0.3}, {"b1": 2.0}, {"k5": 0.1}]
+    "keys",
+    [
+        *({"rolling_shutter": [0, 0, 0.1, 0]}, {"latlong": True}, {"ftheta_p1": 0.3}, {"b1": 2.0}, {"k5": 0.1}),
+        *({"white_transparent": True}, {"mask_color": "0x00ff00"}, {"from_mitsuba": True}),
+    ],
 )
 def test_keys_that_change_the_picture_are_refused(keys: dict) -> None:
     with pytest.raises(InputError, match=f"{next(iter(keys))} is .*not supported"):
