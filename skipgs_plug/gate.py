@@ -15,13 +15,13 @@ from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
-from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Adapter, Hooks
 from skipgs_plug.core.optimizers import listed, step_pending
 from skipgs_plug.core.pace.loop_range import LoopRange
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.report import build_report, counters, summarise
 from skipgs_plug.core.trace import TraceRow
+from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.core.views import view_key
 
 
@@ -108,7 +108,7 @@ class SkipGate:
             raise SkipGSError("SkipGate needs a trainer, or start_iter=, the iteration at which densification ends.")
         else:
             self._engine = Engine(settings, policy, record_trace)
-            self._engine.configure(TrainerFacts(0 if policy is None else policy.start_iter))
+            self._engine.configure(TrainerInfo(0 if policy is None else policy.start_iter))
         self._iteration = self._engine.iteration
 
     # Verbs for a loop of your own.

@@ -10,7 +10,7 @@ import torch
 
 import skipgs_plug
 from skipgs_plug import SkipConfig, SkipGate, adapters
-from skipgs_plug.adapters import AbstractAdapter, Hooks, TrainerFacts
+from skipgs_plug.adapters import AbstractAdapter, Hooks, TrainerInfo
 from skipgs_plug.core.policy import Policy, SkipPolicy
 
 NAMES = {
@@ -76,7 +76,7 @@ HOOKS = {
     "own_loop": "(self, owner: 'Any', name: 'str', always: 'Always | None' = None) -> 'None'",
     "optimizer_names": "(self, named: 'Named') -> 'None'",
     "require": "(self, number: 'int') -> 'None'",
-    "ready": "(self, facts: 'TrainerFacts') -> 'None'",
+    "ready": "(self, info: 'TrainerInfo') -> 'None'",
     "restore": "(self) -> 'None'",
     "signal": "(self, value: 'float | torch.Tensor') -> 'None'",
     "suppress_on_skip": "(self, owner: 'Any', *names: 'str') -> 'None'",
@@ -147,7 +147,7 @@ def test_gate_verbs_and_their_signatures() -> None:
 
 
 def test_what_adapters_are_written_with() -> None:
-    assert set(adapters.__all__) == {"AbstractAdapter", "Hooks", "TrainerFacts", "register_adapter"}
+    assert set(adapters.__all__) == {"AbstractAdapter", "Hooks", "TrainerInfo", "register_adapter"}
     assert signatures(AbstractAdapter) == ADAPTER
     assert AbstractAdapter.__abstractmethods__ == {"attach", "matches"}
     assert set(AbstractAdapter.__annotations__) == {
@@ -156,7 +156,7 @@ def test_what_adapters_are_written_with() -> None:
         "project",
         "gated",
         "left_alone",
-        "thinned",
+        "with_share",
         "saved_state",
         "output_folder",
         "released",
@@ -165,7 +165,7 @@ def test_what_adapters_are_written_with() -> None:
     }
     assert signatures(Hooks) == HOOKS
     assert properties(Hooks) == {"gap", "patched", "state", "trained"}
-    assert str(inspect.signature(TrainerFacts)) == FACTS
+    assert str(inspect.signature(TrainerInfo)) == FACTS
     assert str(inspect.signature(adapters.register_adapter)) == (
         "(adapter: 'type[AbstractAdapter]') -> 'type[AbstractAdapter]'"
     )

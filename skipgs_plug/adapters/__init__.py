@@ -2,7 +2,7 @@
 
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.registry import register_adapter
-from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import TrainerInfo
 
-__all__ = ["AbstractAdapter", "Hooks", "TrainerFacts", "register_adapter"]
+__all__ = ["AbstractAdapter", "Hooks", "TrainerInfo", "register_adapter"]

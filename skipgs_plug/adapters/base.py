@@ -21,7 +21,7 @@ class AbstractAdapter(ABC):
 
     An adapter has no loop and makes no decisions. It reports to the gate through `Hooks`:
 
-    - once: `ready(TrainerFacts(start_iter, ...))`, at attach, or at the latest before the first iteration;
+    - once: `ready(TrainerInfo(start_iter, ...))`, at attach, or at the latest before the first iteration;
     - in each iteration: `iteration(step)`, `view(key)`, and the backward pass (`gate_tensor_backward`, or a wrapped
       method that calls `backward(loss, run)`);
     - for each structural change: `event(kind)`.
@@ -33,7 +33,7 @@ class AbstractAdapter(ABC):
         name: The name by which users choose the adapter.
         project: Name and home of the trainer, in Markdown. This and the next three are text of docs/adapters.md.
         gated: From when on the gate decides, and which changes pause it.
-        thinned: Effect of `share` on densification, or why there is none; empty if the declared events imply it.
+        with_share: Effect of `share` on densification, or why there is none; empty if the declared events imply it.
         left_alone: Behaviour in skipped iterations, beyond the rules for every trainer.
         stand_ins: Family of stand-ins in `skipgs_plug.compat` for the CUDA modules that its scripts import, for
             `--cpu`; empty if there are none.
@@ -50,7 +50,7 @@ class AbstractAdapter(ABC):
     checked: ClassVar[str]
     project: ClassVar[str] = ""
     gated: ClassVar[str] = ""
-    thinned: ClassVar[str] = ""
+    with_share: ClassVar[str] = ""
     left_alone: ClassVar[str] = ""
     stand_ins: ClassVar[str] = ""
     saved_state: Callable[[int], dict[str, Any] | None] | None = None

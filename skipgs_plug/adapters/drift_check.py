@@ -55,10 +55,10 @@ def _like(optimizers: list[torch.optim.Optimizer]) -> tuple[list[str], list[Tens
     """Name of the group of each parameter, and sum and norm of each parameter [2], where they lie."""
     names, sums = [], []
     for optimizer in optimizers:
-        for place, group in enumerate(optimizer.param_groups):
+        for index, group in enumerate(optimizer.param_groups):
             for param in group["params"]:
                 values = param.detach()
-                names.append(str(group.get("name", place)))
+                names.append(str(group.get("name", index)))
                 sums.append(torch.stack([values.sum(), torch.linalg.vector_norm(values)]).double())
     return names, sums
 

@@ -11,8 +11,8 @@ from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, rele
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
-from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.core.views import view_key
 
 MODULE, STEP = "source.trainer", "train_step_gs"
@@ -30,7 +30,7 @@ class EDGS(AbstractAdapter):
     checked = "CompVis/EDGS eb21ad5 (its loop read, and a look-alike)"
     project = "[EDGS](https://github.com/CompVis/EDGS)"
     gated = "From `gs.opt.densify_until_iter` on: until then it densifies, or prunes after every iteration."
-    thinned = "Refused: whole iterations cannot be left out."
+    with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
         "Whole iterations cannot be left out: its loop counts with tqdm's `trange`. Needs CUDA: its initialization "
         "matches images with a network."
@@ -75,4 +75,4 @@ class EDGS(AbstractAdapter):
         self.output_folder = getattr(trainer.scene, "model_path", None)
         end = int(trainer.training_config.densify_until_iter)
         views = [view_key(camera.image_name) for camera in trainer.scene.getTrainCameras()]
-        hooks.ready(TrainerFacts(end, view_names=views, gradients_read_until=end))
+        hooks.ready(TrainerInfo(end, view_names=views, gradients_read_until=end))

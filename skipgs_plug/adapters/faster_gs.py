@@ -10,8 +10,8 @@ from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, rele
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
-from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import TrainerInfo
 
 MODULE, LOOP = "Methods.FasterGS.Trainer", "training_iteration"
 EXPECTED = (LOOP, "renderer", "model", "DENSIFICATION_END_ITERATION", "NUM_ITERATIONS")
@@ -37,7 +37,7 @@ class FasterGS(AbstractAdapter):
         "From `DENSIFICATION_END_ITERATION` + 1 on. With Speedy-Splat's pruning each later prune pauses the gate. As "
         "in a shell: `skipgs-plug run faster_gs -- scripts/train.py -c config.yaml`, in the folder of NeRFICG."
     )
-    thinned = "Refused: whole iterations cannot be left out."
+    with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
         "MCMC's position noise is left out where the gradient step is. Whole iterations cannot be left out: its "
         "callbacks hang on their numbers. Views are known by their frame's number. Needs CUDA: `--cpu` has no stand-in."
@@ -81,4 +81,4 @@ class FasterGS(AbstractAdapter):
         hooks.gate_tensor_backward(LOOP)
         self.output_folder = str(trainer.output_directory) if hasattr(trainer, "output_directory") else None
         end = int(trainer.DENSIFICATION_END_ITERATION)
-        hooks.ready(TrainerFacts(end + 1, max_steps=int(trainer.NUM_ITERATIONS) - 1, gradients_read_until=end))
+        hooks.ready(TrainerInfo(end + 1, max_steps=int(trainer.NUM_ITERATIONS) - 1, gradients_read_until=end))

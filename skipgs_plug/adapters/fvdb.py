@@ -11,8 +11,8 @@ from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, rele
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
-from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import TrainerInfo
 
 MODULE, LOOP = "fvdb_reality_capture.training.scene_optimization_runner", "train"
 EXPECTED = (LOOP, "config", "training_dataset", "optimizer", "_global_step", "_start_step")
@@ -33,7 +33,7 @@ class FVDB(AbstractAdapter):
         "From epoch `refine_stop_epoch` on, or from `pose_opt_stop_epoch` on where camera poses are optimized. "
         "Opacities are reset every `reset_opacities_every_epoch` until the end, and each reset pauses the gate."
     )
-    thinned = "Refused: whole iterations cannot be left out."
+    with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
         "Batches of several images have one joint loss and so one mean. Several crops per image are refused: each has "
         "a backward. Whole iterations cannot be left out: epochs iterate over a DataLoader. Needs CUDA."
@@ -89,4 +89,4 @@ class FVDB(AbstractAdapter):
         end = int(config.refine_stop_epoch * len(dataset))
         if config.optimize_camera_poses:
             end = max(end, int(config.pose_opt_stop_epoch * len(dataset)))
-        hooks.ready(TrainerFacts(end, max_steps=config.max_steps, gradients_read_until=end))
+        hooks.ready(TrainerInfo(end, max_steps=config.max_steps, gradients_read_until=end))

@@ -21,7 +21,7 @@ class GaussianSpa(InriaFamily):
     checked = "noodle-lab/GaussianSpa abdfaf64 (its three scripts, run on the CPU)"
     project = "[GaussianSpa](https://github.com/noodle-lab/GaussianSpa)"
     gated = "From `optimizing_spa_stop_iter` + 1 on, after a pause for the prune in the iteration before."
-    thinned = (
+    with_share = (
         "By visits. The sparsifying phase runs "
         "whole: its terms pull at the model, and the iterations between them pull back."
     )

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from skipgs_plug.adapters.inria import InriaFamily
-from skipgs_plug.core.facts import Densification
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import Densification
 
 ACCUMULATES_FROM = 20_000  # train.py has this number in it
 PRUNED = "prune_iter"  # the loop's variable for the iteration of the final prune
@@ -31,7 +31,7 @@ class GNS(InriaFamily):
         "`train.py`: from `reg_end` + 1 (23,001) on, where selection by opacity has ended; without `prune_reg` from "
         "`densify_until_iter` on. `train-fast.py`: from `e2` + 1 (10,001) on."
     )
-    thinned = (
+    with_share = (
         "All events are kept. The selection runs whole: its term would "
         "act alone where the iterations between are left out. `train-fast.py` densifies whole, in iterations "
         "500 to 7,000."

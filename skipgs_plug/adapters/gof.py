@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from skipgs_plug.adapters.inria import InriaFamily
-from skipgs_plug.core.facts import Densification
+from skipgs_plug.core.trainer_info import Densification
 
 
 class GOF(InriaFamily):
@@ -16,7 +16,9 @@ class GOF(InriaFamily):
     checked = "autonomousvision/gaussian-opacity-fields 5245b20 (its loop read, and a look-alike: no stand-in)"
     project = "[GOF](https://github.com/autonomousvision/gaussian-opacity-fields)"
     gated = "From `densify_until_iter` on; decided on the whole loss, with normals and distortion."
-    thinned = "By visits. Pictures for inspection, which come with them every 100 iterations, are left out with them."
+    with_share = (
+        "By visits. Pictures for inspection, which come with them every 100 iterations, are left out with them."
+    )
     left_alone = (
         "The 3D filter is computed anew every hundredth iteration, skipped or not: where nothing moved it is what it "
         "was. Needs CUDA: `--cpu` has no stand-in for its rasterizer."

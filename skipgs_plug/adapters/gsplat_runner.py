@@ -18,8 +18,8 @@ from skipgs_plug.adapters.gsplat_strategy import (
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
-from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.host_copy import HostCopy
 
 EXPECTED = ("cfg", "parser", "trainset", "rasterize_splats", "world_size")
@@ -37,7 +37,7 @@ class GsplatRunner(AbstractAdapter):
     checked = "nerfstudio-project/gsplat v1.5.3 and v1.6.0 90d7b4b3 (its script, run on the CPU)"
     project = "[gsplat, `examples/simple_trainer.py`](https://github.com/nerfstudio-project/gsplat)"
     gated = "From `strategy.refine_stop_iter` on (15,000, for MCMC 25,000)."
-    thinned = "By visits; those of MCMC are all kept. Opacity resets happen as often as ever."
+    with_share = "By visits; those of MCMC are all kept. Opacity resets happen as often as ever."
     left_alone = (
         "MCMC's position noise is left out where the gradient step is: alone it is a random walk. Batches of several "
         "images have one joint loss and so one mean. Once `--post_processing ppisp` freezes the Gaussians, every "
@@ -115,7 +115,7 @@ class GsplatRunner(AbstractAdapter):
         self._relocations = leave_out_noise(hooks, strategy, type(strategy))
         self.output_folder = runner.cfg.result_dir
         hooks.ready(
-            TrainerFacts(
+            TrainerInfo(
                 strategy.refine_stop_iter,
                 view_names=names,
                 epoch=-(-len(runner.trainset) // runner.cfg.batch_size),

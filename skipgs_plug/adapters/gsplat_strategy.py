@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from skipgs_plug.core.facts import Densification
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import Densification
 
 
 def is_mcmc(strategy: Any) -> bool:

@@ -26,8 +26,8 @@ from skipgs_plug.adapters.loop_bounds import last_calls
 from skipgs_plug.adapters.loop_code import LOOP, LoopCode
 from skipgs_plug.adapters.unknown_forks import BY_HAND, Unrecognised, unrecognised
 from skipgs_plug.core.errors import AdapterMismatchError
-from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 from skipgs_plug.core.views import view_key
 
 # Modules of a checkout, each loaded when the script asks for it.
@@ -66,7 +66,7 @@ class InriaFamily(AbstractAdapter):
         self._code: LoopCode | None = None
         self._drift: DriftCheck
         self.known_names: dict[str, Any] = {}
-        self._strange = Unrecognised(*5 * (frozenset(),))
+        self._unknown = Unrecognised(*5 * (frozenset(),))
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:
@@ -102,20 +102,20 @@ class InriaFamily(AbstractAdapter):
             AdapterMismatchError: It cannot be gated.
         """
         calls = (*self.calls, *self.structural)
-        self._code, self._strange = code, unrecognised(code, renderers, model, calls, self.arguments)
-        self._strange.refuse(self.stranger(code))
-        if self._strange.listed:
+        self._code, self._unknown = code, unrecognised(code, renderers, model, calls, self.arguments)
+        self._unknown.refuse(self.difference(code))
+        if self._unknown.listed:
             warnings.warn(
-                f"{self.stranger(code)}. Recognised: {', '.join(self.renders[:1])}, backward, "
-                f"{', '.join(sorted(self._strange.known))}. Not recognised, and left to go on in skipped iterations: "
-                f"{self._strange.listed}.",
+                f"{self.difference(code)}. Recognised: {', '.join(self.renders[:1])}, backward, "
+                f"{', '.join(sorted(self._unknown.known))}. Not recognised, and left to go on in skipped iterations: "
+                f"{self._unknown.listed}.",
                 RuntimeWarning,
                 stacklevel=2,
             )
 
-    def stranger(self, code: LoopCode) -> str:
+    def difference(self, code: LoopCode) -> str:
         """Beginning of a sentence about a script that does more than this adapter knows."""
-        return f"{code.place} does more than {self.checked.partition(' (')[0]}, which adapter {self.name!r} is for"
+        return f"{code.source} does more than {self.checked.partition(' (')[0]}, which adapter {self.name!r} is for"
 
     def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
         """Keep what later answers need of a run, which begins now; arguments as for `start_iter`.
@@ -158,7 +158,7 @@ class InriaFamily(AbstractAdapter):
         code = LoopCode.of_script(Path(sys.argv[0]))
         if not code.used:
             raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects a function {LOOP}(), which {code.place} does not have; "
+                f"Adapter {self.name!r} expects a function {LOOP}(), which {code.source} does not have; "
                 f"it was checked with {self.checked}."
             )
         self._refuse_fork(code)
@@ -208,11 +208,11 @@ class InriaFamily(AbstractAdapter):
         """Learn iterations and structural changes from calls of the model's methods."""
         model = names["GaussianModel"]
 
-        def heartbeat(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        def rate_updated(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             self._begins(hooks, args[0], sys._getframe(2))  # frame 2 is the loop's
             return original(*args, **kwargs)
 
-        hooks.wrap(model, "update_learning_rate", heartbeat)
+        hooks.wrap(model, "update_learning_rate", rate_updated)
         hooks.events(model, *(name for name in self.structural if hasattr(model, name)))
 
     def _begins(self, hooks: Hooks, model: Any, frame: types.FrameType) -> None:
@@ -265,7 +265,7 @@ class InriaFamily(AbstractAdapter):
         right = next(one for one in asked if one.recognises(code.names))  # the last one does in any case
         if right is not own:
             raise AdapterMismatchError(
-                f"Adapter {self.name!r} is for {self.checked}, but {code.place} "
+                f"Adapter {self.name!r} is for {self.checked}, but {code.source} "
                 f"looks like the training script of {right.name!r}."
             )
 
@@ -302,7 +302,7 @@ class InriaFamily(AbstractAdapter):
             self._label = "uid"
         self.begin(opt, loop)
         hooks.ready(
-            TrainerFacts(
+            TrainerInfo(
                 self._start_after_changes(opt, loop),
                 view_names=[view_key(key) for key in self.view_keys(cameras)],
                 max_steps=opt.iterations,
@@ -329,7 +329,7 @@ class InriaFamily(AbstractAdapter):
 
     def may_end_later(self) -> frozenset[str]:
         """Methods of the model that the gate does not begin before the loop has called for the last time."""
-        return self._strange.calls
+        return self._unknown.calls
 
 
 class Inria(InriaFamily):
@@ -356,12 +356,14 @@ class Inria(InriaFamily):
     def recognises(cls, names: Container[str]) -> bool:
         return True  # asked last: what is not a fork's is the original's
 
-    def stranger(self, code: LoopCode) -> str:
-        return f"{code.place} is a fork of Inria 3DGS that no adapter knows"
+    def difference(self, code: LoopCode) -> str:
+        return f"{code.source} is a fork of Inria 3DGS that no adapter knows"
 
     def examine(self, code: LoopCode, renderers: Sequence[Callable[..., Any]], model: type) -> None:
         if "densify_until_iter" not in code.used:
-            raise AdapterMismatchError(f"{self.stranger(code)}: its loop never asks for densify_until_iter. {BY_HAND}")
+            raise AdapterMismatchError(
+                f"{self.difference(code)}: its loop never asks for densify_until_iter. {BY_HAND}"
+            )
         super().examine(code, renderers, model)
 
     def may_end_later(self) -> frozenset[str]:

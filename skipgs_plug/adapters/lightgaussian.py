@@ -25,7 +25,7 @@ class LightGaussian(InriaFamily):
         "first iteration of the run, not from zero. `train_densify_prune.py`: from `densify_until_iter` on, its later "
         "prunes pause the gate. `distill_train.py`: from the first iteration on."
     )
-    thinned = "`train_densify_prune.py`: by visits. The other two scripts do not densify."
+    with_share = "`train_densify_prune.py`: by visits. The other two scripts do not densify."
     left_alone = "Jittered cameras (two of three iterations with `--augmented_view`) have means of their own."
     stand_ins = "lightgaussian"
     mark = "calculate_v_imp_score"

@@ -13,8 +13,8 @@ from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, rele
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
-from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import TrainerInfo
 
 MODULE, LOOP = "litegs.training.trainer", "start"
 EXPECTED = (LOOP, "densify", "render", "StatisticsHelperInst")
@@ -33,7 +33,7 @@ class LiteGS(AbstractAdapter):
     checked = "MooreThreads/LiteGS 004b952 (its loop read, and a look-alike: its rasterizer has no stand-in)"
     project = "[LiteGS](https://github.com/MooreThreads/LiteGS)"
     gated = "From the epoch `densify_until` on, after a pause for the opacity reset that usually ends the epoch before."
-    thinned = "Refused: whole iterations cannot be left out."
+    with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
         "Gaussians are put in a new order now and then, which changes no image. Whole iterations cannot be left out: "
         "its loop is one over epochs and a DataLoader. Needs CUDA: `--cpu` has no stand-in for its rasterizer."
@@ -95,7 +95,7 @@ class LiteGS(AbstractAdapter):
         self.output_folder = loop["lp"].model_path
         end = int(loop["dp"].densify_until) * views
         hooks.ready(
-            TrainerFacts(
+            TrainerInfo(
                 end,
                 view_names=self._names,
                 max_steps=int(loop["total_epoch"]) * views - 1,

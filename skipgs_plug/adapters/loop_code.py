@@ -19,7 +19,7 @@ class LoopCode(NamedTuple):
     """The names in a training script.
 
     Attributes:
-        place: file of the script, or name of the module, for sentences.
+        source: file of the script, or name of the module, for sentences.
         names: global names of the script, and every global and attribute that its function `training` uses.
         functions: names of its functions and classes.
         used: every global and attribute that `training` uses, and the functions of the script that it calls;
@@ -30,7 +30,7 @@ class LoopCode(NamedTuple):
         syntax: syntax of `training`; None where there is no source.
     """
 
-    place: str
+    source: str
     names: frozenset[str]
     functions: frozenset[str]
     used: frozenset[str] = frozenset()
@@ -42,14 +42,14 @@ class LoopCode(NamedTuple):
     @classmethod
     def of_module(cls, namespace: Mapping[str, Any]) -> LoopCode:
         """Of a module that was imported."""
-        place = str(namespace.get("__file__") or namespace.get("__name__"))
+        source = str(namespace.get("__file__") or namespace.get("__name__"))
         functions = {
             name: value.__code__
             for name, value in namespace.items()
             if isinstance(value, types.FunctionType) and value.__globals__ is namespace
         }
         syntax = function_of(namespace[LOOP], LOOP) if LOOP in functions else None
-        return cls._made(place, set(namespace), functions, syntax)
+        return cls._made(source, set(namespace), functions, syntax)
 
     @classmethod
     def of_script(cls, path: Path) -> LoopCode:
@@ -67,10 +67,10 @@ class LoopCode(NamedTuple):
 
     @classmethod
     def _made(
-        cls, place: str, own: set[str], functions: Mapping[str, types.CodeType], syntax: ast.FunctionDef | None
+        cls, source: str, own: set[str], functions: Mapping[str, types.CodeType], syntax: ast.FunctionDef | None
     ) -> LoopCode:
         if LOOP not in functions:
-            return cls(place, frozenset(own), frozenset(functions))
+            return cls(source, frozenset(own), frozenset(functions))
         training = functions[LOOP]
         repeated, stored = _in_loop(training)
         called = _called(repeated, functions)
@@ -86,7 +86,7 @@ class LoopCode(NamedTuple):
         of_called = {name for code in called for part in _with_inner(code) for name in part.co_names}
         of_loop = {name for part in _with_inner(training) for name in part.co_names}
         return cls(
-            place,
+            source,
             frozenset(own | of_loop),
             frozenset(functions),
             frozenset(of_loop | of_called),

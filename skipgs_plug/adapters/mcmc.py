@@ -10,8 +10,8 @@ import torch
 
 from skipgs_plug.adapters.inria import InriaFamily
 from skipgs_plug.adapters.loop_code import LOOP
-from skipgs_plug.core.facts import Densification
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import Densification
 
 NOISE = "build_scaling_rotation"  # the loop calls it for nothing but its noise
 

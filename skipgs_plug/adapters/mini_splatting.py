@@ -24,7 +24,7 @@ class MiniSplatting(InriaFamily):
         "`ms/train.py`: from `simp_iteration2` + 1 on, after a pause for the prune in that iteration. `ms_d/train.py`, "
         "which does not simplify: from `densify_until_iter` on."
     )
-    thinned = (
+    with_share = (
         "By visits; views in which Gaussians are "
         "blurred are gathered until the next event. Points are made anew from depths, and both "
         "simplifications happen, as ever."

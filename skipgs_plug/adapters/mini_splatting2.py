@@ -22,7 +22,7 @@ class MiniSplatting2(InriaFamily):
         "From the iteration after (`simp_iteration2` + `iterations`) // 2 on, where culled Gaussians return to their "
         "views, after a pause for it."
     )
-    thinned = (
+    with_share = (
         "By visits. Clones by importance every 250 iterations, points from depths and simplifications happen as ever."
     )
     left_alone = "Its sparse Adam has no gradients in skipped iterations. Needs CUDA: its culling has no stand-in."

@@ -19,8 +19,8 @@ from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.loss_scaler import guard_scaler
 from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
 from skipgs_plug.core.errors import AdapterMismatchError
-from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import TrainerInfo
 
 LOOP = "train_iteration"
 
@@ -35,7 +35,7 @@ class Nerfstudio(AbstractAdapter):
     checked = "nerfstudio-project/nerfstudio 1.1.5 50e0e3c7 (ns-train, run on the CPU)"
     project = "[nerfstudio, splatfacto and splatfacto-mcmc](https://github.com/nerfstudio-project/nerfstudio)"
     gated = "As gsplat; decided on `main_loss`, since other terms appear in every tenth iteration only."
-    thinned = "As gsplat. Evaluations and the first and last of gathered gradients happen as often as ever."
+    with_share = "As gsplat. Evaluations and the first and last of gathered gradients happen as often as ever."
     left_alone = (
         "An enabled loss scaler is not asked to update without a gradient. As in a shell: `skipgs-plug run nerfstudio "
         "-- ns-train splatfacto ...` (also `-m nerfstudio.scripts.train`). `skipgs.json` lies beside its "
@@ -93,7 +93,7 @@ class Nerfstudio(AbstractAdapter):
         self._relocations = leave_out_noise(hooks, strategy, strategy)
         self.output_folder = getattr(trainer, "base_dir", None)
         hooks.ready(
-            TrainerFacts(
+            TrainerInfo(
                 getattr(strategy, "refine_stop_iter", None),
                 view_names=names,
                 max_steps=trainer.config.max_num_iterations - 1,

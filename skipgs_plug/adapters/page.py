@@ -6,7 +6,7 @@ import textwrap
 
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.registry import builtin_adapters
-from skipgs_plug.core.facts import Densification
+from skipgs_plug.core.trainer_info import Densification
 
 HEAD = """# Supported trainers
 
@@ -28,7 +28,7 @@ Brush (Rust), LichtFeld Studio and OpenSplat (C++), and Postshot (closed).
 """
 
 # Effect of `share` on the densification events of a trainer, by their requirement (`Densification.needs`).
-THINNED = {"visits": "By visits.", "iterations": "By iterations.", "nothing": "All events are kept."}
+WITH_SHARE = {"visits": "By visits.", "iterations": "By iterations.", "nothing": "All events are kept."}
 
 _WRAP = textwrap.TextWrapper(118, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
@@ -37,13 +37,13 @@ def adapters_page() -> str:
     """Return the page: for each trainer, from when on the gate acts, special behaviour, and the version checked."""
     parts = [HEAD]
     for adapter in builtin_adapters():
-        facts = {
+        entries = {
             "Gated": adapter.gated,
-            "With `share`": adapter.thinned or THINNED.get(getattr(densification(adapter), "needs", ""), ""),
+            "With `share`": adapter.with_share or WITH_SHARE.get(getattr(densification(adapter), "needs", ""), ""),
             "Also": adapter.left_alone,
             "Checked with": f"{adapter.checked}.",
         }
-        lines = [_WRAP.fill(f"- **{what}.** {text}") for what, text in facts.items() if text]
+        lines = [_WRAP.fill(f"- **{what}.** {text}") for what, text in entries.items() if text]
         parts.append(f"## `{adapter.name}`: {adapter.project}\n" + "\n".join(lines) + "\n")
     return "\n".join(parts)
 

@@ -21,7 +21,7 @@ class PerceptualGS(InriaFamily):
         "From `densify_until_iter` + 1 on, after a pause where that iteration rebuilds the model. With images that "
         "have alpha, prunes every hundredth iteration pause the gate until the end."
     )
-    thinned = (
+    with_share = (
         "By visits. Events that read weights of "
         "all views (every 1,000 and 1,500 iterations) happen as ever; with images that have alpha all do."
     )

@@ -13,8 +13,8 @@ from skipgs_plug.core.clock import Times
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.events import MIN_PAUSE_ITERS
-from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
 FULL_SCHEDULE = 30_000  # iterations that the default settings of gate and trainer are made for
 
@@ -26,7 +26,7 @@ class ReferenceTrainer(AbstractAdapter):
     checked = "the trainer of this package (itself, on the CPU, by the tests)"
     project = "this package's own trainer"
     gated = "From the end of densification on."
-    thinned = "By visits; those of MCMC are all kept."
+    with_share = "By visits; those of MCMC are all kept."
     left_alone = "Gate state travels in its snapshots and checkpoints."
 
     @classmethod
@@ -47,7 +47,7 @@ class ReferenceTrainer(AbstractAdapter):
         n_views = len(trainer.view_names)
         scale = trainer.config.schedule / FULL_SCHEDULE
         hooks.ready(
-            TrainerFacts(
+            TrainerInfo(
                 trainer.refine_stop_iter,
                 view_names=trainer.view_names,
                 max_steps=trainer.max_steps - 1,

@@ -134,8 +134,8 @@ def find_script_adapter(script: Path) -> type[AbstractAdapter]:
     )
 
 
-def _load(place: str) -> type[AbstractAdapter]:
-    module, _, attribute = place.partition(":")
+def _load(path: str) -> type[AbstractAdapter]:
+    module, _, attribute = path.partition(":")
     return getattr(importlib.import_module(module), attribute)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from skipgs_plug.adapters.inria import InriaFamily
-from skipgs_plug.core.facts import Densification
+from skipgs_plug.core.trainer_info import Densification
 
 
 class ScaffoldGS(InriaFamily):

@@ -12,8 +12,8 @@ import torch
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
-from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import TrainerInfo
 
 # What `step` calls on the outermost trainer, and what is looked at.
 EXPECTED = ("step", "curr_step", "optimizer", "update_learning_rate", "preprocess", "before_optim_hook", "optim_step")
@@ -37,9 +37,9 @@ class StepTrainer(AbstractAdapter):
         "From the latest of its inclusive bounds + 1 on, after a pause for the opacity reset that falls on that "
         "bound. Modes without densification need `--start-iter`."
     )
-    thinned = (
+    with_share = (
         "Densification runs whole, since it is hidden in wrappers, unless a loop of yours names its events "
-        "(`gate.iterations(..., events=...)`). Refinement is thinned."
+        "(`gate.iterations(..., events=...)`). Refinement is shortened."
     )
     left_alone = (
         "`before_optim_hook`, which reads gradients, is left out with the backward. Attach to the outermost trainer; "
@@ -106,7 +106,7 @@ class StepTrainer(AbstractAdapter):
         hooks.wrap(trainer, "before_optim_hook", hooked)
         hooks.wrap(trainer, "optim_step", watched)
         hooks.gate_tensor_backward("step")
-        hooks.ready(TrainerFacts(end, gradients_read_until=end))
+        hooks.ready(TrainerInfo(end, gradients_read_until=end))
 
     def always_run(self, numbers: range) -> Iterable[int]:
         """Those in which a wrapper raises the SH degree."""

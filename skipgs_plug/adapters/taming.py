@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from skipgs_plug.adapters.inria import InriaFamily
-from skipgs_plug.core.facts import Densification
+from skipgs_plug.core.trainer_info import Densification
 
 
 class Taming(InriaFamily):

@@ -9,8 +9,8 @@ from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, guar
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
-from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import TrainerInfo
 
 MODULE, STEP = "threedgrut.trainer", "run_train_iter"
 EXPECTED = (STEP, "run_training", "strategy", "train_dataset", "conf")
@@ -47,7 +47,7 @@ class ThreeDGRUT(AbstractAdapter):
     checked = "nv-tlabs/3dgrut a37ef72 (its loop read, and a look-alike)"
     project = "[3DGRUT](https://github.com/nv-tlabs/3dgrut)"
     gated = "From the latest `end_iteration` of the strategy on, where nothing is densified, pruned or reset any more."
-    thinned = "Refused: whole iterations cannot be left out."
+    with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
         "MCMC's position noise is left out where the gradient step is. Views are known by image path, or by frame "
         "where the dataset has no paths. Whole iterations cannot be left out: epochs iterate over a "
@@ -95,7 +95,7 @@ class ThreeDGRUT(AbstractAdapter):
         self.output_folder = getattr(getattr(trainer, "tracking", None), "output_dir", None)
         end = last_change(trainer.conf.strategy)
         hooks.ready(
-            TrainerFacts(end, view_names=names, max_steps=int(trainer.conf.n_iterations) - 1, gradients_read_until=end)
+            TrainerInfo(end, view_names=names, max_steps=int(trainer.conf.n_iterations) - 1, gradients_read_until=end)
         )
 
 

@@ -50,9 +50,9 @@ def write_plots(
 def style(policy: str, whole: bool = False) -> tuple[str, str]:
     """Return colour and marker of a policy by its place in its table, the last for one that is not there."""
     known = list(known_policies(whole))
-    place = known.index(policy) if policy in known else zlib.crc32(policy.encode()) % len(COLOURS) - len(COLOURS)
+    index = known.index(policy) if policy in known else zlib.crc32(policy.encode()) % len(COLOURS) - len(COLOURS)
     # The markers lag behind the colours by one in every further round, so that the pairs differ.
-    return COLOURS[place % len(COLOURS)], MARKERS[(place + place // len(COLOURS)) % len(MARKERS)]
+    return COLOURS[index % len(COLOURS)], MARKERS[(index + index // len(COLOURS)) % len(MARKERS)]
 
 
 def looks_at_losses(run: RunRecord) -> bool:

@@ -58,13 +58,13 @@ def stepping_as(name: str) -> GateMaker:
     """Return a function that runs every iteration with the learning-rate factors of policy `name`."""
 
     def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
-        peak = path_factor(float(name.partition("=")[2]), 0.0, shown=earlier[name].gaussians_shown)
+        peak = path_factor(float(name.partition("=")[2]), 0.0, visible=earlier[name].gaussians_shown)
         return gate_with(refine_share=1.0, rate_peak=peak)(trainer, earlier)  # type: ignore[return-value]
 
     return make
 
 
-def thinned_as_long_as(name: str) -> GateMaker:
+def refine_share_as_long_as(name: str) -> GateMaker:
     """Return a function that leaves out so many iterations that the rest takes as long as policy `name`."""
 
     def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
@@ -182,7 +182,7 @@ POLICIES = table_of(
         "shortened,compensate",
         "control: iterations left out down to the gate's time, with larger, shrinking steps",
         (REFERENCE, "gate"),
-        thinned_as_long_as("gate"),
+        refine_share_as_long_as("gate"),
     ),
 )
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from skipgs_plug import SkipGate
 from skipgs_plug.bench.policies import REFERENCE, Earlier, Policy, gate_with, number_after, table_of
 from skipgs_plug.bench.record import RunRecord
-from skipgs_plug.bench.thinning import periodic_numbers, random_numbers
+from skipgs_plug.bench.sampling import periodic_numbers, random_numbers
 from skipgs_plug.bench.whole import Maker, as_many_gaussians, planned, shortened, whole_run
 from skipgs_plug.core.pace.rates import path_factor
 from skipgs_plug.trainer import Trainer
@@ -50,7 +50,7 @@ def gated(**settings: object) -> Run:
 def larger_steps(trainer: Trainer, earlier: Earlier) -> SkipGate:
     """Attach the factors on rates that make a refinement as short as this go as far as the own run's."""
     full = earlier[REFERENCE].iterations
-    peak = path_factor(min(1.0, trainer.max_steps / full), 0.0, shown=earlier[COPIED].gaussians_shown)
+    peak = path_factor(min(1.0, trainer.max_steps / full), 0.0, visible=earlier[COPIED].gaussians_shown)
     gate = gate_with(refine_share=1.0, rate_peak=peak)(trainer, earlier)
     assert gate is not None
     return gate

@@ -42,7 +42,7 @@ class SkipConfig:
             and False with the paper's gate.
         rate_peak: Factor on learning rates when refinement begins; it falls linearly to 0. Higher SH bands, positions
             and scales take a multiple of it, the constant band half, opacities at most 1. None is
-            2 / max(refine_share, 0.25) * sqrt(3 * shown), where `shown` is the measured share of the Gaussians that
+            2 / max(refine_share, 0.25) * sqrt(3 * visible), where `visible` is the measured share of the Gaussians that
             a view shows.
 
     Raises:

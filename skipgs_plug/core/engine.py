@@ -17,8 +17,7 @@ from skipgs_plug.core.clock import GateClock
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
-from skipgs_plug.core.facts import TrainerFacts
-from skipgs_plug.core.iteration import Iteration
+from skipgs_plug.core.gated_iteration import GatedIteration
 from skipgs_plug.core.nonfinite import NonFiniteGuard
 from skipgs_plug.core.pace.base import Pace
 from skipgs_plug.core.pace.compensated import Compensated
@@ -30,6 +29,7 @@ from skipgs_plug.core.scene_check import SceneCheck
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, require_state
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.core.trace import TraceRow
+from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.core.views import require_unique, warn_unless_recurring
 from skipgs_plug.host_copy import HostCopy, has_events
 
@@ -70,7 +70,7 @@ class Engine:
         self.config = config
         self.policy = policy
         self.start = 0
-        self.iteration = Iteration()
+        self.iteration = GatedIteration()
         self.stats = GateStats()
         self.clock = GateClock()
         self.rates = ScaledRates()
@@ -92,38 +92,38 @@ class Engine:
         self._ranks_checked = False
         self._scene_check = SceneCheck()
 
-    def configure(self, facts: TrainerFacts, given: frozenset[str] = frozenset()) -> None:
+    def configure(self, info: TrainerInfo, given: frozenset[str] = frozenset()) -> None:
         """Complete the settings with the facts about the trainer, and create the policy.
 
         Args:
-            facts: About the trainer.
+            info: About the trainer.
             given: Names of settings that the user gave, which no default replaces.
 
         Raises:
             SkipGSError: Nothing says when to begin, the settings begin too early, view names repeat, or other
                 processes are out of reach.
         """
-        if facts.world_size is not None:
-            distributed.refuse_unreachable_ranks(facts.world_size)
-        settings = {name: value for name, value in facts.defaults.items() if name not in given}
+        if info.world_size is not None:
+            distributed.refuse_unreachable_ranks(info.world_size)
+        settings = {name: value for name, value in info.defaults.items() if name not in given}
         if self.config.start_iter is None:
-            settings["start_iter"] = 0 if facts.start_iter is None and not self.config.enabled else facts.start_iter
+            settings["start_iter"] = 0 if info.start_iter is None and not self.config.enabled else info.start_iter
         self.config = config = dataclasses.replace(self.config, **settings)
         if config.start_iter is None:
             raise SkipGSError("This trainer does not densify, so the gate cannot know when to begin; give start_iter=.")
         self.start = config.start_iter
-        read_until = facts.gradients_read_until
+        read_until = info.gradients_read_until
         if config.enabled and read_until is not None and self.start < read_until:
             raise SkipGSError(
                 f"start_iter={self.start} is too early: up to iteration {read_until} this trainer's "
                 "densification reads the gradients; start there or later, or leave start_iter out."
             )
-        if facts.view_names is not None:
-            self._view_names = require_unique(facts.view_names)
-        if config.enabled and facts.max_steps is not None and self.start > facts.max_steps:
-            log.warning("The gate starts at %d, after the last iteration %d.", self.start, facts.max_steps)
-        self._accumulates = facts.accumulates
-        self.pace.configure(self.start, facts, self._view_names)
+        if info.view_names is not None:
+            self._view_names = require_unique(info.view_names)
+        if config.enabled and info.max_steps is not None and self.start > info.max_steps:
+            log.warning("The gate starts at %d, after the last iteration %d.", self.start, info.max_steps)
+        self._accumulates = info.accumulates
+        self.pace.configure(self.start, info, self._view_names)
         if self.policy is None:
             self.policy = self.pace.policy(config)
         if self._pending_state is not None:
@@ -309,7 +309,7 @@ class Engine:
             "clock": self.clock.state_dict(),
             "step": self.iteration.step,
             "pace": self.pace.state_dict(),
-            "shown": self.rates.shown.state_dict(),
+            "shown": self.rates.visibility.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -359,7 +359,7 @@ class Engine:
                 "continue with that setting, or start the gate afresh."
             )
         if "shown" in whole:
-            self.rates.shown.load_state_dict(whole["shown"])
+            self.rates.visibility.load_state_dict(whole["shown"])
         if state is not None:
             self.pace.load_state_dict(state)
 

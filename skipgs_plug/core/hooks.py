@@ -19,12 +19,12 @@ from skipgs_plug.core.errors import (
     SkipGSError,
     warn_of_release,
 )
-from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.intercept import Around, Patches, intercept_tensor_backward
 from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_known
 from skipgs_plug.core.pace.loop_range import LoopRange, replace_range
 from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.rates import Named
+from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 from skipgs_plug.core.views import view_key
 
 # First iterations in which training backward passes are counted. Any number but one in each is a wrong attachment, and
@@ -80,14 +80,14 @@ class Hooks:
 
     # Facts, at attach or when training begins.
 
-    def ready(self, facts: TrainerFacts) -> None:
+    def ready(self, info: TrainerInfo) -> None:
         """Pass on the facts that must be known before the first iteration.
 
         Raises:
             SkipGSError: The settings do not fit the trainer; see `Engine.configure`.
         """
         with self._releasing_on_error(None):
-            self._engine.configure(facts, self._given)
+            self._engine.configure(info, self._given)
             if self._engine.config.enabled:
                 self.on_detach("torch.autograd (hooks for saved tensors)", self._engine.graph.close)
             if self._engine.config.compensates:

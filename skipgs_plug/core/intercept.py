@@ -14,7 +14,6 @@ import torch
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 
 Around = Callable[..., Any]  # called as around(original, *args, **kwargs) in place of original(*args, **kwargs)
-Wrap = Callable[[Any, str, Around], None]  # as `Patches.wrap`
 
 _MARK = "__skipgs_plug__"
 _ABSENT = object()

@@ -17,7 +17,7 @@ NO_REFINEMENT: dict[str, Any] = {
     "gaussians_shown": None,
     "iterations_skipped": 0,
     "always_run": {},
-    "foresight": None,
+    "early_stopping": None,
     "growing": None,
 }
 
@@ -41,7 +41,7 @@ def counters(
         start_iter on), `t_total_processor`, `t_post_processor` (the same in processor seconds, see `Times`);
         `refine_share` (share of the iterations from start_iter on that run or may run, None when none is left out),
         `gaussians_shown` (share of the Gaussians that a view shows, None where it is not known),
-        `iterations_run`, `iterations_skipped`, `always_run`, `foresight` (see
+        `iterations_run`, `iterations_skipped`, `always_run`, `early_stopping` (see
         `Refining.report`), `growing` (see `Growing.report`; None if that phase runs whole).
     """
     return {
@@ -95,15 +95,15 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
             f"  each view shows {100 * counted['gaussians_shown']:.0f} % of the Gaussians, which decides how long "
             "steps are"
         )
-    foresight = counted["foresight"]
-    if foresight is not None and not foresight["watched"]:
+    stopping = counted["early_stopping"]
+    if stopping is not None and not stopping["watched"]:
         lines.append("  too few views to watch some of them: the whole share runs")
-    elif foresight is not None:
-        worth = foresight["rest_worth_db"]
+    elif stopping is not None:
+        worth = stopping["rest_worth_db"]
         judged = "was not estimated" if worth is None else f"could gain at most {worth:.2f} dB at the last check"
         lines.append(
-            f"  {'ended early' if foresight['ended_early'] else 'not ended early'}, in cycle {foresight['cycle'] + 1}; "
-            f"the rest {judged} (tolerance {config.tolerance} dB, {len(foresight['watched'])} views watched)"
+            f"  {'ended early' if stopping['ended_early'] else 'not ended early'}, in cycle {stopping['cycle'] + 1}; "
+            f"the rest {judged} (tolerance {config.tolerance} dB, {len(stopping['watched'])} views watched)"
         )
     elif config.refine_share == "auto":
         lines.append("  all iterations run: refinement is too short, or views come up too seldom, to leave some out")

@@ -129,7 +129,7 @@ def gather_folder(source: Path, folder: Path, progress: Callable[[int], None]) -
     names, cameras = [], set()
     masks = folder.with_name("masks")
     for path in files:
-        name, camera = place(path, source, folder, masks)
+        name, camera = add_photograph(path, source, folder, masks)
         names.append(name)
         cameras.add(camera)
         progress(1)
@@ -139,7 +139,7 @@ def gather_folder(source: Path, folder: Path, progress: Callable[[int], None]) -
     return Gathered(folder, sorted(names), len(cameras) == 1, masks if masks.is_dir() else None)
 
 
-def place(path: Path, source: Path, folder: Path, masks: Path) -> tuple[str, tuple[object, ...]]:
+def add_photograph(path: Path, source: Path, folder: Path, masks: Path) -> tuple[str, tuple[object, ...]]:
     """Link or convert one photograph, with its transparency in `masks`.
 
     Returns:

@@ -200,14 +200,14 @@ def gate_table(caption: str, name: str, data: dict[str, Any]) -> Table:
 
 
 def refinement_table(caption: str, name: str, data: dict[str, Any]) -> Table:
-    foresight = data["foresight"] or {}
-    worth = foresight.get("rest_worth_db")
+    early_stopping = data["early_stopping"] or {}
+    worth = early_stopping.get("rest_worth_db")
     row = (
         name,
         f"{100 * data['refine_share']:.0f}",
         *(f"{data[k]:,}" for k in ("iterations_run", "iterations_skipped")),
         f"{sum(data['always_run'].values()):,}",
-        {None: "-", True: "yes", False: "no"}[foresight.get("ended_early")],
+        {None: "-", True: "yes", False: "no"}[early_stopping.get("ended_early")],
         "-" if worth is None else f"{worth:.2f}",
     )
     return Table(caption, REFINEMENT_HEADING, [row])

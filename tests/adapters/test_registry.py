@@ -8,7 +8,7 @@ import re
 import pytest
 
 from skipgs_plug import SkipGate, SkipGSError, UnknownTrainerError, register_adapter
-from skipgs_plug.adapters import AbstractAdapter, TrainerFacts, registry
+from skipgs_plug.adapters import AbstractAdapter, TrainerInfo, registry
 
 
 class Mine:
@@ -28,7 +28,7 @@ class MyAdapter(AbstractAdapter):
 
     def attach(self, hooks) -> None:
         self.trainer.attached = True
-        hooks.ready(TrainerFacts(5))
+        hooks.ready(TrainerInfo(5))
 
 
 @pytest.fixture(autouse=True)

@@ -48,12 +48,12 @@ def from_file(tmp_path):
     """Make the training module from a file, whose conditions can be read."""
 
     def make(**parts):
-        return stranger(**parts, file=tmp_path / "train.py")
+        return unknown_fork(**parts, file=tmp_path / "train.py")
 
     return make
 
 
-def stranger(argument="", extra="pass", until="densify_until_iter", before="pass", file=None, helper=""):
+def unknown_fork(argument="", extra="pass", until="densify_until_iter", before="pass", file=None, helper=""):
     module = types.ModuleType("train")
     own = {"GaussianModel": type("GaussianModel", (GaussianModel,), {}), "render": render, "Scene": Scene}
     module.__dict__.update(own, log=log, pick=pick, photo_loss=photo_loss, torch=torch)
@@ -72,7 +72,7 @@ def train(module, **options):
 
 
 def test_loop_of_inrias_own_is_no_stranger():
-    with SkipGate(stranger(), policy=SkipAlways()) as gate:
+    with SkipGate(unknown_fork(), policy=SkipAlways()) as gate:
         assert gate.adapter.name == "inria"
         train(gate.adapter.trainer)
     assert gate.report()["backwards_skipped"] == 21
@@ -89,18 +89,18 @@ def test_loop_of_inrias_own_is_no_stranger():
 )
 def test_loop_that_changes_values_itself_is_refused(extra, sentence):
     with pytest.raises(AdapterMismatchError, match=sentence):
-        SkipGate(stranger(extra=extra))
+        SkipGate(unknown_fork(extra=extra))
     assert torch.Tensor.backward.__module__ == "torch._tensor"
 
 
 def test_loop_without_an_end_of_densification_is_refused():
     with pytest.raises(AdapterMismatchError, match="its loop never asks for densify_until_iter"):
-        SkipGate(stranger(until="iterations"))
+        SkipGate(unknown_fork(until="iterations"))
 
 
 def test_further_calls_and_arguments_are_listed():
     with pytest.warns(RuntimeWarning, match="that no adapter knows") as warnings:
-        gate = SkipGate(stranger(", kernel_size=0.1", "gaussians.count()"), policy=SkipAlways())
+        gate = SkipGate(unknown_fork(", kernel_size=0.1", "gaussians.count()"), policy=SkipAlways())
     sentence = str(warnings[0].message)
     assert "Recognised: render, backward, training_setup, update_learning_rate." in sentence
     assert sentence.endswith("left to go on in skipped iterations: render(kernel_size=), count().")
@@ -111,7 +111,7 @@ def test_further_calls_and_arguments_are_listed():
 
 def test_what_moves_the_model_in_skipped_iterations_ends_the_gate_and_not_the_training():
     with pytest.warns(RuntimeWarning, match=r"shake\(\)"):
-        gate = SkipGate(stranger(extra="gaussians.shake()"), policy=SkipAlways())
+        gate = SkipGate(unknown_fork(extra="gaussians.shake()"), policy=SkipAlways())
     with gate, pytest.warns(RuntimeWarning, match="The loop moved xyz in iteration 21, whose backward was skipped"):
         train(gate.adapter.trainer)
         assert not gate.patched
@@ -121,7 +121,7 @@ def test_what_moves_the_model_in_skipped_iterations_ends_the_gate_and_not_the_tr
 
 def test_a_nan_that_stays_in_a_parameter_is_no_drift(recwarn):
     """The model has a hole, but nothing of the loop's moves it in skipped iterations."""
-    module = stranger(extra="gaussians.values['f_rest'].data[0] = float('nan')")
+    module = unknown_fork(extra="gaussians.values['f_rest'].data[0] = float('nan')")
     with SkipGate(module, policy=SkipAlways()) as gate:
         train(module)
         assert gate.patched
@@ -129,7 +129,7 @@ def test_a_nan_that_stays_in_a_parameter_is_no_drift(recwarn):
 
 
 def test_what_moves_beside_a_nan_is_still_found():
-    module = stranger(extra="gaussians.values['f_rest'].data[0] = float('nan'); gaussians.shake()")
+    module = unknown_fork(extra="gaussians.values['f_rest'].data[0] = float('nan'); gaussians.shake()")
     with pytest.warns(RuntimeWarning), SkipGate(module, policy=SkipAlways()) as gate:
         train(module)
     assert not gate.patched
@@ -137,7 +137,7 @@ def test_what_moves_beside_a_nan_is_still_found():
 
 def test_noise_for_a_network_is_listed_and_not_refused():
     with pytest.warns(RuntimeWarning, match=r"left to go on in skipped iterations: randn\(\)"):
-        gate = SkipGate(stranger(extra="noise = torch.randn(3)"), policy=SkipAlways())
+        gate = SkipGate(unknown_fork(extra="noise = torch.randn(3)"), policy=SkipAlways())
     with gate:
         train(gate.adapter.trainer)
     assert gate.report()["backwards_skipped"] == 21
@@ -153,7 +153,7 @@ def test_noise_for_a_network_is_listed_and_not_refused():
     ids=["freeze before", "write before", "freeze"],
 )
 def test_what_changes_no_values_in_the_loop_is_not_refused(parts):
-    with SkipGate(stranger(**parts), policy=SkipAlways()) as gate:
+    with SkipGate(unknown_fork(**parts), policy=SkipAlways()) as gate:
         train(gate.adapter.trainer)
     assert gate.report()["backwards_skipped"] == 21
 
@@ -161,10 +161,10 @@ def test_what_changes_no_values_in_the_loop_is_not_refused(parts):
 def test_functions_that_the_loop_calls_are_read_too():
     helper = "\ndef nudge(gaussians):\n    inner(gaussians)\n\ndef inner(gaussians):\n    gaussians.count()\n"
     with pytest.warns(RuntimeWarning, match=r"in skipped iterations: count\(\)"):
-        SkipGate(stranger(extra="nudge(gaussians)", helper=helper)).detach()
+        SkipGate(unknown_fork(extra="nudge(gaussians)", helper=helper)).detach()
     writes = helper.replace("gaussians.count()", "gaussians.values['xyz'].add_(1.0)")
     with pytest.raises(AdapterMismatchError, match=r"changes values itself \(add_\)"):
-        SkipGate(stranger(extra="nudge(gaussians)", helper=writes))
+        SkipGate(unknown_fork(extra="nudge(gaussians)", helper=writes))
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_failure_of_the_gates_own_code_loses_no_run(monkeypatch):
 
     monkeypatch.setattr(Inria, "start_iter", broken)
     sentence = "released, and training goes on without it: AttributeError: .*no_such_option"
-    with SkipGate(stranger()) as gate:
+    with SkipGate(unknown_fork()) as gate:
         with pytest.warns(RuntimeWarning, match=sentence):
             train(gate.adapter.trainer)
         assert not gate.patched
@@ -215,8 +215,8 @@ def test_failure_of_the_gates_own_code_loses_no_run(monkeypatch):
 def test_a_gate_that_is_off_refuses_nothing_in_the_first_iteration(monkeypatch):
     monkeypatch.setattr(Inria, "scenes", ("no_scene",))
     sentence = "expects no_scene among the variables"
-    with SkipGate(stranger(), enabled=False) as gate, pytest.warns(RuntimeWarning, match=sentence):
+    with SkipGate(unknown_fork(), enabled=False) as gate, pytest.warns(RuntimeWarning, match=sentence):
         train(gate.adapter.trainer)
     assert log.backwards == [*range(1, 41)]
-    with SkipGate(stranger()) as gate, pytest.raises(AdapterMismatchError, match="expects no_scene"):
+    with SkipGate(unknown_fork()) as gate, pytest.raises(AdapterMismatchError, match="expects no_scene"):
         train(gate.adapter.trainer)

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from skipgs_plug.bench.memory import memory_meter
 from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.bench.refine import MOST_DB, measured, peak_memory
+from skipgs_plug.bench.sampling import periodic_numbers, random_numbers
 from skipgs_plug.bench.summary import summarise
 from skipgs_plug.bench.table import WHOLE, cells, notes, searched
-from skipgs_plug.bench.thinning import periodic_numbers, random_numbers
 from skipgs_plug.bench.whole import PARTS, events, nearest, next_setting, same, search
 from skipgs_plug.bench.whole_policies import WHOLE_POLICIES
 from skipgs_plug.trainer import TrainConfig, Trainer

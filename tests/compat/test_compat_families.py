@@ -179,15 +179,15 @@ def test_sparse_adam_moves_visible_rows_only():
 
 @pytest.mark.parametrize("family", sorted(name for name in FAMILIES if FAMILIES[name]))
 def test_modules_are_served_and_taken_away(family):
-    stranger = object()
+    other_module = object()
     names = list(FAMILIES[family])
     before = set(sys.modules)
-    sys.modules[names[0]] = stranger  # what was there comes back
+    sys.modules[names[0]] = other_module  # what was there comes back
     try:
         with serve(family):
             for name, (_, offered) in FAMILIES[family].items():
                 assert all(hasattr(importlib.import_module(name), attribute) for attribute in offered)
-        assert sys.modules[names[0]] is stranger
+        assert sys.modules[names[0]] is other_module
     finally:
         del sys.modules[names[0]]
     left = {name for name in set(sys.modules) - before if not name.startswith("skipgs_plug.")}

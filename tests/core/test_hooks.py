@@ -11,7 +11,7 @@ from always import Always
 from torch.optim import lr_scheduler as schedulers
 
 from skipgs_plug import AdapterMismatchError, GateOrderError, SkipGate, SkipGSError, UnknownTrainerError
-from skipgs_plug.adapters import AbstractAdapter, TrainerFacts
+from skipgs_plug.adapters import AbstractAdapter, TrainerInfo
 from skipgs_plug.adapters.schedulers import catch_up_schedulers
 from skipgs_plug.core.pace.refining import Refining
 from skipgs_plug.core.policy import SkipPolicy
@@ -71,7 +71,7 @@ class Toy(AbstractAdapter):
         hooks.gate_tensor_backward("train")
         if not self.hurried:
             hooks.ready(
-                TrainerFacts(20, view_names=[f"v{i}" for i in range(10)], defaults={"warmup": 12, "pause_iters": 15})
+                TrainerInfo(20, view_names=[f"v{i}" for i in range(10)], defaults={"warmup": 12, "pause_iters": 15})
             )
 
     def must_run(self, step: int) -> bool:
@@ -229,7 +229,7 @@ def test_backwards_outside_iterations_are_an_error() -> None:
     class Deaf(Toy):
         def attach(self, hooks) -> None:
             hooks.gate_tensor_backward("train")
-            hooks.ready(TrainerFacts(20))
+            hooks.ready(TrainerInfo(20))
 
     trainer = ToyTrainer()
     with SkipGate(trainer, adapter=Deaf(trainer)), pytest.raises(AdapterMismatchError, match="in no iteration"):
@@ -250,7 +250,7 @@ class Endless(Toy):
 
     def attach(self, hooks) -> None:
         super().attach(hooks)
-        hooks.ready(TrainerFacts(None))
+        hooks.ready(TrainerInfo(None))
 
 
 def test_facts_that_come_late_and_are_refused_leave_nothing_behind() -> None:
@@ -258,7 +258,7 @@ def test_facts_that_come_late_and_are_refused_leave_nothing_behind() -> None:
         hurried = True
 
         def attach(self, hooks) -> None:
-            hooks.before(self.trainer, "begin", lambda step: hooks.ready(TrainerFacts(None)))
+            hooks.before(self.trainer, "begin", lambda step: hooks.ready(TrainerInfo(None)))
             hooks.gate_tensor_backward("train")
 
     trainer = ToyTrainer()
@@ -275,7 +275,7 @@ def test_two_views_of_one_name_are_refused() -> None:
 
         def attach(self, hooks) -> None:
             super().attach(hooks)
-            hooks.ready(TrainerFacts(20, view_names=["a", "a"]))
+            hooks.ready(TrainerInfo(20, view_names=["a", "a"]))
 
     trainer = ToyTrainer()
     with pytest.raises(SkipGSError, match="'a' names 2"):
@@ -419,7 +419,7 @@ def test_a_trainer_that_knows_of_more_processes_is_believed() -> None:
 
         def attach(self, hooks) -> None:
             super().attach(hooks)
-            hooks.ready(TrainerFacts(20, world_size=4))
+            hooks.ready(TrainerInfo(20, world_size=4))
 
     with pytest.raises(SkipGSError, match="4 processes"):
         SkipGate(trainer := ToyTrainer(), adapter=Crowd(trainer))

@@ -32,7 +32,7 @@ KEYS = {
     "iterations_run",
     "iterations_skipped",
     "always_run",
-    "foresight",
+    "early_stopping",
     "growing",
     "views",
 }

@@ -14,8 +14,8 @@ import torch
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.engine import Engine
-from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.policy import SkipPolicy
+from skipgs_plug.core.trainer_info import TrainerInfo
 
 RELEASE = {
     "state_version": 1,
@@ -196,7 +196,7 @@ def test_a_loaded_state_is_handed_on_until_the_trainer_says_when_densification_e
     assert engine.state_dict() == {}
     engine.load_state_dict(state)
     assert engine.state_dict() == state
-    engine.configure(TrainerFacts(start_iter=0))
+    engine.configure(TrainerInfo(start_iter=0))
     assert engine.state_dict()["policy"] == state["policy"]
 
 

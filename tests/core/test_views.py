@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from skipgs_plug import SkipGate
-from skipgs_plug.adapters import TrainerFacts
+from skipgs_plug.adapters import TrainerInfo
 from skipgs_plug.core import views
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.views import require_unique, view_key
@@ -70,5 +70,5 @@ def test_keys_that_recur_or_are_known_are_not_warned_about(monkeypatch) -> None:
     monkeypatch.setattr(views, "CHECKED_KEYS", 100)
     train(SkipGate(start_iter=0), [*range(98), 0, 1, 98, 99, 100])
     known = SkipGate(start_iter=0)
-    known._engine.configure(TrainerFacts(0, view_names=[str(i) for i in range(200)]))
+    known._engine.configure(TrainerInfo(0, view_names=[str(i) for i in range(200)]))
     train(known, range(200))

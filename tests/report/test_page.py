@@ -204,8 +204,8 @@ def test_an_unfinished_bench_is_named_as_such(tmp_path, capsys):
 @pytest.mark.parametrize(("share", "cells"), [(0.4, ("40", "-", "-")), ("auto", ("40", "no", "9.00"))])
 def test_iterations_left_out_are_told(train_folder, tmp_path, share, cells):
     data = json.loads((train_folder / "skipgs.json").read_text())
-    foresight = {"ended_early": False, "rest_worth_db": 9.0} if share == "auto" else None
-    data |= {"refine_share": 0.4, "iterations_run": 1234, "iterations_skipped": 2000, "foresight": foresight}
+    early_stopping = {"ended_early": False, "rest_worth_db": 9.0} if share == "auto" else None
+    data |= {"refine_share": 0.4, "iterations_run": 1234, "iterations_skipped": 2000, "early_stopping": early_stopping}
     data["always_run"] = {"line 3: step % 10 == 0": 30, "line 9: saves": 2}
     folder = shutil.copytree(train_folder, tmp_path / "run")
     (folder / "skipgs.json").write_text(json.dumps(data))

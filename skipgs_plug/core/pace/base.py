@@ -7,9 +7,9 @@ from types import CodeType
 from typing import Any
 
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.pace.loop_range import LoopRange
 from skipgs_plug.core.policy import Policy, SkipPolicy
+from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
 Source = tuple[CodeType, Mapping[str, Any]]  # code of the function that holds a loop, and the names that it knew
 Always = Callable[[range], Iterable[int]]
@@ -41,12 +41,12 @@ class Pace:
     number: int | None = None
     gap: int = 0
 
-    def configure(self, start: int, facts: TrainerFacts, views: list[str] | None) -> None:
+    def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
         """Take the facts about the trainer.
 
         Args:
             start: First iteration of refinement.
-            facts: About the trainer.
+            info: About the trainer.
             views: Keys of all training views, None if unknown.
 
         Raises:

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.facts import TrainerFacts
 from skipgs_plug.core.pace.base import EveryNumber, Pace, Source
 from skipgs_plug.core.pace.loop_range import LoopRange, require_planned
 from skipgs_plug.core.pace.rates import ScaledRates, path_factor
+from skipgs_plug.core.trainer_info import TrainerInfo
 
 
 class Compensated(Pace):
@@ -27,10 +27,10 @@ class Compensated(Pace):
         self._start = 0
         self._last: int | None = None  # iteration after which steps have no length
 
-    def configure(self, start: int, facts: TrainerFacts, views: list[str] | None) -> None:
+    def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
         self._start = start
-        if facts.max_steps is not None:
-            self._plan(range(facts.max_steps + 1))
+        if info.max_steps is not None:
+            self._plan(range(info.max_steps + 1))
 
     def follow(
         self,
@@ -41,7 +41,7 @@ class Compensated(Pace):
         events: Iterable[int] | None = None,
     ) -> LoopRange:
         self._plan(numbers)
-        return LoopRange(numbers, EveryNumber(self._rates.rest))
+        return LoopRange(numbers, EveryNumber(self._rates.pause))
 
     def begin(self, step: int, floor: float | None) -> None:
         if self._last is None:
@@ -50,11 +50,11 @@ class Compensated(Pace):
                 "for step in gate.iterations(range(...))."
             )
         if step < self._start:
-            self._rates.rest()
+            self._rates.pause()
             return
         # A trainer may go on after the end that it told: with steps of length 0.
         progress = min((step - self._start) / max(self._last + 1 - self._start, 1), 1.0)
-        self._rates.scale(path_factor(floor or 1.0, progress, self._config.rate_peak, self._rates.shown.share))
+        self._rates.scale(path_factor(floor or 1.0, progress, self._config.rate_peak, self._rates.visibility.share))
 
     def _plan(self, numbers: range) -> None:
         if not numbers:

@@ -6,8 +6,8 @@ import bisect
 from collections.abc import Iterable
 from typing import Any
 
-from skipgs_plug.core.facts import Densification
 from skipgs_plug.core.pace.needs import NEARLY_ALL
+from skipgs_plug.core.trainer_info import Densification
 
 # Visits of each Gaussian behind an event. Densification grows what has a large mean gradient over its visits: over
 # fewer, the means are noisier, and more of them lie above the threshold (bonsai with 10 visits: 17 to 90 % more
@@ -17,7 +17,7 @@ VISITS_BEHIND = 20.0
 # Where a view shows nearly all, growth is limited by the number of events instead: every second one ends with half of
 # Lego's Gaussians.
 VISITS_BEHIND_FULL_VIEWS = 8.0
-SHOWN = 1 / 3  # share of the Gaussians that a view shows, before it is measured
+VISIBLE = 1 / 3  # share of the Gaussians that a view shows, before it is measured
 
 
 class Events:
@@ -63,12 +63,12 @@ class Events:
         """An iteration is left out, with its event if it has one."""
         self.left_out += number in self._known
 
-    def enough(self, number: int, shown: float | None) -> bool:
+    def enough(self, number: int, visible: float | None) -> bool:
         """Whether enough stands behind the event in iteration `number`.
 
         Args:
             number: Iteration with an event.
-            shown: Share of the Gaussians that a view shows; None if unknown.
+            visible: Share of the Gaussians that a view shows; None if unknown.
         """
         if self._needs == "nothing":
             return True
@@ -77,9 +77,9 @@ class Events:
         behind = self._behind + 1
         if self._needs == "iterations":
             return behind >= distance
-        shown = shown or SHOWN
-        visits = VISITS_BEHIND_FULL_VIEWS if shown >= NEARLY_ALL else VISITS_BEHIND
-        return behind * shown >= min(visits, distance * shown)
+        visible = visible or VISIBLE
+        visits = VISITS_BEHIND_FULL_VIEWS if visible >= NEARLY_ALL else VISITS_BEHIND
+        return behind * visible >= min(visits, distance * visible)
 
     def _distance(self, number: int) -> int:
         """Iterations from the event before to this one in the trainer's own schedule."""

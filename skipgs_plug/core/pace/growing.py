@@ -8,12 +8,12 @@ from typing import Any
 from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.facts import Densification
 from skipgs_plug.core.pace.base import NAMED
 from skipgs_plug.core.pace.events import Events
 from skipgs_plug.core.pace.needs import growing_factor, growing_share
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.sampling import Sampling
+from skipgs_plug.core.trainer_info import Densification
 
 MEASURED = 20  # steps over which the share of Gaussians that a view shows is averaged before it decides
 
@@ -47,7 +47,7 @@ class Growing:
         self._first_number: int | None = None
         self._length = 0
         self._epoch = 0
-        self._shown: float | None = None
+        self._visible: float | None = None
         self._settled = False
         self._saved_events: dict[str, Any] | None = None
         self._rows = self._grown = 0  # Gaussians when the last event was asked about, and those added since before it
@@ -119,7 +119,7 @@ class Growing:
         assert self.share is not None
         must, barred = number in self._must, False
         if number in self.events and not must:
-            must = (self.share >= 1.0 or self.events.enough(number, self._shown)) and not self._full()
+            must = (self.share >= 1.0 or self.events.enough(number, self._visible)) and not self._full()
             barred = not must
         self.sampling.share = self.share
         runs = self.sampling.runs(must, barred)
@@ -131,25 +131,25 @@ class Growing:
         if factor > 1.0 or not self._settled or self._config.max_gaussians is not None:
             self._rates.scale(factor, evenly=True)
         else:
-            self._rates.rest()
+            self._rates.pause()
         return runs
 
     def _settle(self) -> None:
         """Set share and visibility by what is measured so far; once enough steps were seen, they stay."""
         if self._settled:
             return
-        if self._rates.shown.steps >= MEASURED:
-            self._shown = self._rates.shown.share
+        if self._rates.visibility.steps >= MEASURED:
+            self._visible = self._rates.visibility.share
             self._settled = True
         if self._config.growing == "auto":
-            self.share = growing_share(self._length, self._epoch, self._shown)
+            self.share = growing_share(self._length, self._epoch, self._visible)
 
     @property
     def _factor(self) -> float:
         """Factor on learning rates in force."""
         if self.share is None or not self._config.compensates:
             return 1.0
-        return growing_factor(self._length, self.share, self._shown)
+        return growing_factor(self._length, self.share, self._visible)
 
     def _full(self) -> bool:
         """Whether one more event could grow the scene beyond the number of Gaussians that the user set."""
@@ -182,7 +182,7 @@ class Growing:
             "first": self._first_number,
             "views": self._epoch,
             "settled": self._settled,
-            "gaussians_shown": self._shown,
+            "gaussians_shown": self._visible,
             "sampling": self.sampling.state_dict(),
             "events": self._saved_events if self.events is None else self.events.state_dict(),
         }
@@ -191,6 +191,6 @@ class Growing:
         """Continue from `state_dict()`; `begin` follows."""
         self.share, self._first_number = state["share"], state["first"]
         self._epoch = state["views"]
-        self._settled, self._shown = state["settled"], state["gaussians_shown"]
+        self._settled, self._visible = state["settled"], state["gaussians_shown"]
         self.sampling.load_state_dict(state["sampling"])
         self._saved_events, self.events = state["events"], None

@@ -65,12 +65,12 @@ class Condition:
         values = dict(names)  # once: it holds every global name of the loop's module
         for assumed in (True, False):  # of parts that say nothing of the number
             holds: set[int] = set()
-            rest: set[int] = set()
+            others: set[int] = set()
             for number in numbers:
                 values[self._loop.target] = number
                 if all(self._value(outer, values, True) for outer in self._path):
-                    (holds if self._value(self._test, values, assumed) else rest).add(number)
-            found |= holds if len(holds) <= len(rest) else rest
+                    (holds if self._value(self._test, values, assumed) else others).add(number)
+            found |= holds if len(holds) <= len(others) else others
         return found
 
     def _value(self, node: ast.expr, values: dict[str, Any], assumed: bool) -> bool:
@@ -254,11 +254,11 @@ def _counted(body: list[ast.stmt]) -> Iterator[str]:
 class _Inline(ast.NodeTransformer):
     """Puts an expression where a name or an attribute is read below a line; above, it is of the iteration before."""
 
-    def __init__(self, place: str, value: ast.expr, line: int) -> None:
-        self._place, self._value, self._line = place, value, line
+    def __init__(self, name: str, value: ast.expr, line: int) -> None:
+        self._name, self._value, self._line = name, value, line
 
     def visit_Name(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        if isinstance(node.ctx, ast.Load) and node.lineno > self._line and ast.unparse(node) == self._place:
+        if isinstance(node.ctx, ast.Load) and node.lineno > self._line and ast.unparse(node) == self._name:
             return ast.copy_location(copy.deepcopy(self._value), node)
         return self.generic_visit(node)
 

@@ -37,22 +37,22 @@ def refining_share(iterations: int, epoch: int) -> float:
     return min(1.0, max(LEAST_SHARE, LEAST_STEPS / iterations, RARE_SHARE * (epoch / iterations) ** 0.25))
 
 
-def growing_share(iterations: int, epoch: int, shown: float | None) -> float:
+def growing_share(iterations: int, epoch: int, visible: float | None) -> float:
     """Share of the iterations before the end of densification that are needed.
 
     Args:
         iterations: Iterations of the schedule until densification ends.
         epoch: Number of iterations in which every view comes up once.
-        shown: Share of the Gaussians that a view shows; None before it is measured.
+        visible: Share of the Gaussians that a view shows; None before it is measured.
     """
     if iterations < 1:
         return 1.0
-    full_views = shown is not None and shown >= NEARLY_ALL
+    full_views = visible is not None and visible >= NEARLY_ALL
     steps = LEAST_GROWING_STEPS_FULL_VIEWS if full_views else LEAST_GROWING_STEPS
     return min(1.0, max(LEAST_GROWING_SHARE, steps / iterations, GROWING_VISITS * epoch / iterations))
 
 
-def growing_factor(iterations: int, share: float, shown: float | None) -> float:
+def growing_factor(iterations: int, share: float, visible: float | None) -> float:
     """Factor on learning rates while the scene grows.
 
     On a short schedule parameters do not travel far enough in fewer iterations. Where a view shows nearly all
@@ -61,8 +61,8 @@ def growing_factor(iterations: int, share: float, shown: float | None) -> float:
     Args:
         iterations: As for `growing_share`.
         share: Share of them that runs, in (0, 1].
-        shown: As for `growing_share`.
+        visible: As for `growing_share`.
     """
-    if shown is None or shown < NEARLY_ALL:
+    if visible is None or visible < NEARLY_ALL:
         return 1.0
     return min(1.0 / share, max(1.0, FULL_PATH / math.ceil(share * iterations)))

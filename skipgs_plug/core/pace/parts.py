@@ -17,8 +17,8 @@ NAMED = {
     **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
-BESIDE = 0.25  # of the trainer's rate, at most, for what has no row for each Gaussian
-OF_A_GAUSSIAN = ((), (1,), (2,), (3,), (4,))  # shapes of its parameters beside colours [K, 3]
+OTHERS_AT_MOST = 0.25  # of the trainer's rate, at most, for what has no row for each Gaussian
+GAUSSIAN_SHAPES = ((), (1,), (2,), (3,), (4,))  # shapes of its parameters beside colours [K, 3]
 
 
 def group_part(group: dict[str, Any], name: str | None = None) -> float | None:
@@ -43,13 +43,7 @@ def group_part(group: dict[str, Any], name: str | None = None) -> float | None:
     return OTHERS
 
 
-def group_factor(group: dict[str, Any], factor: float, name: str | None = None) -> float:
-    """Return the factor on the learning rate of a group, where `factor` is that of all; see `group_part`."""
-    part = group_part(group, name)
-    return min(factor, 1.0) if part is None else part * factor
-
-
-class GroupFacts:
+class GroupInfo:
     """Facts about a group of parameters, found once and valid while its parameters are the same tensors.
 
     Args:
@@ -76,7 +70,7 @@ class GroupFacts:
         self._known = known is not None
         shapes = [tuple(param.shape[1:]) for param in self._params]
         # Inria's exposures step before the positions do. Groups with names are a model's, of anchors for example.
-        self._shaped = all(shape in OF_A_GAUSSIAN or (len(shape) == 2 and shape[1] == 3) for shape in shapes)
+        self._shaped = all(shape in GAUSSIAN_SHAPES or (len(shape) == 2 and shape[1] == 3) for shape in shapes)
         may_be = self._params if known is None or known in POSITIONS else []
         self.positions = [param for param in may_be if param.ndim == 2 and param.shape[1] == 3]
         self.betas: Any = None  # of the trainer, for which `_short` was made
@@ -119,10 +113,10 @@ class Share(NamedTuple):
     group: dict[str, Any]
     times: float
     raised: bool
-    longer: GroupFacts | None
+    longer: GroupInfo | None
 
 
-class OptimizerFacts:
+class OptimizerInfo:
     """Facts about an optimizer, valid while its groups hold the same parameters.
 
     Args:
@@ -140,7 +134,7 @@ class OptimizerFacts:
 
     def __init__(self, optimizer: torch.optim.Optimizer, name: str | None) -> None:
         self.name = name
-        self.groups = [GroupFacts(group, name) for group in optimizer.param_groups]
+        self.groups = [GroupInfo(group, name) for group in optimizer.param_groups]
         self.positions = [param for group in self.groups for param in group.positions]
         self.shares: list[Share] = []
         self._divided: tuple[int, bool] | None = None
@@ -167,17 +161,17 @@ class OptimizerFacts:
         return self.shares
 
 
-def _share(facts: GroupFacts, rows: int, evenly: bool) -> Share | None:
-    longer = facts.of_gaussians(rows)
+def _share(info: GroupInfo, rows: int, evenly: bool) -> Share | None:
+    longer = info.of_gaussians(rows)
     if evenly:
-        return Share(facts.group, 1.0, True, facts) if longer else None
+        return Share(info.group, 1.0, True, info) if longer else None
     if not longer:
-        return Share(facts.group, BESIDE, False, None)
-    return Share(facts.group, 1.0 if facts.part is None else facts.part, facts.part is not None, facts)
+        return Share(info.group, OTHERS_AT_MOST, False, None)
+    return Share(info.group, 1.0 if info.part is None else info.part, info.part is not None, info)
 
 
-def _is_about(facts: GroupFacts, group: dict[str, Any]) -> bool:
-    return facts.group is group and facts.fits(group["params"])
+def _is_about(info: GroupInfo, group: dict[str, Any]) -> bool:
+    return info.group is group and info.fits(group["params"])
 
 
 def _same(one: Any, other: Any) -> bool:

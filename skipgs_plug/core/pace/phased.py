@@ -8,7 +8,6 @@ from typing import Any
 
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError, warn_of_release
-from skipgs_plug.core.facts import Densification, TrainerFacts
 from skipgs_plug.core.pace.base import NAMED, Always, Known, Pace, Source, nothing_always, nothing_known
 from skipgs_plug.core.pace.growing import Growing
 from skipgs_plug.core.pace.loop_finder import LoopFinder
@@ -18,6 +17,7 @@ from skipgs_plug.core.pace.policy import RefinementPolicy
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refining import Refining
 from skipgs_plug.core.policy import Policy
+from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
 
 class Phased(Pace):
@@ -59,10 +59,10 @@ class Phased(Pace):
 
     # Facts about the trainer.
 
-    def configure(self, start: int, facts: TrainerFacts, views: list[str] | None) -> None:
-        self._start, self._last, self._views = start, facts.max_steps, views
-        self._keeps_rates, self._epoch = facts.accumulates, facts.epoch
-        self._densification = facts.densification or self._densification
+    def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
+        self._start, self._last, self._views = start, info.max_steps, views
+        self._keeps_rates, self._epoch = info.accumulates, info.epoch
+        self._densification = info.densification or self._densification
         self._configured = True
 
     def policy(self, config: SkipConfig) -> Policy:
@@ -185,7 +185,7 @@ class Phased(Pace):
     def ended(self, loop: LoopRange) -> None:
         """The loop is over, or was left: whatever steps afterwards is no part of it."""
         if loop is self._finder.found:
-            self._rates.rest()
+            self._rates.pause()
 
     def _read(self, loop: LoopRange, number: int) -> None:
         """Read the loop's conditions, with its first number that can be left out: nothing is refused later."""
@@ -247,7 +247,7 @@ class Phased(Pace):
 
     def _refine(self, number: int) -> bool:
         if self.growing is not None and self.refining.sampling.asked == 0:
-            self._rates.shown.restart()  # what views show of the grown scene decides how long steps are
+            self._rates.visibility.restart()  # what views show of the grown scene decides how long steps are
         return self.refining.runs(number)
 
     # State and report.
@@ -255,7 +255,7 @@ class Phased(Pace):
     def report(self) -> dict[str, Any]:
         return {
             **self.refining.report(),
-            "gaussians_shown": self._rates.shown.share,
+            "gaussians_shown": self._rates.visibility.share,
             "growing": None if self.growing is None else self.growing.report(),
         }
 

@@ -15,15 +15,15 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 from torch.utils.hooks import RemovableHandle
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.pace.parts import OptimizerFacts
+from skipgs_plug.core.pace.parts import OptimizerInfo
 from skipgs_plug.core.pace.step_reads import LiteralBetas, WatchedGroup, is_torchs, shorter_memory, unwatch, watch
 from skipgs_plug.core.pace.visibility import Visibility
 
 Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
 Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 
-LONGEST_AT = 0.25  # of the iterations; below, steps that are longer still lose more than the path gains
-SHOWN = 1 / 3  # of the Gaussians by a view, where it is not known: as in a room photographed from within
+LEAST_PATH_SHARE = 0.25  # of the iterations; below, steps that are longer still lose more than the path gains
+VISIBLE = 1 / 3  # of the Gaussians by a view, where it is not known: as in a room photographed from within
 # Of Adam's running mean of squares (beta2), at most. By the gradient of a single view a parameter can move its rate
 # over the root of 1 - beta2: 32 times the rate at the usual 0.999, too far where rates are larger.
 SQUARES_KEPT = 0.98
@@ -33,13 +33,13 @@ UNSTEPPED_WARNS, UNSTEPPED_RAISES = 50, 200
 _hooked: list[ScaledRates] = []  # all whose hooks PyTorch holds
 
 
-def path_factor(share: float, progress: float, peak: float | None = None, shown: float | None = None) -> float:
+def path_factor(share: float, progress: float, peak: float | None = None, visible: float | None = None) -> float:
     """Factor on learning rates at some progress through refinement, when a share of the iterations runs.
 
     Adam's steps are about as long as its learning rate, and refinement is limited by how far parameters travel: a
     share of the steps goes as far as all of them when their mean length is 1 / share. Chance is as large in each step
     of a Gaussian, however rarely a view shows it, and what the views agree on grows with the root of how often they do:
-    with it grows what steps bear. So the factor begins with 2 sqrt(3 shown) / share, which conserves the path where a
+    with it grows what steps bear. So the factor begins with 2 sqrt(3 visible) / share, which conserves the path where a
     view shows a third of the Gaussians, and falls linearly to 0, the shape that averages the noise of the last steps
     out (Defazio et al., arXiv 2310.07831).
 
@@ -47,10 +47,10 @@ def path_factor(share: float, progress: float, peak: float | None = None, shown:
         share: Share of the iterations that run, in (0, 1]; one below a quarter gets the steps of a quarter.
         progress: Share of refinement that is over, in [0, 1].
         peak: Factor at the beginning, instead of that.
-        shown: Share of the Gaussians that a view shows, in (0, 1]; None where it is not known.
+        visible: Share of the Gaussians that a view shows, in (0, 1]; None where it is not known.
     """
     if peak is None:
-        peak = 2.0 * math.sqrt(3.0 * (SHOWN if shown is None else shown)) / max(share, LONGEST_AT)
+        peak = 2.0 * math.sqrt(3.0 * (VISIBLE if visible is None else visible)) / max(share, LEAST_PATH_SHARE)
     return peak * (1.0 - progress)
 
 
@@ -73,12 +73,12 @@ class ScaledRates:
 
     Attributes:
         only: as given.
-        shown: share of the Gaussians that a view shows, by the steps scaled so far.
+        visibility: share of the Gaussians that a view shows, by the steps scaled so far.
     """
 
     def __init__(self, only: Optimizers | None = None) -> None:
         self.only = only
-        self.shown = Visibility()
+        self.visibility = Visibility()
         self._factor: float | None = None
         self._evenly = False
         self._rows = self._rows_now = 0  # Gaussians in the iteration before and in this one; 0 where not known
@@ -91,7 +91,7 @@ class ScaledRates:
         self._removed = False
 
     def scale(self, factor: float, evenly: bool = False) -> None:
-        """Scale the steps of the thread that calls this, which is the one that trains; see `group_factor`.
+        """Scale the steps of the thread that calls this, which is the one that trains; see `group_part`.
 
         Args:
             factor: On learning rates.
@@ -101,7 +101,7 @@ class ScaledRates:
         Raises:
             SkipGSError: Another one scales steps in this thread, and one of the two does not know which are its own.
         """
-        self.rest()
+        self.pause()
         if self._removed:
             return
         thread = get_ident()
@@ -123,7 +123,7 @@ class ScaledRates:
         """Number of Gaussians in the last step of their positions; 0 if it is not known."""
         return self._rows_now or self._rows
 
-    def rest(self) -> None:
+    def pause(self) -> None:
         """Touch nothing until the next `scale`."""
         self._factor = None
         for step in self._under_way:  # one that raised had no end
@@ -133,7 +133,7 @@ class ScaledRates:
 
     def remove(self) -> None:
         """Take the hooks back, for good."""
-        self.rest()
+        self.pause()
         self._removed = True
         for handles in (self._handles, *(steps.handles for steps in self._steps.values())):
             while handles:
@@ -172,18 +172,18 @@ class ScaledRates:
             return  # a step can call the step of its base class
         if self._under_way:
             self._pass_on(optimizer)
-        facts = step.facts
-        if not facts.fits(optimizer):
-            facts = step.facts = OptimizerFacts(optimizer, facts.name)
+        info = step.info
+        if not info.fits(optimizer):
+            info = step.info = OptimizerInfo(optimizer, info.name)
         self._unstepped = 0
-        if not self.shown.complete:
-            self.shown.see(optimizer.param_groups, facts.name)
+        if not self.visibility.complete:
+            self.visibility.see(optimizer.param_groups, info.name)
         # Without names a camera's position has the shape of a Gaussian's, but there are fewer.
-        for param in facts.positions:
+        for param in info.positions:
             if param.shape[0] > self._rows_now:
                 self._rows_now = param.shape[0]
         evenly = self._evenly
-        shares = facts.divide(self._rows_now if self._rows_now > self._rows else self._rows, evenly)
+        shares = info.divide(self._rows_now if self._rows_now > self._rows else self._rows, evenly)
         if self._under_way:  # an optimizer can be wrapped in another one, which has the same groups
             scaled = {id(group) for other in self._under_way for group, _, _ in other.before}
             shares = [one for one in shares if id(one.group) not in scaled]
@@ -254,7 +254,7 @@ class _Steps:
         under_way: Steps that have begun and not ended, the outermost first.
 
     Attributes:
-        facts: about its groups.
+        info: about its groups.
         handles: of hooks on it.
         gone: forgets these steps with the optimizer.
         depth: calls of its `step` within each other.
@@ -267,12 +267,12 @@ class _Steps:
     """
 
     __slots__ = (
-        *("_under_way", "_until_end", "before", "depth", "facts", "gone", "handles", "judged", "literal"),
+        *("_under_way", "_until_end", "before", "depth", "info", "gone", "handles", "judged", "literal"),
         *("longer", "memory_stays", "watched"),
     )
 
     def __init__(self, optimizer: torch.optim.Optimizer, name: str | None, under_way: list[_Steps]) -> None:
-        self.facts = OptimizerFacts(optimizer, name)
+        self.info = OptimizerInfo(optimizer, name)
         self.handles: list[RemovableHandle] = []
         self.gone: Any = None
         self._under_way = under_way

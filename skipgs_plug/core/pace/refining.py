@@ -162,20 +162,20 @@ class Refining:
             self._over = False
         else:
             progress = self.stopping.progress(self.sampling.run / (self.share * (self._last + 1 - self.first)))
-            factor = path_factor(self.share, progress, self._config.rate_peak, self._rates.shown.share)
+            factor = path_factor(self.share, progress, self._config.rate_peak, self._rates.visibility.share)
             self._over = self.stopping.ended
         self.sampling.share = 0.0 if self._over else 1.0
         self._rates.scale(factor)
 
     def report(self) -> dict[str, Any]:
-        """Return `refine_share`, `iterations_run`, `iterations_skipped`, `always_run`, `foresight`."""
+        """Return `refine_share`, `iterations_run`, `iterations_skipped`, `always_run`, `early_stopping`."""
         stopping = self.stopping
         return {
             "refine_share": self.share,
             "iterations_run": self.sampling.run,
             "iterations_skipped": self.sampling.left_out,
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
-            "foresight": None
+            "early_stopping": None
             if stopping is None or not self._auto
             else {
                 "ended_early": stopping.early,

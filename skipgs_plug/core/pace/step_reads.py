@@ -137,12 +137,12 @@ class LiteralBetas:
 
     def _call(self, function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         given = list(args)
-        for place, value in enumerate(args):
+        for index, value in enumerate(args):
             if isinstance(value, tuple) and value[:2] == self._betas:
-                given[place] = (value[0], self._second, *value[2:])
+                given[index] = (value[0], self._second, *value[2:])
                 break
-            if _is_number(value) and (value, *args[place + 1 : place + 2]) == self._betas:
-                given[place + 1] = self._second
+            if _is_number(value) and (value, *args[index + 1 : index + 2]) == self._betas:
+                given[index + 1] = self._second
                 break
         else:
             return function(*args, **kwargs)

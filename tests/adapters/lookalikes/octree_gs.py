@@ -11,7 +11,7 @@ class GaussianModel(SplatModel):
         self.coarse_interval = coarse_iter
 
     def set_anchor_mask(self, iteration):
-        self.shown = len(self.values["xyz"]) * min(1.0, 0.5 + 0.5 * (iteration - 1) / self.coarse_interval)
+        self.visibility = len(self.values["xyz"]) * min(1.0, 0.5 + 0.5 * (iteration - 1) / self.coarse_interval)
 
     def training_statis(self, viewspace_points):
         self.add_densification_stats(viewspace_points)

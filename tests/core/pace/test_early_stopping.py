@@ -13,54 +13,54 @@ VIEWS = [f"{i}.png" for i in range(6)]
 
 def follow(losses, tolerance=0.05, iterations=800):
     """Go through all cycles; `losses(view, share done)` is what a view shows."""
-    foresight = EarlyStopping(tolerance)
+    early_stopping = EarlyStopping(tolerance)
     for i in range(iterations):
         done = i / iterations
-        foresight.progress(done)
-        if foresight.ended:
+        early_stopping.progress(done)
+        if early_stopping.ended:
             break
-        if foresight.watching:
+        if early_stopping.watching:
             view = VIEWS[i % len(VIEWS)]
-            foresight.see(view, losses(view, done))
-    return foresight, i / iterations
+            early_stopping.see(view, losses(view, done))
+    return early_stopping, i / iterations
 
 
 def test_a_scene_that_needs_nothing_ends_after_the_second_cycle():
-    foresight, done = follow(lambda view, done: 0.1)
-    assert foresight.early and done == CYCLE_ENDS[1]
-    assert foresight.gains == [(0.0, 0.0)] and foresight.foreseen == 0.0
+    early_stopping, done = follow(lambda view, done: 0.1)
+    assert early_stopping.early and done == CYCLE_ENDS[1]
+    assert early_stopping.gains == [(0.0, 0.0)] and early_stopping.foreseen == 0.0
 
 
 def test_a_scene_that_gains_to_the_end_gets_all():
-    foresight, _ = follow(lambda view, done: 0.1 * (1.0 - 0.5 * done))
-    assert not foresight.ended and foresight.cycle == len(CYCLE_ENDS) - 1
-    assert len(foresight.gains) == 1 and foresight.gains[0][0] > 0.05
-    foresight.progress(1.0)
-    assert foresight.ended and not foresight.early
+    early_stopping, _ = follow(lambda view, done: 0.1 * (1.0 - 0.5 * done))
+    assert not early_stopping.ended and early_stopping.cycle == len(CYCLE_ENDS) - 1
+    assert len(early_stopping.gains) == 1 and early_stopping.gains[0][0] > 0.05
+    early_stopping.progress(1.0)
+    assert early_stopping.ended and not early_stopping.early
 
 
 def test_doubt_counts_for_going_on():
     gains = {view: 0.002 * (i % 2) for i, view in enumerate(VIEWS)}
-    foresight, done = follow(lambda view, done: 0.1 - gains[view] * (done > 0.125))
-    assert foresight.gains[0][1] > 0.02 and not foresight.ended and done > CYCLE_ENDS[1]
+    early_stopping, done = follow(lambda view, done: 0.1 - gains[view] * (done > 0.125))
+    assert early_stopping.gains[0][1] > 0.02 and not early_stopping.ended and done > CYCLE_ENDS[1]
 
 
 def test_views_that_get_worse_say_nothing():
-    foresight, _ = follow(lambda view, done: 0.1 * (1.0 + done))
-    assert not foresight.ended and foresight.gains[0][0] < -0.05
+    early_stopping, _ = follow(lambda view, done: 0.1 * (1.0 + done))
+    assert not early_stopping.ended and early_stopping.gains[0][0] < -0.05
 
 
 def test_progress_runs_from_zero_to_one_in_every_cycle():
-    foresight = EarlyStopping(0.05)
-    seen = [foresight.progress(i / 80) for i in range(80)]
+    early_stopping = EarlyStopping(0.05)
+    seen = [early_stopping.progress(i / 80) for i in range(80)]
     assert seen == pytest.approx([i / 10 for i in range(10)] * 2 + [i / 60 for i in range(60)])
 
 
 def test_without_two_watched_views_nothing_is_judged():
-    foresight = EarlyStopping(0.05)
+    early_stopping = EarlyStopping(0.05)
     for i in range(100):
-        foresight.progress(i / 100)
-    assert foresight.gains == [] and foresight.foreseen is None and not foresight.ended
+        early_stopping.progress(i / 100)
+    assert early_stopping.gains == [] and early_stopping.foreseen is None and not early_stopping.ended
 
 
 def test_a_saved_state_goes_on():

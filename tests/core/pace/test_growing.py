@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from skipgs_plug import SkipGate, SkipGSError
-from skipgs_plug.core.facts import Densification
 from skipgs_plug.core.pace.events import VISITS_BEHIND_FULL_VIEWS, Events
 from skipgs_plug.core.pace.needs import growing_factor, growing_share
+from skipgs_plug.core.trainer_info import Densification
 
 VIEWS = [f"{i}.png" for i in range(4)]
 INTERVAL, START, LAST = 20, 400, 600

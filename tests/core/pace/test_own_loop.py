@@ -248,8 +248,8 @@ def test_auto_ends_where_nothing_is_gained_and_goes_on_with_what_hangs_on_number
     report = gate.report()
     # A quarter of a fifth of 2,000 iterations, then 500, 1,000, 1,500, 2,000 and the last.
     assert report["iterations_run"] == 100 + 5 and ran[-4:] == [1000, 1500, 2000, 2099]
-    assert report["foresight"]["ended_early"] and "ended early, in cycle 2" in gate.summary()
-    assert report["foresight"]["rest_worth_db"] == 0.0
+    assert report["early_stopping"]["ended_early"] and "ended early, in cycle 2" in gate.summary()
+    assert report["early_stopping"]["rest_worth_db"] == 0.0
     assert report["reasons"]["over"] > 0 and report["reasons"]["watched"] > 0
 
 
@@ -262,7 +262,7 @@ def test_auto_runs_the_whole_share_where_views_are_too_few_to_watch():
             if gate.backward(loss * 1.0, view=f"{step % 20}.png", step=step):
                 optimizer.step()
     report = gate.report()
-    assert report["iterations_run"] == 400 + 1 and report["foresight"]["watched"] == []
+    assert report["iterations_run"] == 400 + 1 and report["early_stopping"]["watched"] == []
     assert report["backwards_skipped"] == 1  # of the last iteration, when steps have shrunk to nothing
     assert "too few views" in gate.summary()
 

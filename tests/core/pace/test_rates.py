@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.pace.parts import group_factor
+from skipgs_plug.core.pace.parts import group_part
 from skipgs_plug.core.pace.rates import UNSTEPPED_RAISES, UNSTEPPED_WARNS, ScaledRates, path_factor
 
 
@@ -160,7 +160,7 @@ def test_groups_of_parameters_take_their_part_of_the_factor(group, shape, times,
     rates.scale(3.0)
     optimizer.step()
     torch.testing.assert_close(value.detach(), torch.full(shape, -0.1 if times is None else -0.3 * times))
-    assert group_factor(optimizer.param_groups[0], 0.25) == (0.25 if times is None else 0.25 * times)
+    assert group_part(optimizer.param_groups[0]) == times
 
 
 class OwnStep(torch.optim.Adam):
@@ -187,7 +187,7 @@ def test_a_step_is_as_long_as_the_factor_says_and_the_rate_comes_back(kind, rate
     before = scaled.param_groups[0]["lr"]
     scaled.step(*arguments)
     assert scaled.param_groups[0]["lr"] is before
-    rates.rest()
+    rates.pause()
     plain.step(*arguments)
     torch.testing.assert_close(1.0 - value.detach(), 4.0 * (1.0 - other.detach()), rtol=1e-5, atol=0)
 
@@ -205,7 +205,7 @@ def test_squares_are_forgotten_sooner_while_steps_are_larger(fused, rates):
             rates.scale(1.5)
         scaled.step()
         assert scaled.param_groups[0]["betas"] == (0.9, 0.999)
-        rates.rest()
+        rates.pause()
         sooner.param_groups[0].update({"lr": 0.1 * 1.5, "betas": (0.9, 0.98)} if larger else {})
         sooner.step()
     torch.testing.assert_close(values[0], values[1], rtol=0, atol=0)
@@ -217,7 +217,7 @@ def test_a_memory_that_is_shorter_already_stays(rates):
     for _ in range(3):
         rates.scale(1.0)
         scaled.step()
-        rates.rest()
+        rates.pause()
         plain.step()
     torch.testing.assert_close(values[0], values[1], rtol=0, atol=0)
 
@@ -252,7 +252,7 @@ def test_a_checkpoint_after_a_step_that_raised_holds_the_trainers_rates(rates):
             optimizer.step()
         assert broken.param_groups[0]["lr"] == 0.5
         assert broken.state_dict() == before
-        rates.rest()
+        rates.pause()
     rates.remove()
     assert not broken._optimizer_state_dict_pre_hooks
 
@@ -343,7 +343,7 @@ def test_literal_betas_are_replaced_for_the_length_of_a_step(rates, passed):
         rates.scale(4.0)
         optimizer.step(True, 5)
         assert EXTENSION is extension
-    rates.rest()
+    rates.pause()
     optimizer.step(True, 5)
     assert [call[1:4] for call in passed] == [(0.8, 0.9, 0.98), (0.8, 0.9, 0.98), (0.1, 0.9, 0.999)]
 
@@ -381,7 +381,7 @@ def test_a_second_one_that_scales_the_same_optimizers_is_refused(rates):
     for other in (second, own):
         with pytest.raises(SkipGSError, match=r"each would scale those of both: detach\(\) it first"):
             other.scale(2.0)
-    rates.rest()
+    rates.pause()
     second.scale(2.0)  # one after the other
     second.remove()
     rates.only = list

@@ -83,9 +83,9 @@ def test_steps_are_longer_where_a_view_shows_more():
     rates.scale(1.0)
     optimizer.step()
     rates.remove()
-    assert path_factor(0.4, 0.25, shown=rates.shown.share) == pytest.approx(3.75 * math.sqrt(2.7))
+    assert path_factor(0.4, 0.25, visible=rates.visibility.share) == pytest.approx(3.75 * math.sqrt(2.7))
     assert path_factor(0.4, 0.25) == pytest.approx(3.75)
-    assert path_factor(0.4, 0.25, peak=3.0, shown=0.9) == 2.25
+    assert path_factor(0.4, 0.25, peak=3.0, visible=0.9) == 2.25
 
 
 def test_other_optimizers_are_not_looked_at():
@@ -94,7 +94,7 @@ def test_other_optimizers_are_not_looked_at():
     rates.scale(1.0)
     other.step()
     own.step()
-    rates.rest()
+    rates.pause()
     own.step()
     rates.remove()
-    assert rates.shown.state_dict() == [0.25, 1, 1, 0, 0]
+    assert rates.visibility.state_dict() == [0.25, 1, 1, 0, 0]

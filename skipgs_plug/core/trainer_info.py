@@ -28,7 +28,7 @@ class Densification:
 
 
 @dataclass(frozen=True)
-class TrainerFacts:
+class TrainerInfo:
     """Facts that an adapter passes to `Hooks.ready`. All but the first may stay unknown.
 
     Args:

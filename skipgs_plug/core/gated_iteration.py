@@ -8,7 +8,7 @@ from skipgs_plug.core import decision
 from skipgs_plug.core.decision import Decision
 
 
-class Iteration:
+class GatedIteration:
     """What is known of the present iteration. `begin` is the one place where it is forgotten.
 
     Attributes:
