@@ -10,7 +10,8 @@ from skipgs_plug import SkipGate
 from skipgs_plug.commands.names import require_names
 from skipgs_plug.commands.options.demo import Args
 from skipgs_plug.core.report import write_report
-from skipgs_plug.trainer import TrainConfig, Trainer
+from skipgs_plug.trainer import Scene, TrainConfig, Trainer
+from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.pictures import Curve, plot_refinement, save_comparison
 from skipgs_plug.trainer.run_folder import RunFolder
@@ -48,7 +49,7 @@ def compare(args: Args) -> list[Result]:
     print(f"Ray tracing {args.views} images ...")
     scene = make_scene(args.views, args.width, args.width * 3 // 4, args.points)
     config = TrainConfig(result_dir=args.out, max_steps=args.max_steps, backend=args.backend, seed=args.seed)  # type: ignore[arg-type]
-    trainer = Trainer(config, scene)
+    trainer = new_trainer(config, scene)
     print(f"Densifying on backend {trainer.backend.name} (its kernels compile on first use: half a minute) ...")
     trainer.train(until=trainer.refine_stop_iter, progress=not args.no_progress)
     snapshot = trainer.snapshot()
@@ -56,7 +57,7 @@ def compare(args: Args) -> list[Result]:
     for name, settings in GATES.items():
         if settings is not None and "share" in settings:
             print(f"Training from the first iteration, {name} ...")
-            trainer = Trainer(config, scene)
+            trainer = new_trainer(config, scene)
         else:
             print(f"Refining, {name} ...")
             trainer.restore(snapshot)
@@ -66,6 +67,13 @@ def compare(args: Args) -> list[Result]:
     print(table(results, trainer))
     print(f"\nPictures: {out / 'comparison.png'}, {out / 'refinement.png'}; models: {out}/*/ply")
     return results
+
+
+def new_trainer(config: TrainConfig, scene: Scene) -> Trainer:
+    """Return a trainer that counts processor seconds on the CPU, so that other programs do not disturb the times."""
+    trainer = Trainer(config, scene)
+    trainer.clock = TrainClock(trainer.backend.device, by_processor=trainer.backend.device.type == "cpu")
+    return trainer
 
 
 def finish(name: str, trainer: Trainer, folder: RunFolder, progress: bool) -> Result:
@@ -108,6 +116,7 @@ def table(results: list[Result], trainer: Trainer) -> str:
         quality = f"{r.stats['num_GS']:,}", f"{r.stats['psnr']:.2f}", f"{r.stats['ssim']:.4f}"
         rows.append((r.name, *times, f"{r.iterations:,}", f"{r.backwards:,}", *quality))
     own, *others = results
+    clock = " in processor seconds" if trainer.backend.device.type == "cpu" else ""
     changes = [
         f"{one.name} took {100 * one.t_total / own.t_total:.0f} % of the time, "
         f"{one.stats['psnr'] - own.stats['psnr']:+.2f} dB"
@@ -121,8 +130,8 @@ def table(results: list[Result], trainer: Trainer) -> str:
             f"{'; '.join(changes)}.",
             f"{len(trainer.scene.test)} held-out views; iteration {trainer.refine_stop_iter:,} of {trainer.max_steps:,}"
             f" ends densification; backend {trainer.backend.name}.",
-            "T_total is the time of training, T_post of its part after densification, both without evaluation and "
-            "compilation.",
+            f"T_total is the time of training{clock}, T_post of its part after densification, both without evaluation "
+            "and compilation.",
             "This is one seed of one small scene: `skipgs-plug bench` compares with controls over several seeds.",
         ]
     )
