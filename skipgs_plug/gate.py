@@ -261,6 +261,11 @@ class SkipGate:
     # Counts and settings.
 
     @property
+    def released(self) -> str | None:
+        """Why the gate let go of a run that then trained on without it; None where it did not."""
+        return self._engine.giving_up.reason
+
+    @property
     def skipped(self) -> bool:
         """Whether the backward pass of the present iteration was skipped."""
         return self._iteration.skipped

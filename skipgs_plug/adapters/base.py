@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -41,7 +39,6 @@ class AbstractAdapter(ABC):
         saved_state: Returns the gate's state of the checkpoint from which the trainer continues, if any. It is called
             once, with the first iteration. Set it before the gate is created.
         output_folder: The trainer's output folder, if known.
-        released: Why the gate let go of a run, which then continued without it; None if it did not.
         replaced: Names that the launcher has replaced around the trainer, for `SkipGate.patched`. Set it before the
             gate is created.
     """
@@ -55,7 +52,6 @@ class AbstractAdapter(ABC):
     stand_ins: ClassVar[str] = ""
     saved_state: Callable[[int], dict[str, Any] | None] | None = None
     output_folder: str | None = None
-    released: str | None = None
     replaced: Sequence[str] = ()
 
     def __init__(self, trainer: Any = None) -> None:
@@ -96,7 +92,7 @@ class AbstractAdapter(ABC):
 
         def begins(original: Callable[..., Any], trainer: Any, *args: Any, **kwargs: Any) -> Any:
             self.trainer = trainer
-            with released_on_error(hooks, self):
+            with hooks.guarded():
                 self.attach(hooks)
             return original(trainer, *args, **kwargs)
 
@@ -126,42 +122,6 @@ def gate_backwards_only(hooks: Hooks, adapter: AbstractAdapter) -> None:
             f"Adapter {adapter.name!r} cannot leave out whole iterations, since its trainer's loop does not count with "
             "range(): leave out share and refine_share, and it gates backwards as in the paper."
         )
-
-
-def release(hooks: Hooks, adapter: AbstractAdapter, reason: str) -> None:
-    """Take the gate off a run, which continues without it, and warn why. An error would lose the trained model."""
-    hooks.restore()
-    adapter.released = reason
-    warnings.warn(reason, RuntimeWarning, stacklevel=3)
-
-
-@contextmanager
-def released_on_error(hooks: Hooks, adapter: AbstractAdapter) -> Iterator[None]:
-    """Release the gate when the adapter's own code fails, so that no run is lost to the gate.
-
-    A refusal ends the script only while nothing is trained. A gate that is off never ends a script.
-
-    Raises:
-        SkipGSError: The gate is on, and refuses this run in its first iteration.
-    """
-    trained = hooks.trained
-    try:
-        yield
-    except Exception as error:
-        if isinstance(error, SkipGSError) and hooks.state.config.enabled and not trained:
-            raise
-        name = "" if isinstance(error, SkipGSError) else f"{type(error).__name__}: "
-        release(hooks, adapter, f"The gate is released, and training goes on without it: {name}{error}")
-
-
-def guarded(hooks: Hooks, adapter: AbstractAdapter, call: Callable[..., Any]) -> Callable[..., None]:
-    """Return `call` as a function that releases the gate when it fails; see `released_on_error`."""
-
-    def safe(*args: Any, **kwargs: Any) -> None:
-        with released_on_error(hooks, adapter):
-            call(*args, **kwargs)
-
-    return safe
 
 
 # Marks a `torch.multiprocessing.spawn` that attaches a gate in each process.

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, released_on_error
+from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
@@ -57,7 +57,7 @@ class EDGS(AbstractAdapter):
         gate_backwards_only(hooks, self)
 
         def stepped(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            with released_on_error(hooks, self):
+            with hooks.guarded():
                 hooks.iteration(trainer.gs_step + 1)
             return original(*args, **kwargs)
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, released_on_error
+from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
@@ -66,7 +66,7 @@ class FasterGS(AbstractAdapter):
         def rendered(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             frame = sys._getframe(2)
             if frame.f_code.co_name == LOOP:
-                with released_on_error(hooks, self):
+                with hooks.guarded():
                     hooks.iteration(frame.f_locals["iteration"])
                     hooks.view(int((kwargs["view"] if "view" in kwargs else args[0]).global_frame_idx))
             return original(*args, **kwargs)

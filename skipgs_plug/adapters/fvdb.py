@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, released_on_error
+from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
@@ -74,7 +74,7 @@ class FVDB(AbstractAdapter):
         def minibatches(batches: Iterator[Any]) -> Iterator[Any]:
             for minibatch in batches:
                 if runner._global_step >= runner._start_step:  # a resumed run passes over the others
-                    with released_on_error(hooks, self):
+                    with hooks.guarded():
                         hooks.iteration(runner._global_step)
                         ids = minibatch["image_id"]
                         hooks.view(BATCH if batched else lambda ids=ids: int(ids[0]))

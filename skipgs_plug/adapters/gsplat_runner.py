@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from skipgs_plug.adapters.base import GATES_SPAWNED, AbstractAdapter, guarded, refuse_other_processes
+from skipgs_plug.adapters.base import GATES_SPAWNED, AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import (
     gradients_read_until,
     leave_out_noise,
@@ -103,10 +103,8 @@ class GsplatRunner(AbstractAdapter):
 
         # HEAD's stage took hold of rasterize_splats when the runner was built.
         stage = getattr(runner, "stage", None)
-        hooks.before(
-            *((runner, "rasterize_splats") if stage is None else (stage, "render")), guarded(hooks, self, remember)
-        )
-        hooks.before(type(strategy), "step_pre_backward", guarded(hooks, self, forwarded))
+        hooks.before(*((runner, "rasterize_splats") if stage is None else (stage, "render")), remember)
+        hooks.before(type(strategy), "step_pre_backward", forwarded)
         hooks.gate_tensor_backward("train")
         hooks.loop(
             function_names(type(runner).train), "train", always=lambda numbers: opacity_resets(strategy, numbers)

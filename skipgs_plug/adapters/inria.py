@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import torch
 
 from skipgs_plug.adapters import registry
-from skipgs_plug.adapters.base import AbstractAdapter, release, released_on_error
+from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.drift_check import DriftCheck
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import last_calls
@@ -166,7 +166,7 @@ class InriaFamily(AbstractAdapter):
         loaded: dict[str, dict[str, Any]] = {}
 
         def examined(module: types.ModuleType, attach: Callable[[Hooks, dict[str, Any]], None]) -> None:
-            with released_on_error(hooks, self):
+            with hooks.guarded():
                 loaded[module.__name__] = vars(module)
                 if len(loaded) == 2:
                     self.examine(code, self._renderers(loaded[RENDERER]), loaded[MODEL]["GaussianModel"])
@@ -217,7 +217,7 @@ class InriaFamily(AbstractAdapter):
 
     def _begins(self, hooks: Hooks, model: Any, frame: types.FrameType) -> None:
         """An iteration begins in the loop that this frame is of; the first one reads the run."""
-        with released_on_error(hooks, self):
+        with hooks.guarded():
             # Variables of the loop are read once, before they hold an iteration's graph.
             if self._model() is not model:
                 self._refuse_fork(LoopCode.of_module(frame.f_globals))
@@ -271,9 +271,7 @@ class InriaFamily(AbstractAdapter):
 
     def _give_up(self, hooks: Hooks, moved: list[str]) -> None:
         """Let training go on ungated: an error would throw away what was trained so far."""
-        release(
-            hooks,
-            self,
+        hooks.release(
             f"The loop moved {', '.join(moved)} in iteration {self._step - 1}, whose backward was skipped: it does "
             f"something of its own that adapter {self.name!r} does not know. The gate is detached, and training goes "
             "on without it. Gate this loop by hand with SkipGate(start_iter=...).",

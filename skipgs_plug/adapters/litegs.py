@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, released_on_error
+from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
@@ -70,7 +70,7 @@ class LiteGS(AbstractAdapter):
         def preprocessed(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             frame = sys._getframe(2)
             if torch.is_grad_enabled() and frame.f_code.co_name == LOOP:
-                with released_on_error(hooks, self):
+                with hooks.guarded():
                     self._begins(hooks, frame, args)
             return original(*args, **kwargs)
 

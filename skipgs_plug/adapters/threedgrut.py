@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only, guarded, released_on_error
+from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError
@@ -77,7 +77,7 @@ class ThreeDGRUT(AbstractAdapter):
         names = None if paths is None else [str(path) for path in paths]
 
         def stepped(original: Callable[..., Any], global_step: int, *args: Any, **kwargs: Any) -> Any:
-            with released_on_error(hooks, self):
+            with hooks.guarded():
                 hooks.iteration(global_step)
             return original(global_step, *args, **kwargs)
 
@@ -87,7 +87,7 @@ class ThreeDGRUT(AbstractAdapter):
 
         strategy = trainer.strategy
         hooks.wrap(trainer, STEP, stepped)
-        hooks.before(strategy, "pre_backward", guarded(hooks, self, told))
+        hooks.before(strategy, "pre_backward", told)
         hooks.events(strategy, *(name for name in EVENTS if hasattr(strategy, name)))
         if hasattr(strategy, "perturb_gaussians"):
             hooks.suppress_on_skip(strategy, "perturb_gaussians")

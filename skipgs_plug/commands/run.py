@@ -61,7 +61,7 @@ def verify(code: int, gate: SkipGate | None) -> None:
     """
     if code or gate is None or not gate.trained or not gate.config.enabled:
         return
-    if gate.adapter is None or gate.adapter.released is None:
+    if gate.released is None:
         gate.verify()
 
 

@@ -24,6 +24,7 @@ from skipgs_plug.core.pace.compensated import Compensated
 from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.policy import Policy
+from skipgs_plug.core.release import Release
 from skipgs_plug.core.saved_graph import SavedGraph, drop_gradients
 from skipgs_plug.core.scene_check import SceneCheck
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, require_state
@@ -73,10 +74,20 @@ class Engine:
         self.iteration = GatedIteration()
         self.stats = GateStats()
         self.clock = GateClock()
+        self.giving_up = Release(config.enabled)
+        own = weakref.ref(self)  # PyTorch holds hooks of the rates, which must not hold a gate that was dropped
+
+        def taken_back() -> None:
+            if (engine := own()) is not None:
+                engine.release()
+
+        self.giving_up.undoes(taken_back)
         self.rates = ScaledRates()
+        giving_up, iteration = self.giving_up, self.iteration
+        self.rates.on_error = lambda error: giving_up.on_error(error, iteration.step)
         self.pace: Pace
         if config.leaves_out:
-            self.pace = Phased(config, self.rates, self._go_on_from_saved)
+            self.pace = Phased(config, self.rates, self._go_on_from_saved, self.giving_up)
         else:
             self.pace = Compensated(config, self.rates) if config.compensates else Pace()
         self.trace: list[TraceRow] | None = [] if record_trace else None

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, ClassVar, Protocol
 
 import torch
 
-from skipgs_plug.core import distributed
 from skipgs_plug.core.clock import Times
 from skipgs_plug.core.engine import Engine
-from skipgs_plug.core.errors import (
-    AdapterMismatchError,
-    BrokenTrainingError,
-    GateOrderError,
-    SkipGSError,
-    warn_of_release,
-)
+from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.intercept import Around, Patches, intercept_tensor_backward
 from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_known
 from skipgs_plug.core.pace.loop_range import LoopRange, replace_range
 from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.rates import Named
+from skipgs_plug.core.release import Original
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 from skipgs_plug.core.views import view_key
 
@@ -39,7 +33,6 @@ class Adapter(Protocol):
     checked: ClassVar[str]
     saved_state: Callable[[int], dict[str, Any] | None] | None
     output_folder: str | None
-    released: str | None
     replaced: Sequence[str]
 
     def attach(self, hooks: Hooks) -> None:
@@ -70,8 +63,12 @@ class Hooks:
         self._adapter = adapter
         self._given = given
         self._expectation = f"Adapter {adapter.name!r} was checked with {adapter.checked}."
-        self._patches = Patches(self._expectation)
-        self._ready = self._released = False
+        self._giving_up = engine.giving_up
+        self._giving_up.undoes(self.restore)
+        # Refusals come with the first iteration, when nothing is lost yet.
+        self._giving_up.refuses = lambda: max(self._iterations, self._backwards) <= 1
+        self._patches = Patches(self._expectation, self._failed)
+        self._ready = False
         self.script_globals: dict[str, Any] = {}
         self._iteration = engine.iteration
         self._iterations = 0
@@ -86,7 +83,7 @@ class Hooks:
         Raises:
             SkipGSError: The settings do not fit the trainer; see `Engine.configure`.
         """
-        with self._releasing_on_error(None):
+        with self.guarded():
             self._engine.configure(info, self._given)
             if self._engine.config.enabled:
                 self.on_detach("torch.autograd (hooks for saved tensors)", self._engine.graph.close)
@@ -98,10 +95,10 @@ class Hooks:
 
     def iteration(self, step: int) -> None:
         """Begin iteration `step`: its first training backward pass will be gated."""
-        if self._released:
+        if self.released:
             return
         step = int(step)  # a NumPy number would get into saved states
-        with self._releasing_on_error(step):
+        with self._giving_up.guarded(lambda: step):
             if not self._ready:
                 raise self._mismatch("the trainer iterates before it said when densification ends")
             if self._iterations == CHECKED_ITERATIONS:
@@ -131,15 +128,19 @@ class Hooks:
 
     def backward(self, loss: torch.Tensor, run: Callable[[], Any], view: Any = None) -> Any:
         """Gate a training backward pass: call `run()`, which runs it, unless it is skipped."""
-        if self._released:
+        if self.released:
             return run()
-        call = _Call(run)
-        with self._releasing_on_error(self._iteration.step, call):
+        call = Original(run)
+        try:
             if not self._is_training_backward():
                 return call()
             self._gate(loss, view, call)
-        # If the gate let go before it decided, the backward pass must still run.
-        return call() if self._released and not (call.made or self._iteration.skipped) else None
+        except Exception as error:
+            if call.failed:
+                raise  # the trainer's own
+            self._failed(error)
+        # A gate that gave up owes the trainer its backward: nothing handles an iteration without one any more.
+        return call() if self.released and not call.made else None
 
     def _is_training_backward(self) -> bool:
         """Whether this backward is the first of an iteration."""
@@ -315,6 +316,28 @@ class Hooks:
         """Whether an iteration was seen, or a training backward that was in none."""
         return self._iterations + self._backwards > 0
 
+    @property
+    def released(self) -> bool:
+        """Whether the gate gave up, and training goes on without it."""
+        return self._giving_up.reason is not None
+
+    def guarded(self) -> AbstractContextManager[None]:
+        """A block of an adapter's own code: an error in it releases the gate, and the code behind it runs on.
+
+        Functions that are put around names need none: there the trainer gets what it would have without a gate.
+
+        Raises:
+            SkipGSError: In the block, of a gate that is on and refuses this run in its first iteration.
+        """
+        return self._giving_up.guarded(lambda: self._iteration.step)
+
+    def release(self, reason: str) -> None:
+        """Take the gate off a run that goes on without it, and say why: an error would end what was trained."""
+        self._giving_up.let_go(reason)
+
+    def _failed(self, error: Exception) -> None:
+        self._giving_up.on_error(error, self._iteration.step)
+
     def restore(self) -> None:
         """Put back every replaced name."""
         self._patches.restore()
@@ -338,45 +361,3 @@ class Hooks:
             f"The trainer does not behave as expected: {what}. {self._expectation} "
             "Name another adapter, or gate the loop by hand with SkipGate(start_iter=...)."
         )
-
-    @contextmanager
-    def _releasing_on_error(self, step: int | None, call: _Call | None = None) -> Iterator[None]:
-        """Leave nothing patched behind when the gate gives up, and let a training that is under way go on.
-
-        Refusals come in the first iterations, when nothing is lost yet. An error of the training itself is raised at
-        any time, and so is every error where other processes would wait for this one.
-        """
-        try:
-            yield
-        except Exception as error:
-            if call is not None and call.failed:
-                raise  # the trainer's own
-            self.restore()
-            refusal = isinstance(error, SkipGSError) and self._iterations <= CHECKED_ITERATIONS
-            broken = isinstance(error, (BrokenTrainingError, GateOrderError))
-            if refusal or broken or distributed.group_size() > 1:
-                raise
-            self._released = True
-            self._engine.release()
-            self._adapter.released = warn_of_release(error, step)
-
-
-class _Call:
-    """A call of the trainer's own.
-
-    Attributes:
-        made: it was called.
-        failed: it raised.
-    """
-
-    def __init__(self, function: Callable[[], Any]) -> None:
-        self._function = function
-        self.made = self.failed = False
-
-    def __call__(self) -> Any:
-        self.made = True
-        try:
-            return self._function()
-        except BaseException:
-            self.failed = True
-            raise

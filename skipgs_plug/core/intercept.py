@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
+from skipgs_plug.core.release import Original
 
 Around = Callable[..., Any]  # called as around(original, *args, **kwargs) in place of original(*args, **kwargs)
 
@@ -22,11 +23,16 @@ _ABSENT = object()
 class Patches:
     """All names that one gate has replaced, in order.
 
+    Where code that was put around a name fails, and not the name itself, `on_error` is told, and the trainer gets what
+    it would have without a gate.
+
     Args:
+        on_error: Told of an error of code around a name; raises it, or has let go of the trainer. None raises it.
         expectation: Sentence for errors: which upstream version the names were checked at.
     """
 
-    def __init__(self, expectation: str = "") -> None:
+    def __init__(self, expectation: str = "", on_error: Callable[[Exception], None] | None = None) -> None:
+        self._on_error = on_error
         self._expectation = expectation
         self._undo: list[tuple[str, Callable[[], None]]] = []
 
@@ -58,8 +64,12 @@ class Patches:
         if _is_bound(original, owner):
             # Schedulers of PyTorch reach for optimizer.step.__func__, so a method stays a method.
             @functools.wraps(original)
-            def method(self: Any, *args: Any, **kwargs: Any) -> Any:
-                return around(original, *args, **kwargs)
+            def method(_: Any, *args: Any, **kwargs: Any) -> Any:
+                call = Original(original)
+                try:
+                    return around(call, *args, **kwargs)
+                except Exception as error:
+                    return self._instead(error, call, args, kwargs)
 
             setattr(method, _MARK, True)
             self._set(owner, name, types.MethodType(method, owner), label)
@@ -67,10 +77,21 @@ class Patches:
 
         @functools.wraps(original)
         def function(*args: Any, **kwargs: Any) -> Any:
-            return around(original, *args, **kwargs)
+            call = Original(original)  # frame 2 of `around` is the caller's: nothing stands between
+            try:
+                return around(call, *args, **kwargs)
+            except Exception as error:
+                return self._instead(error, call, args, kwargs)
 
         setattr(function, _MARK, True)
         self._set(owner, name, function, label)
+
+    def _instead(self, error: Exception, call: Original, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """What the trainer gets where the code around a call failed; an error of its own call is raised."""
+        if call.failed or self._on_error is None:
+            raise error
+        self._on_error(error)
+        return call.result if call.made else call(*args, **kwargs)
 
     def add_undo(self, label: str, undo: Callable[[], None]) -> None:
         """List something else that `restore` has to take back."""

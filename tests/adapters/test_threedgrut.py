@@ -12,7 +12,7 @@ def test_a_view_that_has_no_name_releases_the_gate():
     trainer = threedgrut.Trainer3DGRUT()
     trainer.train_dataset.image_paths = NAMES[:1]
     with SkipGate(trainer) as gate:
-        with pytest.warns(RuntimeWarning, match="released, and training goes on without it: IndexError"):
+        with pytest.warns(RuntimeWarning, match="goes on without it, .*IndexError"):
             trainer.run_training()
         assert not gate.patched
     assert log.backwards == [*range(threedgrut.FIRST, threedgrut.LAST + 1)]

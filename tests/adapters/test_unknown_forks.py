@@ -204,7 +204,7 @@ def test_failure_of_the_gates_own_code_loses_no_run(monkeypatch):
         return opt.no_such_option
 
     monkeypatch.setattr(Inria, "start_iter", broken)
-    sentence = "released, and training goes on without it: AttributeError: .*no_such_option"
+    sentence = "goes on without it, .*AttributeError: .*no_such_option"
     with SkipGate(unknown_fork()) as gate:
         with pytest.warns(RuntimeWarning, match=sentence):
             train(gate.adapter.trainer)

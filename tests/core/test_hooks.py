@@ -187,14 +187,12 @@ def test_detaches_on_an_exception_in_training() -> None:
 
 
 @pytest.mark.parametrize("backwards", [0, 2])
-def test_any_other_number_of_backwards_is_an_error_after_ten_iterations(backwards: int) -> None:
+def test_any_other_number_of_backwards_releases_the_gate_after_ten_iterations(backwards: int) -> None:
     trainer = ToyTrainer(backwards=backwards)
-    with pytest.raises(
-        AdapterMismatchError, match=f"{10 * backwards} training backwards were seen in 10 .*ToyTrainer 1.0"
-    ):
-        attach(trainer)
+    gate = attach(trainer)
+    with pytest.warns(RuntimeWarning, match=f"{10 * backwards} training backwards were seen in 10 .*ToyTrainer 1.0"):
         trainer.train()
-    assert plain(trainer)
+    assert plain(trainer) and "in 10 iterations" in gate.released
 
 
 def test_short_runs_are_judged_by_verify() -> None:
@@ -225,14 +223,14 @@ def test_iterating_before_ready_is_an_error() -> None:
         trainer.train()
 
 
-def test_backwards_outside_iterations_are_an_error() -> None:
+def test_backwards_outside_iterations_release_the_gate() -> None:
     class Deaf(Toy):
         def attach(self, hooks) -> None:
             hooks.gate_tensor_backward("train")
             hooks.ready(TrainerInfo(20))
 
     trainer = ToyTrainer()
-    with SkipGate(trainer, adapter=Deaf(trainer)), pytest.raises(AdapterMismatchError, match="in no iteration"):
+    with SkipGate(trainer, adapter=Deaf(trainer)), pytest.warns(RuntimeWarning, match="in no iteration"):
         trainer.train()
 
 

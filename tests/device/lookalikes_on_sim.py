@@ -129,8 +129,8 @@ def host_reads(case: Any, settings: dict[str, Any]) -> list[dict[str, Any]]:
                 train()
                 flush()
             # Training goes on when the gate's own code fails: here that is the failure that is looked for.
-            if gate.adapter is not None and gate.adapter.released is not None:
-                raise RuntimeError(gate.adapter.released)
+            if gate.released is not None:
+                raise RuntimeError(gate.released)
     finally:
         Log.begins, Engine.decide = begins, decide  # type: ignore[method-assign]
     return rows

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.errors import SkipGSError, warn_of_release
+from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.base import NAMED, Always, Known, Pace, Source, nothing_always, nothing_known
 from skipgs_plug.core.pace.growing import Growing
 from skipgs_plug.core.pace.loop_finder import LoopFinder
@@ -17,6 +17,7 @@ from skipgs_plug.core.pace.policy import RefinementPolicy
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refining import Refining
 from skipgs_plug.core.policy import Policy
+from skipgs_plug.core.release import Release
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
 
@@ -27,16 +28,20 @@ class Phased(Pace):
         config: With `leaves_out`.
         rates: Scales learning rates.
         go_on: Loads the state that belongs to the checkpoint which training goes on from with an iteration, if any.
+        giving_up: Told of errors, which it raises or has let go of the training.
 
     Attributes:
         refining: the phase after densification.
         growing: the phase before; None if it runs whole.
     """
 
-    def __init__(self, config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None]) -> None:
+    def __init__(
+        self, config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None], giving_up: Release
+    ) -> None:
         self._config = config
         self._rates = rates
         self._go_on = go_on
+        self._giving_up = giving_up
         self.refining = Refining(config, rates)
         self.growing: Growing | None = None if config.growing is None else Growing(config, rates)
         self._finder = LoopFinder()
@@ -151,11 +156,7 @@ class Phased(Pace):
         try:
             return self._runs(loop, number)
         except Exception as error:
-            if isinstance(error, SkipGSError) and not self._planned:
-                raise
-            self.remove()
-            self._rates.remove()
-            warn_of_release(error, number)
+            self._giving_up.on_error(error, number, refuses=not self._planned)
             return True
 
     def _runs(self, loop: LoopRange, number: int) -> bool:

@@ -74,11 +74,13 @@ class ScaledRates:
     Attributes:
         only: as given.
         visibility: share of the Gaussians that a view shows, by the steps scaled so far.
+        on_error: Told of errors in hooks, which it raises or has let go of the training; None raises them.
     """
 
     def __init__(self, only: Optimizers | None = None) -> None:
         self.only = only
         self.visibility = Visibility()
+        self.on_error: Callable[[Exception], None] | None = None
         self._factor: float | None = None
         self._evenly = False
         self._rows = self._rows_now = 0  # Gaussians in the iteration before and in this one; 0 where not known
@@ -116,7 +118,7 @@ class ScaledRates:
         self._rows, self._rows_now = self._rows_now or self._rows, 0
         if not self._handles:
             _hooked.append(self)
-            self._handles = [register_optimizer_step_pre_hook(self._scale)]
+            self._handles = [register_optimizer_step_pre_hook(self._safely(self._scale))]
 
     @property
     def rows(self) -> int:
@@ -225,6 +227,19 @@ class ScaledRates:
         step.gone = weakref.ref(optimizer, lambda _, steps=self._steps: steps.pop(key, None))  # type: ignore[misc]
         return step
 
+    def _safely(self, hook: Callable[..., None]) -> Callable[..., None]:
+        """A hook whose errors do not end the trainer's step, unless whoever is told of them raises them."""
+
+        def safe(*args: Any) -> None:
+            try:
+                hook(*args)
+            except Exception as error:
+                if self.on_error is None:
+                    raise
+                self.on_error(error)
+
+        return safe
+
     def _pass_on(self, optimizer: torch.optim.Optimizer) -> None:
         """An optimizer that is wrapped in another one steps inside its step, with the same groups."""
         own = {id(group) for group in optimizer.param_groups}
@@ -234,7 +249,7 @@ class ScaledRates:
 
     def _watch(self, optimizer: torch.optim.Optimizer, step: _Steps) -> list[RemovableHandle]:
         """Put the trainer's settings back before anybody else looks at them."""
-        ends = optimizer.register_step_post_hook(step.end)
+        ends = optimizer.register_step_post_hook(self._safely(step.end))
         # The trainer's own hooks after a step, of a scheduler for example, find and set its rates.
         optimizer._optimizer_step_post_hooks.move_to_end(ends.id, last=False)  # type: ignore[attr-defined]
         # A checkpoint is written although a step raised: it holds the trainer's rates, too.

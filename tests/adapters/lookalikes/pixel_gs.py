@@ -9,6 +9,7 @@ ADAPTER, FIRST, START, LAST = "pixel_gs", 1, 20, 60
 class GaussianModel(SplatModel):
     def add_densification_stats(self, viewspace_points, pixels):
         self.gradients_read += float((viewspace_points.grad[0].norm(dim=-1) * pixels).sum())
+        self.gathered += 1
 
 
 def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, depth_threshold=None):

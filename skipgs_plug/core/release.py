@@ -1,0 +1,105 @@
+"""The one place where a gate gives up: no run is lost to it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from skipgs_plug.core import distributed
+from skipgs_plug.core.errors import BrokenTrainingError, GateOrderError, SkipGSError
+
+
+class Release:
+    """Lets go of a training that continues without a gate.
+
+    A refusal is raised as long as it costs nothing. An error of the training itself is raised at any time, and so is
+    every error where other processes would wait for this one. Any other error releases the gate, with one warning.
+
+    Args:
+        enabled: Whether the gate is on. One that is off has refused nothing and ends nothing.
+
+    Attributes:
+        reason: Sentence that was said; None while the gate holds on.
+        refuses: Whether a refusal still costs nothing. In a loop of the user's own that is always so: it is an error
+            in the use of the gate's verbs.
+    """
+
+    def __init__(self, enabled: bool) -> None:
+        self._enabled = enabled
+        self._undo: list[Callable[[], None]] = []
+        self.reason: str | None = None
+        self.refuses: Callable[[], bool] = lambda: True
+
+    def undoes(self, undo: Callable[[], None]) -> None:
+        """Have something taken back whenever the gate gives up."""
+        self._undo.append(undo)
+
+    def on_error(self, error: Exception, step: int | None, refuses: bool | None = None) -> None:
+        """Raise an error of the gate's own code, or let go.
+
+        Args:
+            error: That was raised.
+            step: Present iteration, if it is known.
+            refuses: Whether a refusal costs nothing, where the caller knows better than `refuses`.
+
+        Raises:
+            Exception: The error, if it is a refusal that costs nothing, is of the training itself, or if other
+                processes would wait for this one.
+        """
+        if self.reason is not None:
+            return
+        broken = isinstance(error, (BrokenTrainingError, GateOrderError))
+        refusal = isinstance(error, SkipGSError) and (self.refuses() if refuses is None else refuses)
+        if broken or (self._enabled and (refusal or distributed.group_size() > 1)):
+            self._take_back()
+            raise error
+        why = str(error) if isinstance(error, SkipGSError) else f"{type(error).__name__}: {error}"
+        where = "" if step is None else f" in iteration {step}"
+        self.let_go(f"The gate is released{where}, and training goes on without it, in all its iterations ({why})")
+
+    def let_go(self, reason: str) -> None:
+        """Take everything back, and say why, once."""
+        if self.reason is None:
+            self.reason = reason
+            self._take_back()
+            warnings.warn(reason, RuntimeWarning, stacklevel=3)
+
+    @contextmanager
+    def guarded(self, step: Callable[[], int | None] = lambda: None) -> Iterator[None]:
+        """Let go when code of the gate in this block fails; the code behind the block runs on."""
+        try:
+            yield
+        except Exception as error:
+            self.on_error(error, step())
+
+    def _take_back(self) -> None:
+        for undo in self._undo:
+            undo()
+
+
+class Original:
+    """A call of the trainer's own, around which code of the gate runs.
+
+    Attributes:
+        made: It was called.
+        failed: It raised, so that an error is the trainer's own.
+        result: What it returned.
+    """
+
+    __slots__ = ("_function", "failed", "made", "result")
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self.made = self.failed = False
+        self.result: Any = None
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        self.made = True
+        try:
+            self.result = self._function(*args, **kwargs)
+        except BaseException:
+            self.failed = True
+            raise
+        return self.result

@@ -1,0 +1,148 @@
+"""Whatever code of the gate fails, wherever it is called: training finishes, and one warning says so."""
+
+import pytest
+from cases import CASES, run
+from lookalikes.splats import log, new_log
+
+from skipgs_plug import SkipGate
+from skipgs_plug.adapters import base, drift_check, inria, nerfstudio, step_trainer
+from skipgs_plug.adapters.registry import get_adapter
+from skipgs_plug.core.engine import Engine
+from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.pace.phased import Phased
+from skipgs_plug.core.pace.rates import ScaledRates, _Steps
+from skipgs_plug.core.policy import SkipPolicy
+
+# One of each kind: a script, an object whose strategy is called, callbacks, wrapped trainers, epochs, minibatches.
+KINDS = ("inria", "deformable", "gsplat_default", "nerfstudio_scaled", "step_trainer", "litegs", "faster_gs", "edgs")
+KINDS += ("3dgrut", "fvdb")
+cases = [case for case in CASES if case.name in KINDS]
+assert len(cases) == len(KINDS)
+each = pytest.mark.parametrize("case", cases, ids=lambda case: case.name)
+
+# Entry points of the gate, by name; a trainer calls those that it has.
+ENTRIES = {
+    "iteration": (Engine, "open_iteration"),
+    "backward": (Engine, "gate"),
+    "decision": (SkipPolicy, "decide"),
+    "event": (Engine, "notify_event"),
+    "view": (Hooks, "view"),
+    "signal": (Hooks, "signal"),
+    "graph": (Engine, "free_skipped"),
+}
+
+
+@pytest.fixture(scope="module")
+def alone():
+    """Log of each trainer when left alone."""
+    logs = {}
+
+    def get(case):
+        if case.name not in logs:
+            logs[case.name] = run(case)[0]
+        return logs[case.name]
+
+    return get
+
+
+def fail_from(monkeypatch, owner, name, iteration):
+    """Let a function of the gate fail from some iteration on; gives the iterations in which it failed."""
+    failed = []
+    original = getattr(owner, name)
+
+    def fails(*args, **kwargs):
+        if log.now >= iteration:
+            failed.append(log.now)
+            raise ZeroDivisionError(f"of {name}")
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(owner, name, fails)
+    return failed
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+@each
+def test_an_error_at_any_entry_point_releases_the_gate_once(case, entry, monkeypatch, alone, recwarn):
+    plain = alone(case)
+    new_log()
+    trainer, train = case.make()
+    owner, name = ENTRIES[entry]
+    failed = fail_from(monkeypatch, owner, name, case.module.START + 3)
+    with SkipGate(trainer, warmup=0, pause_iters=0, min_bwd_ratio=0.0) as gate:
+        train()
+        said = [str(one.message) for one in recwarn if "released" in str(one.message)]
+        if not failed:
+            assert not said  # this trainer has no such call
+            return
+        assert len(said) == 1 and f"ZeroDivisionError: of {name}" in said[0] and gate.released == said[0]
+        assert gate.patched == []
+    later = range(failed[0] + 1, case.module.LAST + 1)
+    assert [n for n in log.backwards if n in later] == [n for n in plain.backwards if n in later]
+    assert max(log.values) == case.module.LAST and log.other_backwards == plain.other_backwards
+
+
+WAYS = {"number": (Phased, "_runs"), "step": (ScaledRates, "_scale"), "end of a step": (_Steps, "end")}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("case", [case for case in cases if case.leaves_out], ids=lambda case: case.name)
+def test_an_error_while_iterations_are_left_out_releases_the_gate_once(case, way, monkeypatch, recwarn):
+    new_log()
+    trainer, train = case.make()
+    owner, name = WAYS[way]
+    failed = fail_from(monkeypatch, owner, name, case.module.START + 3)
+    with SkipGate(trainer, refine_share=0.4, pause_iters=0) as gate:
+        train()
+    said = [str(one.message) for one in recwarn if "released" in str(one.message)]
+    assert failed and len(said) == 1 and gate.released == said[0]
+    ran = [n for n in sorted(log.values) if n > failed[0]]
+    assert ran == list(range(ran[0], case.module.LAST + 1))  # nothing is left out any more
+
+
+OWN = {
+    "inria": (drift_check.DriftCheck, "moved"),
+    "step_trainer": (step_trainer, "parameters"),
+    "nerfstudio_scaled": (nerfstudio.Nerfstudio, "must_run"),
+    "gsplat_default": (base.AbstractAdapter, "must_run"),
+}
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_an_error_of_an_adapters_own_code_does_the_same(name, monkeypatch, recwarn):
+    case = next(case for case in cases if case.name == name)
+    owner, method = OWN[name]
+    if name == "gsplat_default":
+        owner = get_adapter("gsplat")
+    new_log()
+    trainer, train = case.make()
+    failed = fail_from(monkeypatch, owner, method, case.module.START + 3)
+    with SkipGate(trainer, pause_iters=0, warmup=0, min_bwd_ratio=0.0) as gate:
+        train()
+    said = [str(one.message) for one in recwarn if "released" in str(one.message)]
+    assert failed and len(said) == 1 and gate.released == said[0]
+    assert max(log.values) == case.module.LAST
+
+
+def test_an_error_of_the_trainers_own_code_stays_its_own(monkeypatch):
+    case = next(case for case in cases if case.name == "inria")
+
+    def fails(self, *args, **kwargs):
+        raise MemoryError("of the trainer")
+
+    new_log()
+    trainer, train = case.make()
+    monkeypatch.setattr(case.module.GaussianModel, "reset_opacity", fails)
+    with SkipGate(trainer) as gate, pytest.raises(MemoryError, match="of the trainer"):
+        train()
+    assert gate.released is None
+
+
+def test_a_rank_whose_code_fails_raises_since_others_would_wait(monkeypatch):
+    case = next(case for case in cases if case.name == "inria")
+    new_log()
+    trainer, train = case.make()
+    fail_from(monkeypatch, inria.DriftCheck, "moved", case.module.START - 3)
+    monkeypatch.setattr("skipgs_plug.core.distributed.group_size", lambda: 2)
+    with SkipGate(trainer) as gate, pytest.raises(ZeroDivisionError, match="of moved"):
+        train()
+    assert gate.patched == [] and log.now == case.module.START - 3
