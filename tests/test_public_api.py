@@ -44,7 +44,17 @@ GATE = {
     "verify": "(self) -> 'None'",
     "view_table": "(self) -> 'list[dict[str, Any]]'",
 }
-GATE_PROPERTIES = {"script_globals", "adapter", "config", "patched", "policy", "skipped", "trace", "trained"}
+GATE_PROPERTIES = {
+    "script_globals",
+    "adapter",
+    "config",
+    "patched",
+    "policy",
+    "released",
+    "skipped",
+    "trace",
+    "trained",
+}
 
 ADAPTER = {
     "attach": "(self, hooks: 'Hooks') -> 'None'",
@@ -65,6 +75,7 @@ HOOKS = {
     "event": "(self, kind: 'str') -> 'None'",
     "events": "(self, owner: 'Any', *names: 'str') -> 'None'",
     "gate_tensor_backward": "(self, *callers: 'str') -> 'None'",
+    "guarded": "(self) -> 'AbstractContextManager[None]'",
     "iteration": "(self, step: 'int') -> 'None'",
     "loop": (
         "(self, names: 'dict[str, Any]', *functions: 'str', always: 'Always | None' = None, "
@@ -75,6 +86,7 @@ HOOKS = {
     "on_detach": "(self, label: 'str', undo: 'Callable[[], None]') -> 'None'",
     "own_loop": "(self, owner: 'Any', name: 'str', always: 'Always | None' = None) -> 'None'",
     "optimizer_names": "(self, named: 'Named') -> 'None'",
+    "release": "(self, reason: 'str') -> 'None'",
     "require": "(self, number: 'int') -> 'None'",
     "ready": "(self, info: 'TrainerInfo') -> 'None'",
     "restore": "(self) -> 'None'",
@@ -159,12 +171,11 @@ def test_what_adapters_are_written_with() -> None:
         "with_share",
         "saved_state",
         "output_folder",
-        "released",
         "replaced",
         "stand_ins",
     }
     assert signatures(Hooks) == HOOKS
-    assert properties(Hooks) == {"gap", "patched", "state", "trained"}
+    assert properties(Hooks) == {"gap", "patched", "released", "state", "trained"}
     assert str(inspect.signature(TrainerInfo)) == FACTS
     assert str(inspect.signature(adapters.register_adapter)) == (
         "(adapter: 'type[AbstractAdapter]') -> 'type[AbstractAdapter]'"
