@@ -44,9 +44,9 @@ static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedL
         }
         // The part of the list that was blended last comes first.
         for (int part = parts - 1; part >= 0; --part) {
-            const BlendedList& own = part ? far : near;
-            const Record* const records = (const Record*)own.records;
-            const int begin = own.tile_start[t], tile_end = own.tile_stop[t];
+            const Record* const records = (const Record*)(part ? far.records : near.records);
+            const int begin = part ? far.tile_start[t] : tile.begin;
+            const int tile_end = part ? far.tile_stop[t] : near.tile_stop[t];
             int slot = pairs.slot_end[part * grid.tiles_x * grid.tiles_y + t];
             for (int k = tile_end - 1; k >= begin; --k) {
                 __builtin_prefetch(records + pairs.tile_record[larger(k - 8, begin)]);

@@ -21,7 +21,7 @@ from torch import Tensor
 from . import guard
 from .guard import Sizes
 from .native import Kernel, load_kernel
-from .parameters import ArrayKind, Parameter, declare_struct, flattener, parameters_of, structs_of
+from .parameters import ArrayKind, Parameter, address_reader, declare_struct, flattener, parameters_of, structs_of
 from .source import PRELUDE, SHARED, declare, read_kernel
 from .threads import LOCK, get_num_threads, on_threads
 
@@ -64,10 +64,7 @@ class Worker(Generic[P]):
         self._code = code
         self._alone = alone  # on this thread
         self._kernel: Kernel | None = None
-        self._checks = [
-            (field.path, field.kind, field.kind.dtype if isinstance(field.kind, ArrayKind) else None)
-            for field in self._fields
-        ]
+        self._read = address_reader(self._fields)
 
     @property
     def parameter_names(self) -> list[str]:
@@ -89,26 +86,18 @@ class Worker(Generic[P]):
 
     def _values(self, arguments: tuple[Any, ...]) -> list[int | float]:
         """Addresses of tensors, and numbers, in the order of the fields."""
-        values: list[int | float] = []
-        try:
-            checks: Any = zip(self._checks, arguments, strict=True)
-            for (path, kind, dtype), argument in checks:
-                if dtype is None:
-                    if type(argument) is not kind:
-                        self._refuse(path, argument)
-                    if kind is int and not -0x80000000 <= argument <= 0x7FFFFFFF:
-                        raise OverflowError(f"{self.name}: {path} = {argument} does not fit into 32 bits.")
-                    values.append(argument)
-                else:
-                    if argument.dtype is not dtype or not argument.is_cpu or not argument.is_contiguous():
-                        self._refuse(path, argument)
-                    address = argument.data_ptr()
-                    if not address and argument.numel():  # a tensor by name, which keeps its numbers elsewhere
-                        self._refuse(path, argument)
-                    values.append(address)
-        except AttributeError:
-            self._refuse(path, argument)
-        return values
+        values = self._read(arguments)
+        if values is None:
+            self._refuse_one(arguments)
+        return values or []
+
+    def _refuse_one(self, arguments: tuple[Any, ...]) -> None:
+        """Raise TypeError or OverflowError for the first field that is not of its kind."""
+        for field, argument in zip(self._fields, arguments, strict=True):
+            if address_reader([field])((argument,)) is None:
+                if field.kind is int and type(argument) is int:
+                    raise OverflowError(f"{self.name}: {field.path} = {argument} does not fit into 32 bits.")
+                self._refuse(field.path, argument)
 
     def _refuse(self, path: str, argument: Any) -> None:
         """Raise TypeError for a parameter or a field of one."""

@@ -128,6 +128,39 @@ def flattener(
     return made
 
 
+def address_reader(fields: list[Field]) -> Callable[[tuple[Any, ...]], list[int | float] | None]:
+    """Makes a function that turns the fields of a call into addresses of tensors, and numbers.
+
+    It returns None if a field is not of its kind. Written out field by field, it takes half the time of a loop.
+    """
+    names = [f"f{i}" for i in range(len(fields))]
+    namespace: dict[str, Any] = {"SMALLEST": -(2**31), "LARGEST": 2**31 - 1}
+    conditions, values = [], []
+    for i, (name, field) in enumerate(zip(names, fields, strict=True)):
+        if isinstance(field.kind, ArrayKind):
+            namespace[f"dtype{i}"] = field.kind.dtype
+            fits = f"{name}.dtype is dtype{i} and {name}.is_cpu and {name}.is_contiguous()"
+            # A tensor without an address is a tensor by name, which keeps its numbers elsewhere, unless it is empty.
+            conditions.append(f"{fits} and ((a{i} := {name}.data_ptr()) or not {name}.numel())")
+            values.append(f"a{i}")
+        else:
+            in_range = f" and SMALLEST <= {name} <= LARGEST" if field.kind is int else ""
+            conditions.append(f"type({name}) is {field.kind.__name__}{in_range}")
+            values.append(name)
+    source = f"""def read(arguments):
+    ({"".join(f"{name}, " for name in names)}) = arguments
+    try:
+        if {" and ".join(f"({condition})" for condition in conditions) or True}:
+            return [{", ".join(values)}]
+    except AttributeError:
+        pass
+    return None
+"""
+    exec(source, namespace)
+    made: Callable[[tuple[Any, ...]], list[int | float] | None] = namespace["read"]
+    return made
+
+
 def _parameter(name: str, annotation: Any) -> Parameter:
     if isinstance(annotation, type) and issubclass(annotation, tuple):
         return Parameter(name, annotation, tuple(_fields(annotation, f"{name}.")))
