@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from skipgs_plug.core.clock import Times
 from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, LEAST_WATCHED
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.files import write_aside
 
@@ -95,9 +96,19 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
             f"  each view shows {100 * counted['gaussians_shown']:.0f} % of the Gaussians, which decides how long "
             "steps are"
         )
+    wanted, always = counted["refine_share"], sum(counted["always_run"].values())
+    if run > wanted * (run + skipped) + 1:
+        changes = sum(counted["events"].values())
+        lines.append(
+            f"  more than the share of {wanted:.2f}: {always:,} iterations must run by the loop's conditions, and "
+            f"training continues for a while after a prune or reset at the end of refinement ({changes:,} changes in all)"
+        )
     stopping = counted["early_stopping"]
     if stopping is not None and not stopping["watched"]:
-        lines.append("  too few views to watch some of them: the whole share runs")
+        lines.append(
+            f"  no view is watched, so the whole share runs: a twelfth of the views must be {LEAST_WATCHED} or more, "
+            f"the first {CYCLE_ENDS[0]:.1%} of what runs must show each view, and one process must train"
+        )
     elif stopping is not None:
         worth = stopping["rest_worth_db"]
         judged = "was not estimated" if worth is None else f"could gain at most {worth:.2f} dB at the last check"

@@ -264,7 +264,19 @@ def test_auto_runs_the_whole_share_where_views_are_too_few_to_watch():
     report = gate.report()
     assert report["iterations_run"] == 400 + 1 and report["early_stopping"]["watched"] == []
     assert report["backwards_skipped"] == 1  # of the last iteration, when steps have shrunk to nothing
-    assert "too few views" in gate.summary()
+    assert (
+        "no view is watched" in gate.summary() and "the first 12.5% of what runs must show each view" in gate.summary()
+    )
+
+
+def test_the_summary_says_why_more_than_the_share_ran():
+    with SkipGate(start_iter=100, refine_share=0.25, compensate=False) as gate:
+        for step in gate.iterations(range(300)):
+            gate.backward(torch.tensor(0.1, requires_grad=True) * 1.0, view=f"{step % 20}.png", step=step)
+            if step % 2 == 0:
+                pass
+    assert gate.report()["iterations_run"] == 101
+    assert "more than the share of 0.25: 100 iterations must run by the loop's conditions" in gate.summary()
 
 
 def test_auto_leaves_a_short_refinement_as_it_is():
