@@ -101,7 +101,7 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
         changes = sum(counted["events"].values())
         lines.append(
             f"  more than the share of {wanted:.2f}: {always:,} iterations must run by the loop's conditions, and "
-            f"training continues for a while after a prune or reset at the end of refinement ({changes:,} changes in all)"
+            f"training continues after a prune or reset at the end of refinement ({changes:,} changes in all)"
         )
     stopping = counted["early_stopping"]
     if stopping is not None and not stopping["watched"]:
