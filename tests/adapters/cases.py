@@ -185,6 +185,7 @@ SCRIPTS = [
     script("mcmc", mcmc),
     script("mip_splatting", mip_splatting),
     script("absgs", absgs),
+    script("absgs_prune_weight", absgs, use_prune_weight=True),
     script("pixel_gs", pixel_gs),
     script("two_d_gs", two_d_gs),
     script("scaffold_gs", scaffold_gs),
