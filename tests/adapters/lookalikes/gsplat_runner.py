@@ -47,7 +47,7 @@ class MCMCStrategy:
         pass
 
     def step_post_backward(self, params, optimizers, state, step, info, lr):
-        if step < self.refine_stop_iter and step % self.refine_every == 0:
+        if 0 < step < self.refine_stop_iter and step % self.refine_every == 0:
             log.structure.append((step, "relocate", len(params["xyz"])))
             log.behind[step] = 0  # relocation reads no gradients
         with torch.no_grad():

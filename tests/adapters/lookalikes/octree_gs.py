@@ -25,7 +25,7 @@ class GaussianModel(SplatModel):
 
 
 def prefilter_voxel(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0):
-    return torch.arange(len(pc.values["xyz"])) < pc.shown
+    return torch.arange(len(pc.values["xyz"])) < pc.visibility
 
 
 def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, visible_mask=None, retain_grad=False):
