@@ -111,7 +111,8 @@ class GrowingState(TypedDict):
     first: int | None
     views: int
     settled: bool
-    gaussians_shown: float | None
+    gaussians_shown: tuple[float | None, float | None]  # when shares were settled, by the latest measurement
+    measuring: bool
     sampling: SamplingState
     events: EventsState | None
 

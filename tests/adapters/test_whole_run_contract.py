@@ -50,8 +50,9 @@ def thinned():
 def short(monkeypatch):
     """Let "auto" find a share below 1 in runs as short as these."""
     monkeypatch.setattr(needs, "LEAST_GROWING_STEPS", 6)
-    monkeypatch.setattr(needs, "LEAST_GROWING_STEPS_FULL_VIEWS", 6)
+    monkeypatch.setattr(needs, "LEAST_GROWING_STEPS_LONGER", 6)
     monkeypatch.setattr(needs, "GROWING_VISITS", 1.0)
+    monkeypatch.setattr(needs, "GROWING_VISITS_LONGER", 1.0)
     monkeypatch.setattr(needs, "LEAST_STEPS", 8)
 
 

@@ -82,7 +82,8 @@ class ScaledRates:
         self.visibility = Visibility()
         self.on_error: Callable[[Exception], None] | None = None
         self._factor: float | None = None
-        self._evenly = False
+        self._growing = False
+        self._only_look = False
         self._rows = self._rows_now = 0  # Gaussians in the iteration before and in this one; 0 where not known
         self._thread = get_ident()
         self._under_way: list[_Steps] = []  # each within the step of the one before
@@ -92,13 +93,22 @@ class ScaledRates:
         self._unstepped = 0  # iterations in a row that ran without a step
         self._removed = False
 
-    def scale(self, factor: float, evenly: bool = False) -> None:
-        """Scale the steps of the thread that calls this, which is the one that trains; see `group_part`.
+    def look(self) -> None:
+        """Measure what the next view shows and how many Gaussians there are, and change nothing.
+
+        Raises:
+            SkipGSError: As `scale`.
+        """
+        self.scale(1.0)
+        self._only_look = True
+
+    def scale(self, factor: float, growing: bool = False) -> None:
+        """Scale the steps of the thread that calls this, which is the one that trains; see `group_factor`.
 
         Args:
             factor: On learning rates.
-            evenly: Scale all parameters of the Gaussians by this factor itself, with the trainer's memory of squares,
-                and leave everything else alone.
+            growing: The scene still grows: opacities take up to `OPACITIES_GROWING` times their rate, and parameters
+                without a row for each Gaussian are left alone.
 
         Raises:
             SkipGSError: Another one scales steps in this thread, and one of the two does not know which are its own.
@@ -114,7 +124,7 @@ class ScaledRates:
                     "Another gate makes steps larger in this thread, and each would scale those of both: detach() it "
                     "first, or train in threads of their own."
                 )
-        self._factor, self._evenly, self._thread = factor, evenly, thread
+        self._factor, self._growing, self._only_look, self._thread = factor, growing, False, thread
         self._rows, self._rows_now = self._rows_now or self._rows, 0
         if not self._handles:
             _hooked.append(self)
@@ -184,19 +194,20 @@ class ScaledRates:
         for param in info.positions:
             if param.shape[0] > self._rows_now:
                 self._rows_now = param.shape[0]
-        evenly = self._evenly
-        shares = info.divide(self._rows_now if self._rows_now > self._rows else self._rows, evenly)
+        if self._only_look:
+            shares = []
+        else:
+            shares = info.divide(self._rows_now if self._rows_now > self._rows else self._rows, self._growing)
         if self._under_way:  # an optimizer can be wrapped in another one, which has the same groups
             scaled = {id(group) for other in self._under_way for group, _, _ in other.before}
             shares = [one for one in shares if id(one.group) not in scaled]
         self._under_way.append(step)
-        capped = 1.0 if factor > 1.0 else factor
         before = step.before
-        for group, part, raised, longer in shares:
-            times = part * (factor if raised else capped)
+        for group, part, most, longer in shares:
+            times = part * (factor if factor < most else most)
             rate, betas = group.get("lr"), group.get("betas")
             before.append((group, rate, betas))
-            if betas is not None and longer is not None and not evenly:
+            if betas is not None and longer is not None:
                 group["betas"] = longer.short if betas is longer.betas else longer.shorter(betas, SQUARES_KEPT)
                 if step.memory_stays:
                     times = max(min(times, 1.0), times * shorter_memory(betas, SQUARES_KEPT))

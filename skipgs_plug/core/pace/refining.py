@@ -87,7 +87,7 @@ class Refining:
                     'refine_share="auto" must know the training views; give their names to gate.iterations() as views='
                     ", or a share."
                 )
-            self.share = refining_share(total, epoch)
+            self.share = refining_share(total, epoch, grown_by_few=self._config.growing is not None)
         assert self.share is not None
         # Several processes train on different views at a time, so none can be kept out of training and watched.
         if self._auto and views is not None and self.stopping is None and distributed.group_size() == 1:

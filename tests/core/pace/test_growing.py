@@ -7,7 +7,7 @@ import torch
 
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.core.pace.events import VISITS_BEHIND_FULL_VIEWS, Events
-from skipgs_plug.core.pace.needs import growing_factor, growing_share
+from skipgs_plug.core.pace.needs import growing_factor, growing_share, refining_share
 from skipgs_plug.core.trainer_info import Densification
 
 VIEWS = [f"{i}.png" for i in range(4)]
@@ -89,9 +89,9 @@ def test_rates_stay_while_the_scene_grows_unless_longer_steps_replace_iterations
     loop.optimizer.register_step_pre_hook(note)
     with SkipGate(start_iter=START, share=0.25) as gate:
         loop.train(gate)
-    # Every view shows all: once that is measured, steps are 4 times as long, which 100 iterations are short of.
+    # Every view shows all: once that is measured, steps are 4 times as long, and twice that for positions.
     factors = [seen[step] / 0.1 for step in sorted(seen) if step < START]
-    assert factors[0] == pytest.approx(1.0) and factors[-1] == pytest.approx(4.0)
+    assert factors[0] == pytest.approx(1.0) and factors[-1] == pytest.approx(8.0)
     assert gate.report()["growing"]["rate_factor"] == pytest.approx(4.0)
 
 
@@ -178,11 +178,18 @@ def test_needs_of_an_event():
 
 
 def test_shares_that_auto_chooses():
-    assert growing_share(15_000, 255, None) == 0.1
-    assert growing_share(15_000, 1000, None) == pytest.approx(1 / 3)
-    assert growing_share(1500, 17, 0.96) == pytest.approx(700 / 1500)
-    assert growing_share(1500, 17, 0.3) == 0.8
-    assert growing_share(500, 17, 0.3) == growing_share(0, 17, 0.3) == 1.0
-    assert growing_factor(1500, 0.4, 0.96) == 2.5
-    assert growing_factor(15_000, 0.1, 0.96) == 1.4
-    assert growing_factor(1500, 0.4, 0.3) == growing_factor(15_000, 0.2, 0.96) == 1.0
+    assert growing_share(15_000, 255, longer=True) == growing_share(15_000, 255, longer=False) == 0.12
+    assert growing_share(15_000, 1000, longer=False) == pytest.approx(1 / 3)
+    assert growing_share(15_000, 1000, longer=True) == pytest.approx(0.7 / 3)
+    assert growing_share(1500, 17, longer=True) == 0.4
+    assert growing_share(1500, 17, longer=False) == 0.8
+    assert growing_share(500, 17, longer=True) == growing_share(0, 17, longer=True) == 1.0
+    assert refining_share(3500, 255) < refining_share(3500, 255, grown_by_few=True) == pytest.approx(0.291, abs=1e-3)
+
+
+def test_factors_while_the_scene_grows():
+    assert growing_factor(1500, 0.4, None) == growing_factor(1500, 1.0, 0.96) == 1.0
+    assert growing_factor(1500, 0.25, 0.96) == 4.0  # the longest that pay
+    assert growing_factor(700, 0.9, 1 / 3) == pytest.approx(1 / 0.9)  # the path of the iterations left out, no more
+    assert growing_factor(15_000, 0.12, 0.96) == pytest.approx((2100 / 1800) ** 2)
+    assert growing_factor(15_000, 0.2, 0.96) == 1.0
