@@ -11,6 +11,7 @@ from skipgs_plug.commands.names import require_names
 from skipgs_plug.commands.options.demo import Args
 from skipgs_plug.core.report import write_report
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer
+from skipgs_plug.trainer.ahead import prepare_kernels
 from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.pictures import Curve, plot_refinement, save_comparison
@@ -46,9 +47,10 @@ def run(args: Args) -> int:
 def compare(args: Args) -> list[Result]:
     """Train and return the results; prints the table, writes models and pictures to `out`."""
     out = Path(args.out)
+    config = TrainConfig(result_dir=args.out, max_steps=args.max_steps, backend=args.backend, seed=args.seed)  # type: ignore[arg-type]
+    prepare_kernels(config)
     print(f"Ray tracing {args.views} images ...")
     scene = make_scene(args.views, args.width, args.width * 3 // 4, args.points)
-    config = TrainConfig(result_dir=args.out, max_steps=args.max_steps, backend=args.backend, seed=args.seed)  # type: ignore[arg-type]
     trainer = new_trainer(config, scene)
     print(f"Densifying on backend {trainer.backend.name} (its kernels compile on first use: half a minute) ...")
     trainer.train(until=trainer.refine_stop_iter, progress=not args.no_progress)

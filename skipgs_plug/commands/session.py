@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from skipgs_plug import SkipGate
 from skipgs_plug.commands.options.session import SessionOptions
@@ -18,7 +18,9 @@ from skipgs_plug.trainer.curve import LossCurve
 from skipgs_plug.trainer.loop import Iteration
 from skipgs_plug.trainer.run_folder import RunFolder
 from skipgs_plug.trainer.scalars import ScalarLog
-from skipgs_plug.view.live import LiveView
+
+if TYPE_CHECKING:
+    from skipgs_plug.view.live import LiveView
 
 
 class Session:
@@ -79,6 +81,8 @@ class Session:
     def _open_view(self) -> contextlib.AbstractContextManager[LiveView | None]:
         if not self._options.view:
             return contextlib.nullcontext()
+        from skipgs_plug.view.live import LiveView  # with the viewer, which few runs open
+
         live = LiveView(self._trainer)
         print(f"Watch it at http://127.0.0.1:{live.page.port}")
         return live

@@ -18,6 +18,7 @@ from skipgs_plug.files import write_aside
 from skipgs_plug.install import next_command
 from skipgs_plug.photos.gather import are_photographs
 from skipgs_plug.trainer import InputError, MissingFileError, TrainConfig, Trainer, load_scene
+from skipgs_plug.trainer.ahead import prepare_kernels
 from skipgs_plug.trainer.config import REFERENCE_STEPS
 from skipgs_plug.trainer.curve import LossCurve
 from skipgs_plug.trainer.image_store import ImageStore
@@ -41,6 +42,7 @@ def run(args: Args) -> int:
     if args.sfm:
         args = dataclasses.replace(args, scene=str(scene_of_photographs(args, folder)))
     checkpoints, config = configure(args, found)
+    prepare_kernels(config)
     memory = args.session.image_memory
     images = ImageStore(None if memory is None else round(memory * 1e9), progress=not args.session.no_progress)
     loading = (config.data_factor, config.test_every, config.init_num_pts, config.init_ply)

@@ -2,7 +2,7 @@
 
 Its kernels are C++ with vector types (`kernels/*.h`), compiled by NVIDIA Warp's own Clang and launched by Warp on all
 cores; none is written in Warp's Python dialect, and no compiler has to be installed. Warp is imported, and kernels are
-compiled (seconds, cached on disk), when something is first rendered.
+compiled (seconds, cached on disk), when something is first rendered, or on spare threads by `load_kernels_ahead`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .ahead import load_kernels_ahead
     from .install import install_as_gsplat
     from .oracle.torch_reference_projection import spherical_harmonics
     from .rasterize import rasterization
@@ -34,6 +35,7 @@ __all__ = [
     "install_as_gsplat",
     "instead_of_torchs_adam",
     "l1_ssim_loss",
+    "load_kernels_ahead",
     "moments",
     "rasterization",
     "rasterize_splats",
@@ -55,6 +57,7 @@ _HOMES = {
     "install_as_gsplat": "install",
     "instead_of_torchs_adam": "training.optimizer",
     "l1_ssim_loss": "training.loss",
+    "load_kernels_ahead": "ahead",
     "moments": "training.optimizer",
     "rasterization": "rasterize",
     "rasterize_splats": "splats",

@@ -170,14 +170,20 @@ def single_precision() -> Iterator[None]:
         torch.set_default_dtype(before)
 
 
+def choose_backend(name: str = "auto") -> str:
+    """Return the name of the backend that `resolve_backend` takes."""
+    if name != "auto":
+        return name
+    return "gsplat" if torch.cuda.is_available() and _has_gsplat() else "warp"
+
+
 def resolve_backend(name: str = "auto") -> Backend:
     """Return the backend called "gsplat" or "warp"; "auto" takes gsplat where CUDA works, else warp.
 
     Raises:
         InputError: The backend cannot run here; the message names the missing part.
     """
-    if name == "auto":
-        name = "gsplat" if torch.cuda.is_available() and _has_gsplat() else "warp"
+    name = choose_backend(name)
     if name == "gsplat":
         return _gsplat_backend()
     if name == "warp":

@@ -13,6 +13,7 @@ the number of threads.
 
 import ctypes
 import inspect
+import threading
 from collections.abc import Callable
 from typing import Any, Generic, ParamSpec
 
@@ -65,6 +66,7 @@ class Worker(Generic[P]):
         self._alone = alone  # on this thread
         self._kernel: Kernel | None = None
         self._read = address_reader(self._fields)
+        self._loading = threading.Lock()
 
     @property
     def parameter_names(self) -> list[str]:
@@ -113,14 +115,20 @@ class Worker(Generic[P]):
 
     def _run(self, values: list[int | float]) -> None:
         with LOCK:
-            if self._kernel is None:
-                self._kernel = self._load()
-            kernel, threads = self._kernel, 1 if self._alone else get_num_threads()
+            kernel, threads = self.load(), 1 if self._alone else get_num_threads()
             sections = _SECTIONS * threads if threads > 1 else 1
             counters = (ctypes.c_int32 * (_LINE // 4 * (sections + 2)))()
             counters[_LINE // 4] = sections
             # The threads share the arguments of one call.
             on_threads(threads, kernel, kernel.pack(ctypes.addressof(counters) + _LINE, *values))
+
+    def load(self) -> Kernel:
+        """Compile the kernel or take it from the cache, unless that is done; any thread may, while kernels run."""
+        if self._kernel is None:
+            with self._loading:
+                if self._kernel is None:
+                    self._kernel = self._load()
+        return self._kernel
 
     def _load(self) -> Kernel:
         parameters = {"counters_address": "wp.uint64"} | {field.symbol: field.warp for field in self._fields}

@@ -7,6 +7,7 @@ interpreter at the same moments, and every launch waited several times for the s
 
 import _thread
 import ctypes
+import threading
 import time
 
 from .cores import usable_cores
@@ -27,6 +28,9 @@ _acquire = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int)(("PyTh
 _release = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)(("PyThread_release_lock", ctypes.pythonapi))
 _free = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)(("PyThread_free_lock", ctypes.pythonapi))
 
+_loading = threading.Lock()
+_kernels: tuple[Kernel, Kernel] | None = None
+
 
 class ThreadPool:
     """Helpers that run kernels along with the thread that calls `run`, of which there is one at a time.
@@ -39,10 +43,7 @@ class ThreadPool:
         self._count = count
         # With more threads than cores, one that looks keeps another from its work.
         self._patience = _PATIENCE if count < usable_cores() else 0
-        pool = {"pool": "*(ThreadPool*)"}
-        self._server = _load("pool_serve", pool, ["number", "patience"])
-        launch = pool | {"function": "(void (*)(void*, void*))", "bounds": "(void*)", "arguments": "(void*)"}
-        self._launcher = _load("pool_run", launch, ["helpers", "patience"])
+        self._server, self._launcher = load_pool_kernels()
         self._memory = (ctypes.c_char * (_LINE * (_HELPERS + count + 1)))()
         self._address = -(-ctypes.addressof(self._memory) // _LINE) * _LINE
         self._locks = [self._put_lock(line) for line in range(_CALLER, _HELPERS + count)]
@@ -79,6 +80,20 @@ class ThreadPool:
             self._server(self._server.pack(self._address, number, self._patience))
         finally:
             self._alive.remove(number)
+
+
+def load_pool_kernels() -> tuple[Kernel, Kernel]:
+    """Load the kernels of helpers and of launches, unless that is done; any thread may."""
+    global _kernels
+    with _loading:
+        if _kernels is None:
+            pool = {"pool": "*(ThreadPool*)"}
+            launch = pool | {"function": "(void (*)(void*, void*))", "bounds": "(void*)", "arguments": "(void*)"}
+            _kernels = (
+                _load("pool_serve", pool, ["number", "patience"]),
+                _load("pool_run", launch, ["helpers", "patience"]),
+            )
+        return _kernels
 
 
 def _load(name: str, pointers: dict[str, str], numbers: list[str]) -> Kernel:

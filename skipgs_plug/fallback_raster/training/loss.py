@@ -69,9 +69,10 @@ def _loss_tiles(name: str, pixels: Any) -> Worker[...]:
     return loss_tiles
 
 
+BYTES = torch.uint8  # of photographs
 _LOSS_TILES = {
     torch.float32: _loss_tiles("loss_tiles", FloatArray),
-    torch.uint8: _loss_tiles("loss_tiles_bytes", ByteArray),
+    BYTES: _loss_tiles("loss_tiles_bytes", ByteArray),
 }
 
 
