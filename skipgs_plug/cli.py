@@ -26,6 +26,7 @@ class Command(NamedTuple):
 COMMANDS = {
     "sfm": Command("turn photographs or a video into a scene", "train"),
     "train": Command("train a scene by the 3DGS recipe, whole or in fewer iterations", "train"),
+    "estimate": Command("say how long training a scene will take here, from half a minute of it", "train"),
     "view": Command("show a trained model in the browser, with its cameras, photographs and errors", "view"),
     "render": Command("film or picture a trained model: colour and depth, along a path or held-out cameras", "view"),
     "export": Command("convert a trained model for web viewers", "train"),

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 # Kinds of files that the package consists of. What others wrote, such as a library of scripts for a page, comes
 # minified or compiled: it needs a licence beside it that `license-files` names.
-OWN = {".py", ".h", ".jinja", ".css", ".js", ".html", ".typed"}
+OWN = {".py", ".h", ".jinja", ".css", ".js", ".html", ".json", ".typed"}
 LONGEST_LINE = 500  # characters; scripts that were put through a minifier have longer ones
 
 

@@ -9,6 +9,7 @@ import sys
 
 import torch
 
+from skipgs_plug.commands.backend_probe import try_backend
 from skipgs_plug.install import install_command
 
 # import name, distribution, purpose
@@ -23,7 +24,7 @@ EXTRAS = (
     ("filelock", "filelock", "one process per run folder"),
     ("tqdm", "tqdm", "progress bar"),
     ("yaml", "pyyaml", "cfg.yml"),
-    ("torchmetrics", "torchmetrics", "SSIM"),
+    ("torchmetrics", "torchmetrics", "LPIPS"),
     ("matplotlib", "matplotlib", "plots"),
     ("jinja2", "jinja2", "report"),
     ("imageio_ffmpeg", "imageio-ffmpeg", "videos"),
@@ -66,32 +67,10 @@ def check_package(module: str, distribution: str, purpose: str) -> bool:
 
 
 def check_backend(name: str) -> bool:
-    """Render four Gaussians at 16x16 with a backend, and differentiate."""
-    try:
-        from skipgs_plug.trainer.backend import resolve_backend
-
-        backend = resolve_backend(name)
-        means = torch.tensor([[0.0, 0, 2], [0.2, 0, 2], [0, 0.2, 2], [-0.2, 0, 2]], device=backend.device)
-        means.requires_grad_()
-        image, _, _ = backend.rasterization(
-            means=means,
-            quats=torch.tensor([[1.0, 0, 0, 0]], device=backend.device).repeat(4, 1),
-            scales=torch.full((4, 3), 0.1, device=backend.device),
-            opacities=torch.full((4,), 0.8, device=backend.device),
-            colors=torch.rand(4, 3, device=backend.device),
-            viewmats=torch.eye(4, device=backend.device)[None],
-            Ks=torch.tensor([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]], device=backend.device),
-            width=16,
-            height=16,
-        )
-        backend.loss(image[0], torch.zeros_like(image[0]), 0.2).backward()
-        if not (float(image.detach().sum()) > 0 and means.grad is not None and bool(means.grad.any())):
-            raise RuntimeError("it rendered nothing")
-    except Exception as error:  # any error of a backend is a finding
-        report(False, name, str(error).splitlines()[0] if str(error) else type(error).__name__)
-        return False
-    report(True, name, f"renders and differentiates on {backend.device}")
-    return True
+    """Try a backend; whatever it fails with, a crash of native code too, is the finding."""
+    works, finding = try_backend(name)
+    report(works, name, finding)
+    return works
 
 
 def report(works: bool, name: str, finding: str) -> None:

@@ -1,0 +1,90 @@
+"""`skipgs-plug estimate SCENE`: how long training will take here, from half a minute of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from skipgs_plug.commands.names import require_names
+from skipgs_plug.commands.options.estimate import Args
+from skipgs_plug.forecast.errors import measured_errors, spread
+from skipgs_plug.forecast.pilot import Pilot, run_pilot
+from skipgs_plug.forecast.predict import Forecast, predict
+from skipgs_plug.trainer import load_scene
+from skipgs_plug.trainer.ahead import prepare_kernels
+
+HEADS = ("iterations", "time", "with --share auto", "Gaussians", "peak memory")
+SHOWN = ("seconds", "seconds_auto", "gaussians", "memory")  # in the order of HEADS
+
+
+def run(args: Args) -> int:
+    """Train a little and print the table; see `Args`."""
+    require_names(("SCENE", args.scene))
+    config = args.train
+    prepare_kernels(config)
+    scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
+    pilot = run_pilot(config, scene, args.seconds, progress=not args.no_progress)
+    print(described(scene.name, pilot))
+    print(table([predict(pilot, config, steps) for steps in args.steps]))
+    print(errors_seen())
+    return 0
+
+
+def described(name: str, pilot: Pilot) -> str:
+    """Return what was looked at."""
+    seconds = sum(sample.seconds for sample in pilot.samples)
+    return (
+        f"{name}, {pilot.views} training views: {len(pilot.samples):,} iterations in {seconds:.0f} s, "
+        f"{pilot.first_gaussians:,} to {pilot.samples[-1].gaussians:,} Gaussians.\n"
+    )
+
+
+def table(forecasts: Sequence[Forecast]) -> str:
+    """Return one row per length of run."""
+    rows = [
+        (
+            f"{one.max_steps:,}",
+            duration(one.seconds),
+            duration(one.seconds_auto),
+            rounded(one.gaussians),
+            "unknown" if one.memory is None else f"{one.memory / 2**30:.1f} GiB",
+        )
+        for one in forecasts
+    ]
+    widths = [max(map(len, column)) for column in zip(HEADS, *rows, strict=True)]
+    lines = ["   ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in (HEADS, *rows)]
+    return "\n".join(lines)
+
+
+def errors_seen() -> str:
+    """Return how far such forecasts were from the runs of the bench."""
+    stored = measured_errors()
+    scenes = sorted({row["scene"] for row in stored["rows"]})
+    parts = []
+    for head, quantity in zip(HEADS[1:], SHOWN, strict=True):
+        found = spread(stored["rows"], quantity)
+        if found is None:
+            parts.append(f"{head} not compared yet")
+        else:
+            low, high, count = found
+            parts.append(f"{head} {100 * low:+.0f} to {100 * high:+.0f} % (runs: {count})")
+    return f"\nErrors of such estimates on {', '.join(scenes)}: {'; '.join(parts)}. Loading and saving come on top."
+
+
+def duration(seconds: float) -> str:
+    """Return a length of time with two digits that count.
+
+    >>> duration(8.4), duration(95), duration(8000)
+    ('8 s', '1.6 min', '2.2 h')
+    """
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.2g} min" if seconds < 3570 else f"{seconds / 3600:.2g} h"
+
+
+def rounded(count: int) -> str:
+    """Return a number with two digits that count.
+
+    >>> rounded(118544), rounded(7)
+    ('120,000', '7')
+    """
+    return f"{round(count, 2 - len(str(count))):,}"

@@ -1,0 +1,130 @@
+"""Forecasts: curves that are met, numbers of iterations that runs take, errors that were measured, the command."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from skipgs_plug import SkipGate
+from skipgs_plug.cli import main
+from skipgs_plug.commands.estimate import errors_seen
+from skipgs_plug.forecast.errors import QUANTITIES, error, measured_errors, spread
+from skipgs_plug.forecast.pilot import Pilot, Sample, run_pilot
+from skipgs_plug.forecast.predict import fit_cost, fit_growth, growth_shape, predict
+from skipgs_plug.trainer import TrainConfig, Trainer, save_packed
+from skipgs_plug.trainer.synthetic import make_scene
+
+FIRST, ADDED, STOP, BEGIN = 5000, 20_000, 3500, 500 / 15_000
+
+
+def pilot_of(
+    until: float, rate: float = 2.2, seconds: Callable[[float], float] = lambda count: 0.01, peak: int | None = None
+) -> Pilot:
+    """Return a pilot that ran every fourth iteration up to a part of densification, on curves that are known."""
+    samples = []
+    for step in range(0, round(until * STOP), 4):
+        count = FIRST + ADDED * growth_shape(step // 100 * 100 / STOP, BEGIN, rate)  # events every 100 iterations
+        samples.append(Sample(step, round(count), seconds(count)))
+    return Pilot(tuple(samples), FIRST, 20, 0.3, STOP, peak)
+
+
+@pytest.mark.parametrize("rate", [1.0, 2.2, 5.0])
+@pytest.mark.parametrize("until", [0.5, 1.0])
+def test_growth_is_continued(rate: float, until: float) -> None:
+    growth = fit_growth(pilot_of(until, rate), TrainConfig())
+    assert growth(0.0) == FIRST and growth(1.0) == pytest.approx(FIRST + ADDED, rel=0.08)
+    assert growth(0.3) == pytest.approx(FIRST + ADDED * growth_shape(0.3, BEGIN, rate), rel=0.05)
+
+
+def test_growth_that_has_ended_is_met() -> None:
+    seen = pilot_of(1.0)
+    over = Pilot((*seen.samples, Sample(STOP, 26_123, 0.01)), FIRST, 20, 0.3, STOP, None)
+    assert fit_growth(over, TrainConfig())(1.0) == pytest.approx(26_123)
+
+
+def test_without_an_event_nothing_is_said_to_grow() -> None:
+    growth = fit_growth(pilot_of(0.02), TrainConfig())
+    assert growth(1.0) == FIRST
+
+
+def test_mcmc_grows_no_further_than_its_cap() -> None:
+    config = TrainConfig(strategy="mcmc", cap_max=12_000)
+    assert fit_growth(pilot_of(0.5), config)(1.0) == 12_000
+
+
+@pytest.mark.parametrize("power", [0.2, 0.5, 0.9])
+def test_the_cost_of_an_iteration_follows_what_was_seen(power: float) -> None:
+    cost = fit_cost(pilot_of(1.0, seconds=lambda count: 0.02 * (count / 10_000) ** power))
+    assert cost(20_000) == pytest.approx(0.02 * 2**power, rel=0.05)
+    assert cost(50_000) == pytest.approx(0.02 * 5**power, rel=0.35)  # beyond what was seen the usual power counts too
+
+
+def test_a_longer_run_takes_longer_and_auto_takes_less() -> None:
+    seen = pilot_of(1.0, peak=10**9)
+    short, long = (predict(seen, TrainConfig(), steps) for steps in (7000, 30_000))
+    assert short.seconds == pytest.approx(70, rel=0.03) and long.seconds == pytest.approx(300, rel=0.03)
+    for one in (short, long):
+        assert one.iterations_auto < one.max_steps
+        assert one.seconds_auto == pytest.approx(0.01 * one.iterations_auto, rel=0.03)
+    assert short.memory is not None and short.memory >= 10**9
+
+
+def test_a_shorter_run_ends_where_growth_is_by_then() -> None:
+    seen = pilot_of(1.0)
+    whole, half = (predict(seen, TrainConfig(), steps).gaussians for steps in (7000, 3500))
+    assert whole == pytest.approx(FIRST + ADDED, rel=0.05)
+    assert half == pytest.approx(FIRST + ADDED * growth_shape(0.5, BEGIN, 2.2), rel=0.05)
+    assert predict(seen, TrainConfig(), 30_000).gaussians == whole
+
+
+@pytest.mark.parametrize("max_steps", [60, 600])
+def test_auto_runs_as_many_iterations_as_forecast(max_steps: int) -> None:
+    scene = make_scene(n_views=10, width=16, height=12, n_points=40)
+    config = TrainConfig(backend="warp", max_steps=max_steps, refine_every=10)
+    seen = run_pilot(config, scene, 0.5)
+    trainer = Trainer(config, scene)
+    with SkipGate(trainer, share="auto"):
+        trainer.train(progress=False)
+    assert predict(seen, config, max_steps).iterations_auto == pytest.approx(trainer.ran, rel=0.1, abs=3)
+
+
+def test_a_pilot_ends_in_time_and_keeps_its_hands_off() -> None:
+    scene = make_scene(n_views=10, width=32, height=24, n_points=160)
+    seen = run_pilot(TrainConfig(backend="warp", refine_every=20), scene, 0.2)
+    total = sum(sample.seconds for sample in seen.samples)
+    last = seen.samples[-1].seconds
+    assert total - last < 0.2 <= total
+    assert seen.views == 8 and [sample.step for sample in seen.samples] == sorted({s.step for s in seen.samples})
+
+
+def test_errors_were_measured_and_are_printed() -> None:
+    rows = measured_errors()["rows"]
+    assert rows
+    for row in rows:
+        assert row["quantity"] in QUANTITIES and row["expected"] > 0 and row["measured"] > 0
+    found = spread(rows, "seconds_auto")
+    assert found is not None
+    low, high, count = found
+    assert low == min(error(row) for row in rows if row["quantity"] == "seconds_auto") and low <= high
+    assert f"with --share auto {100 * low:+.0f} to {100 * high:+.0f} % (runs: {count})" in errors_seen()
+    assert spread(rows, "nothing") is None
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "tiny.npz"
+    save_packed(make_scene(n_views=10, width=32, height=24, n_points=160), path)
+    monkeypatch.chdir(tmp_path)
+    command = ["estimate", str(path), "--seconds", "0.3", "--steps", "700", "7000", "--no-progress"]
+    assert main(command) == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[0].startswith("demo, 8 training views: ")
+    assert [line.split()[0] for line in shown[2:5]] == ["iterations", "700", "7,000"]
+    assert any(line.startswith("Errors of such estimates on ") for line in shown)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["tiny.npz"]  # nothing is written
+    for wrong in (["--seconds", "0"], ["--steps", "0"], ["--seconds", str(math.nan)]):
+        with pytest.raises(SystemExit, match="2"):  # as for all options that are out of their range
+            main(["estimate", str(path), *wrong])
+        assert "give" in capsys.readouterr().err
