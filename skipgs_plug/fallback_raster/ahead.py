@@ -6,8 +6,10 @@ compiler, which needs no interpreter lock, so threads compile side by side.
 
 import threading
 from collections.abc import Callable, Iterable
+from typing import Any
 
 from .runtime.cores import usable_cores
+from .runtime.launch import Worker
 from .runtime.thread_pool import load_pool_kernels
 from .runtime.threads import get_num_threads
 from .stages.binning import fill_pairs, pack_and_count, scan_pairs
@@ -41,7 +43,7 @@ def load_kernels_ahead(absgrad: bool = False, lazy: bool = True, densify: bool =
     several = get_num_threads() > 1
     loads: list[Callable[[], object]] = [load_pool_kernels] if several else []
     absolute = [ADJOINT[COLOURS, True]] if absgrad else []
-    workers = [
+    workers: list[Worker[Any]] = [
         _take_rows, project_forward, list_visible, sh_forward, pack_and_count, scan_pairs, fill_pairs,
         FORWARD[COLOURS], _LOSS_TILES[BYTES], *absolute, ADJOINT[COLOURS, False], splat_adjoint,
         _adam, *([_catch_up] if lazy else []), *([_sum_norms] if densify else []),

@@ -58,8 +58,9 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
     grown = growth(end)
     per_growing = float(np.mean([cost(growth(x)) for x in np.linspace(0.0, end, 101)]))
     per_refining = cost(grown)
-    growing = growing_share(stop, pilot.views, pilot.shown) * stop
-    refining = refining_share(max_steps - stop, pilot.views) * (max_steps - stop) if stop < max_steps else 0.0
+    growing = growing_share(stop, pilot.views, longer=pilot.shown is not None) * stop
+    left = max_steps - stop
+    refining = refining_share(left, pilot.views, grown_by_few=True) * left if left else 0.0
     more = grown - max(sample.gaussians for sample in pilot.samples)
     memory = None if pilot.peak_memory is None else round(pilot.peak_memory + BYTES_OF_A_GAUSSIAN * max(more, 0.0))
     return Forecast(
