@@ -42,7 +42,7 @@ def extras() -> dict[str, set[str]]:
                 found.add(MODULES.get(name, name))
         return found
 
-    return {extra: names(extra) for extra in declared if extra != "test"}
+    return {extra: names(extra) for extra in declared if extra not in ("test", "docs")}
 
 
 def run_without(hidden: set[str], code: str) -> subprocess.CompletedProcess[str]:

@@ -6,7 +6,9 @@ from cases import SkipAlways, run, script
 from lookalikes import fastgs, taming
 from lookalikes.splats import Log
 
+from skipgs_plug.adapters.fastgs import FastGS
 from skipgs_plug.core import decision
+from skipgs_plug.core.trainer_info import Densification
 
 CASES = {"fastgs": script("fastgs", fastgs), "taming": script("taming", taming, sh_lower=True)}
 
@@ -48,7 +50,8 @@ def test_prunes_of_fastgs_are_events():
     assert [row.step for row in gate.trace if row.reason == "pause"] == [*range(33, 39), *range(45, 51)]
 
 
-def test_growth_without_an_event_that_the_loop_tells_runs_whole():
-    with pytest.warns(RuntimeWarning, match="that names densification_interval holds before iteration 20"):
+def test_growth_without_an_event_that_the_loop_tells_runs_whole(monkeypatch):
+    monkeypatch.setattr(FastGS, "densification", Densification(marks=("interval_of_another_name",)))
+    with pytest.warns(RuntimeWarning, match="that names interval_of_another_name holds before iteration 20"):
         gated, _ = run(CASES["fastgs"], share=0.5)
     assert gated.backwards[:19] == list(range(1, 20)) and len(gated.backwards) < 64

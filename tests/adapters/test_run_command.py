@@ -244,15 +244,15 @@ def test_gate_state_before_densification_ends_changes_nothing(train):
     assert counted(resumed) == counted(whole)
 
 
-def test_gate_state_of_another_scene_is_refused(train, capfd):
+def test_gate_state_of_another_scene_is_not_used(train, capfd):
     _, whole = train("whole", "--save")
     start = ["--start", str(whole / "chkpnt40.pth")]
     code, folder = train("room", *start, "--room")
     assert code == cli.BAD_INPUT and "belongs to another scene: it knows view 'view0'" in capfd.readouterr().err
     assert not (folder / "skipgs.json").exists()  # no iteration ran
-    code, folder = train("bright", *start, "--bright")
-    error = capfd.readouterr().err
-    assert code == cli.BAD_INPUT and "belongs to another scene: up to iteration" in error
+    with pytest.warns(RuntimeWarning, match="belongs to another scene: up to iteration"):
+        code, folder = train("bright", *start, "--bright")
+    assert code == 0  # the losses tell it only after some iterations: the gate is released, and the run goes on
     assert counted(folder)["iterations"] == 40 + 10
 
 
@@ -344,7 +344,7 @@ def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
     forget()
     script = Path(checkout)
     script.write_text(script.read_text().replace("loss.backward()", "loss.mul_(1); loss.backward()"))
-    with pytest.warns(RuntimeWarning, match=r"goes on without it: .* changes values itself \(mul_\)"):
+    with pytest.warns(RuntimeWarning, match=r"goes on without it.* changes values itself \(mul_\)"):
         assert cli.main(["run", "auto", "--no-gate", "--cpu", "--", checkout, str(tmp_path)]) == 0
     forget()
     assert cli.main(["run", "auto", "--cpu", "--", checkout, str(tmp_path)]) == cli.BAD_INPUT

@@ -88,7 +88,7 @@ def test_a_video_is_trained_on_with_one_command(fern, tmp_path, capsys):
     iio.imwrite(video, frames, plugin="FFMPEG", fps=10, quality=9, macro_block_size=2)
     train = ["train", str(video), "--out", str(run), "--no-progress", "--data-factor", "4"]
     assert main([*train, "--max-steps", "6"]) == 2
-    assert f"add --sfm to find that out first, or run: {program()} sfm" in capsys.readouterr().err
+    assert f"{program()} sfm {video} SCENE" in capsys.readouterr().err
     assert not run.exists()
     assert main([*train, "--max-steps", "6", "--sfm"]) == 0
     shown = capsys.readouterr().out

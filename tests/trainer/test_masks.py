@@ -37,7 +37,7 @@ def test_folder_of_masks(tmp_path: Path, tiny_scene: Scene, name: str, caplog: p
     assert packed[0].mask is not None and torch.equal(packed[0].mask, mask) and packed[1].mask is None
     assert torch.equal(packed[0].image, scene.train[0].image)
     drawn(size=(24, 32)).save(folder / "masks/cam" / name)
-    with pytest.raises(InputError, match=rf"masks/cam/{name} is 24x32, which has not the shape"):
+    with pytest.raises(InputError, match=rf"masks/cam/{name} is 24x32, but its camera is 32x24"):
         load_scene(folder)
     Image.new("L", (32, 24)).save(folder / "masks/cam" / name)
     with pytest.raises(InputError, match=r"the mask of 'cam/view_001\.png' leaves no pixel"):
