@@ -12,7 +12,7 @@ from skipgs_plug.core.trainer_info import Densification
 # Visits of each Gaussian behind an event. Densification grows what has a large mean gradient over its visits: over
 # fewer, the means are noisier, and more of them lie above the threshold (bonsai with 10 visits: 17 to 90 % more
 # Gaussians). Over more, events are fewer, and a scene that must grow far does not get there (Lego). What a view shows
-# is measured in the first steps and falls as the scene grows: 20 visits by that measure are 14 in the end.
+# is measured after each event. 20 visits keep bonsai at 86 to 103 % of its Gaussians.
 VISITS_BEHIND = 20.0
 # Where a view shows nearly all, growth is limited by the number of events instead: every second one ends with half of
 # Lego's Gaussians.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from skipgs_plug.core.pace.visibility import POSITIONS
 
-# What a group of parameters takes of the factor that is meant for all; opacities take none beyond the trainer's rate.
+# What a group of parameters takes of the factor that is meant for all. In refinement opacities are never raised.
 HIGHER_BANDS, GEOMETRY, OTHERS, CONSTANT_BAND = 4.0, 2.0, 1.0, 0.5
 NAMED = {
     **dict.fromkeys(("f_rest", "shN", "features_rest"), HIGHER_BANDS),
