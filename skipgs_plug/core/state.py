@@ -110,8 +110,7 @@ class GrowingState(TypedDict):
     share: float | None
     first: int | None
     views: int
-    settled: bool
-    gaussians_shown: tuple[float | None, float | None]  # when shares were settled, by the latest measurement
+    gaussians_shown: tuple[float | None, float | None]  # by the first measurement, by the latest one
     measuring: bool
     sampling: SamplingState
     events: EventsState | None

@@ -52,12 +52,16 @@ def decompress(
         values = (packed["color"] >> np.uint32(24 - 8 * i) & np.uint32(255)) / 255.0
         colour = between(values, name) if f"min_{name}" in chunks else values
         result[f"f_dc_{i}"] = (colour - 0.5) / SH_C0
-    alpha = (packed["color"] & np.uint32(255)) / 255.0
-    with np.errstate(divide="ignore"):
-        result["opacity"] = np.log(alpha) - np.log1p(-alpha)
+    result["opacity"] = logits((packed["color"] & np.uint32(255)) / 255.0)
     for name, values in sh.items():
         result[name] = (np.asarray(values, dtype=np.float64) + 0.5) / 256 * 8 - 4
     return {name: values.astype(np.float32) for name, values in result.items()}
+
+
+def logits(alpha: np.ndarray) -> np.ndarray:
+    """Return the logits of opacities in [0, 1], infinite at both ends."""
+    with np.errstate(divide="ignore"):
+        return np.log(alpha) - np.log1p(-alpha)  # type: ignore[no-any-return]
 
 
 def unpack_111011(packed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

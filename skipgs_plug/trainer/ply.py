@@ -40,6 +40,11 @@ PROPERTIES = (
 )
 
 
+def sh_degree(coefficients: int) -> int:
+    """Return the SH degree that has so many coefficients beyond the constant one: 0, 3, 8 or 15."""
+    return round((coefficients + 1) ** 0.5) - 1
+
+
 def write_ply(splats: Mapping[str, Tensor], path: str | Path) -> None:
     """Write raw values: logit opacity, log scale, wxyz as trained, zero normals.
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from skipgs_plug.trainer.backend import Backend, resolve_backend, single_precision
 from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.trainer.ply import sh_degree
 from skipgs_plug.view.model import Model
 
 DEPTH_QUANTILES = (0.02, 0.98)
@@ -71,7 +72,7 @@ class Painter:
                 height=height,
                 near_plane=self._near_plane,
                 far_plane=self._far_plane,
-                sh_degree=round((1 + raw["shN"].shape[1]) ** 0.5) - 1,
+                sh_degree=sh_degree(raw["shN"].shape[1]),
                 render_mode="RGB+ED",
                 rasterize_mode=self._mode,
                 backgrounds=background,

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skipgs_plug.trainer.ply import sh_degree
 from skipgs_plug.trainer.row_order import morton_order
 
 VERSION = 2
@@ -23,7 +24,6 @@ STEPS = (1 << 16) - 1  # from the lowest position to the highest
 LEVELS = 256  # of a codebook
 ROUNDS = 8  # of k-means
 ROW = 64  # palette entries in a row of their picture
-BANDS = {0: 0, 3: 1, 8: 2, 15: 3}  # by number of coefficients beyond the constant one
 LARGEST_COMPONENT = 252  # alpha of a rotation whose w is the largest; 253 to 255 stand for x, y and z
 MOST_ENTRIES = 1 << 16  # a label has two bytes
 GAUSSIANS_PER_ENTRY = 8
@@ -47,7 +47,7 @@ def to_sog(splats: Mapping[str, Tensor], antialiased: bool = False, pairs: float
     means = splats["means"].detach().cpu().double()
     order = morton_order(means)
     splats = {name: tensor.detach().cpu().float()[order] for name, tensor in splats.items()}
-    n, bands = len(order), BANDS[splats["shN"].shape[1]]
+    n, bands = len(order), sh_degree(splats["shN"].shape[1])
     meta: dict[str, object] = {"version": VERSION, "asset": {"generator": "skipgs_plug"}, "count": n}
     if antialiased:
         meta["model"] = "antialiased"

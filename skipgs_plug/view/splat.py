@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.compressed_ply import SH_C0
+from skipgs_plug.trainer.compressed_ply import SH_C0, logits
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.ply import renderable
 
@@ -34,14 +34,13 @@ def read_splat(path: Path) -> dict[str, Tensor]:
     quats = (rows["quats"].astype(np.float32) - 128.0) / 128.0
     if not np.abs(quats).max(axis=1).all() or (rows["scales"] < 0).any():
         raise InputError(f"{path} is damaged or not a .splat: it holds rotations of length 0 or negative scales.")
-    alpha = rows["rgba"][:, 3] / 255.0
     with np.errstate(divide="ignore"):
-        opacities, scales = np.log(alpha) - np.log1p(-alpha), np.log(rows["scales"])
+        scales = np.log(rows["scales"])
     values = {
         "means": rows["means"],
         "scales": scales,
         "quats": quats,
-        "opacities": opacities,
+        "opacities": logits(rows["rgba"][:, 3] / 255.0),
         "sh0": ((rows["rgba"][:, :3] / 255.0 - 0.5) / SH_C0)[:, None],
         "shN": np.zeros((len(rows), 0, 3)),
     }

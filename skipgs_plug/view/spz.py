@@ -20,8 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skipgs_plug.trainer.compressed_ply import logits
 from skipgs_plug.trainer.errors import InputError, reason
-from skipgs_plug.trainer.ply import renderable
+from skipgs_plug.trainer.ply import renderable, sh_degree
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +32,7 @@ ANTIALIASED, EXTENDED = 1, 2  # flags
 MOST = 10_000_000  # Gaussians in a file, at most: the reader of the format's authors refuses more
 POSITION_BITS = 23  # bits of a coordinate beside its sign: the format has 24
 COLOUR_SCALE = 0.15  # factor on constant SH coefficients before 0.5 is added, as the format says
-DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}  # by number of coefficients beyond the constant one
+HIGHEST_DEGREE = 3
 # Signs of the coefficients of bands 1 to 3 when y and z are turned: (y z x) (xy yz zz xz xx-yy) (...)
 SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)
 SCALES = (-10.0, 255 / 16 - 10.0)  # logarithms that a byte stands for
@@ -67,7 +68,7 @@ def to_spz(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(min=1e-12)
     quats = np.where(quats[:, :1] < 0, -quats, quats)[:, 1:] * (1.0, -1.0, -1.0)
     parts = [
-        struct.pack(HEADER, MAGIC, VERSION, n, DEGREES[rest.shape[1]], bits, ANTIALIASED * antialiased, 0),
+        struct.pack(HEADER, MAGIC, VERSION, n, sh_degree(rest.shape[1]), bits, ANTIALIASED * antialiased, 0),
         fixed.view(np.uint8).reshape(n, 3, 4)[..., :3].tobytes(),  # three bytes, the lowest first
         _bytes(opacities),
         _bytes((colours[:, 0] * COLOUR_SCALE + 0.5) * 255.0),
@@ -94,7 +95,7 @@ def read_spz(path: Path) -> Spz:
         raise InputError(f"{path} is damaged or not an SPZ ({reason(error)}); export it again.") from error
     if magic != MAGIC or not 0 < n <= MOST:
         raise InputError(f"{path} is damaged or not an SPZ; export it again.")
-    if version not in (1, 2, 3) or degree not in DEGREES.values() or flags & EXTENDED:
+    if version not in (1, 2, 3) or degree > HIGHEST_DEGREE or flags & EXTENDED:
         what = "extensions" if flags & EXTENDED else f"version {version} and SH degree {degree}"
         raise InputError(f"{path} is an SPZ with {what}, which is not read here; export it as PLY of degree 3 or less.")
     k = (degree + 1) ** 2 - 1
@@ -103,14 +104,11 @@ def read_spz(path: Path) -> Spz:
     if len(raw) != n * sum(sizes):
         raise InputError(f"{path} is damaged: {len(raw):,} bytes for {n:,} Gaussians; export it again.")
     means, alpha, colours, scales, quats, rest = np.split(raw, np.cumsum(sizes[:-1]) * n)
-    shares = alpha / 255.0
-    with np.errstate(divide="ignore"):
-        opacities = np.log(shares) - np.log1p(-shares)
     values = {
         "means": _positions(means, bits, version).reshape(n, 3) * (1.0, -1.0, -1.0),
         "scales": scales.reshape(n, 3) / 16.0 - 10.0,
         "quats": (_smallest_three if version == 3 else _first_three)(quats.reshape(n, -1)) * (1.0, 1.0, -1.0, -1.0),
-        "opacities": opacities,
+        "opacities": logits(alpha / 255.0),
         "sh0": ((colours.reshape(n, 3) / 255.0 - 0.5) / COLOUR_SCALE)[:, None],
         "shN": (rest.reshape(n, k, 3) / 128.0 - 1.0) * SH_SIGNS[:k, None],
     }

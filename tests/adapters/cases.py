@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
+import pytest
+import torch
 from lookalikes import (
     absgs,
     dash_gaussian,
@@ -43,7 +46,7 @@ from lookalikes import (
     threedgrut,
     two_d_gs,
 )
-from lookalikes.splats import NAMES, log, new_log
+from lookalikes.splats import NAMES, Log, log, new_log
 
 from skipgs_plug import SkipGate
 from skipgs_plug.core import decision
@@ -235,6 +238,30 @@ class SkipAlways(Policy):
 
     def load_state_dict(self, state):
         pass
+
+
+@functools.cache
+def alone(case: Case) -> Any:
+    """Log of a trainer when left alone; read it only, it serves all tests."""
+    return run(case)[0]
+
+
+def note_begun(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return a list that gets the numbers of the iterations that begin, for the length of a test."""
+    numbers: list[int] = []
+    original = Log.begins
+
+    def begins(self: Log, iteration: int, parameters: Any) -> None:
+        numbers.append(iteration)
+        return original(self, iteration, parameters)
+
+    monkeypatch.setattr(Log, "begins", begins)
+    return numbers
+
+
+def same(one: Sequence[torch.Tensor], other: Sequence[torch.Tensor]) -> bool:
+    """Whether as many tensors are equal to the bit."""
+    return len(one) == len(other) and all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 def run(case: Case, **settings: Any) -> tuple[Any, SkipGate | None]:

@@ -6,7 +6,7 @@ import types
 
 import pytest
 import torch
-from cases import CASES, PAUSE, RULE, SCRIPTS, SkipAlways, run
+from cases import CASES, PAUSE, RULE, SCRIPTS, SkipAlways, alone, run, same
 from lookalikes.splats import Log, log, new_log
 
 from skipgs_plug import SkipGate, SkipGSError
@@ -16,23 +16,6 @@ each = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 resumable = [case for case in CASES if case.resume]
 REAL_BACKWARD = torch.Tensor.backward
 NOT_EVENTS = ("frozen", "relocate", "filter")  # change nothing about the losses, or belong to every iteration
-
-
-@pytest.fixture(scope="module")
-def plain():
-    """Log of each trainer when left alone."""
-    logs = {}
-
-    def get(case):
-        if case.name not in logs:
-            logs[case.name] = run(case)[0]
-        return logs[case.name]
-
-    return get
-
-
-def same(one, other):
-    return len(one) == len(other) and all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 def rows(values):
@@ -52,8 +35,8 @@ def test_adapter_is_found_from_the_trainer_and_by_name(case):
 
 @pytest.mark.parametrize("settings", [{"enabled": False}, {"threshold": -0.999, "warmup": 0}], ids=["off", "never"])
 @each
-def test_a_gate_that_skips_nothing_leaves_training_bit_identical(case, settings, plain):
-    ungated = plain(case)
+def test_a_gate_that_skips_nothing_leaves_training_bit_identical(case, settings):
+    ungated = alone(case)
     gated, gate = run(case, pause_iters=0, **settings)
     assert ungated.backwards == gated.backwards == list(case.iterations)
     assert same(ungated.current, gated.current)
@@ -67,7 +50,7 @@ def test_a_gate_that_skips_nothing_leaves_training_bit_identical(case, settings,
 
 
 @each
-def test_skipping_everything_holds_the_model_still(case, plain):
+def test_skipping_everything_holds_the_model_still(case):
     gated, gate = run(case, policy=SkipAlways())
     first, start = case.module.FIRST, case.module.START
     assert gated.backwards == list(range(first, start))
@@ -78,14 +61,14 @@ def test_skipping_everything_holds_the_model_still(case, plain):
         assert start < gated.steps[-1] == settled - 1
     before, after = rows(gated.values[settled]), rows(gated.current)
     assert (after[:, None] == before[None]).all(dim=2).any(dim=1).all()  # prunes take rows away, nothing moves
-    assert len(after) == len(rows(plain(case).current))
+    assert len(after) == len(rows(alone(case).current))
     # What the trainer does for itself goes on: same prunes with the same counts, and the backwards they need.
-    assert gated.structure == plain(case).structure
-    assert gated.other_backwards == plain(case).other_backwards
+    assert gated.structure == alone(case).structure
+    assert gated.other_backwards == alone(case).other_backwards
 
 
 @each
-def test_the_rule_decides_which_backwards_run(case, plain):
+def test_the_rule_decides_which_backwards_run(case):
     gated, gate = run(case, **RULE)
     skipped = [row.step for row in gate.trace if row.skip]
     assert gated.backwards == [i for i in case.iterations if i not in skipped]
@@ -94,7 +77,7 @@ def test_the_rule_decides_which_backwards_run(case, plain):
     assert report["backwards_skipped"] == len(skipped) > 0
     assert report["backwards_run"] == report["gated_iterations"] - len(skipped) > 0
     assert report["settings"]["start_iter"] == case.module.START
-    assert gated.structure == plain(case).structure
+    assert gated.structure == alone(case).structure
     assert {row["view"] for row in report["views"]} == set(case.views)
 
 

@@ -1,7 +1,7 @@
 """Whatever code of the gate fails, wherever it is called: training finishes, and one warning says so."""
 
 import pytest
-from cases import CASES, run
+from cases import CASES, alone
 from lookalikes.splats import log, new_log
 
 from skipgs_plug import SkipGate
@@ -32,19 +32,6 @@ ENTRIES = {
 }
 
 
-@pytest.fixture(scope="module")
-def alone():
-    """Log of each trainer when left alone."""
-    logs = {}
-
-    def get(case):
-        if case.name not in logs:
-            logs[case.name] = run(case)[0]
-        return logs[case.name]
-
-    return get
-
-
 def fail_from(monkeypatch, owner, name, iteration):
     """Let a function of the gate fail from some iteration on; gives the iterations in which it failed."""
     failed = []
@@ -62,7 +49,7 @@ def fail_from(monkeypatch, owner, name, iteration):
 
 @pytest.mark.parametrize("entry", ENTRIES)
 @each
-def test_an_error_at_any_entry_point_releases_the_gate_once(case, entry, monkeypatch, alone, recwarn):
+def test_an_error_at_any_entry_point_releases_the_gate_once(case, entry, monkeypatch, recwarn):
     plain = alone(case)
     new_log()
     trainer, train = case.make()

@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from cases import CASES, run
+from cases import CASES, note_begun, run, same
 from lookalikes import inria, step_trainer
 from lookalikes.splats import Log, log, new_log
 
@@ -17,22 +17,10 @@ resumable = [case for case in LOOPS if case.resume]
 SHARE = 0.4
 
 
-def same(one, other):
-    return len(one) == len(other) and all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
-
-
 @pytest.fixture
 def begun(monkeypatch):
     """Numbers of the iterations that began."""
-    numbers = []
-    original = Log.begins
-
-    def begins(self, iteration, parameters):
-        numbers.append(iteration)
-        return original(self, iteration, parameters)
-
-    monkeypatch.setattr(Log, "begins", begins)
-    return numbers
+    return note_begun(monkeypatch)
 
 
 @each

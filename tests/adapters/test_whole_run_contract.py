@@ -3,8 +3,8 @@
 import json
 
 import pytest
-from cases import CASES, run
-from lookalikes.splats import Log, log, new_log
+from cases import CASES, alone, note_begun, run, same
+from lookalikes.splats import log, new_log
 
 from skipgs_plug import SkipGate
 from skipgs_plug.core.errors import SkipGSError
@@ -19,17 +19,10 @@ SHARE = 0.4
 WHOLE = {"gns": range(20, 31), "gaussianspa": range(20, 41)}
 
 
-@pytest.fixture(scope="module")
-def alone():
-    """Log of each trainer when left alone."""
-    logs = {}
-
-    def get(case):
-        if case.name not in logs:
-            logs[case.name] = run(case)[0]
-        return logs[case.name]
-
-    return get
+@pytest.fixture
+def begun(monkeypatch):
+    """Numbers of the iterations that began."""
+    return note_begun(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -56,20 +49,6 @@ def short(monkeypatch):
     monkeypatch.setattr(needs, "LEAST_STEPS", 8)
 
 
-@pytest.fixture
-def begun(monkeypatch):
-    """Numbers of the iterations that began."""
-    numbers = []
-    original = Log.begins
-
-    def begins(self, iteration, parameters):
-        numbers.append(iteration)
-        return original(self, iteration, parameters)
-
-    monkeypatch.setattr(Log, "begins", begins)
-    return numbers
-
-
 def beside(entries, events):
     """What else happened to the model than densification events: when, and what."""
     return [(step, kind) for step, kind, _ in entries if step not in events]
@@ -77,7 +56,7 @@ def beside(entries, events):
 
 @pytest.mark.parametrize("share", [SHARE, "auto"])
 @each
-def test_events_are_thinned_and_everything_else_happens_exactly_as_often(case, share, alone, begun, short):
+def test_events_are_thinned_and_everything_else_happens_exactly_as_often(case, share, begun, short):
     plain = alone(case)
     events = set(plain.behind)
     begun.clear()
@@ -122,15 +101,11 @@ def start_of_gathering(plain, case):
 
 @pytest.mark.parametrize("settings", [{"share": 1.0}, {"share": 0.4, "enabled": False}], ids=["all", "off"])
 @each
-def test_leaving_out_nothing_leaves_the_whole_run_bit_identical(case, settings, alone):
+def test_leaving_out_nothing_leaves_the_whole_run_bit_identical(case, settings):
     plain = alone(case)
     gated, _ = run(case, **settings)
     assert plain.backwards == gated.backwards and same(plain.current, gated.current)
     assert (plain.structure, plain.steps, plain.happened) == (gated.structure, gated.steps, gated.happened)
-
-
-def same(one, other):
-    return len(one) == len(other) and all(a.equal(b) for a, b in zip(one, other, strict=True))
 
 
 # Of a scheduler that was copied together with its optimizer, before that stepped again.

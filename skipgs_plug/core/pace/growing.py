@@ -50,9 +50,8 @@ class Growing:
         self._first_number: int | None = None
         self._length = 0
         self._epoch = 0
-        self._visible: float | None = None
-        self._settled = False
-        self._visible_now: float | None = None  # by the latest measurement
+        self._visible: float | None = None  # by the first measurement, which settles the share
+        self._visible_now: float | None = None  # by the latest one
         self._measuring = True
         self._saved_events: dict[str, Any] | None = None
         self._rows = self._grown = 0  # Gaussians when the last event was asked about, and those added since before it
@@ -130,7 +129,7 @@ class Growing:
         runs = self.sampling.runs(must, barred)
         if runs:
             self.events.ran(number)
-            if self._settled and number in self.events:
+            if self._visible is not None and number in self.events:
                 self._measuring = True
                 self._rates.visibility.restart()
         else:
@@ -147,12 +146,14 @@ class Growing:
     def _settle(self) -> None:
         """Take what is measured so far; the share of the phase stays once enough steps were seen."""
         visibility = self._rates.visibility
-        if self._measuring and visibility.steps >= (MEASURED_AGAIN if self._settled else MEASURED):
+        settled = self._visible is not None
+        if self._measuring and visibility.steps >= (MEASURED_AGAIN if settled else MEASURED):
             self._visible_now, self._measuring = visibility.share, False
-        if self._settled:
-            return
         if not self._measuring:
-            self._visible, self._settled = self._visible_now, True
+            visibility.finish()
+        if settled:
+            return
+        self._visible = self._visible_now
         if self._config.growing == "auto":
             self.share = growing_share(
                 self._length, self._epoch, self._config.compensates and self._visible is not None
@@ -195,7 +196,6 @@ class Growing:
             "share": self.share,
             "first": self._first_number,
             "views": self._epoch,
-            "settled": self._settled,
             "gaussians_shown": [self._visible, self._visible_now],
             "measuring": self._measuring,
             "sampling": self.sampling.state_dict(),
@@ -206,7 +206,7 @@ class Growing:
         """Continue from `state_dict()`; `begin` follows."""
         self.share, self._first_number = state["share"], state["first"]
         self._epoch = state["views"]
-        self._settled, self._measuring = state["settled"], state["measuring"]
+        self._measuring = state["measuring"]
         self._visible, self._visible_now = state["gaussians_shown"]
         self.sampling.load_state_dict(state["sampling"])
         self._saved_events, self.events = state["events"], None

@@ -47,6 +47,10 @@ class Visibility:
         self.complete = False
         self._unread: Tensor | None = None  # sum of shares and number of steps that are not in the above  # [2]
 
+    def finish(self) -> None:
+        """Look at no further steps until `restart`: on a device each look can be a read that waits for all work."""
+        self.complete = True
+
     def see(self, groups: list[dict[str, Any]], name: str | None) -> None:
         """An optimizer is about to step; `name` is that of groups without a `name`, if it is known.
 

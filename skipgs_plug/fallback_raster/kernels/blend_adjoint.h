@@ -10,11 +10,6 @@ struct Visit : Falloff {
     vpatch full;  // alpha before it is clamped
     Visit(const Tile& tile, int patch, const Record& r) : Falloff(tile, patch, r), full(exp2(log2_alpha)) {}
 };
-// A product that Clang does not fuse with the sum around it.
-static constexpr auto rounded_product = [](float a, vpatch b) INLINE -> vpatch {
-#pragma clang fp contract(off)
-    return a * b;
-};
 static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedList& far, const BackwardPairs& pairs,
                                          const FinalPixels& pixels, const PixelGradients& v_pixels, const PairSlots& slots,
                                          const Grid& grid, const Channels& channels, int with_transmittance, int parts,

@@ -97,18 +97,19 @@ class WebPage:
         if path == "/scene.sog":
             return self._compressed.result(), "application/octet-stream"
         if path == "/about.json":
-            return json.dumps(self._about()).encode(), "application/json"
+            return self._about, "application/json"
         number = path.removeprefix("/compare/").removesuffix(".json")
         if path.startswith("/compare/") and number.isascii() and number.isdigit() and int(number) < len(self._views):
             with self._drawing:
                 return json.dumps(self.compare(int(number))).encode(), "application/json"
         return None
 
-    def _about(self) -> dict[str, Any]:
+    @functools.cached_property
+    def _about(self) -> bytes:
         scene = self._model.scene
         first = POSE if scene is None else self._pose(scene.train[0])
         cameras = [self._pose(view) for view in self._views]
-        return {
+        about = {
             "name": self._model.name,
             "gaussians": len(self._splats["means"]),
             "held_out": bool(scene and scene.test),
@@ -128,6 +129,7 @@ class WebPage:
                 "startMode": "default",
             },
         }
+        return json.dumps(about).encode()
 
     def _pose(self, view: View) -> tuple[list[float], list[float], float]:
         """Return where a camera stands and a point it looks at, on the page, and its vertical angle in degrees."""

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skipgs_plug.trainer.ply import sh_degree
+
 DIRECTIONS = 64  # that coefficients are fitted to; degree 3 has 15
 
 
@@ -54,7 +56,8 @@ def basis(directions: Tensor, k: int) -> Tensor:
     """Return the K functions beyond the constant one along directions [M, 3], as [M, K]."""
     from skipgs_plug.fallback_raster import spherical_harmonics
 
-    degree = round((k + 1) ** 0.5) - 1
     ones = torch.eye(k + 1, dtype=directions.dtype)[1:, :, None].expand(k, k + 1, 3)
-    columns = [spherical_harmonics(degree, directions, one.expand(len(directions), k + 1, 3))[:, 0] for one in ones]
+    columns = [
+        spherical_harmonics(sh_degree(k), directions, one.expand(len(directions), k + 1, 3))[:, 0] for one in ones
+    ]
     return torch.stack(columns, dim=1)

@@ -2,12 +2,6 @@
 #pragma once
 #include "sh.h"
 
-// A product that Clang does not fuse with the sum around it.
-static constexpr auto rounded_product16 = [](v16 a, v16 b) INLINE -> v16 {
-#pragma clang fp contract(off)
-    return a * b;
-};
-
 // Where `with_position`, `v_position` gets this block's part of the gradient of the camera's position. Where `factored`, the
 // gradient of the higher bands goes to `factors`, a row for each visible Gaussian. Constants in place of the flags leave out
 // what they rule out: this is inlined.
@@ -94,8 +88,8 @@ static constexpr auto sh_block_adjoint =
         const v16 back = d.norm * d.shrink;
         // One of two products is rounded by itself, the other one where the camera has no gradient: Clang's choice of old in
         // either kernel, kept so that gradients stay equal to the bit.
-        const v16 radial = with_position ? vx * x + rounded_product16(vy, y) + vz * z
-                                         : rounded_product16(vx, x) + vy * y + vz * z;
+        const v16 radial = with_position ? vx * x + rounded_product(vy, y) + vz * z
+                                         : rounded_product(vx, x) + vy * y + vz * z;
         const v16 v_direction[3] = {(vx - radial * x) * back, (vy - radial * y) * back, (vz - radial * z) * back};
         scatter3(v_means, row, v_direction[0], v_direction[1], v_direction[2], lanes);
         if (!with_position) continue;

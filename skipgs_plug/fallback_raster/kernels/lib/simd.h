@@ -42,6 +42,11 @@ static constexpr auto vabs = [](auto a) { return __builtin_elementwise_abs(a); }
 static constexpr auto clamped = [](v16 x, float low, float high) INLINE -> i16 {
     return __builtin_convertvector(vmin(vmax(x, (v16)low), (v16)high), i16);
 };
+// A product that Clang does not fuse with the sum around it.
+static constexpr auto rounded_product = [](auto a, auto b) INLINE -> decltype(b) {
+#pragma clang fp contract(off)
+    return a * b;
+};
 static constexpr auto vsqrt = [](auto a) { return __builtin_elementwise_sqrt(a); };
 // Pairwise, so that the order of additions (and the result to the bit) is fixed.
 static constexpr auto sum = [](auto a) -> float {
