@@ -50,6 +50,10 @@ static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedL
                 vpatch m[8], abs_x = (vpatch)0.0f, abs_y = (vpatch)0.0f, v_color[D];
                 for (int j = 0; j < 8; ++j) m[j] = (vpatch)0.0f;
                 for (int c = 0; c < D; ++c) v_color[c] = (vpatch)0.0f;
+                // Spread over the lanes once. Left to Clang, colours stay packed in one register, and each patch takes
+                // them apart again.
+                vpatch color[D];
+                for (int c = 0; c < D; ++c) color[c] = (vpatch)r.color[c];
                 unsigned todo = pairs.pair_patches[k] & open;
                 // What the next patch sees is on its way while this one's chain of instructions waits for itself.
                 int b = todo ? __builtin_ctz(todo) : 0;
@@ -62,8 +66,8 @@ static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedL
 
                     const ipatch hit = (visit.log2_alpha >= LOG2_ALPHA_MIN) & (stop[b] > k);
                     const vpatch alpha = hit ? vmin((vpatch)ALPHA_MAX, visit.full) : (vpatch)0.0f;
-                    vpatch shade = r.color[0] * v[b][0];
-                    for (int c = 1; c < D; ++c) shade += r.color[c] * v[b][c];
+                    vpatch shade = color[0] * v[b][0];
+                    for (int c = 1; c < D; ++c) shade += color[c] * v[b][c];
                     const vpatch before = T[b] / (1.0f - alpha);  // from behind the Gaussian to before it
                     // Zero where it was not blended: a store of some lanes only takes long on some processors.
                     const vpatch weight = alpha * before, less = hit ? behind[b] - shade : (vpatch)0.0f;
