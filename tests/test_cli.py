@@ -185,6 +185,7 @@ def test_doctor_names_the_measurement_where_a_gpu_is(
 
 
 HEAVY = {"torch", "numpy", "warp", "gsplat", "pycolmap", "scipy", "matplotlib", "torchmetrics", "PIL", "viser", "tqdm"}
+HEAVY |= {"typeguard", "unittest", "asyncio"}  # what tyro loads for types that it does not compare by itself
 UNUSED_IN_TRAINING = {"torchmetrics", "matplotlib", "scipy.signal", "viser", "torchvision", "pycolmap"}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Optional
 
 from skipgs_plug.trainer.errors import InputError
 
@@ -115,7 +115,7 @@ class TrainConfig:
     """Seed of view order, split noise and random backgrounds."""
     max_steps: int = 30_000
     """Training iterations."""
-    schedule_steps: int | None = None
+    schedule_steps: Optional[int] = None
     """Iterations that milestones and learning rates are scaled to; default: max_steps. A run that is extended
     keeps the schedule that it began with, and ends with the rates of its end."""
     ssim_lambda: float = 0.2
@@ -125,9 +125,9 @@ class TrainConfig:
     """Highest spherical-harmonics degree."""
     sh_degree_interval: int = 1000
     """Iterations between two raises of the SH degree."""
-    init_opa: float | None = None
+    init_opa: Optional[float] = None
     """Initial opacity; default 0.1, with mcmc 0.5."""
-    init_scale: float | None = None
+    init_scale: Optional[float] = None
     """Initial scale, in units of the mean distance to the three nearest points; default 1, with mcmc 0.1."""
 
     means_lr: float = 1.6e-4
@@ -151,7 +151,7 @@ class TrainConfig:
     """Compensate opacities for the 2D low-pass filter (Mip-Splatting)."""
     random_bkgd: bool = False
     """Train on random background colours."""
-    near_plane: float | None = None
+    near_plane: Optional[float] = None
     """Near clipping plane, world units; default: a tenth of the depth of the nearest points that a view shows."""
     far_plane: float = 1e10
     """Far clipping plane, world units."""
@@ -160,7 +160,7 @@ class TrainConfig:
     """Densification: gsplat's DefaultStrategy (clone, split, prune) or MCMCStrategy (move, up to cap_max)."""
     refine_start_iter: int = 500
     """First densification."""
-    refine_stop_iter: int | None = None
+    refine_stop_iter: Optional[int] = None
     """End of densification; a gate becomes active here. Default 15,000, with mcmc 25,000."""
     refine_every: int = 100
     """Iterations between densifications."""
@@ -180,9 +180,9 @@ class TrainConfig:
     """Most Gaussians (mcmc)."""
     noise_lr: float = 5e5
     """Noise on positions, times their learning rate (mcmc)."""
-    opacity_reg: float | None = None
+    opacity_reg: Optional[float] = None
     """Weight of the mean opacity in the loss; default 0, with mcmc 0.01."""
-    scale_reg: float | None = None
+    scale_reg: Optional[float] = None
     """Weight of the mean scale, in units of the scene scale, in the loss; default 0, with mcmc 0.01."""
 
     def __post_init__(self) -> None:

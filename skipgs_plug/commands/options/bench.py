@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import shlex
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Optional
 
 import tyro
 
 from skipgs_plug.bench.choices import Clock
-from skipgs_plug.commands.options.parse import parse_as
+from skipgs_plug.commands.options.parse import Integers, OptionalWords, parse_as
 from skipgs_plug.trainer.config import TrainConfig
 
 
@@ -37,16 +37,16 @@ class Args:
     """Folder with sparse/0, transforms.json or transforms_train.json, or packed .npz."""
     out: str = "skipgs_bench"
     """Folder for table, plots and runs."""
-    seeds: tuple[int, ...] = (0, 1, 2)
+    seeds: Integers = (0, 1, 2)
     """Seeds of training; each densifies once."""
     whole: bool = False
     """Train from the first iteration under each policy, instead of refining one densified snapshot per seed."""
-    policies: tuple[str, ...] | None = None
+    policies: OptionalWords = None
     """What to compare, all unless given; controls copy rate, time or size of others."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
     tensorboard: bool = False
     """Log gsplat's scalars and the gate's counters of every run to OUT/tb; the clock stands meanwhile."""
-    clock: Clock | None = None
+    clock: Optional[Clock] = None
     """Seconds by the clock on the wall, or for which the processor worked for us: for a machine that others use too.
     Processor seconds unless given for whole runs on the CPU, else the wall's."""
     no_progress: bool = False

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from skipgs_plug.commands.options.parse import parse_as
+from skipgs_plug.commands.options.parse import Integers, parse_as
 from skipgs_plug.commands.options.train import Options
 from skipgs_plug.trainer.errors import InputError
 
@@ -25,7 +25,7 @@ class Args:
 
     scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
     """Folder with sparse/0, transforms.json or transforms_train.json, or packed .npz."""
-    steps: tuple[int, ...] = (7000, 30_000)
+    steps: Integers = (7000, 30_000)
     """Lengths of runs, in iterations."""
     seconds: float = 30.0
     """Seconds of training to look at; more see further."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Optional
 
-from skipgs_plug.commands.options.parse import shown
+from skipgs_plug.commands.options.parse import OptionalIntegers, shown
 from skipgs_plug.core.errors import SkipGSError
 
 
@@ -15,36 +15,36 @@ from skipgs_plug.core.errors import SkipGSError
 class GateOptions:
     """Settings of the gate, with the names of SkipConfig. The adapter chooses those that are not given."""
 
-    start_iter: Annotated[int | None, shown("INT", "end of densification")] = None
+    start_iter: Annotated[Optional[int], shown("INT", "end of densification")] = None
     """First iteration that may be skipped."""
-    threshold: Annotated[float | None, shown("FLOAT", "0")] = None
+    threshold: Annotated[Optional[float], shown("FLOAT", "0")] = None
     """Skip when loss <= mean * (1 + threshold)."""
-    ema_decay: Annotated[float | None, shown("FLOAT", "0.95")] = None
+    ema_decay: Annotated[Optional[float], shown("FLOAT", "0.95")] = None
     """Decay of each view's mean loss."""
-    warmup: Annotated[int | None, shown("INT", "500; in train times max_steps / 30,000, at least 2 per view")] = None
+    warmup: Annotated[Optional[int], shown("INT", "500; in train times max_steps / 30,000, at least 2 per view")] = None
     """Gated iterations without skipping."""
-    min_bwd_ratio: Annotated[str | None, shown("SHARE|auto", "auto")] = None
+    min_bwd_ratio: Annotated[Optional[str], shown("SHARE|auto", "auto")] = None
     """Least share of gated iterations with a backward."""
-    on_nonfinite: Annotated[Literal["skip", "raise", "pass"] | None, shown("skip|raise|pass", "skip")] = None
+    on_nonfinite: Annotated[Optional[Literal["skip", "raise", "pass"]], shown("skip|raise|pass", "skip")] = None
     """How to treat a NaN or infinite loss."""
-    pause_iters: Annotated[int | None, shown("INT", "one round of the views, at least 500; scaled in train")] = None
+    pause_iters: Annotated[Optional[int], shown("INT", "one round of the views, at least 500; scaled in train")] = None
     """Real backwards after a prune or reset."""
 
-    share: Annotated[str | None, shown("SHARE|auto", "the paper's gate, which leaves out none")] = None
+    share: Annotated[Optional[str], shown("SHARE|auto", "the paper's gate, which leaves out none")] = None
     """Leave out whole iterations in the whole run: the share that runs, such as 0.3, or auto."""
-    grow_share: Annotated[str | None, shown("SHARE|auto", "as --share")] = None
+    grow_share: Annotated[Optional[str], shown("SHARE|auto", "as --share")] = None
     """The same until densification ends only, with fewer densification events."""
-    refine_share: Annotated[str | None, shown("SHARE|auto", "as --share")] = None
+    refine_share: Annotated[Optional[str], shown("SHARE|auto", "as --share")] = None
     """The same after densification only, such as 0.4, or auto."""
-    max_gaussians: Annotated[int | None, shown("INT", "no bound")] = None
+    max_gaussians: Annotated[Optional[int], shown("INT", "no bound")] = None
     """With --share: densification events stop before one could go beyond this number of Gaussians."""
-    always: Annotated[tuple[int, ...] | None, shown("INT ...", "read from the loop's conditions")] = None
+    always: Annotated[OptionalIntegers, shown("INT ...", "read from the loop's conditions")] = None
     """Iterations that always run, instead of those that the loop's conditions on its number name."""
-    tolerance: Annotated[float | None, shown("FLOAT", "0.05")] = None
+    tolerance: Annotated[Optional[float], shown("FLOAT", "0.05")] = None
     """Decibels that the rest of refinement may be worth when auto ends it."""
-    compensate: Annotated[bool | None, shown("True|False", "with --refine-share only")] = None
+    compensate: Annotated[Optional[bool], shown("True|False", "with --refine-share only")] = None
     """Make up for iterations that are left out with larger, shrinking steps."""
-    rate_peak: Annotated[float | None, shown("FLOAT", "by the share that runs and what views show")] = None
+    rate_peak: Annotated[Optional[float], shown("FLOAT", "by the share that runs and what views show")] = None
     """Factor on learning rates when refinement begins, falling to 0."""
 
     def given(self) -> dict[str, Any]:

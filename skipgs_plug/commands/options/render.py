@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Optional
 
 import tyro
 
@@ -19,7 +19,7 @@ class Args:
     """Run folder, PLY, .splat or .spz."""
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PATH")]
     """Film to write (.mp4), or folder for PNG files."""
-    scene: str | None = None
+    scene: Optional[str] = None
     """Scene that gives the cameras; default: the one the run folder names."""
     cameras: Literal["path", "held-out"] = "path"
     """A path through the training cameras in the order of names, or each held-out camera."""
@@ -29,7 +29,7 @@ class Args:
     """Length of the path."""
     fps: int = 30
     """Frames per second of a film."""
-    data_factor: int | None = None
+    data_factor: Optional[int] = None
     """Size of the frames, as that of the scene's images_{factor}; default: as in training."""
     backend: str = "auto"
     """auto, gsplat (CUDA) or warp (CPU)."""

@@ -7,14 +7,14 @@ from typing import Annotated
 
 import tyro
 
-from skipgs_plug.commands.options.parse import parse_as
+from skipgs_plug.commands.options.parse import Words, parse_as
 
 
 @dataclass
 class Args:
     """Turn run folders into one self-contained HTML page: tables and plots inside, nothing loaded from a network."""
 
-    runs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN ...")]
+    runs: Annotated[tyro.conf.Positional[Words], tyro.conf.arg(metavar="RUN ...")]
     """Folders of `skipgs-plug train`, `run` or `bench`, or their skipgs.json."""
     out: str = "report.html"
     """Page to write."""

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from skipgs_plug.commands.options.gate import GateOptions
-from skipgs_plug.commands.options.parse import parse_as
+from skipgs_plug.commands.options.parse import Words, parse_as
 
 
 def split(argv: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -38,7 +38,7 @@ class Args:
     """Change nothing in training; skipgs.json then holds the seconds of the trainer's own run."""
     cpu: bool = False
     """Run on the CPU: CUDA requests are redirected, and CUDA modules are served by the CPU rasterizer."""
-    command: tyro.conf.Suppress[tuple[str, ...]] = ()
+    command: tyro.conf.Suppress[Words] = ()
     """The command line after `--`."""
 
 

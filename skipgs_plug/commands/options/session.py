@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Optional
 
 from skipgs_plug.commands.options.parse import shown
 from skipgs_plug.trainer.errors import InputError
@@ -13,7 +13,7 @@ from skipgs_plug.trainer.errors import InputError
 class SessionOptions:
     """Files and pages of a session, and when they are written. They do not change the trained model."""
 
-    save_every: int | None = None
+    save_every: Optional[int] = None
     """Iterations between two checkpoints, of which two are kept; default: five minutes of training; 0: the end only."""
     eval_every: int = 0
     """Iterations between two evaluations on the way; 0: the end only."""
@@ -21,9 +21,9 @@ class SessionOptions:
     """Log gsplat's scalars and the gate's counters to RUN/tb, every tenth iteration."""
     view: bool = False
     """Show training in the browser; costs at most 2 % of its time."""
-    image_memory: Annotated[float | None, shown("GB", "a quarter of what is free")] = None
+    image_memory: Annotated[Optional[float], shown("GB", "a quarter of what is free")] = None
     """Memory for decoded photographs. Photographs that do not fit are decoded again, ahead of their turn."""
-    lpips_net: Literal["alex", "vgg"] | None = None
+    lpips_net: Optional[Literal["alex", "vgg"]] = None
     """Also report LPIPS; its weights must be on this machine."""
     no_progress: bool = False
     """No progress bar."""

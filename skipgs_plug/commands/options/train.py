@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Optional
 
 import tyro
 
@@ -21,7 +21,7 @@ class Options(TrainConfig):
     data_dir: tyro.conf.Suppress[str] = ""
     result_dir: tyro.conf.Suppress[str] = ""
     max_steps: tyro.conf.Suppress[int] = REFERENCE_STEPS
-    schedule_steps: tyro.conf.Suppress[int | None] = None
+    schedule_steps: tyro.conf.Suppress[Optional[int]] = None
 
 
 @dataclass
@@ -37,7 +37,7 @@ class Args:
     """Run folder to write."""
     sfm: bool = False
     """Find out first where the photographs were taken, as the command sfm does, and keep the scene in OUT/scene."""
-    max_steps: int | None = None
+    max_steps: Optional[int] = None
     """Training iterations; default: 30,000, or with --resume the number of the run. A larger number extends the run."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
     gate: bool = False

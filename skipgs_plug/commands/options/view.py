@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Optional
 
 import tyro
 
@@ -19,9 +19,9 @@ class Args:
 
     model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
     """Run folder, PLY, .splat or .spz."""
-    scene: str | None = None
+    scene: Optional[str] = None
     """Scene with the photographs; default: the scene of the run folder. A PLY needs no scene."""
-    data_factor: int | None = None
+    data_factor: Optional[int] = None
     """Reduction of the photographs; default: as in training."""
     cameras: bool = False
     """The page for finding errors: all cameras in space, all models of the run, PSNR of every held-out view."""
