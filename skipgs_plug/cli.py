@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, NamedTuple, Union
 
+from skipgs_plug.garbage import keep_everything, uncollected
 from skipgs_plug.terminate import UNREAD, Terminated, terminable
 
 
@@ -63,10 +64,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in own
     if debug:
         arguments.remove("--debug")
+    # The script of another project finds the collector as it would without us, and so does a caller in Python.
+    whole_program = argv is None and arguments[:1] != ["run"]
     try:
         # The script of another project sees signals as it would without us.
         with contextlib.nullcontext() if arguments[:1] == ["run"] else terminable():
-            return run(arguments)
+            return run(arguments, whole_program)
     except KeyboardInterrupt as error:
         return interrupted([error])
     except BrokenPipeError:
@@ -81,6 +84,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exc()
             return BAD_INPUT if sentence else 1
         return fail(sentence)
+    finally:
+        if whole_program:
+            keep_everything()
 
 
 def speak_utf8() -> None:
@@ -116,7 +122,7 @@ def print_any_name() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def run(arguments: list[str]) -> int:
+def run(arguments: list[str], whole_program: bool) -> int:
     """Find the command and call it, or list the commands."""
     name, *rest = arguments or [""]
     if name == "--version":
@@ -130,7 +136,11 @@ def run(arguments: list[str]) -> int:
     if name in COMMANDS:
         # Options are read before heavy packages are loaded, so --help and mistakes are answered at once.
         args = importlib.import_module(f"skipgs_plug.commands.options.{name}").parse(rest)
-        return importlib.import_module(f"skipgs_plug.commands.{name}").run(args)
+        with uncollected() if whole_program else contextlib.nullcontext():
+            command = importlib.import_module(f"skipgs_plug.commands.{name}")
+        if whole_program:
+            keep_everything()
+        return command.run(args)
     if name and not name.startswith("-"):
         return fail(f"There is no command {name!r}; the commands are {', '.join(COMMANDS)}.")
     return overview(arguments) if arguments else overview(["--help"]) or BAD_INPUT

@@ -210,6 +210,26 @@ def test_training_loads_nothing_that_it_does_not_use(tmp_path: Path, packed: str
     assert loaded_by(code.replace("== 0", "== 2"), {"torch"}) == {"torch"}  # the probe sees what is there
 
 
+def test_the_collector_passes_over_what_a_program_has_loaded(packed: str, tmp_path: Path) -> None:
+    arguments = ["skipgs-plug", "train", packed, "--out", str(tmp_path), "--max-steps", "1", "--no-progress"]
+    code = (
+        "import gc, sys\nfrom skipgs_plug.cli import main\n{before}\nassert {call} == 0\n"
+        "assert gc.isenabled()\nprint('frozen', gc.get_freeze_count())"
+    )
+
+    def frozen(before: str, call: str) -> int:
+        ended = subprocess.run(
+            [sys.executable, "-c", code.format(before=before, call=call)], capture_output=True, text=True, check=True
+        )
+        return int(ended.stdout.rpartition("frozen")[2])
+
+    assert frozen(f"sys.argv = {arguments!r}", "main()") > 100_000
+    assert frozen("", f"main({[*arguments[1:], '--resume']!r})") == 0  # a caller in Python goes on after it
+    script = tmp_path / "script.py"
+    script.write_text("import gc\nassert gc.isenabled() and not gc.get_freeze_count()")
+    assert frozen(f"sys.argv = {['skipgs-plug', 'run', 'inria', '--no-gate', '--', str(script)]!r}", "main()") == 0
+
+
 def test_the_home_folder_is_known_everywhere(monkeypatch):
     monkeypatch.setenv("HOME", "/home/somebody")
     from skipgs_plug.cli import expand_home

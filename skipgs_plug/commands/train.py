@@ -15,6 +15,7 @@ from skipgs_plug.commands.options.sfm import Args as SfmArgs
 from skipgs_plug.commands.options.train import Args
 from skipgs_plug.commands.session import Session
 from skipgs_plug.files import write_aside
+from skipgs_plug.garbage import uncollected
 from skipgs_plug.install import next_command
 from skipgs_plug.photos.gather import are_photographs
 from skipgs_plug.trainer import InputError, MissingFileError, TrainConfig, Trainer, load_scene
@@ -42,12 +43,13 @@ def run(args: Args) -> int:
     if args.sfm:
         args = dataclasses.replace(args, scene=str(scene_of_photographs(args, folder)))
     checkpoints, config = configure(args, found)
-    prepare_kernels(config)
-    memory = args.session.image_memory
-    images = ImageStore(None if memory is None else round(memory * 1e9), progress=not args.session.no_progress)
-    loading = (config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
-    scene = load_scene(args.scene, *loading, images)
-    trainer = Trainer(config, scene)
+    with uncollected():
+        prepare_kernels(config)
+        memory = args.session.image_memory
+        images = ImageStore(None if memory is None else round(memory * 1e9), progress=not args.session.no_progress)
+        loading = (config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
+        scene = load_scene(args.scene, *loading, images)
+        trainer = Trainer(config, scene)
     settings = args.gate_options.given()
     gate = SkipGate(trainer, **settings) if args.gate or settings else None
     trainer.register_state("gate_settings", GateSettings(gate))
