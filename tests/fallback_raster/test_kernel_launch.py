@@ -190,8 +190,7 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker[Any], d
     original = Worker.__call__
 
     def record(self: Worker[Any], *arguments: Any, **named: Any) -> None:
-        values = self._flatten(*arguments, **named)
-        calls[self.name] = self, {field.path: value for field, value in zip(self._fields, values, strict=True)}
+        calls[self.name] = self, self.fields_of(*arguments, **named)
         original(self, *arguments, **named)
 
     with monkeypatch.context() as patch:

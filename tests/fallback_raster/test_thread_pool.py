@@ -56,7 +56,7 @@ def test_all_that_began_are_done_when_a_launch_returns(pool: ThreadPool) -> None
 
     working = kernel(work)
     for number in range(400):
-        pool.run(working, Block(number))
+        pool.run(working, bytes(Block(number)))
         assert sorted(begun) == sorted(ended)
         mine = [thread for launch, thread in ended if launch == number]
         assert threading.get_ident() in mine
@@ -71,7 +71,7 @@ def test_helpers_that_sleep_are_woken(pool: ThreadPool) -> None:
     meeting = kernel(lambda _: together.wait(10) and None)
     for _ in range(3):
         time.sleep(20 * PATIENCE)
-        pool.run(meeting, Block(0))
+        pool.run(meeting, bytes(Block(0)))
     assert not together.broken
 
 
@@ -87,13 +87,13 @@ def test_a_caller_waits_for_helpers_that_take_long(pool: ThreadPool) -> None:
             time.sleep(0.05)
             ended.append(True)
 
-    pool.run(kernel(work), Block(0))
+    pool.run(kernel(work), bytes(Block(0)))
     assert ended
 
 
 def test_who_is_dismissed_is_gone_and_may_be_dismissed_again() -> None:
     pool = ThreadPool(4)
-    pool.run(kernel(lambda _: None), Block(0))
+    pool.run(kernel(lambda _: None), bytes(Block(0)))
     pool.dismiss()
     assert not pool._alive and not pool._locks
     pool.dismiss()

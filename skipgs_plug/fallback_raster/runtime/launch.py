@@ -22,7 +22,7 @@ from torch import Tensor
 from . import guard
 from .guard import Sizes
 from .native import Kernel, load_kernel
-from .parameters import ArrayKind, Parameter, address_reader, declare_struct, flattener, parameters_of, structs_of
+from .parameters import ArrayKind, Parameter, call_reader, declare_struct, group, parameters_of, structs_of
 from .source import PRELUDE, SHARED, declare, read_kernel
 from .threads import LOCK, get_num_threads, on_threads
 
@@ -60,12 +60,13 @@ class Worker(Generic[P]):
         self.structs = tuple(dict.fromkeys((*structs_of(self._parameters), *structs)))
         self.constants = constants  # of this kernel alone
         self._fields = [field for parameter in self._parameters for field in parameter.fields]
-        self._flatten = flattener(name, stub, self._parameters, self._refuse)
+        self._signature = inspect.signature(stub)
         self._sizes = Sizes(name, self._fields, constants)
         self._code = code
         self._alone = alone  # on this thread
         self._kernel: Kernel | None = None
-        self._read = address_reader(self._fields)
+        by_name = any(p.kind is p.KEYWORD_ONLY for p in self._signature.parameters.values())
+        self._read = call_reader(name, self._parameters, by_name)
         self._loading = threading.Lock()
 
     @property
@@ -74,29 +75,46 @@ class Worker(Generic[P]):
         return [parameter.name for parameter in self._parameters]
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> None:
-        arguments = self._flatten(*args, **kwargs)
-        values = self._values(arguments)
-        if guard.level() == guard.OFF:
-            self._run(values)
-            return
-        named = dict(zip((field.path for field in self._fields), arguments, strict=True))
-        self._sizes.check(named)
-        if guard.level() == guard.SIZES:
+        values = self._read(*args, **kwargs)
+        if values is None:
+            self._refuse_call(self.fields_of(*args, **kwargs))
+        elif guard.level() == guard.OFF:
             self._run(values)
         else:
-            guard.run_between_zones(self.name, named, lambda inside: self._run(self._values(inside)))
+            self._run_checked(values, self.fields_of(*args, **kwargs))
 
-    def _values(self, arguments: tuple[Any, ...]) -> list[int | float]:
-        """Addresses of tensors, and numbers, in the order of the fields."""
-        values = self._read(arguments)
-        if values is None:
-            self._refuse_one(arguments)
-        return values or []
+    def fields_of(self, *args: P.args, **kwargs: P.kwargs) -> dict[str, Any]:
+        """The fields of a call by their paths, in the order of the kernel's.
 
-    def _refuse_one(self, arguments: tuple[Any, ...]) -> None:
+        Raises:
+            TypeError: An argument is not the declared struct.
+        """
+        arguments = self._signature.bind(*args, **kwargs).arguments
+        values: list[Any] = []
+        for parameter in self._parameters:
+            argument = arguments[parameter.name]
+            if parameter.struct is not None and type(argument) is not parameter.struct:
+                self._refuse(parameter.name, argument)
+            values += [argument] if parameter.struct is None else argument
+        return dict(zip((field.path for field in self._fields), values, strict=True))
+
+    def _run_checked(self, values: tuple[int | float, ...], fields: dict[str, Any]) -> None:
+        self._sizes.check(fields)
+        if guard.level() == guard.SIZES:
+            self._run(values)
+            return
+
+        def run(inside: tuple[Any, ...]) -> None:
+            moved = self._read(**group(self._parameters, inside))
+            assert moved is not None, "copies are of the kind of their originals"
+            self._run(moved)
+
+        guard.run_between_zones(self.name, fields, run)
+
+    def _refuse_call(self, fields: dict[str, Any]) -> None:
         """Raise TypeError or OverflowError for the first field that is not of its kind."""
-        for field, argument in zip(self._fields, arguments, strict=True):
-            if address_reader([field])((argument,)) is None:
+        for field, argument in zip(self._fields, fields.values(), strict=True):
+            if call_reader("field", (Parameter("given", None, (field,)),), False)(argument) is None:
                 if field.kind is int and type(argument) is int:
                     raise OverflowError(f"{self.name}: {field.path} = {argument} does not fit into 32 bits.")
                 self._refuse(field.path, argument)
@@ -113,10 +131,13 @@ class Worker(Generic[P]):
             got = f"{argument.dtype} on {argument.device}, {layout}"
         raise TypeError(f"{self.name}: {path} must be a {wanted}, got {got}.") from None
 
-    def _run(self, values: list[int | float]) -> None:
+    def _run(self, values: tuple[int | float, ...]) -> None:
         with LOCK:
-            kernel, threads = self.load(), 1 if self._alone else get_num_threads()
-            sections = _SECTIONS * threads if threads > 1 else 1
+            kernel, threads = self._kernel or self.load(), 1 if self._alone else get_num_threads()
+            if threads == 1:
+                on_threads(1, kernel, kernel.pack(0, *values))
+                return
+            sections = _SECTIONS * threads
             counters = (ctypes.c_int32 * (_LINE // 4 * (sections + 2)))()
             counters[_LINE // 4] = sections
             # The threads share the arguments of one call.
@@ -140,7 +161,9 @@ class Worker(Generic[P]):
         declared = declare(SHARED | self.constants) + "".join(map(declare_struct, self.structs))
         functions = "" if self.file is None else read_kernel(self.file)
         definitions = "".join(parameter.definition for parameter in self._parameters)
-        definitions += "int* const counters = (int*)counters_address;\n"
+        # A thread by itself counts on its stack.
+        definitions += f"int alone_[{_LINE // 2}] = {{1}};\n"
+        definitions += "int* const counters = counters_address ? (int*)counters_address : alone_;\n"
         return f"{PRELUDE}{declared}{functions}{definitions}{self._code}"
 
 

@@ -25,13 +25,13 @@ class Kernel(NamedTuple):
 
     run: Callable[..., None]
     bounds: Any
-    pack: Callable[..., ctypes.Structure]  # makes the structure of its arguments, from these in their order
+    pack: Callable[..., bytes]  # makes the structure of its arguments, from these in their order
     addresses: tuple[int, int]  # of the function and of the bounds
     command: Any  # of Warp; the code stays loaded as long as it lives
 
-    def __call__(self, arguments: ctypes.Structure) -> None:
-        """Run it with these arguments."""
-        self.run(self.bounds, ctypes.byref(arguments))
+    def __call__(self, arguments: bytes) -> None:
+        """Run it with these arguments, which it reads only."""
+        self.run(self.bounds, arguments)  # ctypes passes the address of the bytes
 
 
 def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:
@@ -73,21 +73,19 @@ def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:
     return Kernel(run, ctypes.byref(bounds), pack, addresses, command)
 
 
-def _packer(name: str, kinds: dict[str, Any]) -> Callable[..., ctypes.Structure]:
+def _packer(name: str, kinds: dict[str, Any]) -> Callable[..., bytes]:
     """Makes structures of these fields, of the simple types of ctypes, from their values."""
     structure = type(name, (ctypes.Structure,), {"_fields_": list(kinds.items())})
     # ctypes looks for the names of fields one by one, far from the caches.
     layout = struct.Struct("".join(kind._type_ for kind in kinds.values()))
 
-    def fill(*values: int | float) -> ctypes.Structure:
-        packed = structure()
+    def pack(*values: int | float) -> bytes:
         try:
-            layout.pack_into(packed, 0, *values)
+            return layout.pack(*values)
         except OverflowError:  # beyond float32, which is infinite to ctypes
-            return structure(*values)
-        return packed
+            return bytes(structure(*values))
 
-    return fill
+    return pack
 
 
 @functools.cache

@@ -5,7 +5,7 @@ instances, C++ receives a `struct` of the same name with the same fields. A kern
 """
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Annotated, Any, NamedTuple, TypeAlias, get_args, get_origin, get_type_hints
 
 import torch
@@ -106,58 +106,64 @@ def declare_struct(struct: type) -> str:
     return f"struct {struct.__name__} {{\n{fields}}};\n"
 
 
-def flattener(
-    name: str, stub: Callable[..., Any], parameters: tuple[Parameter, ...], refuse: Callable[[str, Any], None]
-) -> Callable[..., tuple[Any, ...]]:
-    """Makes a function of the stub's parameters that returns their fields, one after the other.
-
-    Python checks the names of the arguments; `refuse(name, argument)` is called with what is not the declared struct.
-    """
-    checks = "".join(
-        f"    if type({p.name}) is not {p.struct.__name__}: refuse({p.name!r}, {p.name})\n"
+def group(parameters: tuple[Parameter, ...], values: Iterable[Any]) -> dict[str, Any]:
+    """The arguments of a call, by name, from their fields, one after the other."""
+    following = iter(values)
+    return {
+        p.name: next(following) if p.struct is None else p.struct(*(next(following) for _ in p.fields))
         for p in parameters
-        if p.struct is not None
-    )
-    by_name = any(p.kind is p.KEYWORD_ONLY for p in inspect.signature(stub).parameters.values())
-    names = ["*"] * by_name + [p.name for p in parameters]
-    values = "".join(f"*{p.name}, " if p.struct else f"{p.name}, " for p in parameters)
-    source = f"def {name}({', '.join(names)}):\n{checks}    return ({values})\n"
-    namespace: dict[str, Any] = {struct.__name__: struct for struct in structs_of(parameters)} | {"refuse": refuse}
-    exec(source, namespace)
-    made: Callable[..., tuple[Any, ...]] = namespace[name]
-    return made
+    }
 
 
-def address_reader(fields: list[Field]) -> Callable[[tuple[Any, ...]], list[int | float] | None]:
-    """Makes a function that turns the fields of a call into addresses of tensors, and numbers.
+def call_reader(
+    name: str, parameters: tuple[Parameter, ...], by_name: bool
+) -> Callable[..., tuple[int | float, ...] | None]:
+    """Makes a function that turns the arguments of a call into addresses of tensors, and numbers, field after field.
 
-    It returns None if a field is not of its kind. Written out field by field, it takes half the time of a loop.
+    It returns None if an argument or a field is not of its kind. Python checks the names of the arguments. A launch
+    takes a few microseconds, most of them here: everything is written out, and nothing is collected on the way.
+
+    Args:
+        name: That of the function, for messages.
+        parameters: Those of the function.
+        by_name: Whether arguments have to be named.
     """
-    names = [f"f{i}" for i in range(len(fields))]
     namespace: dict[str, Any] = {"SMALLEST": -(2**31), "LARGEST": 2**31 - 1}
-    conditions, values = [], []
-    for i, (name, field) in enumerate(zip(names, fields, strict=True)):
-        if isinstance(field.kind, ArrayKind):
-            namespace[f"dtype{i}"] = field.kind.dtype
-            fits = f"{name}.dtype is dtype{i} and {name}.is_cpu and {name}.is_contiguous()"
-            # A tensor without an address is a tensor by name, which keeps its numbers elsewhere, unless it is empty.
-            conditions.append(f"{fits} and ((a{i} := {name}.data_ptr()) or not {name}.numel())")
-            values.append(f"a{i}")
-        else:
-            in_range = f" and SMALLEST <= {name} <= LARGEST" if field.kind is int else ""
-            conditions.append(f"type({name}) is {field.kind.__name__}{in_range}")
-            values.append(name)
-    source = f"""def read(arguments):
-    ({"".join(f"{name}, " for name in names)}) = arguments
-    try:
-        if {" and ".join(f"({condition})" for condition in conditions) or True}:
-            return [{", ".join(values)}]
-    except AttributeError:
-        pass
+    structs: list[str] = []
+    unpacked: list[str] = []
+    conditions: list[str] = []
+    values: list[str] = []
+    for parameter in parameters:
+        fields = [parameter.name]
+        if parameter.struct is not None:
+            namespace[parameter.struct.__name__] = parameter.struct
+            structs.append(f"type({parameter.name}) is {parameter.struct.__name__}")
+            fields = [f"f{len(values) + i}" for i in range(len(parameter.fields))]
+            unpacked.append(f"{', '.join(fields)}, = {parameter.name}")
+        for given, field in zip(fields, parameter.fields, strict=True):
+            i = len(values)
+            if isinstance(field.kind, ArrayKind):
+                namespace[f"dtype{i}"] = field.kind.dtype
+                fits = f"{given}.dtype is dtype{i} and {given}.is_cpu and {given}.is_contiguous()"
+                # A tensor that is not empty and has no address keeps its numbers elsewhere.
+                conditions.append(f"{fits} and ((a{i} := {given}.data_ptr()) or not {given}.numel())")
+                values.append(f"a{i}")
+            else:
+                in_range = f" and SMALLEST <= {given} <= LARGEST" if field.kind is int else ""
+                conditions.append(f"type({given}) is {field.kind.__name__}{in_range}")
+                values.append(given)
+    source = f"""def {name}({", ".join(["*"] * by_name + [p.name for p in parameters])}):
+    if {" and ".join(structs) or True}:
+        {"; ".join(unpacked) or "pass"}
+        try:
+            if {" and ".join(f"({condition})" for condition in conditions) or True}:
+                return ({"".join(f"{value}, " for value in values)})
+        except AttributeError:
+            pass
     return None
 """
     exec(source, namespace)
-    made: Callable[[tuple[Any, ...]], list[int | float] | None] = namespace["read"]
+    made: Callable[..., tuple[int | float, ...] | None] = namespace[name]
     return made
 
 

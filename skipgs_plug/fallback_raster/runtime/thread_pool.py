@@ -51,9 +51,10 @@ class ThreadPool:
         for number in range(count):
             _thread.start_new_thread(self._serve, (number,))
 
-    def run(self, kernel: Kernel, arguments: ctypes.Structure) -> None:
+    def run(self, kernel: Kernel, arguments: bytes) -> None:
         """Run it on all of them and here; none of them is at it any more when this returns."""
-        self._launch(*kernel.addresses, ctypes.addressof(arguments))
+        held = (ctypes.c_char * len(arguments)).from_buffer_copy(arguments)
+        self._launch(*kernel.addresses, ctypes.addressof(held))
 
     def dismiss(self) -> None:
         """Wait until all are gone; may be called again when an exception ended it."""

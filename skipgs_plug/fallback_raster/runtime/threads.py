@@ -5,7 +5,6 @@ two steps of the main thread, but not while a kernel runs, which is one call of 
 """
 
 import atexit
-import ctypes
 import os
 import threading
 import warnings
@@ -44,7 +43,7 @@ def set_num_threads(n: int) -> None:
         _dismiss()
 
 
-def on_threads(count: int, kernel: Kernel, arguments: ctypes.Structure) -> None:
+def on_threads(count: int, kernel: Kernel, arguments: bytes) -> None:
     """Runs a kernel on one thread, this one, or on all, and returns when it is done. The caller holds `LOCK`."""
     global _pool
     if _forked:
