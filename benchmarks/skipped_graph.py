@@ -1,12 +1,12 @@
-"""The graph of a skipped iteration: memory that it would hold, and the price of keeping it within reach.
+"""The graph of a skipped iteration: memory that it would hold, and the price of freeing it.
 
     python benchmarks/skipped_graph.py [memory] [price]
 
 A backward frees what its graph saved; a skipped one does not. Most trainers overwrite `loss` and `image` only when the
 next forward pass is done, so for that long there would be two graphs; the gate frees the first at the skip
-(`skipgs_plug.core.saved_graph`). For "memory" no gate is attached. For "price" every second iteration keeps its graph
-within reach, and processor seconds of neighbours are compared, on one thread. Rendered are random Gaussians at 504x378
-with SH degree 3, L1 + SSIM, on the CPU rasterizer. Writes `benchmarks/results/skipped_graph.json`.
+(`skipgs_plug.core.saved_graph`). For "memory" no gate is attached. For "price" processor seconds of one iteration and
+of freeing a graph are compared, on one thread; an iteration that runs pays nothing. Rendered are random Gaussians with
+SH degree 3, L1 + SSIM, on the CPU rasterizer. Writes `benchmarks/results/skipped_graph.json`.
 """
 
 from __future__ import annotations
@@ -15,29 +15,18 @@ import dataclasses
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from common import PARAMETERS, RESULTS, frustum_scene, leaves, provenance, threads, write_part
 from torch import Tensor
 
-from skipgs_plug.core.saved_graph import SavedGraph
+from skipgs_plug.core.saved_graph import free_graph, nodes
 from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
 from skipgs_plug.trainer.loss import l1_ssim_loss as loss_of_torch
 
-PAIRS = 60  # of neighbouring iterations, either first in turn
-
-
-def nodes(output: Tensor) -> Iterator[Any]:
-    """Every function of the graph behind a tensor."""
-    waiting, seen = [output.grad_fn], set()
-    while waiting:
-        node = waiting.pop()
-        if node is not None and node not in seen:
-            seen.add(node)
-            waiting += [parent for parent, _ in node.next_functions]
-            yield node
+PAIRS = 30  # of an iteration and a skip
 
 
 def held_bytes(output: Tensor, own: Sequence[Tensor]) -> int:
@@ -56,14 +45,14 @@ def held_bytes(output: Tensor, own: Sequence[Tensor]) -> int:
     return sum(storages.values())
 
 
-def iteration(n: int, own_loss: bool) -> tuple[Callable[[], Tensor], Callable[[Tensor], None]]:
+def iteration(n: int, own_loss: bool, width: int, height: int) -> tuple[Callable[[], Tensor], Callable[[Tensor], None]]:
     """Forward and backward with n Gaussians; activations and loss in plain torch, as trainers have them, or fused."""
-    scene = frustum_scene(n, 504, 378, sh_degree=3)
+    scene = frustum_scene(n, width, height, sh_degree=3)
     scene["scales"], scene["opacities"] = scene["scales"].log(), scene["opacities"].logit()
     scene["features_dc"], scene["features_rest"] = scene["colors"][:, :1].clone(), scene["colors"][:, 1:].clone()
     names = [*(name for name in PARAMETERS if name != "colors"), "features_dc", "features_rest"]
     inputs = leaves(scene, names)
-    target = torch.rand(1, 378, 504, 3)
+    target = torch.rand(1, height, width, 3)
 
     def forward() -> Tensor:
         now = {name: value for name, value in inputs.items() if not name.startswith("features")}
@@ -89,44 +78,27 @@ def saved_tensors(forward: Callable[[], Tensor]) -> int:
     return len(saved)
 
 
-def price(n: int, own_loss: bool) -> dict[str, Any]:
-    """Processor seconds that keeping a graph within reach adds to an iteration that runs, and those of a skip."""
-    forward, backward = iteration(n, own_loss)
-    graph = SavedGraph()
-
-    def seconds(kept: bool) -> float:
+def price(n: int, own_loss: bool, width: int, height: int) -> dict[str, Any]:
+    """Processor seconds of an iteration that runs, and of freeing the graph of one that is skipped."""
+    forward, backward = iteration(n, own_loss, width, height)
+    runs, freeing = [], []
+    for _ in range(PAIRS + 3):
         begin = time.process_time()
-        if kept:
-            graph.open()
+        backward(forward())
+        runs.append(time.process_time() - begin)
         loss = forward()
-        graph.close()
-        backward(loss)
-        return time.process_time() - begin
-
-    for kept in (False, True) * 3:
-        seconds(kept)
-    pairs = []
-    for i in range(PAIRS):
-        first = seconds(bool(i % 2))
-        second = seconds(not i % 2)
-        pairs.append((second, first) if i % 2 else (first, second))
-    freeing = []
-    for _ in range(PAIRS // 2):
-        graph.open()
-        loss = forward()
-        graph.close()
         begin = time.process_time()
-        graph.free(loss)
+        free_graph(loss)
         freeing.append(time.process_time() - begin)
-    plain = statistics.median(one for one, _ in pairs)
+    ran, freed = statistics.median(runs[3:]), statistics.median(freeing[3:])
     return {
         "gaussians": n,
+        "size": f"{width}x{height}",
         "loss": "fused" if own_loss else "plain torch",
         "saved_tensors": saved_tensors(forward),
-        "iteration_ms": 1000 * plain,
-        "price_ms": 1000 * statistics.median(kept - one for one, kept in pairs),
-        "price_share": statistics.median(kept / one for one, kept in pairs) - 1.0,
-        "freeing_ms": 1000 * statistics.median(freeing),
+        "iteration_ms": 1000 * ran,
+        "freeing_ms": 1000 * freed,
+        "freeing_share": freed / ran,
     }
 
 
@@ -147,12 +119,14 @@ def measure_memory() -> list[dict[str, Any]]:
 def measure_prices() -> list[dict[str, Any]]:
     rows = []
     with threads(1):
-        for n in (1000, 10_000, 100_000):
+        for n, width, height in ((300, 64, 48), (1000, 126, 94), (10_000, 504, 378), (100_000, 504, 378)):
             for own_loss in (True, False):
-                rows.append(price(n, own_loss))
+                rows.append(price(n, own_loss, width, height))
                 print(
-                    "{gaussians:9,} Gaussians, {loss} loss: {saved_tensors} saved tensors, {price_ms:.3f} of "
-                    "{iteration_ms:.1f} ms ({price_share:.2%}), freeing {freeing_ms:.3f} ms".format(**rows[-1])
+                    "{gaussians:9,} Gaussians at {size}, {loss} loss: {saved_tensors} saved tensors, "
+                    "iteration {iteration_ms:.2f} ms, freeing {freeing_ms:.3f} ms ({freeing_share:.2%})".format(
+                        **rows[-1]
+                    )
                 )
     return rows
 

@@ -25,7 +25,7 @@ from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.release import Release
-from skipgs_plug.core.saved_graph import SavedGraph, drop_gradients
+from skipgs_plug.core.saved_graph import drop_gradients, free_graph
 from skipgs_plug.core.scene_check import SceneCheck
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, require_state
 from skipgs_plug.core.stats import GateStats
@@ -56,7 +56,6 @@ class Engine:
         stats, clock: counts, seconds.
         rates: scales learning rates, for the pace.
         pace: says which iterations run, and scales learning rates.
-        graph: Tensors that autograd saves for backward passes that may be skipped.
         trace: Rows of gated decisions; None if they are not recorded.
     """
 
@@ -91,8 +90,6 @@ class Engine:
         else:
             self.pace = Compensated(config, self.rates) if config.compensates else Pace()
         self.trace: list[TraceRow] | None = [] if record_trace else None
-        self.graph = SavedGraph()
-        weakref.finalize(self, self.graph.close)  # a gate that was never detached leaves no hooks behind
         self._skipped: list[weakref.ref[Tensor]] = []  # losses of this iteration whose backwards were skipped
         self._accumulates = False
         self._guard = NonFiniteGuard(config.on_nonfinite)
@@ -141,8 +138,7 @@ class Engine:
             self.load_state_dict(self._pending_state)
 
     def release(self) -> None:
-        """Let go of loops, optimizers and graphs; counts stay readable."""
-        self.graph.close()
+        """Let go of loops and optimizers; counts stay readable."""
         self.pace.remove()
         self.rates.remove()
 
@@ -184,7 +180,6 @@ class Engine:
         self.pace.begin(step, None if self.policy is None else self.policy.floor)
         self.iteration.begin(step)
         self._skipped.clear()
-        self._keep_graph(step)
         self.clock.open(post=step >= self.start)
 
     def gate(
@@ -203,7 +198,6 @@ class Engine:
             alone: Whether no other backward of this iteration needs what this one shares with it: a skipped graph is
                 freed at once.
         """
-        self.graph.close()
         back_from = loss if loss is not None else signal if isinstance(signal, Tensor) else None
         foreseen = self._foreseen(view, signal, back_from)
         if foreseen is False:
@@ -221,8 +215,6 @@ class Engine:
                 if alone:
                     self.free_skipped()
         self.clock.mark()
-        if self.iteration.step is not None:
-            self._keep_graph(self.iteration.step + 1)
         return not skip
 
     def free_skipped(self) -> None:
@@ -230,7 +222,7 @@ class Engine:
         for reference in self._skipped:
             loss = reference()
             if loss is not None:
-                self.graph.free(loss)
+                free_graph(loss)
         self._skipped.clear()
 
     def _foreseen(self, view: str, signal: float | Tensor, loss: Tensor | None) -> bool | None:
@@ -263,13 +255,6 @@ class Engine:
         else:
             self.rates.ran()
         return skip
-
-    def _keep_graph(self, step: int) -> None:
-        """Track the tensors that autograd saves in iteration `step`, if its backward pass may be skipped."""
-        if not self.config.enabled or step < self.start or self.policy is None:
-            return
-        if self.policy.foreseen(None, step) is not False:
-            self.graph.open()
 
     def decide(self, view: str, signal: float | Tensor | HostCopy | None) -> Decision:
         """Decide on one view in the present iteration, with all processes, and record the answer.

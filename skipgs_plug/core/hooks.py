@@ -85,8 +85,6 @@ class Hooks:
         """
         with self.guarded():
             self._engine.configure(info, self._given)
-            if self._engine.config.enabled:
-                self.on_detach("torch.autograd (hooks for saved tensors)", self._engine.graph.close)
             if self._engine.config.compensates:
                 self.on_detach("torch.optim.Optimizer.step (hooks)", self._engine.release)
             self._ready = True

@@ -52,11 +52,11 @@ class Policy(ABC):
         """Return the running mean of a view's loss; None if the view or the policy has no mean."""
         return None
 
-    def foreseen(self, view: Hashable | None, step: int) -> bool | None:
+    def foreseen(self, view: Hashable, step: int) -> bool | None:
         """Return whether `decide` will skip, if that is known without the loss; None if it is unknown.
 
-        A `view` of None asks for an answer that holds for every view. The call changes nothing. It returns True only in
-        iterations that train nothing; `decide` is then not called with their loss.
+        The call changes nothing. It returns True only in iterations that train nothing; `decide` is then not called
+        with their loss.
         """
         return None
 
@@ -194,14 +194,14 @@ class SkipPolicy(Policy):
             budget.calibrate()
         return answer
 
-    def foreseen(self, view: Hashable | None, step: int) -> bool | None:
+    def foreseen(self, view: Hashable, step: int) -> bool | None:
         """False in a pause, in warm-up, for a view without a mean, and while the floor forbids skipping."""
         if step < self._start_iter or not self.enabled or step < self.pause.until:
             return False
         warmup_end = step + self._warmup if self._warmup_end is None else self._warmup_end
         if step < warmup_end or not self.budget.allows_skip():
             return False
-        return False if view is not None and self.means.get(view) is None else None
+        return False if self.means.get(view) is None else None
 
     def overrule(self, own: Decision, answer: Decision) -> None:
         """Count the decision that takes effect instead of the one that was recorded last.

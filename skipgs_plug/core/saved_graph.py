@@ -2,92 +2,34 @@
 
 A backward pass frees the tensors that the forward pass saved; a skipped one does not. Most trainers hold `loss` and
 `image` until the next forward pass is done, so two graphs exist at once: 41 % more memory at the peak in a model of
-Inria's sizes. PyTorch's hooks for saved tensors wrap each tensor in an object, which is emptied at a skip.
+Inria's sizes. PyTorch lets hooks be registered on a tensor that a graph has saved already, and drops the tensor for the
+value that the hook returns. Hooks that are registered at a skip cost nothing in the iterations that run.
 """
 
 from __future__ import annotations
 
-import contextlib
 import functools
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NoReturn
 
-import torch
 from torch import Tensor
 
 from skipgs_plug.core.errors import SkipGSError
 
 
-class _Saved:
-    """One saved tensor; None after it is freed."""
-
-    __slots__ = ("tensor", "version")
-
-    def __init__(self, tensor: Tensor) -> None:
-        self.tensor: Tensor | None = tensor
-        self.version = tensor._version
-
-
-class SavedGraph:
-    """Tracks the tensors that autograd saves between `open` and `close`.
-
-    Only one level of hooks is used, and none inside hooks of the trainer's own.
-    """
-
-    def __init__(self) -> None:
-        self._open = False
-        self._freeing = False
-
-    def open(self) -> None:
-        """Begin to track saved tensors in this thread, unless it has begun already or other hooks are active."""
-        if self._open:
-            return
-        top = _top()
-        if top is not None:
-            other = getattr(top[0], "__self__", None)
-            if not isinstance(other, SavedGraph):
-                return
-            other.close()  # of another gate: one that was never detached, or whose turn comes again
-        torch._C._autograd._push_saved_tensors_default_hooks(self._pack, self._unpack)
-        self._open = True
-
-    def close(self) -> None:
-        """Stop tracking saved tensors."""
-        if self._open and _top() is not None and _top()[0] == self._pack:
-            torch._C._autograd._pop_saved_tensors_default_hooks()
-            self._open = False
-
-    def free(self, loss: Tensor) -> None:
-        """Free the tensors saved for the backward pass of a loss; no backward pass can reach them any more."""
-        self._freeing = True
-        try:
-            for node in nodes(loss):
-                for name in _saved_names(node.__class__):
-                    with contextlib.suppress(RuntimeError):  # freed already, or changed in place since
-                        getattr(node, name)  # calls `_unpack`, which empties the tensor that it finds
-        finally:
-            self._freeing = False
-
-    def _pack(self, tensor: Tensor) -> _Saved:
-        return _Saved(tensor)  # small ones too: PyTorch leaves the check of versions to hooks
-
-    def _unpack(self, saved: _Saved) -> Tensor:
-        tensor = saved.tensor
-        if tensor is None:
-            if self._freeing:
-                return torch.empty(0)
-            raise SkipGSError(
-                "A backward needs the graph of a loss whose backward was skipped, and which is freed; call backward on "
-                "both losses at once, or compute what they share anew."
-            )
-        if self._freeing:
-            saved.tensor = None
-        elif tensor._version != saved.version:
-            raise RuntimeError(
-                "one of the variables needed for gradient computation has been modified by an inplace operation: "
-                f"{tuple(tensor.shape)} is at version {tensor._version}; expected version {saved.version} instead."
-            )
-        return tensor
+def free_graph(loss: Tensor) -> None:
+    """Free the tensors saved for the backward pass of a loss; no backward pass can reach them any more."""
+    for node in nodes(loss):
+        for name in _saved_names(node.__class__):
+            try:
+                saved = getattr(node, name)
+            except RuntimeError:  # freed already
+                continue
+            for each in saved if isinstance(saved, (tuple, list)) else (saved,):
+                try:
+                    each.register_hooks(_forget, _refuse)
+                except RuntimeError:  # None, freed already, or under hooks of the trainer's own
+                    continue
 
 
 def nodes(loss: Tensor) -> Iterator[Any]:
@@ -109,13 +51,18 @@ def drop_gradients(loss: Tensor) -> None:
             leaf.grad = None
 
 
+def _forget(tensor: Tensor) -> None:
+    """Return what is kept in place of a saved tensor: nothing."""
+
+
+def _refuse(kept: None) -> NoReturn:
+    raise SkipGSError(
+        "A backward needs the graph of a loss whose backward was skipped, and which is freed; call backward on both "
+        "losses at once, or compute what they share anew."
+    )
+
+
 @functools.cache
 def _saved_names(kind: Any) -> tuple[str, ...]:
-    """Attributes of a function of autograd that give saved tensors."""
-    names = [name for name in dir(kind) if name.startswith("_saved_")]
-    return (*names, "saved_tensors") if hasattr(kind, "saved_tensors") else tuple(names)
-
-
-def _top() -> Any:
-    ask = getattr(torch._C._autograd, "_top_saved_tensors_default_hooks", None)
-    return (None,) if ask is None else ask(True)
+    """Attributes of a function of autograd that give its saved tensors as PyTorch keeps them."""
+    return tuple(name for name in dir(kind) if name.startswith("_raw_saved_"))

@@ -93,8 +93,7 @@ def test_seconds_are_the_trainers_own(trainer: Trainer) -> None:
 
 def test_nothing_is_left_behind(trainer: Trainer) -> None:
     gate = SkipGate(trainer)
-    saved = "torch.autograd (hooks for saved tensors)"
-    assert gate.patched == ["skipgs_plug.trainer.loop.Trainer.backward", saved, "Trainer.registered['skipgs']"]
+    assert gate.patched == ["skipgs_plug.trainer.loop.Trainer.backward", "Trainer.registered['skipgs']"]
     with pytest.raises(SkipGSError, match="gated already"):
         SkipGate(trainer)
     gate.detach()

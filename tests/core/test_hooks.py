@@ -94,7 +94,7 @@ def plain(trainer: ToyTrainer) -> bool:
 def test_gates_counts_and_leaves_nothing_behind() -> None:
     trainer = ToyTrainer()
     with attach(trainer) as gate:
-        assert len(gate.patched) == 6
+        assert len(gate.patched) == 5
         trainer.train()
         gate.verify()
     assert plain(trainer)

@@ -34,11 +34,11 @@ class RefinementPolicy(Policy):
         """Running mean of a view's loss."""
         return self._means.get(view)
 
-    def foreseen(self, view: Hashable | None, step: int) -> bool | None:
+    def foreseen(self, view: Hashable, step: int) -> bool | None:
         """True when refinement is over; False unless views are watched."""
         if self._refining.over:
             return True
-        return None if self._refining.watching and (view is None or view in self._refining.watched) else False
+        return None if self._refining.watching and view in self._refining.watched else False
 
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
         """Run the backward, unless the view is watched or refinement is over; the loss is finite."""
