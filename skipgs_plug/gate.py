@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
@@ -16,9 +17,11 @@ from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
 from skipgs_plug.core.hooks import Adapter, Hooks
-from skipgs_plug.core.optimizers import listed, step_pending
+from skipgs_plug.core.optimizers import has_pending_gradient, listed
+from skipgs_plug.core.pace.base import EveryNumber
 from skipgs_plug.core.pace.loop_range import LoopRange
 from skipgs_plug.core.policy import Policy
+from skipgs_plug.core.release import Original
 from skipgs_plug.core.report import build_report, counters, summarise
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.trainer_info import TrainerInfo
@@ -138,8 +141,8 @@ class SkipGate:
                 some of them.
 
         Raises:
-            SkipGSError: The numbers do not increase by one, they continue those of an earlier call, or a condition
-                of the loop cannot be evaluated ahead.
+            SkipGSError: The numbers do not increase by one. Before training has begun also: they go on after those of
+                an earlier plan, or a condition of the loop cannot be evaluated ahead; later the gate is released.
 
         Examples:
             Four of ten iterations run after densification, which ends here at iteration 10. The last one always runs.
@@ -157,8 +160,10 @@ class SkipGate:
         if always is None:
             frame = sys._getframe(1)
             source = (frame.f_code, {**frame.f_globals, **frame.f_locals})
-        keys = None if views is None else list(dict.fromkeys(view_key(view) for view in views))
-        return self._engine.pace.follow(numbers, source, always or (), keys, events)
+        with self._guarded():
+            keys = None if views is None else list(dict.fromkeys(view_key(view) for view in views))
+            return self._engine.pace.follow(numbers, source, always or (), keys, events)
+        return LoopRange(numbers, EveryNumber(lambda: None))
 
     def backward(self, loss: Any, view: Any, step: int, *, signal: Any = None) -> bool:
         """Run `loss.backward()`, or skip it; return True when gradients were computed.
@@ -174,8 +179,9 @@ class SkipGate:
         Raises:
             GateOrderError: The view was decided already in this iteration, `update` has ended the iteration, or the
                 iteration number decreases.
-            SkipGSError: The key is not usable, the loss is not a tensor, losses stay non-finite, or a share is
-                given and the loop does not run over `iterations`.
+            SkipGSError: The loss is not a tensor, or losses stay non-finite. In the first iteration also: the key is
+                not usable, or a share is given and the loop does not run over `iterations`. Later such an error, like
+                any other of the gate itself, releases the gate with a warning; see `released`.
 
         Examples:
             A batch of two views in one iteration:
@@ -190,24 +196,21 @@ class SkipGate:
             tensor([2., 2.])
         """
         self._require_manual("backward")
-        engine, now, step = self._engine, self._iteration, int(step)
         self._check_losses(loss, view)
-        if engine.pace.lacks_loop and engine.pace.needs_loop(step):
-            raise SkipGSError(
-                "share and refine_share leave out iterations, so the gate must count them; write the loop as "
-                "for step in gate.iterations(range(...))."
-            )
-        if step != now.step:
-            engine.open_iteration(step)
-        elif now.ended or now.stepped:
-            verb = "update" if now.ended else "step"
-            raise GateOrderError(
-                f"backward() was called after {verb}() in iteration {step}; all backwards of an iteration "
-                "come first, and each iteration has its own step number."
-            )
-        if isinstance(view, list):
-            return self._backward_batch(loss, view, loss if signal is None else signal)
-        return engine.gate(self._new_in_iteration(view), loss if signal is None else signal, loss.backward, loss)
+        now, step = self._iteration, int(step)
+        run = Original(_backward_of_sum if isinstance(view, list) else loss.backward)
+        if self.released is None:
+            try:
+                return self._gated_backward(loss, view, step, loss if signal is None else signal, run)
+            except Exception as error:
+                if run.failed:
+                    raise  # of the loop's own backward
+                self._engine.giving_up.on_error(error, step)
+        now.begin(step)
+        now.ran = True
+        if not run.made:
+            run(*([loss] if isinstance(view, list) else ()))
+        return True
 
     def step(self, optimizer: Any, *args: Any) -> bool:
         """Call `optimizer.step(*args)` if a gradient is pending; return True when it stepped.
@@ -223,12 +226,18 @@ class SkipGate:
             GateOrderError: `backward` was not called first in this iteration, or the optimizer has stepped in it.
         """
         self._require_backward_before("step")
-        optimizers = listed(optimizer)
-        for one in optimizers:
-            if id(one) in self._iteration.stepped:
-                raise GateOrderError("step() was called twice for one optimizer in this iteration.")
-        self._iteration.stepped.update(id(one) for one in optimizers)
-        return step_pending(optimizers, args, always=not self._engine.config.enabled)
+        optimizers = stepping = listed(optimizer)
+        if self.released is None:
+            for one in optimizers:
+                if id(one) in self._iteration.stepped:
+                    raise GateOrderError("step() was called twice for one optimizer in this iteration.")
+            self._iteration.stepped.update(id(one) for one in optimizers)
+            if self._engine.config.enabled:  # without a gate all of them step
+                with self._guarded():
+                    stepping = [one for one in optimizers if has_pending_gradient(one)]
+        for one in stepping:
+            one.step(*args)
+        return bool(stepping)
 
     def update(self) -> None:
         """End the iteration and free the graph of a skipped backward pass.
@@ -241,7 +250,8 @@ class SkipGate:
         """
         self._require_backward_before("update")
         self._iteration.ended = True
-        self._engine.free_skipped()
+        with self._guarded():
+            self._engine.free_skipped()
 
     def notify_event(self, kind: str, step: int | None = None) -> None:
         """Report a structural change: real backward passes follow for a while, and the means do not change.
@@ -256,7 +266,8 @@ class SkipGate:
         step = self._iteration.step if step is None else int(step)
         if step is None or self._engine.policy is None:
             raise GateOrderError("notify_event() came before the first iteration; give its step.")
-        self._engine.notify_event(kind, step)
+        with self._guarded():
+            self._engine.notify_event(kind, step)
 
     # Counts and settings.
 
@@ -355,7 +366,7 @@ class SkipGate:
         """Continue from `state_dict()`, or from a state of the authors' controller (version 1).
 
         A state of another scene with the same view names is noticed later: when the first ten losses are all far
-        from the means of their views, the tenth raises SkipGSError.
+        from the means of their views, the tenth releases the gate.
 
         Raises:
             SkipGSError: The state is damaged, has another version, or belongs to another scene.
@@ -412,14 +423,38 @@ class SkipGate:
             if not hasattr(one, "backward"):
                 raise SkipGSError(f"backward() needs the loss itself, a tensor, not {type(one).__name__}.")
 
-    def _backward_batch(self, losses: Any, views: list[Any], signals: Any) -> bool:
+    def _guarded(self) -> AbstractContextManager[None]:
+        """A block of the gate's own code in a verb; an error in it releases the gate, and the loop goes on."""
+        return self._engine.giving_up.guarded(lambda: self._iteration.step)
+
+    def _gated_backward(self, loss: Any, view: Any, step: int, signal: Any, run: Original) -> bool:
+        """`backward`, as long as the gate holds on; `run` is the loop's own backward."""
+        engine, now = self._engine, self._iteration
+        if engine.pace.lacks_loop and (now.opened == 0 or engine.pace.needs_loop(step)):
+            raise SkipGSError(
+                "share and refine_share leave out iterations, so the gate must count them; write the loop as "
+                "for step in gate.iterations(range(...))."
+            )
+        if step != now.step:
+            engine.open_iteration(step)
+        elif now.ended or now.stepped:
+            verb = "update" if now.ended else "step"
+            raise GateOrderError(
+                f"backward() was called after {verb}() in iteration {step}; all backwards of an iteration "
+                "come first, and each iteration has its own step number."
+            )
+        if isinstance(view, list):
+            return self._backward_batch(loss, view, signal, run)
+        return engine.gate(self._new_in_iteration(view), signal, run, loss)
+
+    def _backward_batch(self, losses: Any, views: list[Any], signals: Any, run: Original) -> bool:
         if not len(losses) == len(views) == len(signals):
             raise SkipGSError(f"{len(views)} view keys came with {len(losses)} losses; give one loss per view.")
         keys = [self._new_in_iteration(view) for view in views]
         answers = [self._engine.decide(key, signal) for key, signal in zip(keys, signals, strict=True)]
         kept = [loss for loss, answer in zip(losses, answers, strict=True) if not answer.skip]
         if kept:
-            torch.stack(kept).sum().backward()
+            run(kept)
             self._iteration.ran = True
             self._engine.rates.ran()
         self._engine.clock.mark()
@@ -444,8 +479,12 @@ class SkipGate:
 
     def _require_backward_before(self, verb: str) -> None:
         self._require_manual(verb)
-        if self._iteration.ended or not self._iteration.keys:
+        if self.released is None and (self._iteration.ended or not self._iteration.keys):
             raise GateOrderError(f"{verb}() was called before backward() in this iteration.")
+
+
+def _backward_of_sum(losses: Iterable[Tensor]) -> None:
+    torch.stack(list(losses)).sum().backward()
 
 
 _FIELDS = frozenset(field.name for field in dataclasses.fields(SkipConfig))

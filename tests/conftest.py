@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from skipgs_plug.core import caution
+
 # A shell starts jobs in the background with SIGINT ignored, and the commands that tests interrupt inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def no_warning_of_the_gate_is_missed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Where warnings are errors, as here, the gate prints its own instead: a test that expects none must fail."""
+    printed: list[str] = []
+    monkeypatch.setattr(caution, "_print", printed.append)
+    yield
+    assert not printed, f"The gate warned, and the test does not expect it: {printed}"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 import types
-import warnings
 import weakref
 from collections import ChainMap
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
@@ -25,6 +24,7 @@ from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import last_calls
 from skipgs_plug.adapters.loop_code import LOOP, LoopCode
 from skipgs_plug.adapters.unknown_forks import BY_HAND, Unrecognised, unrecognised
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
@@ -105,12 +105,10 @@ class InriaFamily(AbstractAdapter):
         self._code, self._unknown = code, unrecognised(code, renderers, model, calls, self.arguments)
         self._unknown.refuse(self.difference(code))
         if self._unknown.listed:
-            warnings.warn(
+            caution(
                 f"{self.difference(code)}. Recognised: {', '.join(self.renders[:1])}, backward, "
                 f"{', '.join(sorted(self._unknown.known))}. Not recognised, and left to go on in skipped iterations: "
-                f"{self._unknown.listed}.",
-                RuntimeWarning,
-                stacklevel=2,
+                f"{self._unknown.listed}."
             )
 
     def difference(self, code: LoopCode) -> str:
@@ -291,11 +289,9 @@ class InriaFamily(AbstractAdapter):
         cameras = scene.getTrainCameras()
         names = [camera.image_name for camera in cameras]
         if len(set(names)) < len(names):
-            warnings.warn(
+            caution(
                 "Several training images have the same name; the gate tells views apart by their position, "
-                "which stays the same in a resumed run only with the same seed.",
-                RuntimeWarning,
-                stacklevel=2,
+                "which stays the same in a resumed run only with the same seed."
             )
             self._label = "uid"
         self.begin(opt, loop)
@@ -318,10 +314,8 @@ class InriaFamily(AbstractAdapter):
         late = {name: end for name, end in ends.items() if start < end <= opt.iterations}
         if late:
             listed = ", ".join(f"{name}() until iteration {end - 1}" for name, end in sorted(late.items()))
-            warnings.warn(
-                f"The gate begins with iteration {max(late.values())} in place of {start}: the loop calls {listed}.",
-                RuntimeWarning,
-                stacklevel=2,
+            caution(
+                f"The gate begins with iteration {max(late.values())} in place of {start}: the loop calls {listed}."
             )
         return max([start, *late.values()])
 

@@ -73,7 +73,9 @@ class Engine:
         self.iteration = GatedIteration()
         self.stats = GateStats()
         self.clock = GateClock()
-        self.giving_up = Release(config.enabled)
+        iteration = self.iteration
+        # A refusal in the first iteration loses nothing.
+        self.giving_up = Release(config.enabled, lambda: iteration.opened <= 1)
         own = weakref.ref(self)  # PyTorch holds hooks of the rates, which must not hold a gate that was dropped
 
         def taken_back() -> None:
@@ -82,7 +84,7 @@ class Engine:
 
         self.giving_up.undoes(taken_back)
         self.rates = ScaledRates()
-        giving_up, iteration = self.giving_up, self.iteration
+        giving_up = self.giving_up
         self.rates.on_error = lambda error: giving_up.on_error(error, iteration.step)
         self.pace: Pace
         if config.leaves_out:
@@ -177,6 +179,7 @@ class Engine:
                 f"Iterations went back from {before} to {step}: load the gate state that belongs to "
                 "the checkpoint, or attach a new gate."
             )
+        self.iteration.opened += 1
         self.pace.begin(step, None if self.policy is None else self.policy.floor)
         self.iteration.begin(step)
         self._skipped.clear()

@@ -13,6 +13,7 @@ class GatedIteration:
 
     Attributes:
         step: its number, None before the first.
+        opened: number of iterations that have begun with this gate.
         decision: the last answer in it.
         ran: a real backward ran in it.
         view, signal: what a trainer's hooks named for the backward to come.
@@ -22,11 +23,12 @@ class GatedIteration:
         ended: `update` was called by hand.
     """
 
-    __slots__ = ("backwards", "decision", "ended", "keys", "ran", "signal", "step", "stepped", "view")
+    __slots__ = ("backwards", "decision", "ended", "keys", "opened", "ran", "signal", "step", "stepped", "view")
 
     def __init__(self) -> None:
         self.keys: set[str] = set()
         self.stepped: set[int] = set()
+        self.opened = 0
         self.begin(None)
 
     def begin(self, step: int | None) -> None:

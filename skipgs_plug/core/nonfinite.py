@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
-
 from skipgs_plug.core import decision
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.errors import BrokenTrainingError
 
@@ -43,5 +42,5 @@ class NonFiniteGuard:
         if view not in self._warned:
             self._warned.add(view)
             then = "its backward is skipped" if self._mode == "skip" else "its backward runs all the same"
-            warnings.warn(f"{what}; {then}.", RuntimeWarning, stacklevel=2)
+            caution(f"{what}; {then}.")
         return decision.NON_FINITE if self._mode == "skip" else decision.NON_FINITE_PASSED

@@ -8,22 +8,6 @@ from typing import Any
 import torch
 
 
-def step_pending(optimizers: list[torch.optim.Optimizer], args: tuple[Any, ...], always: bool = False) -> bool:
-    """Step those optimizers that have a pending gradient; True when one was stepped.
-
-    Args:
-        optimizers: All that step together.
-        args: Passed to each `step`.
-        always: Step all of them, as a loop without a gate does.
-    """
-    stepped = False
-    for optimizer in optimizers:
-        if always or has_pending_gradient(optimizer):
-            optimizer.step(*args)
-            stepped = True
-    return stepped
-
-
 def has_pending_gradient(optimizer: torch.optim.Optimizer) -> bool:
     """Whether some parameter of the optimizer has a gradient that no step has used yet."""
     return any(p.grad is not None for group in optimizer.param_groups for p in group["params"])

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from skipgs_plug.core import distributed
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import BrokenTrainingError, GateOrderError, SkipGSError
+
+log = logging.getLogger(__name__)
 
 
 class Release:
@@ -19,18 +22,18 @@ class Release:
 
     Args:
         enabled: Whether the gate is on. One that is off has refused nothing and ends nothing.
+        refuses: Says whether a refusal still costs nothing.
 
     Attributes:
         reason: Sentence that was said; None while the gate holds on.
-        refuses: Whether a refusal still costs nothing. In a loop of the user's own that is always so: it is an error
-            in the use of the gate's verbs.
+        refuses: As given.
     """
 
-    def __init__(self, enabled: bool) -> None:
+    def __init__(self, enabled: bool, refuses: Callable[[], bool]) -> None:
         self._enabled = enabled
         self._undo: list[Callable[[], None]] = []
         self.reason: str | None = None
-        self.refuses: Callable[[], bool] = lambda: True
+        self.refuses = refuses
 
     def undoes(self, undo: Callable[[], None]) -> None:
         """Have something taken back whenever the gate gives up."""
@@ -57,6 +60,7 @@ class Release:
             raise error
         why = str(error) if isinstance(error, SkipGSError) else f"{type(error).__name__}: {error}"
         where = "" if step is None else f" in iteration {step}"
+        log.debug("The error that releases the gate:", exc_info=error)
         self.let_go(f"The gate is released{where}, and training goes on without it, in all its iterations ({why})")
 
     def let_go(self, reason: str) -> None:
@@ -64,7 +68,7 @@ class Release:
         if self.reason is None:
             self.reason = reason
             self._take_back()
-            warnings.warn(reason, RuntimeWarning, stacklevel=3)
+            caution(reason, stacklevel=3)
 
     @contextmanager
     def guarded(self, step: Callable[[], int | None] = lambda: None) -> Iterator[None]:

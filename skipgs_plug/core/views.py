@@ -5,12 +5,12 @@ from __future__ import annotations
 import itertools
 import numbers
 import os
-import warnings
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import PurePath
 from typing import Any
 
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
 
 CHECKED_KEYS = 5_000  # different views after which some must have come twice; if not, keys do not name views
@@ -63,12 +63,10 @@ def require_unique(names: Iterable[str]) -> list[str]:
 def warn_unless_recurring(keys: int, decisions: int) -> None:
     """Warn if keys hardly ever came twice in many decisions; call it at each new key."""
     if keys == CHECKED_KEYS and decisions - keys < RECURRING * decisions:
-        warnings.warn(
+        caution(
             f"{keys:,} different view keys came in {decisions:,} gated decisions, and a view that does not come again "
             "is never skipped: unless there are that many training views, name the image in view=, not a counter or "
-            "the id of an object.",
-            RuntimeWarning,
-            stacklevel=2,
+            "the id of an object."
         )
 
 

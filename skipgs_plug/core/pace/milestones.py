@@ -11,12 +11,12 @@ import ast
 import copy
 import inspect
 import textwrap
-import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from numbers import Integral
 from types import CodeType
 from typing import Any, NamedTuple
 
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.settled import Settled
 
@@ -297,11 +297,9 @@ def milestones(
     names = {**names, **known}
     loop = _loop_at(code, line, names, known, frozenset(pure))
     for leaf in loop.counted_by_itself():
-        warnings.warn(
+        caution(
             f"Line {loop.first_line + leaf.lineno - 1} of {loop.file} ({ast.unparse(leaf)}) counts the iterations "
-            f"that run; where others are left out it happens less often. Decide by {loop.target} if that matters.",
-            RuntimeWarning,
-            stacklevel=2,
+            f"that run; where others are left out it happens less often. Decide by {loop.target} if that matters."
         )
     found: dict[str, set[int]] = {}
     for condition in loop.conditions():

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.base import NAMED, Always, Known, Pace, Source, nothing_always, nothing_known
@@ -179,6 +179,8 @@ class Phased(Pace):
     def expected(self, loop: LoopRange) -> int:
         """How many numbers the loop will run, as far as is known. Ranges that no loop runs over are never asked."""
         numbers = loop.numbers
+        if self._removed:
+            return len(numbers)
         before = len(range(numbers.start, min(max(self._start, numbers.start), numbers.stop)))
         grown = 1.0 if self.growing is None else self.growing.share or 1.0
         return round(before * grown) + round((len(numbers) - before) * (self.refining.share or 1.0))
@@ -238,11 +240,9 @@ class Phased(Pace):
         self._grow_whole("In a loop of your own give events= to gate.iterations()")
 
     def _grow_whole(self, reason: str) -> None:
-        warnings.warn(
+        caution(
             "The densification events of this trainer are not known, so its densification runs whole, and iterations "
-            f"are left out after it. {reason}.",
-            RuntimeWarning,
-            stacklevel=2,
+            f"are left out after it. {reason}."
         )
         self.growing = None
 

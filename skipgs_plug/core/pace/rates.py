@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import warnings
 import weakref
 from collections.abc import Callable, Iterable, Mapping
 from threading import get_ident
@@ -14,6 +13,7 @@ import torch
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 from torch.utils.hooks import RemovableHandle
 
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.parts import OptimizerInfo
 from skipgs_plug.core.pace.step_reads import LiteralBetas, WatchedGroup, is_torchs, shorter_memory, unwatch, watch
@@ -170,7 +170,7 @@ class ScaledRates:
             )
             if self._unstepped == UNSTEPPED_RAISES:
                 raise SkipGSError(sentence)
-            warnings.warn(sentence, RuntimeWarning, stacklevel=2)
+            caution(sentence)
 
     def _scale(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         factor = self._factor
@@ -380,9 +380,7 @@ class _Steps:
         self.literal, self.memory_stays = None, bool(fixed)
         if fixed:
             bound = shorter_memory(fixed[0].group["betas"], SQUARES_KEPT)
-            warnings.warn(
+            caution(
                 f"Steps of {kind} do not read the betas of its param_groups, so squares of gradients cannot be "
-                f"forgotten sooner: its learning rates are raised {bound:.2f} times as far.",
-                RuntimeWarning,
-                stacklevel=2,
+                f"forgotten sooner: its learning rates are raised {bound:.2f} times as far."
             )

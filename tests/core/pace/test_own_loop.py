@@ -329,13 +329,14 @@ def test_the_gate_makes_up_for_skipped_backwards_when_asked():
 
 
 @pytest.mark.parametrize("settings", [{"refine_share": 0.5}, {"compensate": True}])
-def test_iterations_that_come_after_the_last_one_are_refused(settings):
+def test_iterations_that_come_after_the_last_one_release_the_gate_and_run(settings):
     with SkipGate(start_iter=4, **settings) as gate:
         for step in gate.iterations(range(10)):
             gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
-        with pytest.raises(SkipGSError, match=r"up to 19 come after a plan that ends with 9; give gate\.iterations"):
-            gate.iterations(range(10, 20))
         assert gate.iterations(range(5, 10)) and gate.iterations(range(0)) is not None
+        with pytest.warns(RuntimeWarning, match=r"up to 19 come after a plan that ends with 9; give gate\.iterations"):
+            rest = gate.iterations(range(10, 20))
+        assert list(rest) == list(range(10, 20)) and gate.patched == []
 
 
 @pytest.mark.parametrize("settings", [{"refine_share": 0.5}, {"compensate": True}])
