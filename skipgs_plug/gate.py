@@ -13,6 +13,7 @@ from torch import Tensor
 
 from skipgs_plug.adapters.registry import find_adapter
 from skipgs_plug.core import distributed
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
@@ -430,11 +431,12 @@ class SkipGate:
     def _gated_backward(self, loss: Any, view: Any, step: int, signal: Any, run: Original) -> bool:
         """`backward`, as long as the gate holds on; `run` is the loop's own backward."""
         engine, now = self._engine, self._iteration
-        if engine.pace.lacks_loop and (now.opened == 0 or engine.pace.needs_loop(step)):
-            raise SkipGSError(
-                "share and refine_share leave out iterations, so the gate must count them; write the loop as "
-                "for step in gate.iterations(range(...))."
-            )
+        if engine.pace.lacks_loop:
+            loop = "so the gate must count them; write the loop as for step in gate.iterations(range(...))."
+            if engine.pace.needs_loop(step):
+                raise SkipGSError(f"share and refine_share leave out iterations, {loop}")
+            if now.opened == 0:
+                caution(f"refine_share leaves out iterations from {engine.start} on, {loop}", stacklevel=3)
         if step != now.step:
             engine.open_iteration(step)
         elif now.ended or now.stepped:

@@ -120,12 +120,6 @@ def test_a_bad_key_is_refused_in_the_first_iteration_and_releases_later(recwarn)
     assert [str(one.message) for one in recwarn] == [gate.released] and "in iteration 9" in gate.released
 
 
-def test_a_share_without_its_loop_is_refused_in_the_first_iteration():
-    loss = Loop().losses()[0]
-    with pytest.raises(SkipGSError, match=r"for step in gate\.iterations"):
-        SkipGate(start_iter=50, refine_share=0.4).backward(loss, view="a.png", step=0)
-
-
 def test_an_error_of_the_loops_own_backward_stays_its_own():
     loss = torch.ones((), requires_grad=True) * 2
     loss.backward()
