@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.pace.display import Moves, moves, only_shows
 from skipgs_plug.core.pace.settled import Settled
 
 SAFE = frozenset({"abs", "bool", "int", "len", "max", "min", "round"})
@@ -45,12 +46,14 @@ class Condition:
     Attributes:
         text: as it stands in the source.
         line: where.
+        shown: The `if` with it, or around it, that only moves a progress bar; None if there is none.
     """
 
     def __init__(self, test: ast.expr, path: list[ast.expr], loop: _Loop) -> None:
         self.text, self.line = ast.unparse(test), loop.first_line + test.lineno - 1
         self._loop = loop
         self._test = test
+        self.shown = loop.shown_at(test)
         self._path = path
         self._leaves: dict[int, _Leaf] = {}
         self._ordered: dict[int, list[ast.expr]] = {}
@@ -62,16 +65,29 @@ class Condition:
             SkipGSError: It depends on something that changes in the loop.
         """
         found: set[int] = set()
+        for holds, others in self._branches(numbers, names):
+            found |= holds if len(holds) <= len(others) else others
+        return found
+
+    def holds(self, numbers: range, names: Mapping[str, Any]) -> set[int] | None:
+        """Return the numbers for which the condition holds; None if that depends on something else, too."""
+        try:
+            (first, _), (second, _) = self._branches(numbers, names)
+        except SkipGSError:
+            return None
+        return first if first == second else None
+
+    def _branches(self, numbers: range, names: Mapping[str, Any]) -> Iterator[tuple[set[int], set[int]]]:
+        """Numbers of both branches, with each assumption about parts that say nothing of the number."""
         values = dict(names)  # once: it holds every global name of the loop's module
-        for assumed in (True, False):  # of parts that say nothing of the number
+        for assumed in (True, False):
             holds: set[int] = set()
             others: set[int] = set()
             for number in numbers:
                 values[self._loop.target] = number
                 if all(self._value(outer, values, True) for outer in self._path):
                     (holds if self._value(self._test, values, assumed) else others).add(number)
-            found |= holds if len(holds) <= len(others) else others
-        return found
+            yield holds, others
 
     def _value(self, node: ast.expr, values: dict[str, Any], assumed: bool) -> bool:
         if isinstance(node, ast.BoolOp):
@@ -92,6 +108,10 @@ class Condition:
             return bool(eval(leaf.code, values))
         except Exception:  # a name that is not bound yet, a number of another kind
             return assumed
+
+    def is_of(self, statement: ast.If) -> bool:
+        """Whether it is the condition of this `if`."""
+        return _place(self._test) == _place(statement.test)
 
     def _parts(self, node: ast.BoolOp) -> list[ast.expr]:
         """The parts of an `and` or `or`, those last that cannot be foreseen: others may decide without them."""
@@ -150,6 +170,11 @@ class _Loop:
         self._changing = changed.difference(known)
         self._settled = Settled(code, around, names, self._changing | {self.target}, self._pure)
         self._names = names
+        outermost: list[ast.If] = []
+        for node in (part for part in parts if isinstance(part, ast.If)):  # outer ones come first
+            if not any(_is_inside(node, outer) for outer in outermost) and only_shows(node, names, around):
+                outermost.append(node)
+        self._shown = outermost
         self.body = self._spelled_out(statement.body, stored)
 
     def _spelled_out(self, body: list[ast.stmt], stored: list[str]) -> list[ast.stmt]:
@@ -162,6 +187,14 @@ class _Loop:
             if value in self._settled or (self.mentions(value) and not self.leaf(value).unforeseeable):
                 body = [_Inline(text, value, place.lineno).visit(copy.deepcopy(one)) for one in body]
         return body
+
+    def shown_at(self, test: ast.expr) -> ast.If | None:
+        """The outermost `if` that only moves a progress bar, and has this condition as its own or inside it."""
+        return next((one for one in self._shown if _is_inside(test, one)), None)
+
+    def moved(self) -> Iterator[tuple[Any, float]]:
+        """Bars that move on in every iteration, and by how much."""
+        return moves(list(_always(self.body)), self._names)
 
     def leaf(self, node: ast.expr) -> _Leaf:
         if not self.mentions(node):
@@ -218,6 +251,16 @@ class _Loop:
                 given = [*call.args, *(keyword.value for keyword in call.keywords)]
                 if any(isinstance(value, ast.Name) and value.id == self.target for value in given):
                     yield from (value for value in given if isinstance(value, (ast.Name, ast.Attribute)))
+
+
+def _place(node: ast.stmt | ast.expr) -> tuple[int, int]:
+    """Where it begins. What is put in the place of a name stands where the name stood."""
+    return node.lineno, node.col_offset
+
+
+def _is_inside(node: ast.stmt | ast.expr, outer: ast.stmt) -> bool:
+    end = outer.end_lineno or outer.lineno, outer.end_col_offset or outer.col_offset
+    return _place(outer) <= _place(node) < end
 
 
 def _always(body: list[ast.stmt]) -> Iterator[ast.stmt]:
@@ -285,7 +328,8 @@ def milestones(
 
     Returns:
         By "line N: condition", or "line N: list" of iterations that is handed to a function with the number. Of a
-        condition that holds for none of the numbers there are none.
+        condition that holds for none of the numbers there are none. One that only moves a bar is not among them: see
+        `bar_moves`.
 
     Warns:
         RuntimeWarning: A condition is on what the loop counts by itself, and comes less often for each number left out.
@@ -303,6 +347,8 @@ def milestones(
         )
     found: dict[str, set[int]] = {}
     for condition in loop.conditions():
+        if condition.shown is not None:
+            continue
         hits = condition.numbers(numbers, names)
         found.setdefault(f"line {condition.line}: {condition.text}", set()).update(hits)
     for node in loop.lists():
@@ -314,6 +360,27 @@ def milestones(
             hits = {int(entry) for entry in value if entry in numbers}
             if hits:
                 found[f"line {loop.first_line + node.lineno - 1}: {ast.unparse(node)}"] = hits
+    return found
+
+
+def bar_moves(
+    code: CodeType,
+    line: int,
+    numbers: range,
+    names: Mapping[str, Any],
+    pure: Iterable[str] = (),
+    known: Mapping[str, Any] | None = None,
+) -> list[Moves]:
+    """Return how the loop moves bars on by hand, in iterations that need not run for it; as for `milestones`."""
+    known = known or {}
+    names = {**names, **known}
+    loop = _loop_at(code, line, names, known, frozenset(pure))
+    found = [Moves(bar, by, numbers) for bar, by in loop.moved()]
+    for condition in loop.conditions():
+        if condition.shown is not None and condition.is_of(condition.shown):
+            hits = condition.holds(numbers, names)
+            if hits is not None:
+                found += [Moves(bar, by, frozenset(hits)) for bar, by in moves(condition.shown.body, names)]
     return found
 
 

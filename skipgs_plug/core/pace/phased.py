@@ -9,10 +9,11 @@ from skipgs_plug.core.caution import caution
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.base import NAMED, Always, Known, Pace, Source, nothing_always, nothing_known
+from skipgs_plug.core.pace.display import Bars
 from skipgs_plug.core.pace.growing import Growing
 from skipgs_plug.core.pace.loop_finder import LoopFinder
 from skipgs_plug.core.pace.loop_range import LoopRange, line_of, require_planned
-from skipgs_plug.core.pace.milestones import milestones
+from skipgs_plug.core.pace.milestones import bar_moves, milestones
 from skipgs_plug.core.pace.policy import RefinementPolicy
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refining import Refining
@@ -58,6 +59,7 @@ class Phased(Pace):
         self._required: set[int] = set()
         self._conditions: tuple[dict[str, set[int]], dict[str, set[int]]] | None = None  # of both phases
         self._left_out = 0
+        self._bars = Bars([])
         self._attached = False  # by an adapter
         self._configured = self._removed = False
         self._planned = False  # the loop's conditions were read: nothing is refused any more
@@ -172,8 +174,10 @@ class Phased(Pace):
         runs = (self.growing is None or self.growing.runs(number)) if grows else self._refine(number)
         if runs:
             self.gap, self._left_out = self._left_out, 0
+            self._bars.catch_up()
         else:
             self._left_out += 1
+            self._bars.left_out(number)
         return runs
 
     def expected(self, loop: LoopRange) -> int:
@@ -211,6 +215,7 @@ class Phased(Pace):
                 milestones(code, line, numbers, names, self._pure, known) if numbers else {}
                 for numbers in (grown, refined)
             ]
+            self._bars = Bars(bar_moves(code, line, loop.numbers, names, self._pure, known))
         elif self._conditions is not None:
             found = list(self._conditions)  # of this loop, in which a state is loaded
         loop.source = None
