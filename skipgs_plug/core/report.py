@@ -17,6 +17,7 @@ NO_REFINEMENT: dict[str, Any] = {
     "refine_share": None,
     "gaussians_shown": None,
     "iterations_skipped": 0,
+    "ran_for": {},
     "always_run": {},
     "early_stopping": None,
     "growing": None,
@@ -42,7 +43,7 @@ def counters(
         start_iter on), `t_total_processor`, `t_post_processor` (the same in processor seconds, see `Times`);
         `refine_share` (share of the iterations from start_iter on that run or may run, None when none is left out),
         `gaussians_shown` (share of the Gaussians that a view shows, None where it is not known),
-        `iterations_run`, `iterations_skipped`, `always_run`, `early_stopping` (see
+        `iterations_run`, `iterations_skipped`, `ran_for`, `always_run`, `early_stopping` (see
         `Refining.report`), `growing` (see `Growing.report`; None if that phase runs whole).
     """
     return {
@@ -96,12 +97,12 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
             f"  each view shows {100 * counted['gaussians_shown']:.0f} % of the Gaussians, which decides how long "
             "steps are"
         )
-    wanted, always = counted["refine_share"], sum(counted["always_run"].values())
+    wanted, ran_for = counted["refine_share"], counted["ran_for"]
     if run > wanted * (run + skipped) + 1:
-        changes = sum(counted["events"].values())
         lines.append(
-            f"  more than the share of {wanted:.2f}: {always:,} iterations must run by the loop's conditions, and "
-            f"training continues after a prune or reset at the end of refinement ({changes:,} changes in all)"
+            f"  more than the share of {wanted:.2f}: {ran_for['share']:,} for the share, {ran_for['conditions']:,} by "
+            f"conditions of the loop, {ran_for['changes']:,} after prunes and resets at the end of refinement "
+            f"({sum(counted['events'].values()):,} changes in all)"
         )
     stopping = counted["early_stopping"]
     if stopping is not None and not stopping["watched"]:

@@ -31,6 +31,7 @@ KEYS = {
     "gaussians_shown",
     "iterations_run",
     "iterations_skipped",
+    "ran_for",
     "always_run",
     "early_stopping",
     "growing",

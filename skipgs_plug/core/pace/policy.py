@@ -54,7 +54,7 @@ class RefinementPolicy(Policy):
 
     def notify_event(self, step: int, n_views: int) -> None:
         """Tell the phase, which may have ended."""
-        self._refining.notify_event(n_views)
+        self._refining.notify_event(step, n_views)
 
     def state_dict(self) -> dict[str, Any]:
         return {"means": self._means.state_dict()}

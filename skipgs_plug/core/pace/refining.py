@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import Any
 
 from skipgs_plug.core import distributed
@@ -15,7 +16,9 @@ from skipgs_plug.core.pace.sampling import Sampling
 
 log = logging.getLogger(__name__)
 
-RECOVERY = 500  # iterations that run after a structural change which comes when refinement has ended
+RECOVERY = 500  # most iterations that run after a structural change which comes when refinement has ended
+# Reasons for which iterations run.
+OF_SHARE, OF_LOOP, OF_CHANGES = "share", "conditions", "changes"
 
 
 class Refining:
@@ -33,6 +36,8 @@ class Refining:
         sampling: counts the iterations that ran and that were left out.
         stopping: follows the cycles of steps that shrink, one where the share is given; None where rates stay.
         always: iterations that must run, by the reason.
+        ran_for: Number of the iterations that ran by their reason: the share, conditions of the loop when the share was
+            used up, or structural changes after that.
         watched: views that are watched and not trained on while `stopping` says so.
         first: first iteration of the phase; None before it is known.
     """
@@ -48,7 +53,9 @@ class Refining:
         self.first: int | None = None
         self._last: int | None = None
         self._must: frozenset[int] = frozenset()
+        self.ran_for = {OF_SHARE: 0, OF_LOOP: 0, OF_CHANGES: 0}
         self._recovery = self._recovered = 0  # iterations to run after a change, and those that have
+        self._changed: int | None = None  # iteration of the last change
         self._over = False  # holds for the present iteration
         self._begun = self._removed = False
 
@@ -112,7 +119,15 @@ class Refining:
     def runs(self, number: int) -> bool:
         """Whether iteration `number` runs; asked once for each, in order."""
         self._set_pace()
-        return self.sampling.runs(number in self._must or number == self._last)
+        recovers = self._recovered < self._recovery
+        must = number in self._must or number == self._last
+        ran, runs = self.sampling.run, self.sampling.runs(must)
+        if runs and recovers:
+            self._recovered += 1
+            self.ran_for[OF_CHANGES] += 1
+        elif runs:
+            self.ran_for[OF_LOOP if must and (self._over or ran >= self.sampling.due) else OF_SHARE] += 1
+        return runs
 
     def require(self, number: int) -> None:
         """Iteration `number` must run, which is only known now."""
@@ -121,6 +136,7 @@ class Refining:
     def counts(self) -> None:
         """The present iteration began before the training loop was known: it counts as one that ran."""
         self.sampling.runs(must=True)
+        self.ran_for[OF_SHARE] += 1
 
     def remove(self) -> None:
         """Watch no view any more, and train in every iteration."""
@@ -136,11 +152,26 @@ class Refining:
         """Whether steps have shrunk to nothing, so that what still runs need not train."""
         return self._over and not self._removed
 
-    def notify_event(self, n_views: int) -> None:
-        """A structural change happened; when refinement has ended, the model is given time to recover."""
-        if self.stopping is not None and self.stopping.ended:
-            pause = self._config.pause_iters
-            self._recovery, self._recovered = max(n_views, RECOVERY) if pause is None else pause, 0
+    def notify_event(self, step: int, n_views: int) -> None:
+        """A structural change happened; when refinement has ended, the model is given time to recover.
+
+        It gets the share of the iterations up to the next change, which is expected as far away as the last one was, or
+        up to the end. So a trainer that prunes again and again leaves out as much as one that does not.
+
+        Args:
+            step: Iteration of the change.
+            n_views: Number of training views, each of which is to be seen once.
+        """
+        before, self._changed = self._changed, step
+        if self.stopping is None or not self.stopping.ended or step == before:
+            return
+        assert self._last is not None and self.share is not None
+        left = self._last - step
+        apart = left if before is None else min(left, step - before)
+        pause = self._config.pause_iters
+        if pause is None:
+            pause = min(max(n_views, RECOVERY), max(n_views, math.ceil(self.share * apart)))
+        self._recovery, self._recovered = pause, 0
 
     @property
     def _auto(self) -> bool:
@@ -158,7 +189,6 @@ class Refining:
         assert self.first is not None and self._last is not None and self.share is not None
         if self._recovered < self._recovery:
             factor = 1.0 - self._recovered / self._recovery
-            self._recovered += 1
             self._over = False
         else:
             progress = self.stopping.progress(self.sampling.run / (self.share * (self._last + 1 - self.first)))
@@ -168,12 +198,17 @@ class Refining:
         self._rates.scale(factor)
 
     def report(self) -> dict[str, Any]:
-        """Return `refine_share`, `iterations_run`, `iterations_skipped`, `always_run`, `early_stopping`."""
+        """Return the entries of skipgs.json about this phase.
+
+        `refine_share`, `iterations_run`, `iterations_skipped`, `ran_for` (iterations that ran, by their reason),
+        `always_run`, `early_stopping`.
+        """
         stopping = self.stopping
         return {
             "refine_share": self.share,
             "iterations_run": self.sampling.run,
             "iterations_skipped": self.sampling.left_out,
+            "ran_for": dict(self.ran_for),
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
             "early_stopping": None
             if stopping is None or not self._auto
@@ -194,6 +229,8 @@ class Refining:
             "sampling": self.sampling.state_dict(),
             "watched": sorted(self.watched),
             "recovery": [self._recovery, self._recovered],
+            "changed": self._changed,
+            "ran_for": dict(self.ran_for),
             "stopping": None if self.stopping is None else self.stopping.state_dict(),
         }
 
@@ -210,6 +247,9 @@ class Refining:
         self.sampling.load_state_dict(state["sampling"])
         self.watched = frozenset(state["watched"])
         self._recovery, self._recovered = state["recovery"]
+        self._changed = state.get("changed")
+        earlier = {OF_SHARE: self.sampling.run}  # of a version that did not count by reason
+        self.ran_for.update({reason: int(count) for reason, count in state.get("ran_for", earlier).items()})
         if state["stopping"] is not None:
             self.stopping = EarlyStopping(self._config.tolerance)
             self.stopping.load_state_dict(state["stopping"])

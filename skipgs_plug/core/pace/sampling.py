@@ -30,6 +30,11 @@ class Sampling:
         """Iterations counted so far."""
         return self.run + self.left_out
 
+    @property
+    def due(self) -> int:
+        """How many iterations the share has asked for by now; those that ran beyond it had to."""
+        return self._due if 0.0 < self.share < 1.0 else self.run + (self.share > 0.0)
+
     def runs(self, must: bool, barred: bool = False) -> bool:
         """Whether the next iteration runs.
 

@@ -1,0 +1,97 @@
+"""Prunes when refinement has ended: each gets its share of what comes after it, and the report says so."""
+
+import json
+
+import pytest
+import torch
+
+from skipgs_plug import SkipGate
+from skipgs_plug.core.report import write_report
+
+SHARE = 0.2
+
+
+def train(last, prunes, views=4, share=SHARE, always=(), **settings):
+    """Return the gate and the numbers that ran."""
+    weight = torch.nn.Parameter(torch.zeros(1))
+    optimizer = torch.optim.SGD([weight], lr=0.01)
+    gate = SkipGate(start_iter=0, refine_share=share, **settings)
+    ran = []
+    for step in gate.iterations(range(last + 1), always=[*prunes, *always], views=[f"{n}.png" for n in range(views)]):
+        gate.backward((weight - 1).square().mean(), view=f"{step % views}.png", step=step)
+        gate.step(optimizer)
+        ran.append(step)
+        if step in prunes:
+            gate.notify_event("prune", step)
+            gate.notify_event("optimizer", step)  # one change can be reported in two ways
+    gate.detach()
+    return gate, ran
+
+
+def test_each_prune_is_followed_by_its_share_of_the_way_to_the_next():
+    prunes = range(500, 2000, 300)
+    gate, ran = train(2000, prunes)
+    for prune in prunes[1:-1]:
+        after = [step for step in ran if prune < step < prune + 300]
+        assert after == list(range(prune + 1, prune + 61))  # a fifth of 300
+    assert [step for step in ran if step > 1700] == [*range(1701, 1761), 2000]
+    # How far the second one is away is not known at the first one.
+    assert len([step for step in ran if 500 < step < 800]) == 299
+    stats = gate.stats()
+    assert stats["ran_for"]["share"] == 401 == len([step for step in ran if step < 500])
+    assert stats["ran_for"]["changes"] == 300 + 60 * 4
+    assert sum(stats["ran_for"].values()) == stats["iterations_run"] == len(ran)
+
+
+def test_a_long_schedule_and_many_views_bound_it():
+    _, ran = train(8000, [5000])
+    assert [step for step in ran if step > 5000] == [*range(5001, 5501), 8000]  # a fifth of 3,000 is more than 500
+    _, ran = train(1000, [800, 900], views=60)
+    assert [step for step in ran if step > 900] == [*range(901, 961), 1000]  # each view once
+
+
+def test_pause_iters_is_taken_as_it_is():
+    _, ran = train(1000, [600, 800], pause_iters=7)
+    assert [step for step in ran if step > 600] == [*range(601, 608), 800, *range(801, 808), 1000]
+
+
+def test_the_summary_and_skipgs_json_say_why_more_than_the_share_ran(tmp_path):
+    gate, ran = train(1000, [500, 700, 900], always=range(300, 1000, 50))
+    write_report(gate, tmp_path / "skipgs.json")
+    why = json.loads((tmp_path / "skipgs.json").read_text())["ran_for"]
+    assert sum(why.values()) == len(ran) and why["changes"] == 100 + 40 + 20 and why["conditions"] > 5
+    line = next(line for line in gate.summary().splitlines() if "more than the share" in line)
+    for number in why.values():
+        assert f"{number:,} " in line
+    assert "6 changes in all" in line
+
+
+@pytest.mark.parametrize("stop", [560, 720])
+def test_a_resumed_run_counts_on(stop):
+    weight = torch.nn.Parameter(torch.zeros(1))
+    optimizer = torch.optim.SGD([weight], lr=0.01)
+
+    def part(gate, first, end):
+        for step in gate.iterations(range(first, 1001), always=[500, 700, 900]):
+            gate.backward((weight - 1).square().mean(), view=step % 4, step=step)
+            gate.step(optimizer)
+            ran.append(step)
+            if step in (500, 700, 900):
+                gate.notify_event("prune", step)
+            if step == end:
+                return json.loads(json.dumps(gate.state_dict()))
+        return None
+
+    ran = []
+    whole = SkipGate(start_iter=0, refine_share=SHARE)
+    part(whole, 0, 1000)
+    whole.detach()
+    expected, ran = ran, []
+    first = SkipGate(start_iter=0, refine_share=SHARE)
+    state = part(first, 0, stop)
+    first.detach()
+    second = SkipGate(start_iter=0, refine_share=SHARE)
+    second.load_state_dict(state)
+    part(second, ran[-1] + 1, 1000)
+    second.detach()
+    assert ran == expected and second.stats()["ran_for"] == whole.stats()["ran_for"]
