@@ -76,6 +76,8 @@ def only_shows(statement: ast.If, names: Mapping[str, Any], around: ast.AST) -> 
         for part in ast.walk(around)
         if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Load) and id(part) not in inside
     }
+    if not any(isinstance(part, ast.Call) and _is_bars(part, names) for part in ast.walk(statement)):
+        return False
     only = all(_shows(one, names, read) for one in [*statement.body, *statement.orelse])
     return only and not any(_moves_inside(one, names) for one in statement.orelse)
 
@@ -98,6 +100,10 @@ def _is_move(node: ast.AST, names: Mapping[str, Any]) -> bool:
     return is_bar(node.func.value, names) and plain and len(node.args) < 2 and not node.keywords
 
 
+def _is_bars(call: ast.Call, names: Mapping[str, Any]) -> bool:
+    return isinstance(call.func, ast.Attribute) and is_bar(call.func.value, names)
+
+
 def _moves_inside(statement: ast.stmt, names: Mapping[str, Any]) -> bool:
     return any(_is_move(part, names) for part in ast.walk(statement))
 
@@ -118,7 +124,7 @@ def _shows(statement: ast.stmt, names: Mapping[str, Any], read: Container[str]) 
     call = statement.value
     if _is_move(call, names):
         return True
-    shows = isinstance(call.func, ast.Attribute) and call.func.attr in SHOWS and is_bar(call.func.value, names)
+    shows = isinstance(call.func, ast.Attribute) and call.func.attr in SHOWS and _is_bars(call, names)
     return shows and all(map(_looks, [*call.args, *(keyword.value for keyword in call.keywords)]))
 
 

@@ -134,6 +134,13 @@ def another_object(stop):
             shown.update(10)
 
 
+def does_nothing(stop):
+    shown = bar()
+    for step in stop(shown=shown):
+        if step % 10 == 0:
+            pass
+
+
 def moves_by_what_happened(stop):
     shown, done = bar(), 0
     for step in stop(shown=shown):
@@ -144,7 +151,16 @@ def moves_by_what_happened(stop):
 
 @pytest.mark.parametrize(
     "loop",
-    [prints, works_in_the_text, works_beside, keeps, keeps_elsewhere, another_object, moves_by_what_happened],
+    [
+        prints,
+        works_in_the_text,
+        works_beside,
+        keeps,
+        keeps_elsewhere,
+        another_object,
+        does_nothing,
+        moves_by_what_happened,
+    ],
     ids=lambda loop: loop.__name__,
 )
 def test_whatever_does_more_holds_its_iterations(loop):
