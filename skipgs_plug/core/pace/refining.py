@@ -120,13 +120,13 @@ class Refining:
         """Whether iteration `number` runs; asked once for each, in order."""
         self._set_pace()
         recovers = self._recovered < self._recovery
-        must = number in self._must or number == self._last
-        ran, runs = self.sampling.run, self.sampling.runs(must)
+        runs = self.sampling.runs(number in self._must or number == self._last)
         if runs and recovers:
             self._recovered += 1
             self.ran_for[OF_CHANGES] += 1
         elif runs:
-            self.ran_for[OF_LOOP if must and (self._over or ran >= self.sampling.due) else OF_SHARE] += 1
+            of_share = not self._over and self.ran_for[OF_SHARE] < self.sampling.due
+            self.ran_for[OF_SHARE if of_share else OF_LOOP] += 1
         return runs
 
     def require(self, number: int) -> None:
