@@ -19,9 +19,9 @@ def check(value: Any, kind: Any, name: str) -> None:
 
     Args:
         value: Plain values, containers and tensors.
-        kind: A TypedDict (entries it does not know are let pass), `dict[K, V]`, `list[T]`, `tuple[A, B, ...]` (a list
-            serves as well), a union, `Any`, or a class. `int` is a count (a whole number >= 0, no bool), `float` a
-            finite number; `numbers.Real` lets NaN and infinity pass.
+        kind: A TypedDict (entries it does not know are let pass, and those it does not require may be missing),
+            `dict[K, V]`, `list[T]`, `tuple[A, B, ...]` (a list serves as well), a union, `Any`, or a class. `int` is a
+            count (a whole number >= 0, no bool), `float` a finite number; `numbers.Real` lets NaN and infinity pass.
         name: Name of the value in messages.
     """
     origin, inner = get_origin(kind), get_args(kind)
@@ -30,11 +30,12 @@ def check(value: Any, kind: Any, name: str) -> None:
     if is_typeddict(kind):
         _require(isinstance(value, Mapping), value, "a dict", name)
         entries = get_type_hints(kind)
-        missing = [key for key in entries if key not in value]
+        missing = [key for key in entries if key in kind.__required_keys__ and key not in value]
         if missing:
             raise SchemaError(f"{name} lacks {', '.join(missing)}")
         for key, entry in entries.items():
-            check(value[key], entry, f"{name}.{key}")
+            if key in value:
+                check(value[key], entry, f"{name}.{key}")
     elif origin is dict:
         _require(isinstance(value, Mapping), value, "a dict", name)
         for key, entry in value.items():

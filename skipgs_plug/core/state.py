@@ -83,7 +83,14 @@ class EarlyStoppingState(TypedDict):
     before: dict[str, float]
 
 
-class RefiningState(TypedDict):
+class NewerRefiningState(TypedDict, total=False):
+    """What states of earlier versions lack."""
+
+    changed: int | None
+    ran_for: dict[str, int]
+
+
+class RefiningState(NewerRefiningState):
     """As `Refining.state_dict`."""
 
     asked: float | str
