@@ -12,7 +12,7 @@ from typing import Any
 
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.adapters.base import AbstractAdapter
-from skipgs_plug.adapters.registry import builtin_adapters, find_script_adapter, get_adapter
+from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
 from skipgs_plug.commands.options.run import Args
 from skipgs_plug.compat import FAMILIES, serve
 from skipgs_plug.core.report import write_report
@@ -114,9 +114,12 @@ def report(gate: SkipGate, adapter: AbstractAdapter) -> None:
     """Write the report, also of a run that failed half-way, once the script has an output folder."""
     if gate.stats()["iterations"] == 0:
         return
-    folder = Path(adapter.output_folder or ".")
-    write_report(gate, folder / "skipgs.json")
-    print(gate.summary(), file=sys.stderr)
+    path = Path(adapter.output_folder or ".") / "skipgs.json"
+    try:
+        write_report(gate, path)
+        print(gate.summary(), file=sys.stderr)
+    except Exception as error:  # the model is trained, and the script's exit code says how that went
+        say(f"{path} could not be written ({type(error).__name__}: {error}).")
 
 
 @contextlib.contextmanager
@@ -128,7 +131,9 @@ def cpu_instead_of_cuda(args: Args, command: Sequence[str]) -> Iterator[None]:
     """
     family = get_adapter(args.adapter).stand_ins_for(command)
     if family not in FAMILIES:
-        served = [adapter.name for adapter in builtin_adapters() if adapter.stand_ins]
-        raise SkipGSError(f"--cpu has no stand-ins for {args.adapter!r}; it has for {', '.join(sorted(served))}.")
+        raise SkipGSError(
+            f"--cpu has no stand-in for the rasterizer of {args.adapter!r}: run {script_name(command)} with CUDA, without "
+            "--cpu."
+        )
     with serve(family), cuda_on_cpu(), exclusive_cores(), instead_of_torchs_adam():
         yield

@@ -108,8 +108,12 @@ class Checkpoints:
         for state in checkpoint.parent.glob(f"*{SUFFIX}"):  # some scripts keep the last few checkpoints only
             if not state.with_name(state.name.removesuffix(SUFFIX)).exists():
                 state.unlink(missing_ok=True)
-        with write_aside(_beside(checkpoint)) as temporary:
-            temporary.write_text(json.dumps({**self._run, "gate": gate.state_dict()}) + "\n")
+        try:
+            with write_aside(_beside(checkpoint)) as temporary:
+                temporary.write_text(json.dumps({**self._run, "gate": gate.state_dict()}) + "\n")
+        except Exception as error:  # the script's checkpoint is written, and its training goes on
+            why = f"{type(error).__name__}: {error}"
+            _say(f"{_beside(checkpoint)} could not be written ({why}): a run that is resumed here gates afresh.")
 
 
 def _beside(checkpoint: Path) -> Path:

@@ -190,7 +190,10 @@ def test_script_that_never_trains_keeps_its_code(checkout, tmp_path, capfd):
     ("arguments", "sentence"),
     [
         (["nerfacto", "--", "train.py"], "no adapter 'nerfacto'"),
-        (["reference", "--cpu", "--", "train.py"], "no stand-ins for 'reference'"),
+        (
+            ["reference", "--cpu", "--", "train.py"],
+            "no stand-in for the rasterizer of 'reference': run train.py with CUDA",
+        ),
         (["inria"], "no script to run"),
         (["inria", "--", "absent.py"], "absent.py: name the training script after '--'"),
         (["inria", "--resume-gate", __file__, "--", __file__], "holds no gate state: give a file that ends in"),
@@ -236,6 +239,19 @@ def test_gate_goes_on_with_the_scripts_own_checkpoint(train, capfd):
     copied = state.rename(state.parent / "moved.json")
     _, given = train("given", "--start", str(whole / "chkpnt40.pth"), gate=["--resume-gate", str(copied)])
     assert counted(given) == counted(whole)
+
+
+def test_what_cannot_be_written_beside_the_scripts_files_is_said_and_no_more(train, capfd, monkeypatch):
+    def fails(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("skipgs_plug.scripts.checkpoints.write_aside", fails)
+    monkeypatch.setattr("skipgs_plug.core.report.write_aside", fails)
+    code, folder = train("full", "--save")
+    error = capfd.readouterr().err
+    assert code == 0 and (folder / "model.pth").exists() and not (folder / "skipgs.json").exists()
+    assert "chkpnt40.pth.skipgs.json could not be written (OSError: [Errno 28] No space left on device)" in error
+    assert "skipgs.json could not be written (OSError" in error and "Traceback" not in error
 
 
 def test_gate_state_before_densification_ends_changes_nothing(train):
