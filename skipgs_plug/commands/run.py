@@ -132,8 +132,8 @@ def cpu_instead_of_cuda(args: Args, command: Sequence[str]) -> Iterator[None]:
     family = get_adapter(args.adapter).stand_ins_for(command)
     if family not in FAMILIES:
         raise SkipGSError(
-            f"--cpu has no stand-in for the rasterizer of {args.adapter!r}: run {script_name(command)} with CUDA, without "
-            "--cpu."
+            f"--cpu has no stand-in for the rasterizer of {args.adapter!r}: run {script_name(command)} with CUDA, "
+            "without --cpu."
         )
     with serve(family), cuda_on_cpu(), exclusive_cores(), instead_of_torchs_adam():
         yield
