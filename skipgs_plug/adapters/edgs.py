@@ -31,10 +31,7 @@ class EDGS(AbstractAdapter):
     project = "[EDGS](https://github.com/CompVis/EDGS)"
     gated = "From `gs.opt.densify_until_iter` on: until then it densifies, or prunes after every iteration."
     with_share = "Refused: whole iterations cannot be left out."
-    left_alone = (
-        "Whole iterations cannot be left out: its loop counts with tqdm's `trange`. Needs CUDA: its initialization "
-        "matches images with a network."
-    )
+    left_alone = "Its loop counts with tqdm's `trange`. Needs CUDA: its initialization matches images with a network."
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:

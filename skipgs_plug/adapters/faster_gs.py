@@ -39,7 +39,7 @@ class FasterGS(AbstractAdapter):
     )
     with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
-        "MCMC's position noise is left out where the gradient step is. Whole iterations cannot be left out: its "
+        "MCMC's position noise is left out where the gradient step is. Its "
         "callbacks hang on their numbers. Views are known by their frame's number. Needs CUDA: `--cpu` has no stand-in."
     )
 

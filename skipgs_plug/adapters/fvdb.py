@@ -36,7 +36,7 @@ class FVDB(AbstractAdapter):
     with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
         "Batches of several images have one joint loss and so one mean. Several crops per image are refused: each has "
-        "a backward. Whole iterations cannot be left out: epochs iterate over a DataLoader. Needs CUDA."
+        "a backward. Epochs iterate over a DataLoader. Needs CUDA."
     )
 
     @classmethod

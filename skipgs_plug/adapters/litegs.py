@@ -35,8 +35,8 @@ class LiteGS(AbstractAdapter):
     gated = "From the epoch `densify_until` on, after a pause for the opacity reset that usually ends the epoch before."
     with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
-        "Gaussians are put in a new order now and then, which changes no image. Whole iterations cannot be left out: "
-        "its loop is one over epochs and a DataLoader. Needs CUDA: `--cpu` has no stand-in for its rasterizer."
+        "Gaussians are put in a new order now and then, which changes no image. Its "
+        "loop is one over epochs and a DataLoader. Needs CUDA: `--cpu` has no stand-in for its rasterizer."
     )
 
     def __init__(self, trainer: Any = None) -> None:

@@ -50,7 +50,7 @@ class ThreeDGRUT(AbstractAdapter):
     with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
         "MCMC's position noise is left out where the gradient step is. Views are known by image path, or by frame "
-        "where the dataset has no paths. Whole iterations cannot be left out: epochs iterate over a "
+        "where the dataset has no paths. Epochs iterate over a "
         "DataLoader. Needs CUDA."
     )
 
