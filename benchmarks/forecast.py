@@ -1,14 +1,14 @@
 """How far the forecasts of `skipgs-plug estimate` are from whole runs.
 
-    python benchmarks/forecast.py pilot fern               # half a minute of training, and what is forecast from it
-    python benchmarks/forecast.py run fern 7000 own        # one whole run with its peak of memory: own or auto
-    python benchmarks/forecast.py compare                  # errors of all forecasts whose runs are stored
+    python benchmarks/forecast.py fern             # half a minute of training, then a whole run with share="auto"
+    python benchmarks/forecast.py lego own         # and one that leaves nothing out
+    python benchmarks/forecast.py compare          # errors of all forecasts whose runs are stored
 
 Numbers of Gaussians are also compared with the runs that `skipgs-plug bench --whole` stored in
-`benchmarks/results/bench`, the mean of their seeds. Each run is one process on one thread, in processor seconds, which
-other work on a machine changes less than those on the wall: give the pilot and the runs of a scene one after another.
-Scenes and settings are the bench's (`--grow-grad2d 0.001`, Lego from 10,000 points). Writes
-`benchmarks/results/forecast.json` and, with `compare`, `skipgs_plug/forecast/errors.json`, which the command prints.
+`benchmarks/results/bench`, the mean of their seeds. A scene's runs share one process and one thread, and are compared in
+processor seconds, which other work on a machine changes less than those on the wall. Scenes and settings are the
+bench's (`--grow-grad2d 0.001`, Lego from 10,000 points). Writes `benchmarks/results/forecast.json` and
+`skipgs_plug/forecast/errors.json`, which the command prints. Run it again when the rule of `share="auto"` has changed.
 """
 
 import dataclasses
@@ -25,14 +25,15 @@ from skipgs_plug.bench.memory import memory_meter
 from skipgs_plug.fallback_raster import set_num_threads
 from skipgs_plug.forecast.errors import FILE as ERRORS
 from skipgs_plug.forecast.errors import QUANTITIES, error
-from skipgs_plug.forecast.pilot import Pilot, Sample, run_pilot
+from skipgs_plug.forecast.pilot import run_pilot
 from skipgs_plug.forecast.predict import predict
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.files import write_json
 
 FILE = RESULTS / "forecast.json"
 FOLDERS = {"fern": ("fern", 2), "lego": ("lego_200", 1), "bonsai": ("bonsai", 4), "bonsai_large": ("bonsai", 1)}
-LENGTHS = (7000, 30_000)
+LENGTHS = (3000, 7000)  # of the bench on fern and bonsai, and of the runs that are made here
+RUN = 7000
 SECONDS = 30.0
 
 
@@ -58,32 +59,24 @@ def measure(name: str, steps: int, how: str) -> dict[str, Any]:
         SkipGate(trainer, share="auto")
     trainer.train(progress=False)
     return {
-        "scene": name,
         "max_steps": steps,
         "how": how,
         "seconds": trainer.clock.processor.total,
         "iterations": trainer.ran,
         "gaussians": trainer.num_gaussians,
         "memory": None if meter is None else meter.peak(),
-        "provenance": provenance(),
     }
 
 
 def pilot(name: str) -> dict[str, Any]:
-    """Return half a minute of training, and what is forecast from it."""
-    config, scene = settings(name, LENGTHS[0])
+    """Return what is forecast from half a minute of training."""
+    config, scene = settings(name, RUN)
     assert scene is not None
     seen = run_pilot(config, scene, SECONDS, by_processor=True)
     return {
-        "scene": name,
         "iterations": len(seen.samples),
         "gaussians": seen.samples[-1].gaussians,
         "forecasts": [dataclasses.asdict(predict(seen, config, steps)) for steps in LENGTHS],
-        "pilot": {
-            **dataclasses.asdict(seen),
-            "samples": [(one.step, one.gaussians, round(one.seconds, 6)) for one in seen.samples],
-        },
-        "provenance": provenance(),
     }
 
 
@@ -114,24 +107,16 @@ def bench_runs() -> list[dict[str, Any]]:
 def compare(stored: dict[str, Any]) -> list[dict[str, Any]]:
     """Return one row for each quantity that was forecast and measured."""
     rows = []
-    for seen in stored["pilots"]:
-        pilot = Pilot(**{**seen["pilot"], "samples": tuple(Sample(*sample) for sample in seen["pilot"]["samples"])})
-        for run in (*stored["runs"], *bench_runs()):
-            if run["scene"] != seen["scene"]:
+    for name, scene in stored.items():
+        forecasts = {forecast["max_steps"]: forecast for forecast in scene["pilot"]["forecasts"]}
+        for run in (*scene["runs"], *(run for run in bench_runs() if run["scene"] == name)):
+            if (forecast := forecasts.get(run["max_steps"])) is None:
                 continue
-            config, _ = settings(run["scene"], run["max_steps"], load=False)
-            forecast = dataclasses.asdict(predict(pilot, config, run["max_steps"]))
             found = {"seconds" if run["how"] == "own" else "seconds_auto": run["seconds"]}
             found |= {"gaussians": run["gaussians"], "memory": run["memory"]}
+            about = {"scene": name, "max_steps": run["max_steps"], "how": run["how"]}
             rows += [
-                {
-                    "scene": run["scene"],
-                    "max_steps": run["max_steps"],
-                    "how": run["how"],
-                    "quantity": quantity,
-                    "expected": forecast[quantity],
-                    "measured": found[quantity],
-                }
+                {**about, "quantity": quantity, "expected": forecast[quantity], "measured": found[quantity]}
                 for quantity in QUANTITIES
                 if found.get(quantity) is not None and forecast[quantity] is not None
             ]
@@ -141,26 +126,17 @@ def compare(stored: dict[str, Any]) -> list[dict[str, Any]]:
 def main(arguments: list[str]) -> None:
     torch.set_num_threads(1)
     set_num_threads(1)
-    stored = json.loads(FILE.read_text()) if FILE.exists() else {"pilots": [], "runs": []}
-    if arguments[0] == "run":
-        name, steps, how = arguments[1], int(arguments[2]), arguments[3]
-        found = measure(name, steps, how)
-        same = ("scene", "max_steps", "how")
-        stored = json.loads(FILE.read_text()) if FILE.exists() else stored  # others may have written meanwhile
-        stored["runs"] = [run for run in stored["runs"] if any(run[key] != found[key] for key in same)] + [found]
+    stored = json.loads(FILE.read_text()) if FILE.exists() else {}
+    name, *more = arguments
+    if name in FOLDERS:
+        found = {"provenance": provenance(), "pilot": pilot(name)}
+        found["runs"] = [measure(name, RUN, how) for how in ("auto", *more)]
+        stored[name] = found
         write_json(FILE, stored)
-        print({key: value for key, value in found.items() if key != "provenance"})
-    elif arguments[0] == "pilot":
-        found = pilot(arguments[1])
-        stored = json.loads(FILE.read_text()) if FILE.exists() else stored
-        stored["pilots"] = [one for one in stored["pilots"] if one["scene"] != found["scene"]] + [found]
-        write_json(FILE, stored)
-        print(found["forecasts"])
-    else:
-        rows = compare(stored)
-        write_json(ERRORS, {"provenance": "benchmarks/forecast.py compare", "rows": rows})
-        for row in rows:
-            print(f"{row['scene']:14} {row['max_steps']:6,} {row['how']:4} {row['quantity']:14} {error(row):+7.1%}")
+    rows = compare(stored)
+    write_json(ERRORS, {"provenance": "benchmarks/forecast.py", "rows": rows})
+    for row in rows:
+        print(f"{row['scene']:14} {row['max_steps']:6,} {row['how']:4} {row['quantity']:14} {error(row):+7.1%}")
 
 
 if __name__ == "__main__":

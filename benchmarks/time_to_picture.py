@@ -45,8 +45,8 @@ class Args:
     """Lengths of schedules, each with the share of iterations that runs."""
     repeats: int = 2
     """Processes of each schedule."""
-    more: tuple[str, ...] = ("--grow-grad2d", "0.001")
-    """Further options of the command."""
+    grow_grad2d: float = 0.001
+    """Gradient above which Gaussians are duplicated or split: the smaller, the more of them."""
 
 
 def processor() -> float:
@@ -84,7 +84,7 @@ def import_torch() -> float:
 def main(args: Args) -> None:
     folder, options, aim = AIMS[args.scene]
     scene = SCENES / folder
-    rows, given = [], [*options, *args.more]
+    rows, given = [], [*options, "--grow-grad2d", str(args.grow_grad2d)]
     with tempfile.TemporaryDirectory() as root:
         train(scene, [*given, "--gate"], 1, Path(root) / "compiled")
         for schedule in args.schedules:

@@ -53,7 +53,7 @@ const panel = (viewer, about) => {
   const kind = about.held_out ? 'held out' : 'trained on';
   const show = async () => {
     const asked = chosen;
-    element('title').textContent = `${about.views[asked]} (${asked + 1} of ${about.views.length})`;
+    element('title').textContent = `${asked + 1} of ${about.views.length}: ${about.views[asked]}`;
     element('quality').textContent = 'Rendering …';
     try {
       const found = await fetch(`compare/${asked}.json`).then((answer) => answer.json());
