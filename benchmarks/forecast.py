@@ -5,7 +5,7 @@
     python benchmarks/forecast.py compare          # errors of all forecasts whose runs are stored
 
 Numbers of Gaussians are also compared with the runs that `skipgs-plug bench --whole` stored in
-`benchmarks/results/bench`, the mean of their seeds. A scene's runs share one process and one thread, and are compared in
+`benchmarks/results/bench`, the mean of their seeds. Runs of a scene share a process and one thread, and are compared in
 processor seconds, which other work on a machine changes less than those on the wall. Scenes and settings are the
 bench's (`--grow-grad2d 0.001`, Lego from 10,000 points). Writes `benchmarks/results/forecast.json` and
 `skipgs_plug/forecast/errors.json`, which the command prints. Run it again when the rule of `share="auto"` has changed.

@@ -106,8 +106,8 @@ class Session:
             tqdm.write(f"Iteration {iteration.step:,}: {self._described(self._evaluate([]))}")
         self._autosave.iteration(iteration)
 
-    def _evaluate(self, failed: list[WriteError]) -> dict[str, Any]:
-        stats = self._trainer.evaluate("test" if self._split == "val" else "train", self._options.lpips_net)
+    def _evaluate(self, failed: list[WriteError], keep: Any = None) -> dict[str, Any]:
+        stats = self._trainer.evaluate("test" if self._split == "val" else "train", self._options.lpips_net, keep)
         with keep_going(failed):
             self._folder.write_stats(self._trainer, stats, self._split)
         if self._log is not None:
@@ -117,11 +117,10 @@ class Session:
     def _finish(self) -> None:
         """Evaluate, and write all files of a finished run, also those that an earlier session did not write."""
         folder, trainer = self._folder, self._trainer
-        stats = self._evaluate(self._failed)
+        with keep_going(self._failed), folder.renders(trainer, self._split) as keep:
+            stats = self._evaluate(self._failed, keep)
         with keep_going(self._failed):
             self._curve.write(folder.root / "stats" / "train_curve.json")
-        with keep_going(self._failed):
-            folder.write_renders(trainer, self._split)
         ply = None
         with keep_going(self._failed):
             ply = folder.write_ply(trainer)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -277,8 +277,18 @@ class Trainer:
         return self._exposed(image, view)
 
     @single_precision()
-    def evaluate(self, split: str = "test", lpips_net: str | None = None) -> dict[str, Any]:
+    def evaluate(
+        self,
+        split: str = "test",
+        lpips_net: str | None = None,
+        keep: Callable[[int, View, Tensor], object] | None = None,
+    ) -> dict[str, Any]:
         """Return the means of the chosen metrics over the views of "test" or "train", with the number of Gaussians.
+
+        Args:
+            split: "test" or "train".
+            lpips_net: Backbone of LPIPS, which is measured too if one is named.
+            keep: Called with the number, the view and the render [H, W, 3] of each.
 
         Returns:
             The means by name, their flavours, `num_GS step split views`, and `per_view`: the metrics of each.
@@ -289,7 +299,13 @@ class Trainer:
         self.clock.settle()
         wanted = metrics.chosen(lpips_net, fitted=self.exposure is not None and split == "test")
         with self.backend.exclusive_cores():
-            rows = [self._measure(wanted, view) for view in one_by_one(views)]
+            rows = []
+            for i, view in enumerate(one_by_one(views)):
+                render = self.render(view)
+                if keep is not None:
+                    keep(i, view, render)
+                image, target = leave_out(render, self._target(view).float() / 255.0, view.mask)
+                rows.append(metrics.measure(wanted, image, target, view.mask))
         means = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
         return {
             **means,
@@ -300,10 +316,6 @@ class Trainer:
             "per_view": [{"view": view.name, **row} for view, row in zip(views, rows, strict=True)],
             **{f"{metric.name}_flavour": metric.flavour for metric in wanted},
         }
-
-    def _measure(self, wanted: Sequence[metrics.Metric], view: View) -> dict[str, float]:
-        image, target = leave_out(self.render(view), self._target(view).float() / 255.0, view.mask)
-        return metrics.measure(wanted, image, target, view.mask)
 
     def export_ply(self, path: str | Path) -> None:
         """Write the 62-property INRIA PLY, in the coordinates of the dataset."""

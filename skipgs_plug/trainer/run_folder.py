@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import re
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from skipgs_plug.files import remove_leftovers, write_aside
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.files import write_json
-from skipgs_plug.trainer.image_store import one_by_one
 from skipgs_plug.trainer.loop import Trainer
+from skipgs_plug.trainer.scene import View
 
 CHECKPOINT = re.compile(r"ckpt_(\d+)_rank0\.pt")
 SCENE = "scene"  # folder in a run folder with the scene that `train --sfm` reconstructed
 KEPT = 2  # checkpoints that stay: the older one is read when the last is damaged
+MOST_WAITING = 2  # renders that wait to be written: memory stays bounded where the disk is slow
 FOLDERS = ("", "ckpts", "ply", "stats", "renders")
 
 
@@ -68,13 +74,40 @@ class RunFolder:
         write_json(path, {**stats, **seconds})
         return path
 
-    def write_renders(self, trainer: Trainer, split: str = "val") -> None:
-        """Write photograph and render side by side for every held-out (or, for "train", training) view."""
-        from PIL import Image
+    @contextlib.contextmanager
+    def renders(self, trainer: Trainer, split: str = "val") -> Iterator[Callable[[int, View, Tensor], None]]:
+        """Yield a function that writes photograph and render side by side, on a thread while the next view is rendered.
 
-        views = trainer.scene.test if split == "val" else trainer.scene.train
-        for i, view in enumerate(one_by_one(views)):
-            render = (trainer.render(view).clamp(0, 1) * 255).round().byte().cpu().numpy()
-            both = np.concatenate([view.image.numpy(), render], axis=1)
-            with write_aside(self.root / "renders" / f"{split}_step{trainer.step - 1}_{i:04d}.png") as temporary:
-                Image.fromarray(both).save(temporary, format="PNG")
+        It takes the number of a held-out (or, for "train", training) view, the view, and its render [H, W, 3].
+
+        Raises:
+            WriteError: One could not be written; those after it are left out. Raised at the end of the block.
+        """
+        waiting: deque[Future[None]] = deque()
+        failed: list[BaseException] = []
+
+        def collect(left: int) -> None:
+            while len(waiting) > left:
+                error = waiting.popleft().exception()
+                failed.extend([] if error is None else [error])
+
+        def keep(i: int, view: View, render: Tensor) -> None:
+            collect(MOST_WAITING)
+            if not failed:
+                path = self.root / "renders" / f"{split}_step{trainer.step - 1}_{i:04d}.png"
+                waiting.append(writer.submit(write_pair, path, view.image, render.detach().cpu()))
+
+        with ThreadPoolExecutor(1) as writer:
+            yield keep
+            collect(0)
+        if failed:
+            raise failed[0]
+
+
+def write_pair(path: Path, photograph: Tensor, render: Tensor) -> None:
+    """Write a photograph [H, W, 3] uint8 and its render [H, W, 3] in [0, 1] side by side as a PNG."""
+    from PIL import Image
+
+    shown = (render.clamp(0, 1) * 255).round().byte()
+    with write_aside(path) as temporary:
+        Image.fromarray(np.concatenate([photograph.numpy(), shown.numpy()], axis=1)).save(temporary, format="PNG")

@@ -12,14 +12,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
+from torch import Tensor
 from torch.optim.optimizer import _global_optimizer_pre_hooks
 from tqdm.auto import tqdm
 
 from benchmarks import soak_runs
 from skipgs_plug.cli import main
-from skipgs_plug.trainer import Trainer, save_packed
+from skipgs_plug.trainer import Trainer, View, save_packed
 from skipgs_plug.trainer.synthetic import make_scene
 
 OPTIONS = ["--max-steps", "60", "--refine-every", "10", "--no-progress", "--warmup", "6", "--save-every", "20"]
@@ -149,6 +152,39 @@ def test_a_full_disk_costs_one_checkpoint(
     sentences = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert len(sentences) == 2 and all("it needs about 0." in sentence for sentence in sentences)
     assert "ckpt_19_rank0.pt cannot be written (No space left on device)" in sentences[0]
+    assert_same(tmp_path / "run", whole)
+
+
+def test_at_the_end_each_view_is_rendered_once_and_kept_as_it_was_measured(
+    tmp_path: Path, packed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rendered, render = [], Trainer.render
+
+    def counted(self: Trainer, view: View) -> Tensor:
+        image = render(self, view)
+        rendered.append((view, image))
+        return image
+
+    monkeypatch.setattr(Trainer, "render", counted)
+    assert train(packed, tmp_path) == 0
+    names = [view.name for view, _ in rendered]
+    assert len(names) == len(set(names)) == 2
+    for i, (view, image) in enumerate(rendered):
+        with Image.open(tmp_path / f"renders/val_step59_{i:04d}.png") as picture:
+            photograph, shown = np.split(np.asarray(picture), 2, axis=1)
+        np.testing.assert_array_equal(photograph, view.image)
+        np.testing.assert_array_equal(shown, (image.clamp(0, 1) * 255).round().byte())
+
+
+def test_a_full_disk_costs_the_renders_and_not_the_evaluation(
+    tmp_path: Path, packed: str, whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with monkeypatch.context() as patch:
+        fail_to_write(patch, "val_step59_0000.png")
+        assert train(packed, tmp_path / "run") == 2
+    assert "1 files of" in capsys.readouterr().err
+    assert (tmp_path / "run/stats/val_step59.json").is_file()
+    assert train(packed, tmp_path / "run", "--resume") == 0
     assert_same(tmp_path / "run", whole)
 
 
