@@ -234,6 +234,26 @@ def test_clock_separates_the_part_from_start_on() -> None:
     assert 0.0 < stats["t_post"] < stats["t_total"]
 
 
+def test_clocks_are_asked_once_in_an_iteration_and_count_all_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = iter(range(1000))
+    asked: list[int] = []
+
+    def clock_of_the_processor() -> float:
+        asked.append(next(seconds))
+        return float(asked[-1])
+
+    monkeypatch.setattr("time.process_time", clock_of_the_processor)
+    gate = SkipGate(start_iter=2)
+    counts = []
+    for step in range(5):
+        gate.backward(loss_of(1.0), view="a", step=step)
+        counts.append(len(asked))
+    # Once more in the first iteration, and where the part behind `start_iter` begins.
+    assert counts == [2, 3, 5, 6, 7]
+    stats = gate.stats()
+    assert (stats["t_total_processor"], stats["t_post_processor"]) == (6.0, 3.0)
+
+
 @pytest.mark.parametrize("loss", [1.0, None, "loss"])
 def test_a_loss_that_is_no_tensor_is_refused_and_the_iteration_can_be_given_again(loss) -> None:
     gate = SkipGate(start_iter=0)

@@ -2,7 +2,9 @@
 
 import math
 import time
+from itertools import count
 
+import pytest
 import torch
 
 from skipgs_plug.trainer.clock import TrainClock
@@ -52,3 +54,20 @@ def test_processor_time_does_not() -> None:
     assert clock.phase_seconds["forward"] >= 0.05
     assert clock.phase_seconds["loss"] < 0.15
     assert clock.t_total == clock.t_post < 0.25
+
+
+@pytest.mark.parametrize(("by_processor", "asked"), [(False, 2), (True, 4)])
+def test_the_clock_of_the_processor_is_asked_where_an_iteration_begins_and_ends(
+    by_processor: bool, asked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    processor, wall = count(), count(0, 10)
+    clock = TrainClock(torch.device("cpu"), by_processor=by_processor)
+    with monkeypatch.context() as patch:
+        patch.setattr("time.process_time", lambda: float(next(processor)))
+        patch.setattr("time.perf_counter", lambda: float(next(wall)))
+        clock.start()
+        clock.mark("forward")
+        clock.mark("loss")
+        clock.stop(after_densification=False)
+    assert next(processor) == asked
+    assert sum(clock.phase_seconds.values()) == clock.t_total
