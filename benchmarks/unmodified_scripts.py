@@ -1,6 +1,7 @@
 """Other projects' own scripts, run by `skipgs-plug run`: their scenes, what their models show, and the table of it.
 
     python benchmarks/unmodified_scripts.py scene ../shared/data/bonsai OUT --keep-every 5 --factors 4 8
+    python benchmarks/unmodified_scripts.py run fastgs auto CHECKOUTS OUT --data-factor 4  # one row of script_rows.py
     python benchmarks/unmodified_scripts.py measure MODEL.ply SCENE --data-factor 8
     python benchmarks/unmodified_scripts.py pictures OUT/test/ours_3000
     python benchmarks/unmodified_scripts.py table benchmarks/results/scripts/runs.json
@@ -12,9 +13,14 @@ in 8 bits.
 """
 
 import json
+import os
+import shlex
 import shutil
+import subprocess
+import sys
+import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -22,11 +28,15 @@ import tyro
 from PIL import Image
 from torch import Tensor
 
+from benchmarks.script_rows import ROWS, Row, schedule
 from skipgs_plug.fallback_raster import rasterization
+from skipgs_plug.files import write_aside
 from skipgs_plug.trainer.loaders import load_scene
 from skipgs_plug.trainer.metrics import chosen, measure
 from skipgs_plug.trainer.ply import read_ply
 
+RUNS = Path(__file__).parent / "results/scripts/runs.json"
+MODES = {"own": ["--no-gate"], "auto": ["--share", "auto"]}
 MIP_FILTER = 0.1  # square pixels, that Mip-Splatting trains with
 
 
@@ -78,6 +88,137 @@ def thin_scene(
             size = (round(image.width / factor), round(image.height / factor))
             image.resize(size, Image.Resampling.LANCZOS).save(folder / name, quality=97)
     print(f"{out}: {len(kept)} photographs, {len(model.points3D):,} points")
+
+
+def run(
+    row: tyro.conf.Positional[str],
+    mode: tyro.conf.Positional[Literal["own", "auto"]],
+    checkouts: tyro.conf.Positional[Path],
+    scene: tyro.conf.Positional[Path],
+    data_factor: int = 4,
+    iterations: int = 3000,
+    out: Path = Path("out"),
+    runs: Path = RUNS,
+    more: str = "",
+) -> None:
+    """Run a row's script once, measure its model, and record both, in place of the same run recorded before.
+
+    Keep other programs from the core (taskset), since processor seconds of a busy one are too many.
+
+    Args:
+        row: Name in script_rows.py.
+        mode: With the gate, or without.
+        checkouts: Folder with the checkouts of all projects.
+        scene: COLMAP folder with images_{data_factor}.
+        data_factor: Size of the photographs.
+        iterations: Of the schedule.
+        out: Folder for what scripts write.
+        runs: File of records.
+        more: Further options of the script.
+    """
+    one = ROWS[row]
+    folder = (out / f"{row}.{scene.name}.{data_factor}.{iterations}.{mode}").resolve()
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    filled = {"scene": scene.resolve(), "factor": data_factor, "out": folder, **schedule(iterations)}
+    gate = ["run", "auto", "--cpu", *MODES[mode], "--"]
+    script = [*shlex.split(one.command.format(**filled)), *shlex.split(more)]
+    settings = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    begun = time.perf_counter()
+    with (folder / "log.txt").open("w") as log:
+        child = subprocess.Popen(
+            [sys.executable, "-P", "-m", "skipgs_plug", *gate, *script],
+            cwd=checkouts / one.folder,
+            env=settings,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
+        _, status, used = os.wait4(child.pid, 0)
+    code = os.waitstatus_to_exitcode(status)
+    judged = judge(one, folder, scene, data_factor)
+    if code:
+        print(f"The script ended with {code}; its log is {folder / 'log.txt'}.", file=sys.stderr)
+    record = {
+        "scene": named(scene, data_factor),
+        "script": one.label,
+        "mode": mode,
+        "iterations": iterations,
+        "seconds": round(used.ru_utime + used.ru_stime, 1),
+        "wall_seconds": round(time.perf_counter() - begun, 1),
+        "peak_rss_gib": round(used.ru_maxrss / 2**20, 2),
+        "exit_code": code,
+        **facts(folder, iterations),
+        **judged,
+        "project": one.project,
+        "project_commit": commit_of(checkouts / one.folder),
+        "command": shlex.join(["skipgs-plug", *gate, *script])
+        .replace(str(folder), "OUT")
+        .replace(str(scene.resolve()), scene.name),
+        "package_commit": commit_of(Path(__file__).parent),
+    }
+    keep(record, runs)
+    print(json.dumps(record, indent=1))
+
+
+def judge(row: Row, folder: Path, scene: Path, factor: int) -> dict[str, Any]:
+    """Return PSNR, SSIM, number of held-out views and of Gaussians (None where no PLY says it)."""
+    plys = sorted(folder.rglob("point_cloud*.ply"), key=lambda path: path.stat().st_mtime)
+    if not row.pictures:
+        return measure_ply(plys[-1], scene, factor)
+    pictures = [path.parent for path in folder.rglob("gt") if path.is_dir()] + list(folder.glob("renders"))
+    from plyfile import PlyData
+
+    count = PlyData.read(str(plys[-1]))["vertex"].count if plys else None
+    return {**measure_pictures(max(pictures, key=lambda path: path.stat().st_mtime)), "gaussians": count}
+
+
+def facts(folder: Path, iterations: int) -> dict[str, Any]:
+    """Return the facts of skipgs.json that stand in the records; few without a gate."""
+    found = next(iter(folder.rglob("skipgs.json")), None)
+    report = {} if found is None else json.loads(found.read_text(encoding="utf-8"))
+    growing = report.get("growing") or {}
+    left_out = report.get("iterations_skipped", 0) + growing.get("iterations_skipped", 0)
+    return {
+        "iterations_run": iterations - left_out,
+        "refine_share": report.get("refine_share"),
+        "ran_for": report.get("ran_for"),
+        "grow_share": growing.get("share"),
+        "grow_rate_factor": growing.get("rate_factor"),
+        "gaussians_shown": report.get("gaussians_shown"),
+        "events_run": growing.get("events_run"),
+        "events_skipped": growing.get("events_skipped"),
+    }
+
+
+def keep(record: dict[str, Any], runs: Path) -> None:
+    """Put a record in the file, in place of the same run's; a checkout without git has the commit of earlier ones."""
+    whole = json.loads(runs.read_text(encoding="utf-8")) if runs.exists() else {"runs": []}
+    if record["project_commit"] is None:
+        same = [one["project_commit"] for one in whole["runs"] if one["project"] == record["project"]]
+        record["project_commit"] = next(iter(same), None)
+    key = ("scene", "script", "mode", "iterations")
+    places = [i for i, one in enumerate(whole["runs"]) if all(one[name] == record[name] for name in key)]
+    if places:
+        whole["runs"][places[0]] = record
+    else:
+        whole["runs"].append(record)
+    with write_aside(runs) as temporary:
+        temporary.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+
+
+def named(scene: Path, factor: int) -> str:
+    """Return a scene with its size and the number of its views."""
+    loaded = load_scene(scene, factor)
+    view = loaded.test[0]
+    views = f"{len(loaded.train)} training and {len(loaded.test)} held-out views"
+    return f"{scene.name} {view.width}x{view.height}, {views}"
+
+
+def commit_of(folder: Path) -> str | None:
+    """Return the commit of a checkout; None where it is none of git."""
+    asked = subprocess.run(["git", "-C", folder, "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    return asked.stdout.strip() or None
 
 
 @torch.no_grad()
@@ -202,5 +343,5 @@ def print_table(runs: tyro.conf.Positional[Path]) -> None:
 
 if __name__ == "__main__":
     tyro.extras.subcommand_cli_from_dict(
-        {"scene": thin_scene, "measure": print_ply, "pictures": print_pictures, "table": print_table}
+        {"scene": thin_scene, "run": run, "measure": print_ply, "pictures": print_pictures, "table": print_table}
     )
