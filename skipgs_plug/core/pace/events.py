@@ -51,6 +51,11 @@ class Events:
         """Iteration at which one more event would follow the last one upstream; None without events."""
         return self._numbers[-1] + self._distance(self._numbers[-1]) if self._numbers else None
 
+    @property
+    def all_run(self) -> bool:
+        """Whether each event runs, however few iterations stand behind it."""
+        return self._needs == "nothing"
+
     def ran(self, number: int) -> None:
         """An iteration runs, with its event if it has one."""
         if number in self._known:
@@ -70,7 +75,7 @@ class Events:
             number: Iteration with an event.
             visible: Share of the Gaussians that a view shows; None if unknown.
         """
-        if self._needs == "nothing":
+        if self.all_run:
             return True
         distance = self._distance(number)
         # The event's own iteration adds to its statistics too.
