@@ -7,6 +7,7 @@ from lookalikes.splats import log, new_log
 from skipgs_plug import SkipGate
 from skipgs_plug.adapters import base, drift_check, inria, nerfstudio, step_trainer
 from skipgs_plug.adapters.registry import get_adapter
+from skipgs_plug.core import caution
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.pace.phased import Phased
@@ -108,6 +109,20 @@ def test_an_error_of_an_adapters_own_code_does_the_same(name, monkeypatch, recwa
     said = [str(one.message) for one in recwarn if "released" in str(one.message)]
     assert failed and len(said) == 1 and gate.released == said[0]
     assert max(log.values) == case.module.LAST
+
+
+def test_where_warnings_are_errors_the_sentence_is_printed_once_and_training_goes_on(monkeypatch):
+    case = next(case for case in cases if case.name == "inria")
+    plain = alone(case)
+    printed = []
+    monkeypatch.setattr(caution, "_print", printed.append)
+    new_log()
+    trainer, train = case.make()
+    failed = fail_from(monkeypatch, SkipPolicy, "decide", case.module.START + 3)
+    with SkipGate(trainer, warmup=0, pause_iters=0, min_bwd_ratio=0.0) as gate:
+        train()
+    assert printed == [gate.released] and "ZeroDivisionError: of decide" in printed[0]
+    assert [n for n in log.backwards if n > failed[0]] == [n for n in plain.backwards if n > failed[0]]
 
 
 def test_an_error_of_the_trainers_own_code_stays_its_own(monkeypatch):
