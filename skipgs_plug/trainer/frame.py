@@ -1,7 +1,9 @@
-"""Coordinates of training: the dataset's, moved to the origin and scaled where float32 needs it.
+"""Coordinates of training: around the origin, with cameras that spread over a length of 1.
 
-Near 500,000, float32 has steps of 0.03, so a scene in coordinates of a map would be blurred. The recipe also holds
-absolute constants, so a scene in an odd unit would train differently. Both are undone in float64.
+A scene trains in the same way wherever it lies and in whatever unit it is measured: both are taken out in float64 when
+the scene is loaded. In coordinates of the dataset neither would hold. Near 500,000, float32 has steps of 0.03, which
+blurs a scene in coordinates of a map. And densification turns differences of one rounded bit into another number of
+Gaussians, so that a scene in feet would end elsewhere than the same scene in metres.
 """
 
 from __future__ import annotations
@@ -15,14 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# Distance from the origin, in extents of the cameras, from which a scene is moved: float32 would lose fine structure.
+# Distance from the origin, in extents, from which a model is far away: float32 would lose fine structure.
 FAR = 100.0
-SMALL, LARGE = 2.0**-6, 2.0**10  # extents between which a scene keeps its unit
+SMALL, LARGE = 2.0**-6, 2.0**10  # extents between which a model without cameras keeps its unit
 MOST = 0.9  # share of the Gaussians that lie within a model's extent, if it has no cameras: outliers do not count
 SAME = 1e-5  # difference of two sessions' frames that counts as rounding, as a share of the scene's size
-# Extent of the cameras, at least, as a share of the distance to the points: cameras that turn on the spot have none of
-# their own.
-SHARE_OF_DEPTH = 0.01
+# Extent of the cameras as a share of the distance to the points, below which they turn on the spot: then the distance
+# is the extent.
+ON_THE_SPOT = 0.01
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Frame:
 
     Attributes:
         centre: what is subtracted, in units of the dataset.
-        unit: a power of two, so that scaling rounds nothing.
+        unit: what is divided by: the largest distance of a training camera from their centre, in units of the dataset.
     """
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -39,26 +41,28 @@ class Frame:
 
     @classmethod
     def of(cls, viewmats: np.ndarray, points: np.ndarray) -> Frame:
-        """Return the frame of cameras [C, 4, 4] (world to camera) and points [M, 3], float64."""
+        """Return the frame of cameras [C, 4, 4] (world to camera) and points [M, 3], float64.
+
+        Cameras have an extent of 1 in it. If all of them are in one place, the median distance to the points is 1.
+        """
         centres = -np.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[..., 0]
         centre = centres.mean(axis=0)
         extent = float(np.linalg.norm(centres - centre, axis=1).max())
-        if len(points):
-            depth = float(np.median(np.linalg.norm(points - centre, axis=1)))
-            extent = max(extent, SHARE_OF_DEPTH * depth)
-        return cls.at(centre, extent)
+        depth = float(np.median(np.linalg.norm(points - centre, axis=1))) if len(points) else 0.0
+        extent = depth if extent < ON_THE_SPOT * depth else extent
+        if not (extent > 0.0 and math.isfinite(extent)):
+            return cls()
+        return cls((float(centre[0]), float(centre[1]), float(centre[2])), extent)
 
     @classmethod
     def around(cls, positions: np.ndarray) -> Frame:
-        """Return the frame of a model alone, by its positions [N, 3], of which some may be far off."""
+        """Return the frame of a model alone, by its positions [N, 3], of which some may be far off.
+
+        It keeps the coordinates of the file if float32 suffices for them.
+        """
         positions = np.asarray(positions, dtype=np.float64)
         centre = np.median(positions, axis=0)
         extent = float(np.quantile(np.linalg.norm(positions - centre, axis=1), MOST))
-        return cls.at(centre, extent)
-
-    @classmethod
-    def at(cls, centre: np.ndarray, extent: float) -> Frame:
-        """Return the frame of a scene within `extent` of `centre` [3]; the dataset's own if float32 suffices."""
         if not (extent > 0.0 and math.isfinite(extent)):
             return cls()
         kept = SMALL <= extent < LARGE
@@ -69,13 +73,13 @@ class Frame:
 
     @property
     def moves(self) -> bool:
-        """Return whether local coordinates differ from those of the dataset."""
+        """Whether local coordinates differ from those of the dataset."""
         return self != Frame()
 
     def is_like(self, other: Frame, size: float) -> bool:
         """Whether both are the same for a scene of this size in local units, but for rounding."""
         apart = max(abs(own - their) for own, their in zip(self.centre, other.centre, strict=True))
-        return self.unit == other.unit and apart <= SAME * size * self.unit
+        return abs(self.unit / other.unit - 1.0) <= SAME and apart <= SAME * size * self.unit
 
     def as_dict(self) -> dict[str, object]:
         """Return the entries of skipgs.json and cfg.yml: the vector subtracted from positions, and the divisor."""

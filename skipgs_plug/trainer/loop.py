@@ -123,7 +123,7 @@ class Trainer:
 
     @property
     def splats(self) -> nn.ParameterDict:
-        """Raw parameters `means scales quats opacities sh0 shN`, up to date until the next iteration."""
+        """Raw parameters `means scales quats opacities sh0 shN`, in coordinates of `scene.frame`, as they are now."""
         self._catch_up()
         return self._splats
 

@@ -32,6 +32,7 @@ MAX_HEADER = (
     1 << 16
 )  # bytes of a header, at most: 3DGS headers take about 2 KB, and a damaged file may have no end_header
 COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+BRIGHTEST = 2.0  # largest number in a cloud whose colours are floats from 0 to 1; with 255 as white it would be black
 PACKED_COLOURS = ("rgb", "rgba")  # of the Point Cloud Library: one number, bytes 0xAARRGGBB
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
@@ -194,8 +195,8 @@ def positions_of(vertices: Mapping[str, np.ndarray]) -> np.ndarray:
 def colours_of(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return colours [M, 3] uint8 from columns of any known name and type; grey if there are no colours.
 
-    Bytes are taken as they are. The range of other types is told by the largest value: up to 1 for floats, else up to
-    255, else up to 65,535.
+    Bytes are taken as they are, also those of a type with a sign. The range of other types is told by the largest
+    value: up to 1 for floats, which may exceed it a little, else up to 255, else up to 65,535.
     """
     by_name = {name.lower(): values for name, values in vertices.items()}
     for name in PACKED_COLOURS:
@@ -205,10 +206,11 @@ def colours_of(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
             return np.stack([bits >> shift & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
     names = next((names for names in COLOURS if set(names) <= set(by_name)), None)
     if names is not None:
+        by_name |= {name: by_name[name].view("u1") for name in names if by_name[name].dtype == np.int8}
         colours = columns(path, by_name, list(names))
         largest = float(colours.max(initial=0.0))
         kinds = {by_name[name].dtype for name in names}
-        if any(kind.kind == "f" for kind in kinds) and largest <= 1.0:
+        if any(kind.kind == "f" for kind in kinds) and largest <= BRIGHTEST:
             colours = colours * 255
         elif any(kind.itemsize > 1 for kind in kinds) and largest > 255.5:
             colours = colours / 257

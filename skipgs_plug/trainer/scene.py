@@ -17,6 +17,7 @@ BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
 MIN_POINTS = 4  # the scale of an initial Gaussian is the mean distance to its three nearest neighbours
 MIN_SIDE = 11  # pixels: the side of SSIM's window
+SCENE_SCALE = 1.1  # of every scene, whose cameras have an extent of 1 in local coordinates; 3DGS's factor
 MAX_COORDINATE = 1e15  # units of the scene: squares of distances stay below the largest float32, 3e38
 
 
@@ -55,9 +56,9 @@ class View:
 class Scene:
     """Training views, held-out views and the points that training starts from.
 
-    Cameras and points are in local coordinates. These are the coordinates of the dataset unless `frame` says otherwise.
-    Files are written in coordinates of the dataset, so an exported PLY lies where its cameras are. Every length in
-    the recipe is multiplied by `scene_scale`.
+    Cameras and points are in local coordinates, around the origin and in a unit of their own: see `frame`. Files are
+    written in coordinates of the dataset, so an exported PLY lies where its cameras are. Every length in the recipe is
+    multiplied by `scene_scale`.
 
     Examples:
         >>> from skipgs_plug.trainer.synthetic import make_scene
@@ -71,7 +72,7 @@ class Scene:
     test: list[View]
     points: Tensor  # [M, 3] float32
     points_rgb: Tensor  # [M, 3] uint8
-    scene_scale: float  # 1.1 x largest distance of a training camera from their centre
+    scene_scale: float  # 1.1 x the extent that `frame` makes 1; 3DGS's name and factor for it
     background: tuple[float, float, float] = BLACK  # colour in [0, 1] behind the scene
     gaussians: dict[str, Tensor] | None = None  # as of `read_ply`, to start from instead of one per point; local
     frame: Frame = field(default_factory=Frame)  # from local coordinates to those of the dataset
@@ -115,14 +116,14 @@ def assemble_scene(
     if frame.moves:
         for view in train + test:
             view.viewmat = frame.local_pose(view.viewmat)
-    points = frame.to_local(points) if frame.moves else points
+        points = frame.to_local(points)
     return Scene(
         name=printable(name),
         train=train,
         test=test,
         points=torch.from_numpy(np.ascontiguousarray(points, dtype=np.float32)),
         points_rgb=torch.from_numpy(np.ascontiguousarray(points_rgb, dtype=np.uint8)),
-        scene_scale=camera_extent(train),
+        scene_scale=SCENE_SCALE,
         background=background,
         frame=frame,
     )
@@ -162,11 +163,3 @@ def check_points(points: np.ndarray, source: Path) -> None:
 def is_text(name: str) -> bool:
     """Whether a name can be printed and written: it has no control characters and no surrogates."""
     return not any(ord(c) < 32 or 0xD800 <= ord(c) <= 0xDFFF for c in name)
-
-
-def camera_extent(views: list[View]) -> float:
-    """Return 1.1 x the largest distance of a camera from the mean camera position, as 3DGS does."""
-    poses = torch.stack([view.viewmat for view in views]).double()  # [C, 4, 4]
-    centres = -(poses[:, :3, :3].transpose(1, 2) @ poses[:, :3, 3:])[..., 0]  # [C, 3]
-    extent = 1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max())
-    return extent if extent > 0.0 else 1.0  # a single camera has no extent

@@ -191,6 +191,7 @@ def load_checkpoint(trainer: Capturable, path: str | Path) -> None:
     content = read_checkpoint(path, trainer.backend.device)
     _require_same_run(trainer, content, path)
     _require_same_shape(trainer, content, path)
+    content = _in_local_coordinates(content, trainer.scene)
     try:
         apply(trainer, content)
     except InputError:
@@ -275,13 +276,33 @@ def _require_same_run(trainer: Capturable, content: dict[str, Any], path: str | 
         )
 
 
+def _in_local_coordinates(content: dict[str, Any], scene: Scene) -> dict[str, Any]:
+    """Return the content of a checkpoint for training; up to 0.1.0 it is in coordinates of the dataset."""
+    if frame_of(content["scene"]).moves or not scene.frame.moves:
+        return content
+    unit = scene.frame.unit
+    moments = dict(content["optimizers"]["means"])
+    for key, power in (("exp_avg", 1), ("exp_avg_sq", 2)):  # of gradients, which grow with the unit
+        if key in moments:
+            moments[key] = moments[key] * unit**power
+    strategy = content["strategy"]
+    if "scene_scale" in strategy:
+        strategy = {**strategy, "scene_scale": scene.scene_scale}
+    return {
+        **content,
+        "splats": scene.frame.local_splats(content["splats"]),
+        "optimizers": {**content["optimizers"], "means": moments},
+        "strategy": strategy,
+    }
+
+
 def _require_same_cameras(scene: Scene, saved: Mapping[str, Any], path: str | Path) -> None:
     """Raise InputError if Gaussians of a checkpoint would not lie where the cameras of the scene look."""
     try:
         frame = frame_of(saved)
     except (TypeError, ValueError, KeyError) as error:
         raise DamagedCheckpointError(f"Checkpoint {path} is damaged ({error}); use an older one.") from error
-    if not frame.is_like(scene.frame, scene.scene_scale):
+    if frame.moves and not frame.is_like(scene.frame, scene.scene_scale):
         raise InputError(
             f"Checkpoint {path} was trained with {frame.as_dict()} subtracted and divided by, which is "
             f"{scene.frame.as_dict()} for the scene now; resume with the scene as it was, or begin a new run with "
@@ -293,7 +314,10 @@ def _require_same_cameras(scene: Scene, saved: Mapping[str, Any], path: str | Pa
     own = _viewmats(scene)
     if not isinstance(poses, Tensor) or poses.shape != own.shape:
         raise DamagedCheckpointError(f"Checkpoint {path} is damaged (its cameras are none); use an older one.")
-    apart = (poses.cpu().double() - own).abs()
+    poses = poses.cpu().double()
+    if not frame.moves:
+        poses = torch.stack([scene.frame.local_pose(pose) for pose in poses])
+    apart = (poses - own).abs()
     apart[:, :3, 3] /= scene.scene_scale
     changed = (apart.amax(dim=(1, 2)) > SAME).nonzero()[:, 0].tolist()
     if changed:

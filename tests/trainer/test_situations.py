@@ -14,7 +14,7 @@ from scene_folders import write_blender, write_colmap
 
 from skipgs_plug.cli import main
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer, load_scene
-from skipgs_plug.trainer.loaders.camera_keys import read_camera
+from skipgs_plug.trainer.loaders.camera_keys import read_camera, values_of
 from skipgs_plug.trainer.metrics import psnr
 from skipgs_plug.trainer.ply import PROPERTIES, read_ply, read_points, read_start, write_ply
 
@@ -95,7 +95,7 @@ def test_a_cloud_in_place_of_no_points(tmp_path: Path, tiny_scene: Scene, kind: 
         root = write_blender(tiny_scene, tmp_path / "scene")
     write_columns(tmp_path / "cloud.ply", {name: np.arange(8.0) for name in "xyz"})
     scene = load_scene(root, init_ply=tmp_path / "cloud.ply")
-    assert scene.points[:, 0].tolist() == list(range(8))
+    assert scene.points[:, 0].tolist() == pytest.approx(range(8), abs=1e-6)
 
 
 def write_nerf(scene: Scene, root: Path, **changes) -> Path:
@@ -143,6 +143,19 @@ def test_camera_keys(keys: dict, model: str, parameters: list[float]) -> None:
     camera = read_camera({"w": 80, "h": 60, **keys}, Path("x.png"), Path("transforms.json"))
     assert camera.model.name == model
     np.testing.assert_allclose(camera.params, parameters, atol=1e-9)
+
+
+def test_a_frame_has_the_last_word_about_its_lens() -> None:
+    """In whatever keys the file and the frame speak of it."""
+    file = {"w": 80, "h": 60, "fl_x": 50.0, "fl_y": 50.0, "k1": 0.0}
+    for own, focal in (
+        ({"camera_angle_x": 2 * math.atan(0.5)}, 80.0),
+        ({"y_fov": 90.0}, 30.0),
+        ({"fl_y": 70.0}, 70.0),
+        ({"fl_x": None, "cx": 1.0}, 50.0),
+    ):
+        camera = read_camera(values_of(file, own), Path("x.png"), Path("transforms.json"))
+        assert camera.params[:2] == pytest.approx([focal, focal], abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -196,6 +209,16 @@ def test_colours_of_any_name_and_type(tmp_path: Path, triple, kind: str, factor:
     own = {name: (colours[:, i] * factor).astype(kind) for i, name in enumerate(triple)}
     write_columns(tmp_path / "cloud.ply", dict(reversed([*xyz.items(), *own.items()])))
     np.testing.assert_array_equal(read_points(tmp_path / "cloud.ply")[1], colours)
+
+
+def test_colours_a_little_too_bright_and_bytes_with_a_sign(tmp_path: Path) -> None:
+    xyz = {name: np.arange(4, dtype="f4") for name in "xyz"}
+    white = {name: np.array([1.0005, 0.5, 0.0, 1.0], dtype="f4") for name in ("red", "green", "blue")}
+    write_columns(tmp_path / "bright.ply", {**xyz, **white})
+    assert read_points(tmp_path / "bright.ply")[1][:, 0].tolist() == [255, 128, 0, 255]
+    signed = {name: np.array([-1, -128, 127, 0], dtype="i1") for name in ("red", "green", "blue")}
+    write_columns(tmp_path / "signed.ply", {**xyz, **signed})
+    assert read_points(tmp_path / "signed.ply")[1][:, 2].tolist() == [255, 128, 127, 0]
 
 
 def test_packed_and_missing_colours(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

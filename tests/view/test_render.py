@@ -102,7 +102,9 @@ def test_a_model_is_shown_with_the_settings_of_its_training(scene_file, ply, tmp
     assert main(["train", scene_file.name, "--out", str(tmp_path / "run"), "--max-steps", "3", *options]) == 0
     monkeypatch.chdir(tmp_path)
     model = open_model(tmp_path / "run")
-    assert (model.near_plane, model.far_plane, model.exposure, model.antialiased) == (0.3, 90.0, True, False)
+    planes = [plane * model.scene.frame.unit for plane in (model.near_plane, model.far_plane)]
+    assert planes == pytest.approx([0.3, 90.0])
+    assert (model.exposure, model.antialiased) == (True, False)
     assert len(model.scene.points) == len(read_ply(ply)["means"])
     alone, with_scene = open_model(ply), open_model(ply, str(scene_file))
     assert alone.near_plane == 0.01 and not with_scene.exposure

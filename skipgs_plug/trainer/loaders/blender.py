@@ -12,7 +12,7 @@ from torch import Tensor
 
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.image_store import ImageStore
-from skipgs_plug.trainer.loaders.camera_keys import read_camera
+from skipgs_plug.trainer.loaders.camera_keys import read_camera, values_of
 from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.loaders.json_file import opencv_viewmat, read_object, read_pose, read_string
 from skipgs_plug.trainer.loaders.paths import find_image, find_images, inside
@@ -72,7 +72,7 @@ def read_transforms(path: Path, file_name: str, data_factor: int, images: ImageS
     cache = UndistortedCache(path)
     names = [read_string(frame.get("file_path"), "file_path of a frame", source) for frame in frames]
     for frame, image_path in images.reading(list(zip(frames, find_images(path, names), strict=True))):
-        view, alpha = read_frame(path, image_path, {**content, **frame}, cache, data_factor, images, source)
+        view, alpha = read_frame(path, image_path, values_of(content, frame), cache, data_factor, images, source)
         views.append(view)
         any_alpha |= alpha
     return views, any_alpha

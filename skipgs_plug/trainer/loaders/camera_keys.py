@@ -15,7 +15,8 @@ from skipgs_plug.trainer.loaders.photograph import MAX_SIDE
 PERSPECTIVE = ("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", *DISTORTION)
+FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")  # each says the same in its own way
+NUMBERS = ("w", "h", "cx", "cy", *FOCAL, *DISTORTION)
 UNDISTORT = "undistort the images"
 ALPHA = "write what is transparent as the alpha channel of the images"
 # Keys that change a picture and are not modelled: refused unless zero, false or empty. Meaning and cure of each.
@@ -31,6 +32,14 @@ UNSUPPORTED = {
     **dict.fromkeys(("white_transparent", "black_transparent", "mask_color"), ("transparency by colour", ALPHA)),
     **dict.fromkeys(("from_mitsuba", "normal_mts_args"), ("the axes of Mitsuba", "export with those of Blender")),
 }
+
+
+def values_of(content: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+    """Return the keys that hold for a frame: its own, and those of the file for which it has no word."""
+    shared = content
+    if any(frame.get(key) is not None for key in FOCAL):
+        shared = {key: value for key, value in content.items() if key not in FOCAL}
+    return {**shared, **{key: value for key, value in frame.items() if value is not None}}
 
 
 def read_camera(values: dict[str, Any], image_path: Path, source: Path) -> Any:

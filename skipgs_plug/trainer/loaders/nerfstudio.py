@@ -11,7 +11,7 @@ import numpy as np
 
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.image_store import ImageStore
-from skipgs_plug.trainer.loaders.camera_keys import read_camera
+from skipgs_plug.trainer.loaders.camera_keys import read_camera, values_of
 from skipgs_plug.trainer.loaders.json_file import opencv_viewmat, read_object, read_pose, read_string
 from skipgs_plug.trainer.loaders.paths import find_image, find_images, inside, relative_name
 from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, find_mask, load_photograph, lost_angle, model_name
@@ -47,7 +47,7 @@ def load_nerfstudio(
     views, distorted = [], set()
     for frame, name, full, mask in images.reading(list(zip(frames, names, paths, masks, strict=True))):
         viewmat = opencv_viewmat(read_pose(frame.get("transform_matrix"), name, source))
-        camera = read_camera({**content, **frame}, full, source)
+        camera = read_camera(values_of(content, frame), full, source)
         image_path, factor = reduced_image(path, full, data_factor)
         views.append(load_photograph(name, image_path, camera, viewmat, cache, factor, mask, images))
         if model_name(camera) not in PINHOLE_MODELS:
