@@ -58,6 +58,25 @@ def test_names_of_another_case(colmap: Path, rename) -> None:
     assert same(load_scene(colmap), expected)
 
 
+def test_folders_of_another_case(colmap: Path) -> None:
+    view = load_scene(colmap).train[0]
+    mask = colmap / "Masks" / f"{view.name}.png"
+    mask.parent.mkdir(parents=True)
+    Image.fromarray(np.uint8([[0, 255]]).repeat(view.height, 0).repeat(view.width // 2, 1)).save(mask)
+    (colmap / "images").rename(colmap / "Images")
+    found = load_scene(colmap).train[0]
+    assert torch.equal(found.image, view.image)
+    assert found.mask is not None and not found.mask.all()
+
+
+def test_colours_of_a_text_model_as_decimal_numbers(colmap: Path) -> None:
+    expected = load_scene(colmap).points_rgb
+    file = colmap / "sparse/0/points3D.txt"
+    rows = [line.split() for line in file.read_text().splitlines()]
+    file.write_text("\n".join(" ".join([*row[:4], *(f"{row[i]}.0" for i in (4, 5, 6)), *row[7:]]) for row in rows))
+    assert torch.equal(load_scene(colmap).points_rgb, expected)
+
+
 def test_two_files_that_differ_by_case_are_told_apart(colmap: Path) -> None:
     folder = colmap / "images/cam"
     shutil.copy(folder / "view_001.png", folder / "VIEW_000.png")

@@ -16,7 +16,7 @@ from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.colmap_files import check_lengths, leave_out_points
 from skipgs_plug.trainer.loaders.colmap_text import content_lines, image_records, simplify
 from skipgs_plug.trainer.loaders.native import import_pycolmap
-from skipgs_plug.trainer.loaders.paths import find_images, relative_name
+from skipgs_plug.trainer.loaders.paths import find_images, relative_name, subfolder
 from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, find_mask, load_photograph, lost_angle, model_name
 from skipgs_plug.trainer.loaders.said import say_bare, say_what_is_unlisted
 from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
@@ -42,7 +42,7 @@ def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStor
         model = find_model(path)
     reconstruction, names = read_model(model)
     folder, factor = image_folder(path, data_factor)
-    masks = path / "masks"
+    masks = subfolder(path, "masks")
     cache = UndistortedCache(path)
     listed = [reconstruction.images[number] for number in sorted(reconstruction.images)]
     called = [relative_name(folder, names.get(image.image_id) or image_name(image, model)) for image in listed]
@@ -104,7 +104,7 @@ def is_complete(folder: Path, suffix: str) -> bool:
 def scene_of(model: Path) -> Path:
     """Return the scene that a model belongs to: the next folder above it with images, else its own."""
     parents = [model, *model.resolve().parents[:3]]
-    return next((folder for folder in parents if (folder / "images").is_dir()), model)
+    return next((folder for folder in parents if subfolder(folder, "images").is_dir()), model)
 
 
 def find_model(path: Path) -> Path:
@@ -226,9 +226,9 @@ def pose_of(image: Any, name: str, model: Path) -> np.ndarray:
 
 def image_folder(path: Path, data_factor: int) -> tuple[Path, int]:
     """Return the folder to read and the factor that is left to apply in memory."""
-    full = path / "images"
+    full = subfolder(path, "images")
     if data_factor > 1:
-        reduced = path / f"images_{data_factor}"
+        reduced = subfolder(path, f"images_{data_factor}")
         if reduced.is_dir():
             return reduced, 1
         if full.is_dir():

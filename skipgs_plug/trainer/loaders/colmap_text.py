@@ -41,9 +41,18 @@ def simplify(model: Path, target: Path, camera_models: Mapping[str, int]) -> tup
         lines += [" ".join([*fields[:IMAGE_FIELDS], str(number)]), ""]
     (target / "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     listed = content_lines(model / "points3D.txt") if (model / "points3D.txt").is_file() else []
-    points = [" ".join(line.split()[:8]) for line in listed if line.strip()]
+    points = [" ".join(point_of(line.split())) for line in listed if line.strip()]
     (target / "points3D.txt").write_text("\n".join(points) + "\n", encoding="utf-8")
     return names, len(points)
+
+
+def point_of(fields: list[str]) -> list[str]:
+    """Return id, position, colour and error of a point; colours that were written as 254.0 as whole numbers."""
+    try:
+        colour = [str(round(float(value))) for value in fields[4:7]]
+    except (ValueError, OverflowError):
+        colour = fields[4:7]  # pycolmap refuses the line
+    return [*fields[:4], *colour, *fields[7:8]]
 
 
 def check_parameters(fields: list[str], camera_models: Mapping[str, int], path: Path) -> None:

@@ -13,7 +13,7 @@ from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.camera_keys import read_camera, values_of
 from skipgs_plug.trainer.loaders.json_file import opencv_viewmat, read_object, read_pose, read_string
-from skipgs_plug.trainer.loaders.paths import find_image, find_images, inside, relative_name
+from skipgs_plug.trainer.loaders.paths import find_image, find_images, inside, relative_name, subfolder
 from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, find_mask, load_photograph, lost_angle, model_name
 from skipgs_plug.trainer.loaders.said import say_bare, say_what_is_unlisted
 from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
@@ -56,7 +56,7 @@ def load_nerfstudio(
         log.warning("%s: lens distortion (%s) is removed, and the result kept.", source, ", ".join(sorted(distorted)))
     for folder in sorted({path / full.relative_to(path).parts[0] for full in paths} - set(paths)):
         say_what_is_unlisted(folder, paths, f"frame of {FILE}")
-    say_bare(path / "masks", masks)
+    say_bare(subfolder(path, "masks"), masks)
     if len({repr(frame.get("time")) for frame in frames}) > 1:
         log.warning("%s: its frames have different times; whatever moved between them will be blurred.", source)
     train, test = own_split(content, views, path, source) or split_views(views, test_every)
@@ -69,7 +69,7 @@ def mask_of(path: Path, frame: dict[str, Any], name: str, source: Path) -> Path 
     given = frame.get("mask_path")
     if given is not None:
         return find_image(path, read_string(given, f"mask_path of {name!r}", source))
-    masks, below = path / "masks", name.partition("/")[2]
+    masks, below = subfolder(path, "masks"), name.partition("/")[2]
     return find_mask(masks, below or name) if masks.is_dir() else None
 
 

@@ -132,6 +132,14 @@ def in_any_case(folder: Path, name: PurePosixPath) -> Path | None:
     return found[0] if len(found) == 1 else None
 
 
+def subfolder(folder: Path, name: str) -> Path:
+    """Return folder/name, or the only folder there whose name differs from it by capital letters alone."""
+    if os.path.isdir(folder / name):
+        return folder / name
+    found = [path for path in entries(folder, [name]) if path.is_dir()]
+    return found[0] if len(found) == 1 else folder / name
+
+
 def same_stem(path: Path) -> Path | None:
     """Return a file beside `path` that differs from it by its suffix alone."""
     try:
