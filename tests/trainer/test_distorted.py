@@ -156,10 +156,11 @@ def test_nerfstudio(tmp_path: Path, model: str) -> None:
     for i, view in enumerate(scene.train):
         assert_straight(view)
         # OpenGL poses look along -z with y up; ours along +z with y down.
-        torch.testing.assert_close(view.viewmat, torch.tensor(
+        torch.testing.assert_close(scene.frame.dataset_pose(view.viewmat), torch.tensor(
             [[1.0, 0, 0, -i], [0, -1, 0, 2], [0, 0, -1, 3], [0, 0, 0, 1]]).double())  # fmt: skip
     assert scene.train[0].mask is not None and scene.train[1].mask is None
-    assert scene.points[4].tolist() == [4, 0, 4] and scene.points_rgb[4].tolist() == [40, 0, 255]
+    place = scene.points[4].numpy() * scene.frame.unit + scene.frame.centre
+    assert place.tolist() == pytest.approx([4, 0, 4], abs=1e-5) and scene.points_rgb[4].tolist() == [40, 0, 255]
 
 
 def test_nerfstudio_pinhole_by_angle_split_and_factor(tmp_path: Path) -> None:
