@@ -6,6 +6,7 @@ import inspect
 import subprocess
 import sys
 
+import pytest
 import torch
 
 import skipgs_plug
@@ -180,6 +181,14 @@ def test_what_adapters_are_written_with() -> None:
     assert str(inspect.signature(adapters.register_adapter)) == (
         "(adapter: 'type[AbstractAdapter]') -> 'type[AbstractAdapter]'"
     )
+
+
+def test_names_of_earlier_versions_still_work_and_say_their_new_ones() -> None:
+    with pytest.warns(DeprecationWarning, match="TrainerFacts is called TrainerInfo now"):
+        from skipgs_plug.adapters import TrainerFacts
+    assert TrainerFacts is TrainerInfo
+    with pytest.raises(AttributeError, match="has no attribute 'Facts'"):
+        adapters.Facts  # noqa: B018 - the access is what is tested
 
 
 def test_what_policies_are_written_with() -> None:
