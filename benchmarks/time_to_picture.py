@@ -104,7 +104,7 @@ def main(args: Args) -> None:
                 flush=True,
             )
     about = {"aim_db": aim, "options": given, "cores": usable_cores(), **provenance()}
-    write_part(FILE, args.scene, rows, about)
+    write_part(FILE, f"{args.scene}, grow_grad2d {args.grow_grad2d:g}", rows, about)
 
 
 if __name__ == "__main__":
