@@ -88,6 +88,7 @@ class NewerRefiningState(TypedDict, total=False):
     """What states of earlier versions lack."""
 
     changed: int | None
+    expected: int | None
     ran_for: dict[str, int]
 
 

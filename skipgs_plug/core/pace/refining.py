@@ -56,6 +56,7 @@ class Refining:
         self.ran_for = {OF_SHARE: 0, OF_LOOP: 0, OF_CHANGES: 0}
         self._recovery = self._recovered = 0  # iterations to run after a change, and those that have
         self._changed: int | None = None  # iteration of the last change
+        self._expected: int | None = None  # iteration of the next one; None if no more are
         self._over = False  # holds for the present iteration
         self._begun = self._removed = False
 
@@ -118,6 +119,10 @@ class Refining:
 
     def runs(self, number: int) -> bool:
         """Whether iteration `number` runs; asked once for each, in order."""
+        if self._expected is not None and number > self._expected:
+            assert self._last is not None
+            self._recover(min(RECOVERY, self._last - self._expected))
+            self._expected = None
         self._set_pace()
         recovers = self._recovered < self._recovery
         runs = self.sampling.runs(number in self._must or number == self._last)
@@ -155,8 +160,10 @@ class Refining:
     def notify_event(self, step: int, n_views: int) -> None:
         """A structural change happened; when refinement has ended, the model is given time to recover.
 
-        It gets the share of the iterations up to the next change, which is expected as far away as the last one was, or
-        up to the end. So a trainer that prunes again and again leaves out as much as one that does not.
+        The next change is expected as far away as the last one was. Up to it the share of the iterations runs, so that
+        a trainer that prunes again and again still leaves most of them out. After the last change, or where none comes
+        as expected, all of them run, up to `RECOVERY`: with the share alone, five prunes cost Speedy-Splat 1.1 dB
+        (benchmarks/notes/EVIDENCE.md).
 
         Args:
             step: Iteration of the change.
@@ -166,12 +173,18 @@ class Refining:
         if self.stopping is None or not self.stopping.ended or step == before:
             return
         assert self._last is not None and self.share is not None
-        left = self._last - step
-        apart = left if before is None else min(left, step - before)
-        pause = self._config.pause_iters
-        if pause is None:
-            pause = min(max(n_views, RECOVERY), max(n_views, math.ceil(self.share * apart)))
-        self._recovery, self._recovered = pause, 0
+        pause, most, self._expected = self._config.pause_iters, max(n_views, RECOVERY), None
+        if pause is not None:
+            self._recover(pause)
+        elif before is None or self._last - step <= step - before:
+            self._recover(min(most, self._last - step))
+        else:
+            self._expected = 2 * step - before
+            self._recover(min(most, max(n_views, math.ceil(self.share * (step - before)))))
+
+    def _recover(self, iterations: int) -> None:
+        """Let this many iterations run from now on."""
+        self._recovery, self._recovered = iterations, 0
 
     @property
     def _auto(self) -> bool:
@@ -230,6 +243,7 @@ class Refining:
             "watched": sorted(self.watched),
             "recovery": [self._recovery, self._recovered],
             "changed": self._changed,
+            "expected": self._expected,
             "ran_for": dict(self.ran_for),
             "stopping": None if self.stopping is None else self.stopping.state_dict(),
         }
@@ -247,7 +261,7 @@ class Refining:
         self.sampling.load_state_dict(state["sampling"])
         self.watched = frozenset(state["watched"])
         self._recovery, self._recovered = state["recovery"]
-        self._changed = state.get("changed")
+        self._changed, self._expected = state.get("changed"), state.get("expected")
         earlier = {OF_SHARE: self.sampling.run}  # of a version that did not count by reason
         self.ran_for.update({reason: int(count) for reason, count in state.get("ran_for", earlier).items()})
         if state["stopping"] is not None:
