@@ -56,6 +56,18 @@ def register_adapter(adapter: type[AbstractAdapter]) -> type[AbstractAdapter]:
 
     Raises:
         SkipGSError: It has no name, or the name is taken.
+
+    Example:
+        An adapter for a fork whose training script has a function `refine_all`. It iterates as Inria's does.
+
+        >>> from skipgs_plug.adapters.inria import Inria
+        >>> @register_adapter
+        ... class MyFork(Inria):
+        ...     name = "my_fork"
+        ...     mark = "refine_all"
+        ...     checked = "my_fork at 1a2b3c4 (trained)"
+        >>> adapter_names()[0]
+        'my_fork'
     """
     name = getattr(adapter, "name", None)
     if not name or not getattr(adapter, "checked", None):

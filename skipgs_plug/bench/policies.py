@@ -20,7 +20,7 @@ from skipgs_plug.trainer import Trainer
 from skipgs_plug.trainer.errors import InputError
 
 REFERENCE = "own"  # policy that all others are compared with
-THINNED = "refine_share=0.4"  # policy whose steps and iterations the controls copy
+COPIED = "refine_share=0.4"  # policy whose steps and iterations the controls copy
 Earlier = Mapping[str, RunRecord]
 GateMaker = Callable[[Trainer, Earlier], SkipGate | None]
 Plan = Callable[[int, int, int, int], PlannedSkipping]  # of first, end, number of skips, seed
@@ -150,18 +150,18 @@ POLICIES = table_of(
     ),
     PolicySpec(
         "own,compensate",
-        f"every iteration runs, with the larger, shrinking steps of {THINNED}",
-        (THINNED,),
-        stepping_as(THINNED),
+        f"every iteration runs, with the larger, shrinking steps of {COPIED}",
+        (COPIED,),
+        stepping_as(COPIED),
     ),
-    PolicySpec(THINNED, "40 % of the iterations run, with larger, shrinking steps", gate=gate_with(refine_share=0.4)),
+    PolicySpec(COPIED, "40 % of the iterations run, with larger, shrinking steps", gate=gate_with(refine_share=0.4)),
     PolicySpec(
         "refine_share=auto",
         "as many iterations as the scene needs, with larger, shrinking steps",
         gate=gate_with(refine_share="auto"),
     ),
     PolicySpec(
-        f"{THINNED},no-compensate",
+        f"{COPIED},no-compensate",
         "control: 40 % of the iterations run, steps as they are",
         gate=gate_with(refine_share=0.4, compensate=False),
     ),

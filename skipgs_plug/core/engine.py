@@ -308,7 +308,7 @@ class Engine:
             "clock": self.clock.state_dict(),
             "step": self.iteration.step,
             "pace": self.pace.state_dict(),
-            "shown": self.rates.visibility.state_dict(),
+            "visibility": self.rates.visibility.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -357,8 +357,8 @@ class Engine:
                 f"The gate state was saved with refine_share={saved!r}, not {self.config.refining!r}; "
                 "continue with that setting, or start the gate afresh."
             )
-        if "shown" in whole:
-            self.rates.visibility.load_state_dict(whole["shown"])
+        if "visibility" in whole:
+            self.rates.visibility.load_state_dict(whole["visibility"])
         if state is not None:
             self.pace.load_state_dict(state)
 

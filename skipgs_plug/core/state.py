@@ -149,7 +149,7 @@ class GateState(TypedDict):
     clock: ClockState
     step: int | None
     pace: PaceState | None
-    shown: tuple[float, float, int, float, float]  # as `Visibility.state_dict`
+    visibility: tuple[float, float, int, float, float]  # as `Visibility.state_dict`
 
 
 class ReleaseStats(TypedDict):
@@ -226,10 +226,10 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
                 "continue with that version, or start the gate afresh."
             )
         # States from before iterations could be left out, and before steps depended on what a view shows.
-        state = {"pace": None, "shown": [0.0, 0], **state}
-        shown = state["shown"]
-        if isinstance(shown, (list, tuple)) and len(shown) == 2:  # from before sums could wait on a device
-            state["shown"] = [*shown, shown[1], 0.0, 0.0]
+        state = {"pace": None, **state}
+        visibility = state.setdefault("visibility", state.pop("shown", [0.0, 0]))  # it was called "shown"
+        if isinstance(visibility, (list, tuple)) and len(visibility) == 2:  # from before sums could wait on a device
+            state["visibility"] = [*visibility, visibility[1], 0.0, 0.0]
         if isinstance(state.get("clock"), Mapping):  # and from before processor seconds were counted
             state["clock"] = {"t_total_processor": math.nan, "t_post_processor": math.nan, **state["clock"]}
         _require(state, GateState, "state")

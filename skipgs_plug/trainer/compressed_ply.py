@@ -75,10 +75,10 @@ def unpack_rotation(packed: np.ndarray) -> list[np.ndarray]:
     bits = [packed >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
     others = np.stack([(value / 1023.0 - 0.5) * np.sqrt(2.0) for value in bits])  # [3, N]
     largest = np.sqrt(np.maximum(1.0 - (others**2).sum(axis=0), 0.0))
-    place = packed >> np.uint32(30)
+    largest_at = packed >> np.uint32(30)
     parts = []
     for i in range(4):
         before = others[min(i, 2)]  # where the largest comes later
         after = others[max(i - 1, 0)]  # where it came earlier
-        parts.append(np.where(place == i, largest, np.where(place > i, before, after)))
+        parts.append(np.where(largest_at == i, largest, np.where(largest_at > i, before, after)))
     return parts

@@ -54,10 +54,10 @@ def nearest_depth(views: list[View], points: torch.Tensor) -> float | None:
     points = points[:: -(-len(points) // MOST)]
     depths = []
     for view in views:
-        seen = depths_in_picture(view, points)
-        seen = seen[seen > 0]
-        if len(seen) >= LEAST:
-            depths.append(float(np.quantile(seen.numpy(), NEAREST)))
+        inside = depths_in_picture(view, points)
+        inside = inside[inside > 0]
+        if len(inside) >= LEAST:
+            depths.append(float(np.quantile(inside.numpy(), NEAREST)))
     return min(depths, default=None)
 
 

@@ -103,11 +103,11 @@ def assemble_scene(
             f"{source} leaves no training view: its {held_out} held out. Give --test-every 0 (test_every=0) to train "
             "on all of them."
         )
-    seen: set[str] = set()
+    names: set[str] = set()
     for view in train + test:
-        if view.name in seen:
+        if view.name in names:
             raise InputError(f"{source} names two views {view.name!r}; image paths must be unique.")
-        seen.add(view.name)
+        names.add(view.name)
         check_view(view, source)
     check_points(points, source)
     for view in train + test:

@@ -25,7 +25,7 @@ from skipgs_plug.view.spz import read_spz
 
 # Where trainers write their models: ours and gsplat's, then those of the Inria family. The last one of an
 # iteration counts: it is the format that is quickest to read.
-PLACES = ("ckpts/ckpt_*_rank0.pt", "point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
+MODEL_FILES = ("ckpts/ckpt_*_rank0.pt", "point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 LOADING = ("test_every", "init_num_pts", "init_ply")  # settings of a run that change how its scene is loaded
 NEAR_PLANE = 0.01  # near clipping plane of a PLY without a scene, in its units; gsplat's default
 FILES: dict[str, Callable[[Path], dict[str, Tensor]]] = {
@@ -168,15 +168,15 @@ def find_snapshots(folder: Path) -> list[Snapshot]:
         MissingFileError: the folder holds no model.
     """
     found = {}
-    for place in PLACES:
-        for path in folder.glob(place):
+    for pattern in MODEL_FILES:
+        for path in folder.glob(pattern):
             number = NUMBER.search(path.relative_to(folder).as_posix())
             if number:
                 step = int(number.group(1))
                 found[step] = Snapshot(step, path)
     if not found:
         raise MissingFileError(
-            f"{folder} holds no model ({', '.join(PLACES)}); give a run folder or a PLY, .splat or .spz."
+            f"{folder} holds no model ({', '.join(MODEL_FILES)}); give a run folder or a PLY, .splat or .spz."
         )
     return [found[step] for step in sorted(found)]
 

@@ -53,8 +53,8 @@ def to_sog(splats: Mapping[str, Tensor], antialiased: bool = False, pairs: float
         meta["model"] = "antialiased"
     pictures: dict[str, np.ndarray] = {}
 
-    places, lowest, highest = _positions(means[order].numpy())
-    pictures["means_l"], pictures["means_u"] = _grid(places & 255), _grid(places >> 8)
+    quantized, lowest, highest = _positions(means[order].numpy())
+    pictures["means_l"], pictures["means_u"] = _grid(quantized & 255), _grid(quantized >> 8)
     meta["means"] = {"mins": lowest, "maxs": highest, "files": ["means_l.webp", "means_u.webp"]}
 
     scales, codebook = _levels(splats["scales"].numpy())
@@ -101,8 +101,8 @@ def _positions(means: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]
     scaled = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     lowest, highest = scaled.min(axis=0), scaled.max(axis=0)
     extent = np.where(highest > lowest, highest - lowest, 1.0)
-    places = np.rint((scaled - lowest) / extent * STEPS).astype(np.uint16)
-    return places, lowest.tolist(), (lowest + extent).tolist()
+    quantized = np.rint((scaled - lowest) / extent * STEPS).astype(np.uint16)
+    return quantized, lowest.tolist(), (lowest + extent).tolist()
 
 
 def _rotations(quats: np.ndarray) -> np.ndarray:

@@ -50,9 +50,10 @@ def at_least(wanted: int) -> Iterator[None]:
 class Sizes:
     """Sizes of a kernel's tensors, as its stub declares them.
 
-    A shape is a list of expressions of the kernel's numbers, its constants and `blocks`. In a struct, its own
-    numbers come first. A name that is none of these stands for one size throughout the struct, or throughout the
-    kernel's other parameters, which know it as `struct.name`: the first tensor that has it decides.
+    A shape is a list of expressions of the kernel's numbers and tensors, its constants and `blocks`: `block_start[-1]`
+    is the last element of a tensor. In a struct, its own fields come first. A name that is none of these stands for one
+    size throughout the struct, or throughout the kernel's other parameters, which know it as `struct.name`: the first
+    tensor that has it decides.
     """
 
     def __init__(self, kernel: str, fields: Sequence[Field], own_constants: dict[str, int | float]):
@@ -83,14 +84,13 @@ class Sizes:
         for path, value in arguments.items():
             struct, _, name = path.rpartition(".")
             own = vars(shared.setdefault(struct, SimpleNamespace())) if struct else shared
-            if not isinstance(value, Tensor):
-                own[name] = value
+            own[name] = value
         for field, dimensions in self._parsed:
             struct, _, name = field.path.rpartition(".")
             own = vars(shared[struct]) if struct else shared
             size = arguments[field.path].numel()
             unknown = {name for name, _ in dimensions if name is not None and name not in own and name not in shared}
-            rest = math.prod(eval(code, shared, own) for name, code in dimensions if name not in unknown)
+            rest = math.prod(int(eval(code, shared, own)) for name, code in dimensions if name not in unknown)
             if len(unknown) == 1 and rest and size % rest == 0:
                 own[unknown.pop()] = size // rest
             elif unknown or size != rest:

@@ -34,6 +34,13 @@ def set_num_threads(n: int) -> None:
 
     Raises:
         ValueError: `n` is not a whole number of at least 1.
+
+    Example:
+        >>> before = get_num_threads()
+        >>> set_num_threads(1)
+        >>> get_num_threads()
+        1
+        >>> set_num_threads(before)
     """
     global _num_threads
     if not isinstance(n, int) or n < 1:

@@ -45,7 +45,7 @@ def grid(width: int, height: int) -> Grid:
 class RowList(NamedTuple):
     """Some rows, ascending, and where each block of rows begins among them."""
 
-    rows: Annotated[IntArray, "M"]
+    rows: Annotated[IntArray, "block_start[-1]"]
     block_start: Annotated[IntArray, "blocks(n) + 1"]
 
 

@@ -136,6 +136,16 @@ def l1_ssim_loss(
         ValueError: Shapes differ, there are more than 32 channels, a row has more than 2^24 numbers, an image is too
             small for "valid", a tensor is of another kind or not on the CPU, or a gradient with respect to `target` is
             asked for.
+
+    Example:
+        A grey image against a black photograph.
+
+        >>> import torch
+        >>> image = torch.full((32, 32, 3), 0.5, requires_grad=True)
+        >>> loss = l1_ssim_loss(image, torch.zeros(32, 32, 3))
+        >>> loss.backward()
+        >>> round(loss.item(), 3), image.grad.shape
+        (0.6, torch.Size([32, 32, 3]))
     """
     in_bytes = target.dtype is torch.uint8
     for name, tensor, kinds, fits in (

@@ -23,7 +23,17 @@ _torchs_base: Any = importlib.import_module("torch.optim.optimizer")
 
 
 class Adam(torch.optim.Adam):
-    """`torch.optim.Adam` whose steps are those of `adam` below: options, state, state_dict and hooks are torch's."""
+    """`torch.optim.Adam` whose steps are those of `adam` below: options, state, state_dict and hooks are torch's.
+
+    Example:
+        >>> import torch
+        >>> means = torch.nn.Parameter(torch.zeros(100, 3))
+        >>> optimizer = Adam([means], lr=0.01, eps=1e-15)
+        >>> (means - 1.0).square().sum().backward()
+        >>> optimizer.step()
+        >>> round(means[0, 0].item(), 4)
+        0.01
+    """
 
     # Torch wraps these two, and its wrapper loads the compiler: 75 MB and 800 modules that training has no use for.
 

@@ -20,10 +20,9 @@ TRANSFORMS = ("transforms_train.json", "transforms.json")
 
 def is_scene(folder: Path) -> bool:
     """Return whether `load_scene` recognises the content of a folder."""
-    places = (folder / place for place in MODEL_FOLDERS)
     return (
         is_model(folder)
-        or any(place.is_dir() for place in places)
+        or any((folder / name).is_dir() for name in MODEL_FOLDERS)
         or any((folder / name).is_file() for name in TRANSFORMS)
     )
 

@@ -114,8 +114,8 @@ def find_model(path: Path) -> Path:
         MissingFileError: There is no model.
     """
     found: list[Path] = []
-    for place in MODEL_FOLDERS:
-        root = path / place
+    for name in MODEL_FOLDERS:
+        root = path / name
         numbered = sorted(root.glob("*"), key=lambda folder: [int(n) for n in re.findall(r"\d+", folder.name)] or [-1])
         found += [folder for folder in (root / "0", root, *numbered) if is_model(folder) and folder not in found]
         if found:

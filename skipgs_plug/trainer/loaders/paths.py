@@ -124,11 +124,11 @@ def spellings(name: PurePosixPath) -> Iterator[PurePosixPath]:
 
 def in_any_case(folder: Path, name: PurePosixPath) -> Path | None:
     """Return the only file whose path differs from `name` by capital letters alone, image suffixes apart."""
-    places = [folder]
+    folders = [folder]
     for part in name.parts[:-1]:
-        places = [path for place in places for path in entries(place, [part]) if path.is_dir()]
+        folders = [path for parent in folders for path in entries(parent, [part]) if path.is_dir()]
     wanted = [spelling.name for spelling in spellings(PurePosixPath(name.name))]
-    found = [path for place in places for path in entries(place, wanted) if path.is_file()]
+    found = [path for parent in folders for path in entries(parent, wanted) if path.is_file()]
     return found[0] if len(found) == 1 else None
 
 
