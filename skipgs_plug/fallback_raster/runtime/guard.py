@@ -27,7 +27,9 @@ _level = ZONES if os.environ.get("SKIPGS_PLUG_GUARD", "0") not in ("", "0") else
 
 # Two patterns of four bytes: no number as a float, and no index as an int.
 _PATTERNS = (-1, -0x00400002)
-_ZONE = 1024  # of four bytes each, on either side
+# Numbers of four bytes in a guard zone before and behind each buffer: 4 KiB, more than the 16 rows that a kernel handles
+# at a time have.
+_ZONE = 1024
 
 
 def level() -> int:

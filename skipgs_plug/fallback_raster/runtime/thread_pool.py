@@ -18,9 +18,12 @@ from .source import PRELUDE, read_kernel
 # takes processor time from others, looking less makes launches late.
 _PATIENCE = 5000
 
-_LINE = 64  # bytes of the lines in memory that `kernels/lib/thread_pool.h` consists of
+# Bytes of a cache line, of which `kernels/lib/thread_pool.h` gives each thread its own: threads that wrote into one line
+# would pass it to and fro.
+_LINE = 64
 _CALLER, _HELPERS = 2, 3  # which of them are the caller's and the first helper's
-_LOCK = 8  # bytes of a line before its lock
+# Bytes from the beginning of a thread's line to its lock, as in the struct of `kernels/lib/thread_pool.h`.
+_LOCK = 8
 
 # Locks of Python work on every system, and without the interpreter.
 _allocate = ctypes.PYFUNCTYPE(ctypes.c_void_p)(("PyThread_allocate_lock", ctypes.pythonapi))

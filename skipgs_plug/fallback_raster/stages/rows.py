@@ -29,7 +29,7 @@ def _take_rows(
 def _put_rows(
     *,
     visible: RowList,
-    packed: Annotated[FloatArray, "visible.M, width"],
+    packed: Annotated[FloatArray, "visible.block_start[-1], width"],
     put: Annotated[FloatOutput, "n, width"],
     n: int,
     width: int,

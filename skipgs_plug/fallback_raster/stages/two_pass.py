@@ -23,7 +23,8 @@ from .structs import BlockRows, Grid, RowList, Splats, grid
 ROWS_PER_TILE = 128
 # Share of the rows in the first lists above which all are listed at once: a second pass would cost more than it saves.
 WORTH = 0.7
-NO_DEPTH = 0x7FFFFFFF  # as bits of a depth, beyond every float
+# Bits of a depth beyond that of every Gaussian: the largest int, which no finite float has.
+NO_DEPTH = 0x7FFFFFFF
 
 # Tiles along the side of a cell, over which the light that Gaussians take is averaged.
 CELL = 4

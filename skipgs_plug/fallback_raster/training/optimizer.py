@@ -12,7 +12,9 @@ from torch import Tensor
 from .adam import adam_step
 
 ADAM_REPLACED = "torch.optim.adam.adam"  # the function that `torch.optim.Adam` steps with
-MAX_NUMBERS = 2**30  # of one parameter, which kernels count in 32 bits
+# Numbers of one parameter that our kernel steps, at most: it counts them in 32 bits. Larger
+# parameters are stepped by torch.
+MAX_NUMBERS = 2**30
 # Options of torch's Adam that are left to torch, and all that a group of parameters has, but `betas`.
 _TORCHS = ("amsgrad", "maximize", "weight_decay", "capturable", "differentiable", "has_complex")
 _OPTIONS = (*_TORCHS[:-1], "lr", "eps", "foreach", "fused", "decoupled_weight_decay")
