@@ -27,8 +27,8 @@ _level = ZONES if os.environ.get("SKIPGS_PLUG_GUARD", "0") not in ("", "0") else
 
 # Two patterns of four bytes: no number as a float, and no index as an int.
 _PATTERNS = (-1, -0x00400002)
-# Numbers of four bytes in a guard zone before and behind each buffer: 4 KiB, more than the 16 rows that a kernel handles
-# at a time have.
+# Numbers of four bytes in a guard zone before and behind each buffer: 4 KiB, more than the 16 rows have that a kernel
+# handles at a time.
 _ZONE = 1024
 
 

@@ -15,13 +15,14 @@ from collections import deque
 import torch
 from torch import Tensor
 
-# Bytes from which a tensor gets a piece of memory that stays mapped. Keeping smaller ones too (from 1, 2 or 4 MiB) gained
-# nothing, and takes 10 us in Python for each tensor.
+# Bytes from which a tensor gets a piece of memory that stays mapped. Keeping smaller ones too (from 1, 2 or 4 MiB)
+# gained nothing, and takes 10 us in Python for each tensor.
 LARGE = 1 << 23
-# A piece has room for a tensor larger by 1 / GROWTH, so that it fits after densification, too. Pages without content take
-# no memory.
+# A piece has room for a tensor larger by 1 / GROWTH, so that it fits after densification, too. Pages without content
+# take no memory.
 GROWTH = 8
-# A tensor takes a free piece if the piece is larger by 1 / SLACK of the tensor at most: a fifth of the piece is unused then.
+# A tensor takes a free piece if the piece is larger by 1 / SLACK of the tensor at most: a fifth of the piece is unused
+# then.
 SLACK = 4
 # Free pieces that fit nothing for a while may take an eighth of what was ever in use. Without it those that only the
 # forward pass needs push out the gradients, which are mapped and filled with zeros anew in every iteration.

@@ -18,8 +18,8 @@ from .source import PRELUDE, read_kernel
 # takes processor time from others, looking less makes launches late.
 _PATIENCE = 5000
 
-# Bytes of a cache line, of which `kernels/lib/thread_pool.h` gives each thread its own: threads that wrote into one line
-# would pass it to and fro.
+# Bytes of a cache line, of which `kernels/lib/thread_pool.h` gives each thread its own: threads that wrote into one
+# line would pass it to and fro.
 _LINE = 64
 _CALLER, _HELPERS = 2, 3  # which of them are the caller's and the first helper's
 # Bytes from the beginning of a thread's line to its lock, as in the struct of `kernels/lib/thread_pool.h`.

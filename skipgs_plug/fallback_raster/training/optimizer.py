@@ -12,8 +12,8 @@ from torch import Tensor
 from .adam import adam_step
 
 ADAM_REPLACED = "torch.optim.adam.adam"  # the function that `torch.optim.Adam` steps with
-# Numbers of one parameter that our kernel steps, at most: it counts them in 32 bits. Larger
-# parameters are stepped by torch.
+# Numbers of one parameter that our kernel steps, at most: it counts them in 32 bits. Larger parameters are stepped by
+# torch.
 MAX_NUMBERS = 2**30
 # Options of torch's Adam that are left to torch, and all that a group of parameters has, but `betas`.
 _TORCHS = ("amsgrad", "maximize", "weight_decay", "capturable", "differentiable", "has_complex")
