@@ -69,7 +69,6 @@ class SamplingState(TypedDict):
     run: int
     left_out: int
     due: int
-    before: tuple[float, int]
 
 
 class EarlyStoppingState(TypedDict):
@@ -121,8 +120,6 @@ class GrowingState(TypedDict):
     views: int
     gaussians_shown: tuple[float | None, float | None]  # by the first measurement, by the latest one
     measuring: bool
-    grows: bool
-    gaussians: tuple[int, int]  # at the last event, and those added since the one before
     sampling: SamplingState
     events: EventsState | None
 

@@ -55,7 +55,6 @@ class Growing:
         self._measuring = True
         self._saved_events: dict[str, Any] | None = None
         self._rows = self._grown = 0  # Gaussians when the last event was asked about, and those added since before it
-        self._grows = True  # False once an event that may add Gaussians has left their number as it was
 
     @property
     def first(self) -> int | None:
@@ -124,9 +123,7 @@ class Growing:
         assert self.share is not None
         must, barred = number in self._must, False
         if number in self.events and not must:
-            must = self.share >= 1.0 or self.events.enough(number, self._visible_now)
-            if must and self._counts_gaussians:
-                must = self._count_gaussians()
+            must = (self.share >= 1.0 or self.events.enough(number, self._visible_now)) and not self._full()
             barred = not must
         self.sampling.share = self.share
         runs = self.sampling.runs(must, barred)
@@ -140,7 +137,7 @@ class Growing:
         factor = self._factor
         if factor > 1.0:
             self._rates.scale(factor, growing=True)
-        elif self._measuring or self._counts_gaussians:
+        elif self._measuring or self._config.max_gaussians is not None:
             self._rates.look()
         else:
             self._rates.pause()
@@ -148,6 +145,7 @@ class Growing:
 
     def _settle(self) -> None:
         """Take what is measured so far; the share of the phase stays once enough steps were seen."""
+        assert self.events is not None
         visibility = self._rates.visibility
         settled = self._visible is not None
         if self._measuring and visibility.steps >= (MEASURED_AGAIN if settled else MEASURED):
@@ -158,14 +156,9 @@ class Growing:
             return
         self._visible = self._visible_now
         if self._config.growing == "auto":
-            self.share = self._needed()
-
-    def _needed(self) -> float:
-        """Share of the iterations that is needed, by what is known now."""
-        assert self.events is not None
-        longer = self._config.compensates and self._visible is not None
-        events = len(self.events) if self.events.all_run and self._grows else 0
-        return growing_share(self._length, self._epoch, longer, events)
+            longer = self._config.compensates and self._visible is not None
+            events = len(self.events) if self.events.all_run else 0
+            self.share = growing_share(self._length, self._epoch, longer, events)
 
     @property
     def _factor(self) -> float:
@@ -174,25 +167,16 @@ class Growing:
             return 1.0
         return growing_factor(self._length, self.share, self._visible)
 
-    @property
-    def _counts_gaussians(self) -> bool:
-        """Whether something depends on how many Gaussians there are."""
-        assert self.events is not None
-        waits = self._config.growing == "auto" and self.events.all_run and self._grows
-        return waits or self._config.max_gaussians is not None
-
-    def _count_gaussians(self) -> bool:
-        """Count them before an event; False if one more could grow the scene beyond the number that the user set."""
+    def _full(self) -> bool:
+        """Whether one more event could grow the scene beyond the number of Gaussians that the user set."""
+        bound = self._config.max_gaussians
+        if bound is None:
+            return False
         rows = distributed.largest(self._rates.rows)  # ranks leave out the same events
         if self._rows:
             self._grown = max(rows - self._rows, 0)
-            if rows == self._rows and self._config.growing == "auto" and self._grows and self._visible is not None:
-                self._grows = False  # they only move from now on, which needs fewer iterations
-                self.share = self._needed()
-                self.sampling.change(self.share)
         self._rows = rows
-        bound = self._config.max_gaussians
-        return bound is None or rows + self._grown <= bound
+        return rows + self._grown > bound
 
     def report(self) -> dict[str, Any]:
         """Return `share`, `iterations_run`, `iterations_skipped`, `events_run`, `events_skipped`, `always_run`."""
@@ -215,8 +199,6 @@ class Growing:
             "views": self._epoch,
             "gaussians_shown": [self._visible, self._visible_now],
             "measuring": self._measuring,
-            "grows": self._grows,
-            "gaussians": [self._rows, self._grown],
             "sampling": self.sampling.state_dict(),
             "events": self._saved_events if self.events is None else self.events.state_dict(),
         }
@@ -225,8 +207,7 @@ class Growing:
         """Continue from `state_dict()`; `begin` follows."""
         self.share, self._first_number = state["share"], state["first"]
         self._epoch = state["views"]
-        self._measuring, self._grows = state["measuring"], state["grows"]
-        self._rows, self._grown = state["gaussians"]
+        self._measuring = state["measuring"]
         self._visible, self._visible_now = state["gaussians_shown"]
         self.sampling.load_state_dict(state["sampling"])
         self._saved_events, self.events = state["events"], None

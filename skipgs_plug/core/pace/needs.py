@@ -13,7 +13,7 @@ GROWING_VISITS_LONGER = 3.5  # of each view, with longer steps: 2.7 lost 0.002 S
 NEARLY_ALL = 0.8  # share of the Gaussians that a view shows, from which growth is limited by the number of events
 # Iterations per event where each event adds a share of the Gaussians or a part of a budget: what an event adds must be
 # fitted before the next one copies it. 3DGS-MCMC from 1,500 points to 12,000 on fern loses 0.8 dB with 10 iterations
-# per event and nothing with 14. Once events add nothing more, 6 are enough.
+# per event and nothing with 14. `LEAST_GROWING_STEPS` are enough for any number of events.
 STEPS_PER_EVENT = 14
 # Iterations of growth that need no longer steps. With fewer, steps may be longer by the square of the lack: longer
 # schedules reset opacities more often than the few iterations between two resets can bear at long steps. Four times the
@@ -55,13 +55,14 @@ def growing_share(iterations: int, epoch: int, longer: bool, events: int = 0) ->
         iterations: Iterations of the schedule until densification ends.
         epoch: Iterations in which each training view comes up once.
         longer: Whether longer steps may replace iterations; see `growing_factor`.
-        events: Densification events that all run, while each may add Gaussians; 0 where events are left out.
+        events: Densification events, if all of them run; 0 where events are left out.
     """
     if iterations < 1:
         return 1.0
     steps = LEAST_GROWING_STEPS_LONGER if longer else LEAST_GROWING_STEPS
     visits = GROWING_VISITS_LONGER if longer else GROWING_VISITS
-    needed = max(steps, visits * epoch, STEPS_PER_EVENT * events)
+    steps = max(steps, min(STEPS_PER_EVENT * events, LEAST_GROWING_STEPS))
+    needed = max(steps, visits * epoch)
     return min(1.0, max(LEAST_GROWING_SHARE, needed / iterations))
 
 

@@ -24,7 +24,6 @@ class Sampling:
         self.run = 0
         self.left_out = 0
         self._due = 0  # how many should have run by now
-        self._before = (0.0, 0)  # how many should have run, of how many asked, when the share was changed last
 
     @property
     def asked(self) -> int:
@@ -35,12 +34,6 @@ class Sampling:
     def due(self) -> int:
         """How many iterations the share has asked for by now; those that ran beyond it had to."""
         return self._due if 0.0 < self.share < 1.0 else self.run + (self.share > 0.0)
-
-    def change(self, share: float) -> None:
-        """Go on with another share from here; setting `share` changes the mean over all iterations instead."""
-        budget, asked = self._before
-        self._before = budget + (self.asked - asked) * self.share, self.asked
-        self.share = share
 
     def runs(self, must: bool, barred: bool = False) -> bool:
         """Whether the next iteration runs.
@@ -53,8 +46,7 @@ class Sampling:
             self.left_out += 1
             return False
         if 0.0 < self.share < 1.0:
-            budget, asked = self._before
-            while (self._due + _place(self._due) - budget) / self.share < self.asked + 1 - asked:
+            while (self._due + _place(self._due)) / self.share < self.asked + 1:
                 self._due += 1
             must = must or self.run < self._due
         else:
@@ -66,19 +58,11 @@ class Sampling:
         return must
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "share": self.share,
-            "run": self.run,
-            "left_out": self.left_out,
-            "due": self._due,
-            "before": self._before,
-        }
+        return {"share": self.share, "run": self.run, "left_out": self.left_out, "due": self._due}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.share = float(state["share"])
         self.run, self.left_out, self._due = int(state["run"]), int(state["left_out"]), int(state["due"])
-        budget, asked = state["before"]
-        self._before = float(budget), int(asked)
 
 
 def _place(slot: int) -> float:

@@ -1,16 +1,13 @@
 """Fewer iterations and fewer densification events while the scene grows."""
 
 import json
-from types import SimpleNamespace
 
 import pytest
 import torch
 
 from skipgs_plug import SkipGate, SkipGSError
-from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.pace.events import VISITS_BEHIND_FULL_VIEWS, Events
-from skipgs_plug.core.pace.growing import Growing
-from skipgs_plug.core.pace.needs import STEPS_PER_EVENT, growing_factor, growing_share, refining_share
+from skipgs_plug.core.pace.needs import growing_factor, growing_share, refining_share
 from skipgs_plug.core.trainer_info import Densification
 
 VIEWS = [f"{i}.png" for i in range(4)]
@@ -186,55 +183,12 @@ def test_shares_that_auto_chooses():
     assert growing_share(15_000, 1000, longer=True) == pytest.approx(0.7 / 3)
     assert growing_share(1500, 17, longer=True) == 0.4
     assert growing_share(1500, 17, longer=False) == 0.8
+    # Where all events run, each needs 14 iterations, as far as all need more than 600 and no more than 1,200.
+    assert growing_share(2500, 17, longer=True, events=10) == 600 / 2500
     assert growing_share(2500, 17, longer=True, events=58) == 14 * 58 / 2500
+    assert growing_share(2500, 17, longer=True, events=97) == growing_share(2500, 17, longer=False) == 1200 / 2500
     assert growing_share(500, 17, longer=True) == growing_share(0, 17, longer=True) == 1.0
     assert refining_share(3500, 255) < refining_share(3500, 255, grown_by_few=True) == pytest.approx(0.291, abs=1e-3)
-
-
-class Measured:
-    """Rates of a scene whose views show nearly all of its Gaussians, all of which are counted."""
-
-    rows = 1000
-
-    def __init__(self):
-        self.visibility = SimpleNamespace(steps=100, share=0.95, restart=lambda: None, finish=lambda: None)
-
-    def scale(self, factor, growing):
-        pass
-
-    def look(self):
-        pass
-
-
-def test_events_that_all_add_gaussians_have_enough_iterations_behind_them_until_they_add_none():
-    events = range(100, 2500, 40)
-
-    def begun(rates, state=None):
-        growing = Growing(SkipConfig(share="auto"), rates)
-        if state is not None:
-            growing.load_state_dict(json.loads(json.dumps(state)))
-        assert growing.begin(range(2500), {}, set(), Densification(numbers=lambda _: events, needs="nothing"), epoch=17)
-        return growing
-
-    def train(growing, rates, numbers):
-        ran = []
-        for number in numbers:
-            if growing.runs(number):
-                ran.append(number)
-                if number in growing.events and number < 1000:
-                    rates.rows += 50
-        return ran
-
-    rates = Measured()
-    growing = begun(rates)
-    ran = train(growing, rates, range(700))
-    growing = begun(rates, growing.state_dict())
-    ran += train(growing, rates, range(700, 2500))
-    assert set(events) <= set(ran)
-    # 60 events need 14 iterations each, of 2,500; once the number of Gaussians stays, 600 of 2,500 are enough.
-    assert sum(number < 1000 for number in ran) == pytest.approx(1000 * STEPS_PER_EVENT * 60 / 2500, abs=3)
-    assert growing.share == growing_share(2500, 17, longer=True) == 0.24
-    assert sum(number >= 1040 for number in ran) == pytest.approx(1460 * 0.24, abs=12)
 
 
 def test_factors_while_the_scene_grows():
