@@ -62,7 +62,7 @@ def main() -> None:
             trainer.train(trainer.step + 10, progress=False)
             taken = host.take()
             result[name] = [[kind, file.rsplit("/", 1)[-1], line, n] for (kind, file, line, _), n in taken.items()]
-        result["compare"] = compare(scene, backend, SimMachine(), Deadline(60.0), steps=200)
+        result["compare"] = compare(scene, backend, SimMachine(), Deadline(60.0, lambda: 0.0), steps=200)
     json.dump(result, sys.stdout)
 
 
