@@ -151,10 +151,10 @@ def _blend_lists(bins: Bins, block_start: Tensor, colors: Tensor, pixels: Pixels
 
 def pair_sums(
     composed: Composed,
-    colors: Tensor,  # [R, D], as the next one of the forward pass
-    transmittance: Tensor,  # H W numbers
-    v_image: Tensor | None,  # H W D numbers, None for zeros, as the next
-    v_transmittance: Tensor | None,  # H W numbers
+    colors: Tensor,  # [R, D], of the forward pass
+    transmittance: Tensor,  # H W numbers, of the forward pass
+    v_image: Tensor | None,  # H W D numbers; None for zeros
+    v_transmittance: Tensor | None,  # H W numbers; None for zeros
     with_absolute: bool,
 ) -> Iterator[tuple[Channels, PairSums]]:
     """Channels and sums of each pass of the adjoint; sums live until the next one."""
@@ -208,13 +208,15 @@ def pair_sums(
 
 def compose_adjoint(
     composed: Composed,
-    means2d: Tensor,  # [R, 2], as the next ones the inputs of `compose`
+    # Inputs of `compose`.
+    means2d: Tensor,  # [R, 2]
     conics: Tensor,  # [R, 3]
     opacities: Tensor,  # [R]
     colors: Tensor,  # [R, D]
+    # What it returned, and gradients of it.
     transmittance: Tensor,  # H W numbers
-    v_image: Tensor | None,  # H W D numbers, None for zeros, as the next
-    v_transmittance: Tensor | None,  # H W numbers
+    v_image: Tensor | None,  # H W D numbers; None for zeros
+    v_transmittance: Tensor | None,  # H W numbers; None for zeros
     absolute: Tensor | None,  # [R, 2]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Gradients of means2d, conics, opacities and colors; `absolute` receives the sum over pixels of |v_means2d|."""

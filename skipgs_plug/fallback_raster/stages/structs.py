@@ -23,16 +23,16 @@ class Camera(NamedTuple):
 
     viewmat: Annotated[FloatArray, "4, 4"]  # world to camera
     K: Annotated[FloatArray, "3, 3"]  # intrinsics in pixels
-    width: float  # pixels, as the next
-    height: float
+    width: float  # pixels
+    height: float  # pixels
     eps2d: float  # added to the 2D covariance's diagonal, square pixels
 
 
 class Grid(NamedTuple):
     """An image and its tiles."""
 
-    width: int  # pixels, as the next
-    height: int
+    width: int  # pixels
+    height: int  # pixels
     tiles_x: int
     tiles_y: int
 
@@ -139,7 +139,8 @@ class PairSums(NamedTuple):
     rows: Annotated[IntArray, "M"]  # visible Gaussians
     block_start: Annotated[IntArray, "blocks(n) + 1"]  # where each block of rows begins among them
     pair_start: Annotated[IntArray, "M + 1"]  # number of the first pair of each
-    far_rows: Annotated[IntArray, "F"]  # as the last three, of the second part of the lists, if there is one
+    # The same three of the second part of the lists, if there is one.
+    far_rows: Annotated[IntArray, "F"]
     far_block_start: Annotated[IntArray, "blocks(n) + 1"]
     far_pair_start: Annotated[IntArray, "F + 1"]
     pair_slot: Annotated[IntArray, "P"]  # 1 + the slot of each pair, 0 if it was not blended

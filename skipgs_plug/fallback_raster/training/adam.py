@@ -66,11 +66,11 @@ def adam_step(
     rounding in one number of a thousand: its square root is not the nearest float.
 
     Args:
-        wanted: Rows to update, not zero; all without.
-        values: The parameter, changed as the next but `gradient`.
-        gradient: Of the same shape, as the next two.
-        mean: Running mean of the gradient.
-        square: Running mean of its square.
+        wanted: Not zero for each row to update; None for all rows.
+        values: The parameter. The step changes it in place.
+        gradient: Its gradient, of the same shape.
+        mean: Running mean of the gradient, of the same shape. The step changes it in place.
+        square: Running mean of the squared gradient, of the same shape. The step changes it in place.
         rate: Learning rate, divided by the bias correction of the mean if there is any.
         root: Divides the root of `square`: the root of its bias correction, or 1.
         betas: Decay of the two means.
@@ -97,9 +97,9 @@ def adam_step(
 @torch.no_grad()
 def adam_rows(
     visibility: Tensor,  # [N] bool
-    param: Tensor,  # [N, ...], updated, as the next two
-    mean: Tensor,  # like param
-    square: Tensor,  # like param
+    param: Tensor,  # [N, ...], updated in place
+    mean: Tensor,  # of the same shape, updated in place
+    square: Tensor,  # of the same shape, updated in place
     rate: float,
     betas: tuple[float, float],
     eps: float,

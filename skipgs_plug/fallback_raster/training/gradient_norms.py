@@ -13,8 +13,8 @@ def _sum_norms(
     *,
     rows: Annotated[IntArray, "n"],  # none of them twice
     gradient: Annotated[FloatArray, "n, 2"],
-    norms: Annotated[FloatOutput, "R"],  # added to, as the next
-    counts: Annotated[FloatOutput, "R"],
+    norms: Annotated[FloatOutput, "R"],  # the kernel adds to these
+    counts: Annotated[FloatOutput, "R"],  # and to these
     n: int,
     scale_x: float,
     scale_y: float,
@@ -25,8 +25,8 @@ def sum_norms(
     rows: Tensor,  # [M] int32, none of them twice
     gradient: Tensor,  # [M, 2] float32, of the 2D means
     scale: tuple[float, float],  # by which both columns are multiplied first
-    norms: Tensor,  # [N] float32, changed in place as the next
-    counts: Tensor,  # [N] float32
+    norms: Tensor,  # [N] float32, changed in place
+    counts: Tensor,  # [N] float32, changed in place
 ) -> None:
     """Add the norms of gradients to `norms` and 1 to `counts`, for the rows that an image shows."""
     _sum_norms(

@@ -135,9 +135,9 @@ def next_step(step: Tensor, lr: float, betas: tuple[float, float]) -> tuple[floa
 
 def adam(
     params: Sequence[Tensor],
-    grads: Sequence[Tensor],  # of the same shapes, as the next two
-    exp_avgs: Sequence[Tensor],
-    exp_avg_sqs: Sequence[Tensor],
+    grads: Sequence[Tensor],  # of the same shapes
+    exp_avgs: Sequence[Tensor],  # of the same shapes
+    exp_avg_sqs: Sequence[Tensor],  # of the same shapes
     max_exp_avg_sqs: Sequence[Tensor],
     state_steps: Sequence[Tensor],
     *flags: Any,
@@ -149,14 +149,14 @@ def adam(
     amsgrad, maximize, capturable, differentiable, a scaler of gradients), is left to torch.
 
     Args:
-        params: Updated, as the next but `grads`.
+        params: Parameters, updated in place.
         grads: Their gradients.
-        exp_avgs: Running means of the gradients.
-        exp_avg_sqs: Running means of their squares.
-        max_exp_avg_sqs: As torch has it.
-        state_steps: Steps of each so far.
-        flags: More of torch's, by position.
-        options: More of torch's, by name.
+        exp_avgs: Running means of the gradients, updated in place.
+        exp_avg_sqs: Running means of the squared gradients, updated in place.
+        max_exp_avg_sqs: Greatest of these means so far, which only `amsgrad` uses; passed on to torch.
+        state_steps: Number of steps of each parameter so far, updated in place.
+        flags: Further positional arguments of torch's function.
+        options: Further keyword arguments of torch's function.
     """
     everything = (params, grads, exp_avgs, exp_avg_sqs, max_exp_avg_sqs, state_steps)
     betas = options["beta1"], options["beta2"]
