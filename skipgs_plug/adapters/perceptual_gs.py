@@ -15,7 +15,7 @@ class PerceptualGS(InriaFamily):
     """
 
     name = "perceptual_gs"
-    checked = "eezkni/Perceptual-GS 991f196 (its loop read, and a look-alike)"
+    checked = "eezkni/Perceptual-GS 991f196 (its script, run on the CPU)"
     project = "[Perceptual-GS](https://github.com/eezkni/Perceptual-GS)"
     gated = (
         "From `densify_until_iter` + 1 on, after a pause where that iteration rebuilds the model. With images that "
