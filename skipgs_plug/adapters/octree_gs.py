@@ -16,7 +16,7 @@ class OctreeGS(InriaFamily):
     """
 
     name = "octree_gs"
-    checked = "city-super/Octree-GS 9db64fe (its loop read, and a look-alike)"
+    checked = "city-super/Octree-GS 9db64fe (its script, run on the CPU)"
     project = "[Octree-GS](https://github.com/city-super/Octree-GS)"
     gated = "From `update_until` on, or with `progressive` from the end of `coarse_iter` on, whichever is later."
     left_alone = "Networks and anchors have one optimizer, which is left alone. The mask of levels is a forward's."
