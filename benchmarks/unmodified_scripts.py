@@ -290,7 +290,10 @@ def means(rows: list[dict[str, float]]) -> dict[str, Any]:
 
 
 def table(runs: list[dict[str, Any]]) -> str:
-    """Return one row for each pair of runs, by scene, in the order in which they were recorded."""
+    """Return one row for each pair of runs, by scene, in the order in which they were recorded.
+
+    Seconds on a core that many used have a star, and are compared with others of such a core alone.
+    """
     pairs: dict[tuple[str, str, int], dict[str, dict[str, Any]]] = {}
     for run in runs:
         pairs.setdefault((run["scene"], run["script"], run["iterations"]), {})[run["mode"]] = run
@@ -311,19 +314,25 @@ def table(runs: list[dict[str, Any]]) -> str:
 def row(key: tuple[str, str, int], pair: dict[str, dict[str, Any]]) -> str:
     """Return a row of the table."""
     own, auto = pair["own"], pair["auto"]
+    alike = own.get("busy_core", False) == auto.get("busy_core", False)
     cells = [
         key[1],
         f"{key[2]:,}",
         f"{auto['iterations_run']:,}",
-        f"{own['seconds']:.0f}",
-        f"{auto['seconds']:.0f}",
-        f"{100 * auto['seconds'] / own['seconds']:.0f}",
+        seconds(own),
+        seconds(auto),
+        f"{100 * auto['seconds'] / own['seconds']:.0f}" if alike else "",
         f"{own['gaussians']:,}",
         f"{auto['gaussians']:,}",
         *(f"{run['psnr']:.2f} ({run['ssim']:.4f})" for run in (own, auto)),
         f"{auto['psnr'] - own['psnr']:+.2f}",
     ]
     return f"| {' | '.join(cells)} |"
+
+
+def seconds(run: dict[str, Any]) -> str:
+    """Return the seconds of a run, with a star where many programs used its core: they are too many."""
+    return f"{run['seconds']:.0f}{'*' if run.get('busy_core') else ''}"
 
 
 def print_ply(model: tyro.conf.Positional[Path], scene: tyro.conf.Positional[Path], data_factor: int = 1) -> None:
