@@ -38,15 +38,19 @@ def has_backend() -> bool:
         return False
 
 
-pytestmark = pytest.mark.skipif(
-    not has_backend(), reason=f"torch {torch.__version__} has no backends in Python; 2.9 and later have"
-)
+LONGEST = 1800  # seconds; all look-alikes take more than the 300 of other tests
+pytestmark = [
+    pytest.mark.timeout(LONGEST),
+    pytest.mark.skipif(
+        not has_backend(), reason=f"torch {torch.__version__} has no backends in Python; 2.9 and later have"
+    ),
+]
 
 
 def on_sim(*args: str) -> dict[str, Any]:
     """Host reads by mutant ("" for none), look-alike and settings; in a process of its own."""
     done = subprocess.run(
-        [sys.executable, str(HERE / "lookalikes_on_sim.py"), *args], capture_output=True, text=True, timeout=290
+        [sys.executable, str(HERE / "lookalikes_on_sim.py"), *args], capture_output=True, text=True, timeout=LONGEST
     )
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout)  # type: ignore[no-any-return]
