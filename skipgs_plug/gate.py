@@ -26,7 +26,7 @@ from skipgs_plug.core.release import Original
 from skipgs_plug.core.report import build_report, counters, summarise
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.trainer_info import TrainerInfo
-from skipgs_plug.core.views import view_key
+from skipgs_plug.core.views import NOT_READ, view_key
 
 
 class SkipGate:
@@ -463,6 +463,11 @@ class SkipGate:
         return bool(kept)
 
     def _new_in_iteration(self, view: Any) -> str:
+        """Key of a view without a backward in this iteration; an index on a device is read from the start on alone."""
+        index = isinstance(view, Tensor) and view.numel() == 1 and not view.is_floating_point()
+        if index and view.device.type != "cpu" and not self._engine.active:
+            self._iteration.keys.add(NOT_READ)
+            return NOT_READ
         key = view_key(view)
         if key in self._iteration.keys:
             raise GateOrderError(

@@ -19,7 +19,7 @@ from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.rates import Named
 from skipgs_plug.core.release import Original
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
-from skipgs_plug.core.views import view_key
+from skipgs_plug.core.views import NOT_READ, view_key
 
 # First iterations in which training backward passes are counted. Any number but one in each is a wrong attachment, and
 # the user hears of it within seconds.
@@ -161,7 +161,7 @@ class Hooks:
         if view is None:
             raise self._mismatch("no training view was rendered before the backward")
         if callable(view):
-            view = view() if self._engine.active else "not read"
+            view = view() if self._engine.active else NOT_READ
         self._engine.gate(view_key(view), loss if now.signal is None else now.signal, call, loss, alone=True)
 
     # Ways to attach to the trainer.

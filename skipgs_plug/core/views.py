@@ -15,6 +15,7 @@ from skipgs_plug.core.errors import SkipGSError
 
 CHECKED_KEYS = 5_000  # different views after which some must have come twice; if not, keys do not name views
 RECURRING = 0.01  # share of decisions on views that were seen before, at least, for keys to name views
+NOT_READ = "not read"  # key in iterations whose view matters to nothing, and would be read from a device
 MAX_VIEWS = 200_000  # views per table, at most: more than any scene has, and about 60 MB in all
 
 

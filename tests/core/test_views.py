@@ -46,6 +46,16 @@ def test_shared_names_are_found() -> None:
         require_unique(["a", "b", "a"])
 
 
+def test_an_index_on_a_device_is_read_from_the_start_on_alone() -> None:
+    there = torch.tensor(7, device="meta")
+    with pytest.raises(SkipGSError, match="view key"):
+        view_key(there)  # whoever reads it gets an error
+    gate = SkipGate(start_iter=3, warmup=0)
+    for step in range(3):
+        assert gate.backward(torch.tensor(1.0, requires_grad=True), view=there, step=step)
+    assert gate.released is None and gate.stats()["iterations"] == 3
+
+
 def train(gate: SkipGate, keys) -> None:
     for step, key in enumerate(keys, start=gate.stats()["iterations"]):
         gate.backward(torch.tensor(1.0, requires_grad=True), view=key, step=step)
