@@ -49,7 +49,7 @@ class Condition:
         shown: The `if` with it, or around it, that only moves a progress bar; None if there is none.
     """
 
-    def __init__(self, test: ast.expr, path: list[ast.expr], loop: _Loop) -> None:
+    def __init__(self, test: ast.expr, path: list[ast.expr], loop: LoopCode) -> None:
         self.text, self.line = ast.unparse(test), loop.first_line + test.lineno - 1
         self._loop = loop
         self._test = test
@@ -132,7 +132,7 @@ class Condition:
         return found
 
 
-class _Loop:
+class LoopCode:
     """One `for` statement of a function, whose target is the iteration's number.
 
     Args:
@@ -192,9 +192,55 @@ class _Loop:
         """The outermost `if` that only moves a progress bar, and has this condition as its own or inside it."""
         return next((one for one in self._shown if _is_inside(test, one)), None)
 
-    def moved(self) -> Iterator[tuple[Any, float]]:
-        """Bars that move on in every iteration, and by how much."""
-        return moves(list(_always(self.body)), self._names)
+    def milestones(self, numbers: range) -> dict[str, set[int]]:
+        """Return the iterations that must run, by the condition that names them.
+
+        Args:
+            numbers: Iterations that may be left out.
+
+        Returns:
+            By "line N: condition", or "line N: list" of iterations that is handed to a function with the number. Of a
+            condition that holds for none of the numbers there are none. One that only moves a bar is not among them:
+            see `bar_moves`.
+
+        Warns:
+            RuntimeWarning: A condition is on what the loop counts by itself, and comes less often for each number left
+                out.
+
+        Raises:
+            SkipGSError: A condition cannot be evaluated ahead.
+        """
+        for leaf in self.counted_by_itself():
+            caution(
+                f"Line {self.first_line + leaf.lineno - 1} of {self.file} ({ast.unparse(leaf)}) counts the iterations "
+                f"that run; where others are left out it happens less often. Decide by {self.target} if that matters."
+            )
+        found: dict[str, set[int]] = {}
+        for condition in self.conditions():
+            if condition.shown is not None:
+                continue
+            hits = condition.numbers(numbers, self._names)
+            found.setdefault(f"line {condition.line}: {condition.text}", set()).update(hits)
+        for node in self.lists():
+            try:
+                value = eval(compile(ast.Expression(node), self.file, "eval"), dict(self._names))
+            except Exception:
+                continue
+            if _is_list(value):
+                hits = {int(entry) for entry in value if entry in numbers}
+                if hits:
+                    found[f"line {self.first_line + node.lineno - 1}: {ast.unparse(node)}"] = hits
+        return found
+
+    def bar_moves(self, numbers: range) -> list[Moves]:
+        """Return how the loop moves bars on by hand, in iterations that need not run for it."""
+        found = [Moves(bar, by, numbers) for bar, by in moves(list(_always(self.body)), self._names)]
+        for condition in self.conditions():
+            if condition.shown is not None and condition.is_of(condition.shown):
+                hits = condition.holds(numbers, self._names)
+                if hits is not None:
+                    found += [Moves(bar, by, frozenset(hits)) for bar, by in moves(condition.shown.body, self._names)]
+        return found
 
     def leaf(self, node: ast.expr) -> _Leaf:
         if not self.mentions(node):
@@ -308,95 +354,26 @@ class _Inline(ast.NodeTransformer):
     visit_Attribute = visit_Name
 
 
-def milestones(
+def read_loop(
     code: CodeType,
     line: int,
-    numbers: range,
     names: Mapping[str, Any],
     pure: Iterable[str] = (),
     known: Mapping[str, Any] | None = None,
-) -> dict[str, set[int]]:
-    """Return the iterations that must run, by the condition that names them.
+) -> LoopCode:
+    """Return the loop that asks for its numbers.
 
     Args:
         code: Of the function that holds the loop.
         line: Where the function stands when the loop asks for a number: in the first lines of its `for`.
-        numbers: Iterations that may be left out.
         names: What the function had names for before its loop began.
         pure: Functions that only look at numbers, and may stand in conditions.
         known: Values of names that the loop assigns, where they are known before it.
 
-    Returns:
-        By "line N: condition", or "line N: list" of iterations that is handed to a function with the number. Of a
-        condition that holds for none of the numbers there are none. One that only moves a bar is not among them: see
-        `bar_moves`.
-
-    Warns:
-        RuntimeWarning: A condition is on what the loop counts by itself, and comes less often for each number left out.
-
     Raises:
-        SkipGSError: The source cannot be read, has no loop, or a condition cannot be evaluated ahead.
+        SkipGSError: The source cannot be read, or has no loop.
     """
     known = known or {}
-    names = {**names, **known}
-    loop = _loop_at(code, line, names, known, frozenset(pure))
-    for leaf in loop.counted_by_itself():
-        caution(
-            f"Line {loop.first_line + leaf.lineno - 1} of {loop.file} ({ast.unparse(leaf)}) counts the iterations "
-            f"that run; where others are left out it happens less often. Decide by {loop.target} if that matters."
-        )
-    found: dict[str, set[int]] = {}
-    for condition in loop.conditions():
-        if condition.shown is not None:
-            continue
-        hits = condition.numbers(numbers, names)
-        found.setdefault(f"line {condition.line}: {condition.text}", set()).update(hits)
-    for node in loop.lists():
-        try:
-            value = eval(compile(ast.Expression(node), loop.file, "eval"), dict(names))
-        except Exception:
-            continue
-        if _is_list(value):
-            hits = {int(entry) for entry in value if entry in numbers}
-            if hits:
-                found[f"line {loop.first_line + node.lineno - 1}: {ast.unparse(node)}"] = hits
-    return found
-
-
-def bar_moves(
-    code: CodeType,
-    line: int,
-    numbers: range,
-    names: Mapping[str, Any],
-    pure: Iterable[str] = (),
-    known: Mapping[str, Any] | None = None,
-) -> list[Moves]:
-    """Return how the loop moves bars on by hand, in iterations that need not run for it; as for `milestones`."""
-    known = known or {}
-    names = {**names, **known}
-    loop = _loop_at(code, line, names, known, frozenset(pure))
-    found = [Moves(bar, by, numbers) for bar, by in loop.moved()]
-    for condition in loop.conditions():
-        if condition.shown is not None and condition.is_of(condition.shown):
-            hits = condition.holds(numbers, names)
-            if hits is not None:
-                found += [Moves(bar, by, frozenset(hits)) for bar, by in moves(condition.shown.body, names)]
-    return found
-
-
-def _is_list(value: Any) -> bool:
-    """Whether this can be a list of iterations; a range without gaps is the whole run."""
-    if isinstance(value, range):
-        return value.step != 1
-    return isinstance(value, (list, tuple, set, frozenset)) and all(isinstance(entry, Integral) for entry in value)
-
-
-def _first_line(code: CodeType) -> int:
-    """Line of the file that is the first one of this code's source."""
-    return code.co_firstlineno if code.co_flags & inspect.CO_NEWLOCALS else 1
-
-
-def _loop_at(code: CodeType, line: int, names: Mapping[str, Any], known: Iterable[str], pure: frozenset[str]) -> _Loop:
     function = code.co_flags & inspect.CO_NEWLOCALS
     try:
         # Of a module, getsource gives what stands before its first function alone.
@@ -415,11 +392,23 @@ def _loop_at(code: CodeType, line: int, names: Mapping[str, Any], known: Iterabl
             and isinstance(node.target, ast.Name)
             and node.lineno <= line - first + 1 <= (node.iter.end_lineno or node.lineno)
         ):
-            return _Loop(node, tree, code, names, known, pure)
+            return LoopCode(node, tree, code, {**names, **known}, known, frozenset(pure))
     raise SkipGSError(
         f"Line {line} of {code.co_filename} is not in a loop over one number; "
         "write the loop as: for step in gate.iterations(range(...))."
     )
+
+
+def _is_list(value: Any) -> bool:
+    """Whether this can be a list of iterations; a range without gaps is the whole run."""
+    if isinstance(value, range):
+        return value.step != 1
+    return isinstance(value, (list, tuple, set, frozenset)) and all(isinstance(entry, Integral) for entry in value)
+
+
+def _first_line(code: CodeType) -> int:
+    """Line of the file that is the first one of this code's source."""
+    return code.co_firstlineno if code.co_flags & inspect.CO_NEWLOCALS else 1
 
 
 def _tests(body: list[ast.stmt], path: list[ast.expr]) -> Iterator[tuple[ast.expr, list[ast.expr]]]:

@@ -13,7 +13,7 @@ from skipgs_plug.core.pace.display import Bars
 from skipgs_plug.core.pace.growing import Growing
 from skipgs_plug.core.pace.loop_finder import LoopFinder
 from skipgs_plug.core.pace.loop_range import LoopRange, line_of, require_planned
-from skipgs_plug.core.pace.milestones import bar_moves, milestones
+from skipgs_plug.core.pace.milestones import read_loop
 from skipgs_plug.core.pace.policy import RefinementPolicy
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refining import Refining
@@ -210,12 +210,9 @@ class Phased(Pace):
         found: list[dict[str, set[int]]] = [{}, {}]
         if loop.source is not None and self._config.always is None:
             code, names = loop.source
-            line, known = line_of(code), self._known(names)
-            found = [
-                milestones(code, line, numbers, names, self._pure, known) if numbers else {}
-                for numbers in (grown, refined)
-            ]
-            self._bars = Bars(bar_moves(code, line, loop.numbers, names, self._pure, known))
+            read = read_loop(code, line_of(code), names, self._pure, self._known(names))
+            found = [read.milestones(numbers) if numbers else {} for numbers in (grown, refined)]
+            self._bars = Bars(read.bar_moves(loop.numbers))
         elif self._conditions is not None:
             found = list(self._conditions)  # of this loop, in which a state is loaded
         loop.source = None

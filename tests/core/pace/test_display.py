@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from skipgs_plug import SkipGate
 from skipgs_plug.core.pace.loop_range import line_of
-from skipgs_plug.core.pace.milestones import bar_moves, milestones
+from skipgs_plug.core.pace.milestones import read_loop
 
 NUMBERS = range(1, 101)
 
@@ -36,8 +36,8 @@ def read(loop):
     def stop(**names):
         code = sys._getframe(1).f_code
         names = {**loop.__globals__, **names}
-        line = line_of(code)
-        caught.extend([milestones(code, line, NUMBERS, names), bar_moves(code, line, NUMBERS, names)])
+        read = read_loop(code, line_of(code), names)
+        caught.extend([read.milestones(NUMBERS), read.bar_moves(NUMBERS)])
         raise Stopped
 
     with pytest.raises(Stopped):

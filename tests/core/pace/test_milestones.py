@@ -9,7 +9,7 @@ import pytest
 
 from skipgs_plug import SkipGSError
 from skipgs_plug.core.pace.loop_range import line_of
-from skipgs_plug.core.pace.milestones import milestones
+from skipgs_plug.core.pace.milestones import read_loop
 
 NUMBERS = range(50, 100)
 
@@ -23,7 +23,7 @@ def found(loop, pure=(), known=None):
 
     def stop(**names):
         code = sys._getframe(1).f_code
-        caught.update(milestones(code, line_of(code), NUMBERS, {**loop.__globals__, **names}, pure, known))
+        caught.update(read_loop(code, line_of(code), {**loop.__globals__, **names}, pure, known).milestones(NUMBERS))
         raise Stopped
 
     with pytest.raises(Stopped):
