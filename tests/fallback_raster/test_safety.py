@@ -247,6 +247,28 @@ def test_a_damaged_kernel_cache_is_rebuilt_and_compiling_prints_nothing(tmp_path
     assert compiled.read_bytes() == good
 
 
+def test_threads_that_need_warp_at_once_start_it_once() -> None:
+    code = """
+import threading, time
+import warp
+from skipgs_plug.fallback_raster.runtime.native import _warp
+
+started, init = [], warp.init
+
+def slow_init():
+    started.append(threading.get_ident())
+    time.sleep(0.3)
+    init()
+
+warp.init = slow_init
+threads = [threading.Thread(target=_warp) for _ in range(4)]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+assert len(started) == 1, started
+"""
+    run("-c", code)
+
+
 def test_a_cache_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     code = "import sys\nfrom skipgs_plug.commands.doctor import check_backend\ncheck_backend('warp')"

@@ -10,6 +10,7 @@ import linecache
 import os
 import struct
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -88,8 +89,18 @@ def _packer(name: str, kinds: dict[str, Any]) -> Callable[..., bytes]:
     return pack
 
 
-@functools.cache
+# Kernels load on several threads at once. Two threads that start Warp together make it two runtimes, and the second one
+# keeps its kernels in a folder inside the first one's, where no later process looks for them.
+_starting = threading.Lock()
+
+
 def _warp() -> Any:
+    with _starting:
+        return _started_warp()
+
+
+@functools.cache
+def _started_warp() -> Any:
     try:
         wp: Any = importlib.import_module("warp")
     except ImportError as error:
