@@ -9,7 +9,9 @@ import torch
 
 from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
+from skipgs_plug.adapters.loop_bounds import ASSIGNED
 from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.adapters.unknown_forks import CALLS, Survey
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
@@ -18,6 +20,7 @@ from skipgs_plug.core.views import view_key
 MODULE, STEP = "source.trainer", "train_step_gs"
 EXPECTED = (STEP, "train", "GS", "gs_step", "training_config", "scene")
 EVENTS = ("prune_points", "reset_opacity", "training_setup")
+CHANGES = (*EVENTS, "densify_and_prune", ASSIGNED)  # opacities are assigned to with `reduce_opacity`
 
 
 class EDGS(AbstractAdapter):
@@ -64,12 +67,14 @@ class EDGS(AbstractAdapter):
                 hooks.view(camera.image_name)
             return original(*args, **kwargs)
 
+        gaussians = type(trainer.GS.gaussians)
+        survey = Survey(self, [gaussians], CALLS, CHANGES)
+        survey.read(trainer.train, "self.gs_step", "self.training_step")
         hooks.wrap(trainer, STEP, stepped)
         hooks.wrap(trainer.GS, "forward", rendered)
-        gaussians = type(trainer.GS.gaussians)
         hooks.events(gaussians, *(name for name in EVENTS if hasattr(gaussians, name)))
         hooks.gate_tensor_backward(STEP)
         self.output_folder = getattr(trainer.scene, "model_path", None)
         end = int(trainer.training_config.densify_until_iter)
         views = [view_key(camera.image_name) for camera in trainer.scene.getTrainCameras()]
-        hooks.ready(TrainerInfo(end, view_names=views, gradients_read_until=end))
+        hooks.ready(TrainerInfo(survey.start_after_changes(end), view_names=views, gradients_read_until=end))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import operator
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.adapters.unknown_forks import Survey
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
@@ -20,6 +22,18 @@ EVENTS = (
     "mcmc_densification",
     "reset_opacities",
     "importance_pruning",
+)
+# Methods of the Gaussians that callbacks run. Prunes by importance go on after densification, and pause the gate.
+KNOWN = (
+    "apply_morton_ordering",
+    "compute_3d_filter",
+    "importance_pruning",
+    "increase_used_sh_degree",
+    "post_optimizer_step",
+    "prune",
+    "reset_densification_info",
+    "sort",
+    "update_learning_rate",
 )
 
 
@@ -75,10 +89,29 @@ class FasterGS(AbstractAdapter):
             return original(gaussians, inject_noise=inject_noise and not hooks.state.skipped)
 
         gaussians = type(trainer.model.gaussians)
+        survey = Survey(self, [gaussians], KNOWN, set(EVENTS) - set(KNOWN))
+        for callback, ends in callbacks(trainer):
+            survey.read(callback, "iteration", values={"self": trainer}, end=ends)
         hooks.wrap(trainer.renderer, "render_image_training", rendered)
         hooks.wrap(gaussians, "post_optimizer_step", stepped)
         hooks.events(gaussians, *(name for name in EVENTS if hasattr(gaussians, name)))
         hooks.gate_tensor_backward(LOOP)
         self.output_folder = str(trainer.output_directory) if hasattr(trainer, "output_directory") else None
-        end = int(trainer.DENSIFICATION_END_ITERATION)
-        hooks.ready(TrainerInfo(end + 1, max_steps=int(trainer.NUM_ITERATIONS) - 1, gradients_read_until=end))
+        end, last = int(trainer.DENSIFICATION_END_ITERATION), int(trainer.NUM_ITERATIONS) - 1
+        start = survey.start_after_changes(end + 1, last)
+        hooks.ready(TrainerInfo(start, max_steps=last, gradients_read_until=end))
+
+
+def callbacks(trainer: Any) -> Iterator[tuple[Callable[..., Any], int | None]]:
+    """Yield the callbacks of a trainer that run during training, and the first iteration that is too late for each."""
+    for name in dir(type(trainer)):
+        callback = getattr(type(trainer), name, None)
+        if callback is None or getattr(callback, "callback_type", None) != 0:
+            continue
+        active, end = (option(trainer, getattr(callback, key, None)) for key in ("active", "end_iteration"))
+        yield callback, 0 if active is False else None if end is None else int(end) + 1
+
+
+def option(trainer: Any, value: Any) -> Any:
+    """Return the value of an option of a callback, which may be the name of one of the trainer's."""
+    return operator.attrgetter(value)(trainer) if isinstance(value, str) else value

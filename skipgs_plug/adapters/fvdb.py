@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -10,6 +11,7 @@ import torch
 from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.adapters.unknown_forks import Survey
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
@@ -18,6 +20,7 @@ MODULE, LOOP = "fvdb_reality_capture.training.scene_optimization_runner", "train
 EXPECTED = (LOOP, "config", "training_dataset", "optimizer", "_global_step", "_start_step")
 BATCH = "batch"  # one key for the joint loss of random batches
 EVENTS = ("refine_gaussians", "reset_opacities", "remove_gaussians")
+KNOWN = ("step", "zero_grad", "state_dict")  # further methods of the optimizer that the loop runs
 
 
 class FVDB(AbstractAdapter):
@@ -89,4 +92,7 @@ class FVDB(AbstractAdapter):
         end = int(config.refine_stop_epoch * len(dataset))
         if config.optimize_camera_poses:
             end = max(end, int(config.pose_opt_stop_epoch * len(dataset)))
-        hooks.ready(TrainerInfo(end, max_steps=config.max_steps, gradients_read_until=end))
+        survey = Survey(self, [type(optimizer)], KNOWN, EVENTS)
+        survey.read(getattr(runner, LOOP), "self._global_step")
+        start = survey.start_after_changes(end, math.inf if config.max_steps is None else config.max_steps)
+        hooks.ready(TrainerInfo(start, max_steps=config.max_steps, gradients_read_until=end))

@@ -14,6 +14,7 @@ from skipgs_plug.adapters.gsplat_strategy import (
     leave_out_noise,
     opacity_resets,
     strategy_events,
+    survey_of,
 )
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
@@ -82,6 +83,8 @@ class GsplatRunner(AbstractAdapter):
             )
         strategy = runner.cfg.strategy
         refuse_frozen(runner.cfg, hooks)
+        survey = survey_of(self, strategy)
+        survey.read(runner.train, "step")
         batched = runner.cfg.batch_size > 1
         names = [BATCH] if batched else view_names(runner)
         # Id of the view rendered last. It lies on the device: it is on its way before the render is launched.
@@ -112,15 +115,16 @@ class GsplatRunner(AbstractAdapter):
         catch_up_schedulers(hooks, "train")
         self._relocations = leave_out_noise(hooks, strategy, type(strategy))
         self.output_folder = runner.cfg.result_dir
+        last = runner.cfg.max_steps - 1
         hooks.ready(
             TrainerInfo(
-                strategy.refine_stop_iter,
+                survey.start_after_changes(strategy.refine_stop_iter, last),
                 view_names=names,
                 epoch=-(-len(runner.trainset) // runner.cfg.batch_size),
-                max_steps=runner.cfg.max_steps - 1,
+                max_steps=last,
                 world_size=runner.world_size,
                 gradients_read_until=gradients_read_until(strategy),
-                densification=strategy_events(strategy),
+                densification=None if survey.unknown else strategy_events(strategy),
             )
         )
 

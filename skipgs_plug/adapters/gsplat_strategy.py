@@ -2,11 +2,36 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from typing import Any
 
-from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.adapters.unknown_forks import Survey
+from skipgs_plug.core.hooks import Adapter, Hooks
 from skipgs_plug.core.trainer_info import Densification
+
+OPERATIONS = "gsplat.strategy.ops"  # module of the functions by which strategies change the model
+CHANGES = (
+    "_add_new_gs",
+    "_grow_gs",
+    "_prune_gs",
+    "_relocate_gs",
+    "duplicate",
+    "relocate",
+    "remove",
+    "reset_opa",
+    "sample_add",
+    "split",
+)
+# Further methods of a strategy, and functions, that change no parameters: noise is left out with the gradient step.
+KNOWN = ("_update_state", "check_sanity", "initialize_state", "inject_noise_to_position")
+STAGES = ("step_pre_backward", "step_post_backward")
+
+
+def survey_of(adapter: Adapter, strategy: Any, *owners: Any, through: Iterable[str] = ()) -> Survey:
+    """Return a survey of calls by which a strategy, or more owners of the model, change it; see `Survey`."""
+    operations = [sys.modules[OPERATIONS]] if OPERATIONS in sys.modules else []
+    return Survey(adapter, [type(strategy), *operations, *owners], KNOWN, CHANGES, [*STAGES, *through])
 
 
 def is_mcmc(strategy: Any) -> bool:

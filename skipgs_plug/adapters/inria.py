@@ -23,7 +23,7 @@ from skipgs_plug.adapters.drift_check import DriftCheck
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import last_calls
 from skipgs_plug.adapters.loop_code import LOOP, LoopCode
-from skipgs_plug.adapters.unknown_forks import BY_HAND, Unrecognised, unrecognised
+from skipgs_plug.adapters.unknown_forks import BY_HAND, Unrecognised, begin_after, left_alone, unrecognised
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
@@ -107,8 +107,7 @@ class InriaFamily(AbstractAdapter):
         if self._unknown.listed:
             caution(
                 f"{self.difference(code)}. Recognised: {', '.join(self.renders[:1])}, backward, "
-                f"{', '.join(sorted(self._unknown.known))}. Not recognised, and left to go on in skipped iterations: "
-                f"{self._unknown.listed}."
+                f"{', '.join(sorted(self._unknown.known))}. {left_alone(self._unknown.listed)}"
             )
 
     def difference(self, code: LoopCode) -> str:
@@ -310,14 +309,7 @@ class InriaFamily(AbstractAdapter):
         start = self.start_iter(opt, loop)
         if self._code is None or self._code.syntax is None:
             return start
-        ends = last_calls(self._code.syntax, self.may_end_later(), loop)
-        late = {name: end for name, end in ends.items() if start < end <= opt.iterations}
-        if late:
-            listed = ", ".join(f"{name}() until iteration {end - 1}" for name, end in sorted(late.items()))
-            caution(
-                f"The gate begins with iteration {max(late.values())} in place of {start}: the loop calls {listed}."
-            )
-        return max([start, *late.values()])
+        return begin_after(start, opt.iterations, last_calls(self._code.syntax, self.may_end_later(), loop))
 
     def may_end_later(self) -> frozenset[str]:
         """Methods of the model that the gate does not begin before the loop has called for the last time."""

@@ -12,6 +12,7 @@ import torch
 from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.adapters.unknown_forks import Survey
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
@@ -20,6 +21,7 @@ MODULE, LOOP = "litegs.training.trainer", "start"
 EXPECTED = (LOOP, "densify", "render", "StatisticsHelperInst")
 CONTROLLER = "DensityControllerTamingGS"
 EVENTS = ("split_and_clone", "prune", "reset_opacity")
+KNOWN = ("is_densify_actived", "_get_params_from_optimizer")  # further methods that a controller runs
 INDEX = 11  # place of the tensor that holds the view's index among the arguments of `render_preprocess`
 
 
@@ -43,6 +45,7 @@ class LiteGS(AbstractAdapter):
         super().__init__(trainer)
         self._step: int | None = None
         self._names: list[str] = []
+        self._loop: Callable[..., Any]
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:
@@ -74,6 +77,7 @@ class LiteGS(AbstractAdapter):
                     self._begins(hooks, frame, args)
             return original(*args, **kwargs)
 
+        self._loop = names[LOOP]
         hooks.wrap(names["render"], "render_preprocess", preprocessed)
         controller = getattr(names["densify"], CONTROLLER)
         hooks.events(controller, *(name for name in EVENTS if hasattr(controller, name)))
@@ -93,12 +97,14 @@ class LiteGS(AbstractAdapter):
         views = len(loop["train_loader"])
         self._names = [str(frame.name) for frame in loop["trainingset"].frames]
         self.output_folder = loop["lp"].model_path
-        end = int(loop["dp"].densify_until) * views
+        end, last = int(loop["dp"].densify_until) * views, int(loop["total_epoch"]) * views - 1
+        survey = Survey(self, [type(loop["density_controller"])], KNOWN, EVENTS, through=["step"])
+        survey.read(self._loop, "epoch", values=loop)
         hooks.ready(
             TrainerInfo(
-                end,
+                survey.start_after_changes(end, last, unit=views),
                 view_names=self._names,
-                max_steps=int(loop["total_epoch"]) * views - 1,
+                max_steps=last,
                 gradients_read_until=end,
             )
         )

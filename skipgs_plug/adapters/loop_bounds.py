@@ -1,35 +1,204 @@
-"""The iteration after which a training loop no longer calls a method, read from its conditions."""
+"""The calls that a training loop makes, and the iteration after which it no longer makes each of them.
+
+Both are read from the source: of the loop, and of the functions of the same project that it calls.
+"""
 
 from __future__ import annotations
 
 import ast
+import builtins
+import functools
 import inspect
+import math
 import textwrap
-from collections.abc import Collection, Iterator, Mapping
+from collections import ChainMap, Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from types import CodeType, FunctionType, MethodType
+from typing import Any, NamedTuple
 
 NUMBER = "iteration"  # the loop's variable in the whole Inria family
+ASSIGNED = "data ="  # stands for an assignment to a tensor's `data` among the names of calls
+# Functions that may be evaluated in a condition: they change nothing.
+PURE = {name: getattr(builtins, name) for name in ("abs", "int", "float", "len", "max", "min", "round")}
+# Calls inside calls that are read. A trainer's loop reaches its strategy in three; more of them reach libraries.
+MAX_DEPTH = 5
+_NEGATED = {ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt}
+_MIRRORED = {ast.Lt: ast.Gt, ast.LtE: ast.GtE, ast.Gt: ast.Lt, ast.GtE: ast.LtE, ast.Eq: ast.Eq}
+
+
+class Scope(NamedTuple):
+    """Names of a function that is read.
+
+    Attributes:
+        numbers: Expressions that hold the iteration's number, as they stand in the source.
+        values: Names and their values when the loop begins.
+        code: Code of the function; None for the loop of a script.
+    """
+
+    numbers: frozenset[str]
+    values: Mapping[str, Any]
+    code: CodeType | None = None
+
+
+class CallReader:
+    """Reads functions, and notes the end of every call in them.
+
+    A call ends when an `if` around it bounds the number from above by something that is known when the loop begins, as
+    in `iteration < opt.prune_until_iter`, `iteration == 300` or `iteration in args.prune_iterations`. A guard before it
+    does the same: `if step >= self.stop: return`.
+
+    Args:
+        projects: Top-level packages whose functions are read where they are called; more may be added.
+        stops: Names of functions that are not read.
+        windows: Names of functions `f(number, start, end, ...)` that tell whether a number lies between two others. A
+            negative start means that it never does, a negative end that there is no end.
+
+    Attributes:
+        ends: For each name that is called, the first iteration that is too late for it. It is the latest of all places
+            with that name, and None if one of them has no end.
+    """
+
+    def __init__(self, projects: Iterable[str] = (), stops: Iterable[str] = (), windows: Iterable[str] = ()) -> None:
+        self.ends: dict[str, int | None] = {}
+        self.projects, self._stops = set(projects), frozenset(stops)
+        self._windows = frozenset(windows)
+        self._open: list[CodeType] = []  # functions that are being read
+
+    def read(self, function: Any, numbers: Collection[str], values: Mapping[str, Any], end: int | None = None) -> None:
+        """Read a function or a bound method, called until iteration `end` (None: to the end of the run).
+
+        Args:
+            function: The function; one without a Python source is passed over.
+            numbers: Expressions that hold the iteration's number in it.
+            values: Values of its arguments, as far as they are known.
+            end: First iteration that is too late for the call of this function.
+        """
+        plain = undecorated(function)
+        syntax = None if plain is None else _syntax_of(plain)
+        if plain is None or syntax is None or plain.__code__ in self._open or len(self._open) == MAX_DEPTH:
+            return
+        owner = getattr(function, "__self__", None)
+        if owner is not None and syntax.args.args:
+            values = {syntax.args.args[0].arg: owner, **values}
+        self._open.append(plain.__code__)
+        names = ChainMap(dict(values), plain.__globals__)
+        self.read_body(syntax, Scope(frozenset(numbers), names, plain.__code__), end)
+        self._open.pop()
+
+    def read_body(self, syntax: ast.FunctionDef, scope: Scope, end: int | None = None) -> None:
+        """Read the body of a function whose names are known."""
+        stores = Counter(
+            node.id for node in ast.walk(syntax) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+        )
+        known: dict[str, Any] = {}  # names that are assigned once, from values that are known
+        scope = scope._replace(values=ChainMap(known, *_maps(scope.values)))
+        self._body(syntax.body, scope, end, stores, known)
+
+    def _body(
+        self, body: list[ast.stmt], scope: Scope, end: int | None, stores: Counter[str], known: dict[str, Any]
+    ) -> None:
+        for statement in body:
+            if isinstance(statement, ast.If):
+                self._calls(statement.test, scope, end)
+                inside = _sooner(end, self._end(statement.test, scope))
+                after = _sooner(end, self._end(statement.test, scope, holds=False))
+                self._body(statement.body, scope, inside, stores, known)
+                self._body(statement.orelse, scope, after, stores, known)
+                if isinstance(statement.body[-1], (ast.Return, ast.Continue)):
+                    end = after
+                continue
+            blocks = [block for field in ("body", "orelse", "finalbody") for block in getattr(statement, field, [])]
+            blocks += [inner for handler in getattr(statement, "handlers", []) for inner in handler.body]
+            blocks += [inner for case in getattr(statement, "cases", []) for inner in case.body]
+            if isinstance(statement, (ast.Assign, ast.AnnAssign)):
+                self._assign(statement, scope, stores, known)
+            self._calls(statement, scope, end, {id(node) for block in blocks for node in ast.walk(block)})
+            self._body(blocks, scope, end, stores, known)
+
+    def _assign(
+        self, statement: ast.Assign | ast.AnnAssign, scope: Scope, stores: Counter[str], known: dict[str, Any]
+    ) -> None:
+        match statement:
+            case ast.Assign([ast.Name(name)], value) | ast.AnnAssign(ast.Name(name), _, ast.expr() as value):
+                found = _value(value, scope)
+                if stores[name] == 1 and found is not None:
+                    known[name] = found
+
+    def _calls(self, part: ast.AST, scope: Scope, end: int | None, but: Collection[int] = ()) -> None:
+        """Note the calls in a statement or an expression, but for these nodes, and read the functions called."""
+        for node in ast.walk(part):
+            if id(node) in but:
+                continue
+            if isinstance(node, ast.Attribute) and node.attr == "data" and isinstance(node.ctx, ast.Store):
+                self.note(ASSIGNED, end)
+            elif isinstance(node, ast.Call):
+                name = getattr(node.func, "attr", getattr(node.func, "id", None))
+                if name is not None:
+                    self.note(name, end)
+                    self._follow(name, node, scope, end)
+
+    def note(self, name: str, end: int | None) -> None:
+        """Note a call that iteration `end` is too late for; None if it has no end."""
+        before = self.ends.get(name, 0)
+        self.ends[name] = None if end is None or before is None else max(before, end)
+
+    def _follow(self, name: str, call: ast.Call, scope: Scope, end: int | None) -> None:
+        if not self.projects or name in self._stops:
+            return
+        function = _called(call.func, scope)
+        plain = undecorated(function)
+        syntax = None if plain is None else _syntax_of(plain)
+        if plain is None or syntax is None or str(plain.__module__).partition(".")[0] not in self.projects:
+            return
+        owner = getattr(function, "__self__", None)
+        parameters = [one.arg for one in syntax.args.args][owner is not None :]
+        given = [*zip(parameters, call.args, strict=False), *((one.arg, one.value) for one in call.keywords if one.arg)]
+        numbers = {parameter for parameter, value in given if ast.unparse(value) in scope.numbers}
+        # What hangs on the object has the same name in all of its methods.
+        numbers |= {text for text in scope.numbers if text.startswith("self.") and owner is scope.values.get("self")}
+        values = {parameter: _value(value, scope) for parameter, value in given if parameter not in numbers}
+        self.read(function, numbers, {text: value for text, value in values.items() if value is not None}, end)
+
+    def _end(self, test: ast.expr, scope: Scope, holds: bool = True) -> int | None:
+        """First iteration from which a condition is false for good (or true, unless `holds`); None if not known."""
+        match test:
+            case ast.UnaryOp(ast.Not(), operand):
+                return self._end(operand, scope, not holds)
+            case ast.BoolOp(operator, parts):
+                ends = [self._end(part, scope, holds) for part in parts]
+                known = [end for end in ends if end is not None]
+                if isinstance(operator, ast.And) is holds:
+                    return min(known, default=None)
+                return max(known) if len(known) == len(ends) else None
+            case ast.Compare(left, [operator], [right]) if not holds:
+                negated = _NEGATED.get(type(operator))
+                return None if negated is None else _end_of_one(left, negated(), right, scope)
+            case ast.Compare(left, operators, others) if holds:
+                sides = [left, *others]
+                limits = [_end_of_one(*one, scope) for one in zip(sides, operators, others, strict=False)]
+                return min((end for end in limits if end is not None), default=None)
+            case ast.Call(ast.Name(name), [number, first, last, *_]) if holds and name in self._windows:
+                start, end = _value(first, scope), _value(last, scope)
+                if ast.unparse(number) not in scope.numbers or not isinstance(start, int) or not isinstance(end, int):
+                    return None
+                return 0 if start < 0 else end if end >= 0 else None
+        return None
 
 
 def last_calls(function: ast.FunctionDef, names: Collection[str], values: Mapping[str, Any]) -> dict[str, int]:
     """Return the first iteration that is too late for each of these calls, for calls that end at some iteration.
 
-    A call ends when an `if` around it bounds the iteration from above by something that is known when the loop begins,
-    as in `iteration < opt.prune_until_iter`, `iteration == 300` or `iteration in args.prune_iterations`. Where a
-    method is called in several places, the latest end counts; a place without an end leaves the method out.
+    Functions of the loop's own module are read too.
 
     Args:
         function: The function that holds the loop.
         names: Names of the methods.
         values: Names of the loop and their values when it begins.
     """
-    ends: dict[str, int | None] = {}
-    for name, end in _calls(function.body, None, values):
-        if name in names:
-            before = ends.get(name, 0)
-            ends[name] = None if end is None or before is None else max(before, end)
-    return {name: end for name, end in ends.items() if end is not None}
+    reader = CallReader(projects={str(values.get("__name__", "__main__")).partition(".")[0]}, stops=names)
+    reader.read_body(function, Scope(frozenset({NUMBER}), values))
+    return {name: end for name, end in reader.ends.items() if name in names and end is not None}
 
 
 def function_of(source: Path | Any, name: str) -> ast.FunctionDef | None:
@@ -42,75 +211,95 @@ def function_of(source: Path | Any, name: str) -> ast.FunctionDef | None:
     return next((node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name), None)
 
 
-def _calls(body: list[ast.stmt], end: int | None, values: Mapping[str, Any]) -> Iterator[tuple[str, int | None]]:
-    """Yield the name of each method that is called, and the first iteration that is too late for it."""
-    for statement in body:
-        if isinstance(statement, ast.If):
-            own = _end(statement.test, values)
-            yield from _calls(statement.body, end if own is None else own if end is None else min(own, end), values)
-            yield from _calls(statement.orelse, end, values)
-            continue
-        blocks = [block for field in ("body", "orelse", "finalbody") for block in getattr(statement, field, [])]
-        blocks += [inner for handler in getattr(statement, "handlers", []) for inner in handler.body]
-        yield from _calls(blocks, end, values)
-        inside = {id(node) for block in blocks for node in ast.walk(block)}
-        for node in ast.walk(statement):
-            if id(node) not in inside and isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-                yield node.func.attr, end
-
-
-def _end(test: ast.expr, values: Mapping[str, Any]) -> int | None:
-    """First iteration from which a condition is false for good; None where that is not known."""
-    if isinstance(test, ast.BoolOp):
-        ends = [_end(part, values) for part in test.values]
-        known = [end for end in ends if end is not None]
-        if isinstance(test.op, ast.And):
-            return min(known, default=None)
-        return max(known) if len(known) == len(ends) else None
-    if not isinstance(test, ast.Compare):
+def undecorated(function: Any) -> FunctionType | None:
+    """Return the function under its decorators, also where a decorator does not tell; None if it is no function."""
+    function = function.__func__ if isinstance(function, MethodType) else function
+    if not isinstance(function, FunctionType):
         return None
-    sides = [test.left, *test.comparators]
-    limits = [
-        end
-        for left, operator, right in zip(sides, test.ops, sides[1:], strict=False)
-        if (end := _end_of_one(left, operator, right, values)) is not None
-    ]
-    return min(limits, default=None)
+    function = inspect.unwrap(function)
+    for cell in getattr(function, "__closure__", None) or ():
+        held = getattr(cell, "cell_contents", None)
+        if isinstance(held, FunctionType) and held.__name__ == function.__name__ and held is not function:
+            return undecorated(held)
+    return function if isinstance(function, FunctionType) else None
 
 
-def _end_of_one(left: ast.expr, operator: ast.cmpop, right: ast.expr, values: Mapping[str, Any]) -> int | None:
-    if _is_number(right) and isinstance(operator, (ast.Gt, ast.GtE, ast.Eq)):  # X > iteration
-        left, right = right, left
-        operator = {ast.Gt: ast.Lt, ast.GtE: ast.LtE, ast.Eq: ast.Eq}[type(operator)]()
-    if not _is_number(left):
-        return None
-    limit = _value(right, values)
-    if isinstance(operator, ast.In) and isinstance(limit, (list, tuple, set, frozenset, range)):
-        return max((int(number) for number in limit), default=0) + 1
-    if isinstance(limit, bool) or not isinstance(limit, (int, float)):
-        return None
-    if isinstance(operator, ast.Lt):
-        return int(-(-limit // 1))
-    if isinstance(operator, (ast.LtE, ast.Eq)):
-        return int(limit) + 1
+@functools.lru_cache(maxsize=1024)
+def _syntax_of(function: FunctionType) -> ast.FunctionDef | None:
+    return function_of(function, function.__code__.co_name)
+
+
+def _called(node: ast.expr, scope: Scope) -> Any:
+    """The function that an expression names; None if that is not known. Properties are not run."""
+    match node:
+        case ast.Name(name):
+            return scope.values.get(name)
+        case ast.Attribute(ast.Call(ast.Name("super"), []), name):
+            return _inherited(name, scope)
+        case ast.Attribute(place, name):
+            owner = _value(place, scope)
+            found = inspect.getattr_static(owner, name, None)
+            if isinstance(found, FunctionType) and not inspect.isclass(owner) and not inspect.ismodule(owner):
+                in_class = inspect.getattr_static(type(owner), name, None) is found
+                return MethodType(found, owner) if in_class else found
+            return found.__func__ if isinstance(found, staticmethod) else found
     return None
 
 
-def _is_number(node: ast.expr) -> bool:
-    return isinstance(node, ast.Name) and node.id == NUMBER
+def _inherited(name: str, scope: Scope) -> Any:
+    """The method that `super().name` is, in the function that is read."""
+    owner = scope.values.get("self")
+    above = iter(type(owner).__mro__)
+    for cls in above:
+        own = undecorated(vars(cls).get(name))
+        if own is not None and own.__code__ is scope.code:
+            break
+    found = next((vars(cls)[name] for cls in above if isinstance(vars(cls).get(name), FunctionType)), None)
+    return None if found is None else MethodType(found, owner)
 
 
-def _value(node: ast.expr, values: Mapping[str, Any]) -> Any:
-    """Value of an expression of names, attributes and numbers; None for anything else."""
-    allowed = (ast.Name, ast.Attribute, ast.Constant, ast.BinOp, ast.UnaryOp, ast.List, ast.Tuple)
-    leaves = (ast.expr_context, ast.operator, ast.unaryop)
-    if not all(isinstance(part, (*allowed, *leaves)) for part in ast.walk(node)) or NUMBER in _names(node):
+def _sooner(one: int | None, other: int | None) -> int | None:
+    return one if other is None else other if one is None else min(one, other)
+
+
+def _maps(values: Mapping[str, Any]) -> list[Any]:
+    return values.maps if isinstance(values, ChainMap) else [values]
+
+
+def _end_of_one(left: ast.expr, operator: ast.cmpop, right: ast.expr, scope: Scope) -> int | None:
+    if ast.unparse(right) in scope.numbers and type(operator) in _MIRRORED:  # X > iteration
+        left, right = right, left
+        operator = _MIRRORED[type(operator)]()
+    if ast.unparse(left) not in scope.numbers:
+        return None
+    limit = _value(right, scope)
+    if isinstance(operator, ast.In) and isinstance(limit, (list, tuple, set, frozenset, range)):
+        return max((int(number) for number in limit), default=0) + 1
+    if isinstance(limit, bool) or not isinstance(limit, (int, float)) or not math.isfinite(limit):
+        return None
+    if isinstance(operator, ast.Lt):
+        return math.ceil(limit)
+    if isinstance(operator, (ast.LtE, ast.Eq)):
+        return math.floor(limit) + 1
+    return None
+
+
+def _value(node: ast.expr, scope: Scope) -> Any:
+    """Value of an expression of names, attributes, numbers and pure functions; None for anything else."""
+    if not all(_is_plain(part) for part in ast.walk(node)) or any(text in scope.numbers for text in _places(node)):
         return None
     try:
-        return eval(compile(ast.Expression(node), "<condition>", "eval"), {"__builtins__": {}}, values)
+        return eval(compile(ast.Expression(node), "<condition>", "eval"), {"__builtins__": PURE}, scope.values)
     except Exception:
         return None
 
 
-def _names(node: ast.expr) -> set[str]:
-    return {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
+def _is_plain(part: ast.AST) -> bool:
+    if isinstance(part, ast.Call):
+        return isinstance(part.func, ast.Name) and part.func.id in PURE and not part.keywords
+    allowed = (ast.Name, ast.Attribute, ast.Constant, ast.BinOp, ast.UnaryOp, ast.List, ast.Tuple)
+    return isinstance(part, (*allowed, ast.expr_context, ast.operator, ast.unaryop))
+
+
+def _places(node: ast.expr) -> Iterator[str]:
+    return (ast.unparse(part) for part in ast.walk(node) if isinstance(part, (ast.Name, ast.Attribute)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from skipgs_plug.adapters.gsplat_strategy import (
     leave_out_noise,
     opacity_resets,
     strategy_events,
+    survey_of,
 )
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.loss_scaler import guard_scaler
@@ -23,6 +24,7 @@ from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 
 LOOP = "train_iteration"
+CALLBACKS = ("step_cb", "step_post_backward")  # of splatfacto
 
 
 class Nerfstudio(AbstractAdapter):
@@ -82,6 +84,10 @@ class Nerfstudio(AbstractAdapter):
                 hooks.view(lambda: names[int(index)])
             return camera, batch
 
+        strategy = getattr(pipeline.model, "strategy", None)
+        survey = survey_of(self, strategy, type(pipeline.model), through=CALLBACKS)
+        for callback, end in callbacks(trainer):
+            survey.read(callback, "step", "self.step", end=end)
         hooks.wrap(pipeline, "get_train_loss_dict", forwarded)
         hooks.wrap(pipeline.datamanager, "next_train", batch_made)
         hooks.gate_tensor_backward(LOOP)
@@ -89,17 +95,17 @@ class Nerfstudio(AbstractAdapter):
         catch_up_schedulers(hooks, "scheduler_step_all")
         guard_scaler(hooks, trainer.grad_scaler)
         hooks.optimizer_names(lambda: trainer.optimizers.optimizers)
-        strategy = getattr(pipeline.model, "strategy", None)
         self._relocations = leave_out_noise(hooks, strategy, strategy)
         self.output_folder = getattr(trainer, "base_dir", None)
+        start, last = getattr(strategy, "refine_stop_iter", None), trainer.config.max_num_iterations - 1
         hooks.ready(
             TrainerInfo(
-                getattr(strategy, "refine_stop_iter", None),
+                None if start is None else survey.start_after_changes(start, last),
                 view_names=names,
-                max_steps=trainer.config.max_num_iterations - 1,
+                max_steps=last,
                 world_size=trainer.world_size,
                 gradients_read_until=gradients_read_until(strategy),
-                densification=strategy_events(strategy),
+                densification=None if survey.unknown else strategy_events(strategy),
             )
         )
 
@@ -116,6 +122,13 @@ class Nerfstudio(AbstractAdapter):
             evaluates = any(interval and n % interval == 0 for interval in every)
             if evaluates or any(n % steps in (0, steps - 1) for steps in gathered):
                 yield n
+
+
+def callbacks(trainer: Any) -> Iterator[tuple[Callable[..., Any], int | None]]:
+    """Yield the functions that the trainer calls around iterations, and the first step that is too late for each."""
+    for callback in trainer.callbacks:
+        steps = getattr(callback, "iters", None)
+        yield getattr(callback, "func", callback), None if steps is None else max(steps, default=-1) + 1
 
 
 def view_names(files: list[Path]) -> list[str]:

@@ -11,14 +11,15 @@ import torch
 
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 
 # What `step` calls on the outermost trainer, and what is looked at.
 EXPECTED = ("step", "curr_step", "optimizer", "update_learning_rate", "preprocess", "before_optim_hook", "optim_step")
-# Last iteration of each kind of densification, inclusive.
-BOUNDS = ("densify_until_iter", "prune_until_iter", "opacity_reset_until_iter")
+BOUND = "_until_iter"  # ends the name of a part's last iteration (inclusive) with a change of its kind
+BOUNDS = ("densify_until_iter", "prune_until_iter", "opacity_reset_until_iter")  # of the package itself
 RAISES = "sh_degree_up_interval"  # of the wrapper that raises the SH degree
 
 
@@ -77,8 +78,13 @@ class StepTrainer(AbstractAdapter):
                 f"Adapter {self.name!r} expects a trainer with {', '.join(missing)}, as in {self.checked}."
             )
 
-        bounds = [getattr(part, name) for part in layers(trainer) for name in BOUNDS if hasattr(part, name)]
-        end = max(bounds) + 1 if bounds else None
+        bounds = {name: getattr(part, name) for part in layers(trainer) for name in dir(part) if name.endswith(BOUND)}
+        end = max(bounds.values()) + 1 if bounds else None
+        if unknown := sorted(bounds.keys() - set(BOUNDS)):
+            caution(
+                f"The trainer does more than {self.checked.partition(' (')[0]}, which adapter {self.name!r} is for. "
+                f"Not recognised: {', '.join(unknown)}. The gate begins with iteration {end}, after the last bound."
+            )
 
         def watched(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             if end is not None and trainer.curr_step < end - 1:

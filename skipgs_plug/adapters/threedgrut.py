@@ -8,6 +8,7 @@ from typing import Any
 from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.adapters.unknown_forks import Survey
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
@@ -25,6 +26,7 @@ CHANGES = (
     "relocate",
     "add",
 )
+WINDOW = "check_step_condition"  # tells whether a step lies between two others
 EVENTS = (
     "densify_gaussians",
     "prune_gaussians_opacity",
@@ -35,6 +37,22 @@ EVENTS = (
     "relocate_gaussians",
     "add_new_gaussians",
 )
+# Further methods of strategy and model that the loop and the strategy run.
+KNOWN = (
+    "build_acc",
+    "clamp_density",
+    "clone",
+    "freeze_gaussians",
+    "increase_num_active_features",
+    "perturb_gaussians",
+    "scheduler_step",
+    "suspend",
+    "trace",
+    "update_gradient_buffer",
+)
+# The loop calls these, and they decide by the step.
+STAGES = ("pre_backward", "post_backward", "post_optimizer_step")
+THROUGH = (*STAGES, *(f"_{name}" for name in STAGES))
 
 
 class ThreeDGRUT(AbstractAdapter):
@@ -86,6 +104,8 @@ class ThreeDGRUT(AbstractAdapter):
                 hooks.view(int(batch.frame_idx) if names is None else names[int(batch.frame_idx)])
 
         strategy = trainer.strategy
+        survey = Survey(self, [type(strategy), type(trainer.model)], KNOWN, EVENTS, THROUGH, windows=[WINDOW])
+        survey.read(getattr(trainer, STEP), "global_step")
         hooks.wrap(trainer, STEP, stepped)
         hooks.before(strategy, "pre_backward", told)
         hooks.events(strategy, *(name for name in EVENTS if hasattr(strategy, name)))
@@ -93,10 +113,9 @@ class ThreeDGRUT(AbstractAdapter):
             hooks.suppress_on_skip(strategy, "perturb_gaussians")
         hooks.gate_tensor_backward(STEP)
         self.output_folder = getattr(getattr(trainer, "tracking", None), "output_dir", None)
-        end = last_change(trainer.conf.strategy)
-        hooks.ready(
-            TrainerInfo(end, view_names=names, max_steps=int(trainer.conf.n_iterations) - 1, gradients_read_until=end)
-        )
+        end, last = last_change(trainer.conf.strategy), int(trainer.conf.n_iterations) - 1
+        start = survey.start_after_changes(end, last)
+        hooks.ready(TrainerInfo(start, view_names=names, max_steps=last, gradients_read_until=end))
 
 
 def last_change(strategy: Any) -> int:

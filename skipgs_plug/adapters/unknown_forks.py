@@ -1,15 +1,19 @@
-"""What a loop of the Inria family does beyond what its adapter knows."""
+"""What a trainer does beyond what its adapter knows: found before it trains, named, and waited for."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable
-from typing import NamedTuple
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any, NamedTuple
 
 import torch
 
+from skipgs_plug.adapters.loop_bounds import ASSIGNED, CallReader, undecorated
 from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.hooks import Adapter
 
 NOISE = frozenset({"randn", "randn_like", "normal"})
 # Methods of a tensor that change no values.
@@ -68,14 +72,12 @@ class Unrecognised(NamedTuple):
             )
 
     @property
-    def listed(self) -> str:
-        """All of it in one line; empty where everything was recognised."""
-        return ", ".join(
-            [
-                *(f"render({name}=)" for name in sorted(self.arguments)),
-                *(f"{name}()" for name in sorted(self.calls | self.noise)),
-            ]
-        )
+    def listed(self) -> list[str]:
+        """All of it as a sentence shows it; empty where everything was recognised."""
+        return [
+            *(f"render({name}=)" for name in sorted(self.arguments)),
+            *(spelled(name) for name in sorted(self.calls | self.noise)),
+        ]
 
 
 def unrecognised(
@@ -105,6 +107,121 @@ def unrecognised(
         frozenset(writes - known),
         frozenset(code.used & known),
     )
+
+
+class Survey:
+    """Compares the calls of a trainer object with the ones that its adapter knows.
+
+    A fork that adds a method to the model, or calls a known one until later, has the same names as its parent
+    otherwise, so it is taken for its parent. The survey names what it adds, and puts the start of the gate off.
+
+    Args:
+        adapter: The adapter, for sentences.
+        owners: Classes, and modules with functions, through which the model changes.
+        known: Their methods and functions that the trainer of the adapter calls.
+        changes: Further ones, which change the model until densification ends.
+        through: Further ones, which are read too: they call changes, in some iterations. No others are read.
+        windows: As for `CallReader`.
+    """
+
+    def __init__(
+        self,
+        adapter: Adapter,
+        owners: Iterable[Any],
+        known: Iterable[str],
+        changes: Iterable[str],
+        through: Iterable[str] = (),
+        windows: Collection[str] = (),
+    ) -> None:
+        self._adapter = adapter
+        self._changes = frozenset(changes)
+        self._known = self._changes.union(known, through)
+        owners = list(owners)
+        self._methods = {ASSIGNED}.union(*map(_callables, owners))
+        self._reader = CallReader(map(_project, owners), self._methods.difference(through), windows)
+
+    def read(
+        self, function: Any, *numbers: str, values: Mapping[str, Any] | None = None, end: int | None = None
+    ) -> None:
+        """Read a function or bound method of the trainer, and the functions of its project that it calls.
+
+        Args:
+            function: The function.
+            *numbers: Expressions that hold the iteration's number in it, as they stand in its source.
+            values: Values of its names, as far as they are known.
+            end: First iteration that is too late for this function; None if it is called to the end.
+        """
+        plain = undecorated(function)
+        if plain is not None:
+            self._reader.projects.add(_project(plain))
+            self._reader.note(plain.__name__, end)
+            self._reader.read(function, numbers, values or {}, end)
+
+    @property
+    def unknown(self) -> list[str]:
+        """The calls that the adapter does not know, but for getters."""
+        called = self._reader.ends.keys() & self._methods - self._known
+        return sorted(name for name in called if not name.startswith("get_"))
+
+    def start_after_changes(self, start: int, last: float = math.inf, unit: int = 1) -> int:
+        """Return `start`, or the end of the last known or unknown change of the model, if that is later.
+
+        Says what was not recognised, and why the gate starts later.
+
+        Args:
+            start: First iteration after densification, by the trainer's options.
+            last: Last iteration of the run, if it is known.
+            unit: Iterations in one step of the numbers that are read, such as the views of an epoch.
+        """
+        if self.unknown:
+            name, checked = self._adapter.name, self._adapter.checked.partition(" (")[0]
+            recognised = sorted(self._reader.ends.keys() & self._known) or ["no call of the model"]
+            caution(
+                f"The trainer does more than {checked}, which adapter {name!r} is for. Recognised: "
+                f"{', '.join(recognised)}. {left_alone(map(spelled, self.unknown))}"
+            )
+        names = self._changes.union(self.unknown)
+        ends = {name: end * unit for name, end in self._reader.ends.items() if end is not None and name in names}
+        return begin_after(start, last, ends)
+
+
+def left_alone(names: Iterable[str]) -> str:
+    """Return the sentence about calls that were not recognised."""
+    return f"Not recognised, and left to go on in skipped iterations: {', '.join(names)}."
+
+
+def spelled(name: str) -> str:
+    """Return a call as a sentence shows it."""
+    return "an assignment to data" if name == ASSIGNED else f"{name}()"
+
+
+def begin_after(start: int, last: float, ends: Mapping[str, int]) -> int:
+    """Return the first iteration after `start` and after all of these ends; say so if it is later than `start`.
+
+    Args:
+        start: First iteration that may be skipped as far as the adapter knows.
+        last: Last iteration of the run. What ends after it goes on to the end, and is not waited for.
+        ends: First iteration that is too late for each call.
+    """
+    late = {name: end for name, end in ends.items() if start < end <= last}
+    if late:
+        listed = ", ".join(f"{spelled(name)} until iteration {end - 1}" for name, end in sorted(late.items()))
+        caution(f"The gate begins with iteration {max(late.values())} in place of {start}: the loop calls {listed}.")
+    return max([start, *late.values()])
+
+
+def _project(part: Any) -> str:
+    """Top-level package of a class, function or module."""
+    return str(getattr(part, "__module__", None) or part.__name__).partition(".")[0]
+
+
+def _callables(owner: Any) -> set[str]:
+    """Names of the methods of a class, or of the functions of a module."""
+    inherited = set(dir(torch.nn.Module)) if inspect.isclass(owner) else set()
+    names = {name for name in dir(owner) if not name.startswith("__")} - inherited
+    functions = {name: undecorated(inspect.getattr_static(owner, name, None)) for name in names}
+    own = owner.__name__ if inspect.ismodule(owner) else None  # a module has names of others, too
+    return {name for name, one in functions.items() if one is not None and own in (None, one.__module__)}
 
 
 def writes_in_place(name: str) -> bool:

@@ -8,6 +8,20 @@ from lookalikes.splats import SplatModel, draw, log, make_cameras, note_step, ph
 ADAPTER, FIRST, START, LAST = "faster_gs", 0, 20, 59
 
 
+def training_callback(start_iteration=None, end_iteration=None):
+    """As in NeRFICG: what it registers does not tell which function it wraps."""
+
+    def decorator(function):
+        def wrapper(*args, **kwargs):
+            return function(*args, **kwargs)
+
+        wrapper.callback_type, wrapper.active, wrapper.__name__ = 0, True, function.__name__
+        wrapper.start_iteration, wrapper.end_iteration = start_iteration, end_iteration
+        return wrapper
+
+    return decorator
+
+
 class Gaussians(SplatModel):
     def adaptive_density_control(self):
         self.prune_gaussians(0.05, self.values["opacity"])
@@ -42,13 +56,16 @@ class FasterGSTrainer:
         for number, view in enumerate(sorted(self.views, key=lambda view: view.camera.image_name)):
             view.global_frame_idx = number
 
+    @training_callback(start_iteration=5, end_iteration="DENSIFICATION_END_ITERATION")
     def densify(self, iteration):
         self.model.gaussians.adaptive_density_control()
 
+    @training_callback(start_iteration=30)
     def hard_pruning(self, iteration):
         self.renderer.compute_pruning_scores(self.views[0])
         self.model.gaussians.importance_pruning()
 
+    @training_callback()
     def training_iteration(self, iteration, dataset):
         gaussians = self.model.gaussians
         log.begins(iteration, gaussians.values.values())
@@ -60,7 +77,7 @@ class FasterGSTrainer:
         loss = photo_loss(rendered["render"], camera)
         loss.backward()
         if early and not self.USE_MCMC:
-            gaussians.add_densification_stats(rendered["viewspace_points"])
+            float(rendered["viewspace_points"].grad.norm())  # its rasterizer gathers them: fails without a backward
         note_step([gaussians.optimizer])
         gaussians.optimizer.step()
         gaussians.optimizer.zero_grad()

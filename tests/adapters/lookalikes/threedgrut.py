@@ -12,6 +12,11 @@ def section(start, end):
     return SimpleNamespace(start_iteration=start, end_iteration=end)
 
 
+class MixtureOfGaussians(SplatModel):
+    def scheduler_step(self, step):
+        self.update_learning_rate(step)
+
+
 class GSStrategy:
     conf = SimpleNamespace(densify=section(5, 20), prune=section(5, 18), prune_scale=section(-1, 40))
 
@@ -23,7 +28,10 @@ class GSStrategy:
 
     def post_backward(self, step, points):
         if step < 20:
-            self.model.add_densification_stats(points)
+            self.update_gradient_buffer(points)
+
+    def update_gradient_buffer(self, points):
+        self.model.add_densification_stats(points)
 
     def prune_gaussians_opacity(self):
         self.model.prune_gaussians(0.05, self.model.values["opacity"])
@@ -49,7 +57,7 @@ class MCMCStrategy(GSStrategy):
 
 class Trainer3DGRUT:
     def __init__(self, strategy=GSStrategy):
-        self.model = SplatModel()
+        self.model = MixtureOfGaussians()
         self.model.training_setup()
         self.strategy = strategy(self.model)
         self.cameras = make_cameras()
@@ -74,7 +82,7 @@ class Trainer3DGRUT:
         note_step([self.model.optimizer])
         self.model.optimizer.step()
         self.model.optimizer.zero_grad()
-        self.model.update_learning_rate(global_step)
+        self.model.scheduler_step(global_step)
         self.strategy.post_optimizer_step(global_step)
         self.global_step = global_step + 1
 
