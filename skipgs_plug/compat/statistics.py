@@ -9,7 +9,12 @@ from torch import Tensor
 
 from skipgs_plug.fallback_raster.runtime.buffers import floats, ints, zeros
 from skipgs_plug.fallback_raster.stages.binning import bin_gaussians
-from skipgs_plug.fallback_raster.stages.statistics import SUMS, SortedLists, StatisticsMaps, blend_statistics
+from skipgs_plug.fallback_raster.stages.statistics import (
+    STATISTICS_FLOATS,
+    SortedLists,
+    StatisticsMaps,
+    blend_statistics,
+)
 from skipgs_plug.fallback_raster.stages.structs import Splats
 
 
@@ -60,7 +65,7 @@ def gather(f: Footprint, values: Tensor | None = None) -> Statistics:
     rows = visible[bins.packed.listed[bins.tile_record]]
     size = (f.height, f.width)
     picture = zeros(*size) if values is None else values.detach().to(torch.float32).reshape(size).contiguous()
-    pair_sums, maps = floats(len(rows), SUMS), StatisticsMaps(ints(*size), ints(*size))
+    pair_sums, maps = floats(len(rows), STATISTICS_FLOATS), StatisticsMaps(ints(*size), ints(*size))
     blend_statistics(
         lists=SortedLists(bins.packed.records, bins.tile_start, bins.tile_record, rows),
         values=picture,
@@ -68,6 +73,6 @@ def gather(f: Footprint, values: Tensor | None = None) -> Statistics:
         maps=maps,
         grid=bins.grid,
     )
-    total = zeros(len(f), SUMS).index_add_(0, rows, pair_sums)
+    total = zeros(len(f), STATISTICS_FLOATS).index_add_(0, rows, pair_sums)
     count, weight, light, value, weighted, distance = (column.contiguous() for column in total[:, :6].unbind(dim=1))
     return Statistics(count.to(torch.int32), weight, light, value, weighted, distance, *maps)

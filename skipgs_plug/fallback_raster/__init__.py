@@ -1,8 +1,9 @@
 """A CPU rasterizer for 3D Gaussians with gsplat's signature.
 
-Its kernels are C++ with vector types (`kernels/*.h`), compiled by NVIDIA Warp's own Clang and launched by Warp on all
-cores; none is written in Warp's Python dialect, and no compiler has to be installed. Warp is imported, and kernels are
-compiled (seconds, cached on disk), when something is first rendered, or on spare threads by `load_kernels_ahead`.
+Its kernels are C++ with vector types (`kernels/*.h`), which NVIDIA Warp's own Clang compiles, so no compiler has to be
+installed. Warp launches them on all cores. No kernel is written in Warp's Python dialect. Warp is imported and kernels
+are compiled when something is first rendered, or on spare threads by `load_kernels_ahead`. Compilation takes seconds,
+and the result is cached on disk.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ __all__ = [
     "usable_cores",
 ]
 
-# Loaded on first use: a program that only asks for the number of threads should not load optimizers.
+# Modules are loaded on first use: a program that only asks for the number of threads should not load optimizers.
 _HOMES = {
     "ADAM_REPLACED": "training.optimizer",
     "Adam": "training.optimizer",

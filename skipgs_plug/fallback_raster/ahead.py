@@ -1,7 +1,7 @@
-"""The kernels of training, loaded on spare threads while a program still reads its data.
+"""Loads the kernels of training on spare threads while a program still reads its data.
 
-A kernel that was never compiled on this machine takes up to some seconds. Nearly all of that is spent in Warp's
-compiler, which needs no interpreter lock, so threads compile side by side.
+Compiling a kernel for the first time on a machine takes up to a few seconds. Nearly all of that time is spent in Warp's
+compiler, which does not hold the interpreter lock, so several threads can compile at the same time.
 """
 
 import threading
@@ -21,31 +21,31 @@ from .stages.splat_adjoint import splat_adjoint
 from .training.adam import _adam
 from .training.gradient_norms import _sum_norms
 from .training.lazy_adam import _catch_up
-from .training.loss import _LOSS_TILES, BYTES
+from .training.loss import _LOSS_TILES, PHOTO_DTYPE
 
-COLOURS = 3  # channels of an image
+RGB_CHANNELS = 3  # of the images of training; kernels of other numbers are not loaded ahead
 
 
 def load_kernels_ahead(absgrad: bool = False, lazy: bool = True, densify: bool = True) -> list[threading.Thread]:
-    """Load the kernels that training needs on as many threads as there are cores, those needed first before others.
+    """Load the kernels that training needs, in the order of their first use, on as many threads as there are cores.
 
-    Whoever runs a kernel that is not there yet waits for it, or loads it. What depends on the scene is left to that.
-    With one core nothing is done: nobody would gain.
+    A call of a kernel that is not loaded yet waits for it, or loads it. Kernels that only some scenes need are not
+    loaded ahead. With one core nothing is done, because nothing could run at the same time.
 
     Args:
-        absgrad: Absolute gradients of 2D means are computed too.
-        lazy: Colours are stepped by `LazyAdam`.
-        densify: Gradients of 2D means are summed up.
+        absgrad: Whether absolute gradients of 2D means are computed.
+        lazy: Whether `LazyAdam` steps the SH coefficients.
+        densify: Whether gradients of 2D means are accumulated for densification.
 
     Returns:
-        The threads, which end by themselves, and early when the main thread has ended.
+        The threads. They end by themselves, and early when the main thread has ended.
     """
     several = get_num_threads() > 1
     loads: list[Callable[[], object]] = [load_pool_kernels] if several else []
-    absolute = [ADJOINT[COLOURS, True]] if absgrad else []
+    absolute = [ADJOINT[RGB_CHANNELS, True]] if absgrad else []
     workers: list[Worker[Any]] = [
         _take_rows, project_forward, list_visible, sh_forward, pack_and_count, scan_pairs, fill_pairs,
-        FORWARD[COLOURS], _LOSS_TILES[BYTES], *absolute, ADJOINT[COLOURS, False], splat_adjoint,
+        FORWARD[RGB_CHANNELS], _LOSS_TILES[PHOTO_DTYPE], *absolute, ADJOINT[RGB_CHANNELS, False], splat_adjoint,
         _adam, *([_catch_up] if lazy else []), *([_sum_norms] if densify else []),
     ]  # fmt: skip
     loads += [worker.load for worker in workers]
@@ -53,9 +53,10 @@ def load_kernels_ahead(absgrad: bool = False, lazy: bool = True, densify: bool =
 
 
 def run_aside(calls: Iterable[Callable[[], object]], count: int) -> list[threading.Thread]:
-    """Make the calls on `count` threads, each as soon as one is free, and return the threads.
+    """Make the calls on `count` threads and return the threads. A free thread takes the next call.
 
-    A thread whose call fails ends: what the call was to prepare fails again where it is needed, and is reported there.
+    A thread whose call raises ends. The kernel that was to be loaded is loaded again when it is needed, and that
+    failure is reported.
     """
     pending, taking = iter(calls), threading.Lock()
 

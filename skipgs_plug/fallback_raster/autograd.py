@@ -1,8 +1,8 @@
-"""The three differentiable steps of the rasterizer as torch.autograd.Functions.
+"""The differentiable steps of the rasterizer as torch.autograd.Functions.
 
-Ownership of buffers: every step allocates its outputs and gradients itself and never writes into a tensor that
-came from outside, except the caller's `absolute`. Inputs are saved with `save_for_backward`, so that torch
-notices when one is changed in place between forward and backward.
+Every step allocates its outputs and gradients itself. It never writes to a tensor of the caller, except `absolute`.
+Inputs are saved with `save_for_backward`, so that torch notices when one is changed in place between forward and
+backward.
 """
 
 from typing import Any
@@ -32,12 +32,12 @@ from .stages.structs import (
 
 
 def check_shapes(tensors: tuple[Tensor, ...], **shapes: torch.Size) -> tuple[Tensor, ...]:
-    """The saved tensors, if those that came from outside still have the sizes that the forward pass saw.
+    """Return the saved tensors after checking that inputs still have the shapes that the forward pass saw.
 
-    Torch notices what is changed in place, but not that `.data` was replaced, as code that densifies does.
+    Torch notices changes in place, but it does not notice when `.data` is replaced, as code that densifies does.
 
     Raises:
-        RuntimeError: A tensor has another size now.
+        RuntimeError: The shape of a tensor changed.
     """
     for tensor, (name, shape) in zip(tensors, shapes.items(), strict=False):
         if tensor.shape != shape:
@@ -49,11 +49,11 @@ def check_shapes(tensors: tuple[Tensor, ...], **shapes: torch.Size) -> tuple[Ten
 
 
 class Project(torch.autograd.Function):
-    """Gaussians of one camera on its image plane.
+    """Projects Gaussians onto the image plane of one camera (EWA splatting, Zwicker et al. 2001).
 
-    Gives means2d [1, N, 2], depths [1, N], conics [1, N, 3], compensations [1, N] (empty unless antialiased), and
-    without a gradient radii [1, N, 2], sigmas [1, N, 2] (standard deviations in pixels), the visible rows [M] and where
-    each block of rows begins among them [ceil(N / BLOCK) + 1].
+    Returns means2d [1, N, 2], depths [1, N], conics [1, N, 3] and compensations [1, N] (empty unless antialiased). Also
+    returns, without gradients, radii [1, N, 2], sigmas [1, N, 2] (standard deviations in pixels), the visible rows [M],
+    and where each block of rows begins in that list [ceil(N / BLOCK_ROWS) + 1].
     """
 
     @staticmethod
@@ -62,7 +62,7 @@ class Project(torch.autograd.Function):
         means: Tensor,  # [N, 3]
         quats: Tensor,  # [N, 4]
         scales: Tensor,  # [N, 3]
-        opacities: Tensor,  # [N], only decides what is visible
+        opacities: Tensor,  # [N], only decides which Gaussians are visible
         viewmat: Tensor,  # [1, 4, 4]
         K: Tensor,  # [1, 3, 3]
         width: int,
@@ -104,7 +104,7 @@ class Project(torch.autograd.Function):
         ctx.shapes = {"means": means.shape, "quats": quats.shape, "scales": scales.shape, "viewmats": viewmat.shape}
         ctx.size = (width, height, eps2d)
         ctx.mark_non_differentiable(radii, sigmas, visible, block_start)
-        ctx.set_materialize_grads(False)  # depths rarely have a gradient: no zeros for them
+        ctx.set_materialize_grads(False)  # depths rarely have a gradient, and zeros would cost time
         return means2d, depths, conics, compensations, radii, sigmas, visible, block_start
 
     @staticmethod
@@ -151,9 +151,9 @@ class Project(torch.autograd.Function):
 
 
 class SphericalHarmonics(torch.autograd.Function):
-    """View-dependent colours [N, 3] of one camera.
+    """Evaluates view-dependent colours [N, 3] for one camera.
 
-    The coefficients are `sh0` [N, K, 3] with `shN` None, or `sh0` [N, 1, 3] and `shN` [N, K - 1, 3].
+    The SH coefficients are `sh0` [N, K, 3] with `shN` None, or `sh0` [N, 1, 3] and `shN` [N, K - 1, 3].
     """
 
     @staticmethod
@@ -164,7 +164,7 @@ class SphericalHarmonics(torch.autograd.Function):
         sh0: Tensor,
         shN: Tensor | None,
         visible: Tensor,  # [M]
-        block_start: Tensor,  # [ceil(N / BLOCK) + 1]
+        block_start: Tensor,  # [ceil(N / BLOCK_ROWS) + 1]
         degree: int,
     ) -> Tensor:
         n = len(means)
@@ -212,7 +212,7 @@ class SphericalHarmonics(torch.autograd.Function):
 
 
 class Pack(torch.autograd.Function):
-    """The visible rows [M, ...] of a tensor [N, ...] of one camera, as gsplat's `packed` has them."""
+    """Selects the visible rows [M, ...] of a tensor [N, ...] of one camera, for gsplat's packed mode."""
 
     @staticmethod
     def forward(ctx: Any, tensor: Tensor, visible: Tensor, block_start: Tensor) -> Tensor:  # type: ignore[override]
@@ -228,11 +228,11 @@ class Pack(torch.autograd.Function):
 
 
 class Blend(torch.autograd.Function):
-    """Image [1, H, W, D] and alpha [1, H, W, 1] of one camera, and tiles_per_gauss [R].
+    """Blends projected Gaussians to an image [1, H, W, D] and an alpha map [1, H, W, 1] of one camera.
 
-    Tensors of rows may have a dimension of one camera in front: views of them, whose gradients are views too, would
-    take as long as a small kernel. `absolute` [R, 2] receives the sum over pixels of |v_means2d| (AbsGS) when it is
-    not None.
+    Also returns tiles_per_gauss [R]. Row tensors may have a leading dimension of one camera: views without it, whose
+    gradients are views too, would take as long as a small kernel. If `absolute` [R, 2] is not None, the backward pass
+    adds the sum over pixels of |v_means2d| to it (AbsGS).
     """
 
     @staticmethod
@@ -245,7 +245,7 @@ class Blend(torch.autograd.Function):
         depths: Tensor,  # [R]
         sigmas: Tensor,  # [R, 2]
         visible: Tensor,  # [M]
-        block_start: Tensor,  # [ceil(R / BLOCK) + 1]
+        block_start: Tensor,  # [ceil(R / BLOCK_ROWS) + 1]
         width: int,
         height: int,
         absolute: Tensor | None,
@@ -264,7 +264,7 @@ class Blend(torch.autograd.Function):
         ctx.absolute = absolute
         tiles_per_gauss = ctx.composed.near.bins.tiles_per_gauss
         ctx.mark_non_differentiable(tiles_per_gauss)
-        ctx.set_materialize_grads(False)  # no zeros for tiles_per_gauss, which has a number for each row
+        ctx.set_materialize_grads(False)  # zeros for tiles_per_gauss [R] would cost time
         return image, alpha, tiles_per_gauss
 
     @staticmethod

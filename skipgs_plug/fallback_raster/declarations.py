@@ -1,11 +1,11 @@
-"""What an editor needs to read the kernels: the names that Python declares, and a compile database.
+"""Writes files with which an editor can resolve every name in the kernels: C++ declarations and a compile database.
 
     python -m skipgs_plug.fallback_raster.declarations [FOLDER]
 
-Kernels use constants and structs whose only declaration is in Python (`runtime/constants.py`, `runtime/parameters.py`).
-This writes `declarations.h` with all of them, and `compile_commands.json` that includes it in front of each file, into
-FOLDER, `build` by default. clangd finds `build/compile_commands.json` from the files below the folder that `build` lies
-in; other editors are told where it is.
+Kernels use constants and structs that only Python declares (`runtime/constants.py`, `runtime/parameters.py`). The
+command writes `declarations.h` with all of them, and `compile_commands.json`, which includes it before each file.
+FOLDER is `build` by default. clangd finds `build/compile_commands.json` for all files below the parent folder of
+`build`; other editors have to be told its path.
 """
 
 import importlib
@@ -20,12 +20,12 @@ from .runtime.launch import Worker
 from .runtime.parameters import declare_struct
 from .runtime.source import KERNELS, SHARED, declare
 
-# Warp gives its Clang the same standard. Kernels are headers of their own, of which each is included once.
+# Warp compiles with the same standard. Kernels are headers that are compiled as main files.
 FLAGS = ("-std=c++17", "-xc++", "-Wno-pragma-once-outside-header")
 
 
 def workers() -> dict[str, Worker[Any]]:
-    """All kernels of the package by name."""
+    """Return all kernels of the package by name."""
     names = [
         f"{package.__name__}.{module.name}"
         for package in (stages, training)
@@ -37,7 +37,7 @@ def workers() -> dict[str, Worker[Any]]:
 
 
 def declarations() -> str:
-    """C++ that declares all constants and structs; of a constant that differs between kernels, one of its values."""
+    """Return C++ that declares all constants and structs. One value stands for constants that differ by kernel."""
     constants = dict(SHARED)
     structs: dict[str, type] = {}
     for worker in workers().values():
@@ -48,7 +48,7 @@ def declarations() -> str:
 
 
 def compile_commands(header: Path) -> list[dict[str, Any]]:
-    """Entries of a compile database, one for each file, that include `header` first."""
+    """Return entries of a compile database, one per file, that include `header` first."""
     return [
         {
             "directory": str(KERNELS),
@@ -60,7 +60,7 @@ def compile_commands(header: Path) -> list[dict[str, Any]]:
 
 
 def write(folder: Path) -> Path:
-    """Write both files into a folder, and return the compile database."""
+    """Write both files to a folder and return the path of the compile database."""
     folder.mkdir(parents=True, exist_ok=True)
     header, database = folder / "declarations.h", folder / "compile_commands.json"
     header.write_text(declarations(), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Puts the CPU rasterizer in the place of gsplat's, and takes it out again."""
+"""Replaces gsplat's rasterizer by the CPU rasterizer, and undoes it."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Installation:
     """One call of `install_as_gsplat`; also a context manager that undoes itself."""
 
     def undo(self) -> None:
-        """Give gsplat its own function back once every other installation is undone too.
+        """Restore gsplat's own function, once every other installation is undone too.
 
-        A second call does nothing. A name that somebody else has replaced since is left alone.
+        A second call does nothing. A name that other code has replaced since is not changed.
         """
         if self not in _open:
             return
@@ -43,11 +43,11 @@ class Installation:
 
 
 def install_as_gsplat() -> Installation:
-    """Let code written for gsplat's `rasterization` run on the CPU.
+    """Make code written for gsplat's `rasterization` run on the CPU.
 
-    Replaces `gsplat.rasterization` and `gsplat.rendering.rasterization`. A module that has already executed
-    `from gsplat import rasterization` keeps what it imported, so call this first. Installing again while
-    installed is harmless; gsplat's function returns when the last installation is undone.
+    Replaces `gsplat.rasterization` and `gsplat.rendering.rasterization`. Call this first: a module that has already
+    executed `from gsplat import rasterization` keeps gsplat's function. Several installations may be active. gsplat's
+    function returns when the last of them is undone.
 
         install_as_gsplat()  # for the rest of the process
 

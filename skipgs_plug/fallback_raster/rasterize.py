@@ -70,30 +70,30 @@ def rasterization(
         quats: Rotations w, x, y, z of any length; zero stands for no rotation.
         scales: Standard deviations along the axes, world units.
         opacities: In [0, 1].
-        colors: D channels per Gaussian (per camera if C is given), or K >= (sh_degree + 1)^2 SH coefficients. Not in
-            gsplat: the constant band and the others as a pair of tensors, which spares joining them in every
-            iteration.
+        colors: D channels per Gaussian (per camera if C is given), or K >= (sh_degree + 1)^2 SH coefficients. The
+            constant band and the higher bands may also be a pair of tensors, which saves joining them in every
+            iteration. gsplat does not offer that.
         viewmats: World to camera, x right, y down, z forward.
         Ks: Intrinsics in pixels; pixel centres lie at +0.5.
         width: Image width in pixels.
         height: Image height in pixels.
-        near_plane: Gaussians nearer than this are left out, world units; those behind the camera always are.
-        far_plane: Gaussians farther than this are left out, world units.
-        radius_clip: Gaussians whose radii are all at or below this are left out, pixels.
+        near_plane: Gaussians nearer than this are culled, world units. Gaussians behind the camera always are.
+        far_plane: Gaussians farther than this are culled, world units.
+        radius_clip: Gaussians whose radii are all at or below this are culled, pixels.
         eps2d: Added to the 2D covariance's diagonal, square pixels.
         sh_degree: 0 to 3 to read `colors` as SH coefficients, None to read them as colours.
-        packed: True: `info` holds one row per visible (camera, Gaussian) pair, as gsplat's packed mode.
-        tile_size: Kept for gsplat's callers; tiles are 16 pixels wide whatever it says.
-        backgrounds: Colour behind everything; black if None.
+        packed: If True, `info` has one row per visible (camera, Gaussian) pair, as in gsplat's packed mode.
+        tile_size: Accepted for gsplat's callers and ignored: tiles are always 16 pixels wide.
+        backgrounds: Colour behind all Gaussians; black if None.
         render_mode: Colour, accumulated depth (D), expected depth (ED), or colour and depth.
         sparse_grad: Not supported.
-        absgrad: Also add up |gradient| of the 2D means over pixels (AbsGS), in `info["means2d"].absgrad`;
-            with at most four channels, depth included.
-        rasterize_mode: "antialiased" scales opacities by the area lost to `eps2d` (Mip-Splatting).
-        channel_chunk: Kept for gsplat's callers; any number of channels works.
-        distributed: Not supported, as every argument below; each raises when it is used.
+        absgrad: Also sum the absolute gradients of the 2D means over pixels (AbsGS), in `info["means2d"].absgrad`.
+            Needs at most four channels, depth included.
+        rasterize_mode: "antialiased" scales opacities down for the area that `eps2d` adds (Mip-Splatting).
+        channel_chunk: Accepted for gsplat's callers and ignored: any number of channels works.
+        distributed: Not supported. This argument and all unsupported ones below raise an error when they are used.
         camera_model: Only "pinhole".
-        segmented: Kept for gsplat's callers; has no effect.
+        segmented: Accepted for gsplat's callers and ignored.
         covars: Not supported.
         with_ut: Not supported.
         with_eval3d: Not supported.
@@ -105,12 +105,12 @@ def rasterization(
         viewmats_rs: Not supported.
 
     Returns:
-        Colours [C, H, W, X], alphas [C, H, W, 1] and gsplat's dictionary: means2d (with a gradient after
-        backward), radii, depths, conics, opacities, tiles_per_gauss, width, height, n_cameras, ...; not in it are
-        isect_ids, flatten_ids and isect_offsets.
+        Colours [C, H, W, X], alphas [C, H, W, 1] and gsplat's dictionary: means2d (with a gradient after backward),
+        radii, depths, conics, opacities, tiles_per_gauss, width, height, n_cameras and others. The entries isect_ids,
+        flatten_ids and isect_offsets are missing.
 
     Raises:
-        ValueError: A shape, dtype, device or mode does not fit, or a camera is not finite or cannot be inverted.
+        ValueError: A shape, dtype, device or mode is wrong, or a camera is not finite or not invertible.
         NotImplementedError: An option is not supported on the CPU.
 
     Examples:
@@ -158,17 +158,17 @@ def rasterization(
         raise ValueError(f"render_mode must be RGB, D, ED, RGB+D or RGB+ED, not {render_mode!r}.")
     if rasterize_mode not in get_args(RasterizeMode):
         raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', not {rasterize_mode!r}.")
-    sh_rest = None
+    shN = None
     if isinstance(colors, tuple):
         if sh_degree is None or len(colors) != 2:
             raise ValueError("colors as a tuple must be a pair (sh0 [N, 1, 3], shN [N, K - 1, 3]) with sh_degree set.")
-        colors, sh_rest = colors
+        colors, shN = colors
     near_plane, far_plane = planes(near_plane, far_plane)
     radius_clip, eps2d = as_float("radius_clip", radius_clip), as_float("eps2d", eps2d)
     width, height = as_int(width), as_int(height)
-    check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, sh_rest, backgrounds, width, height)
+    check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree, shN, backgrounds, width, height)
     blended = (render_mode != "RGB") + ("RGB" in render_mode) * colors.shape[-1]
-    # A pass over some of the channels knows a part of each pixel's gradient, whose absolute value is none of the whole.
+    # A pass over some channels knows only a part of each pixel's gradient. The absolute value needs the whole.
     if absgrad and blended > MAX_CHANNELS:
         raise NotImplementedError(
             f"The CPU rasterizer supports absgrad with at most {MAX_CHANNELS} channels, depth included, got {blended}; "
@@ -178,8 +178,8 @@ def rasterization(
     dtype, n_cameras, n = means.dtype, len(viewmats), len(means)
     given = means, quats, scales, opacities, colors, viewmats, Ks
     means, quats, scales, opacities, colors, viewmats, Ks = as_kernels_read(*given)
-    if sh_rest is not None:
-        (sh_rest,) = as_kernels_read(sh_rest)
+    if shN is not None:
+        (shN,) = as_kernels_read(shN)
     antialiased = rasterize_mode == "antialiased"
     shared_colors = colors.dim() == (2 if sh_degree is None else 3)
 
@@ -192,7 +192,7 @@ def rasterization(
     ]  # fmt: skip
     *stacked, visible, block_starts = map(list, zip(*projected, strict=True))
     means2d, depths, conics, compensations, radii, sigmas = (_join(parts) for parts in stacked)
-    # The adjoint of `expand` adds up, of one camera too.
+    # `expand` has an adjoint that sums, even over a single camera.
     opacities = opacities[None] if n_cameras == 1 else opacities.expand(n_cameras, n)
     if antialiased:
         opacities = opacities * compensations
@@ -204,7 +204,7 @@ def rasterization(
             if sh_degree is not None:
                 centre = camera_centre(viewmats[camera])
                 of_camera = SphericalHarmonics.apply(
-                    means, centre, of_camera, sh_rest, visible[camera], block_starts[camera], sh_degree
+                    means, centre, of_camera, shN, visible[camera], block_starts[camera], sh_degree
                 )
             features.append(of_camera)
 
@@ -219,7 +219,7 @@ def rasterization(
 
         features = pack(features) if features else []
         means2d, depths, conics, opacities, radii, sigmas = (
-            # The adjoint of `unbind` copies.
+            # `unbind` has an adjoint that copies.
             _join(pack([t.squeeze(0)] if n_cameras == 1 else t.unbind()))
             for t in (means2d, depths, conics, opacities, radii, sigmas)
         )
@@ -271,15 +271,15 @@ def rasterization(
 def _render_camera(
     projection: tuple[Tensor, ...],  # means2d, conics, opacities, depths and sigmas of R rows
     visible: Tensor,  # [M]
-    block_start: Tensor,  # [ceil(R / BLOCK) + 1]
-    features: Tensor | None,  # [R, D], None where only depth is wanted
+    block_start: Tensor,  # [ceil(R / BLOCK_ROWS) + 1]
+    features: Tensor | None,  # [R, D]; None if only depth is rendered
     absolute: Tensor | None,  # [R, 2]
     background: Tensor | None,  # [D]
     width: int,
     height: int,
     render_mode: RenderMode,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Image [1, H, W, X], alpha [1, H, W, 1] and tiles_per_gauss [R] of projected Gaussians."""
+    """Render projected Gaussians. Returns image [1, H, W, X], alpha [1, H, W, 1] and tiles_per_gauss [R]."""
     means2d, conics, opacities, depths, sigmas = projection
     with_depth = render_mode != "RGB"
     channels = [] if features is None else [features]
@@ -300,13 +300,13 @@ def _render_camera(
     return image, alpha, tiles_per_gauss
 
 
-# One camera is the rule in training: it needs neither copies nor views, whose gradients are views too.
+# Training usually renders one camera. It needs neither copies nor views, whose gradients would be views too.
 def _join(tensors: Sequence[Tensor]) -> Tensor:
     return tensors[0] if len(tensors) == 1 else torch.cat(list(tensors))
 
 
 def _split(tensor: Tensor, counts: list[int] | None) -> Sequence[Tensor]:
-    """One tensor per camera, of rows [C, N, ...], whose first dimension stays, or packed with `counts` per camera."""
+    """Split into one tensor per camera: [C, N, ...] keeps its first dimension, packed rows have `counts` per camera."""
     if len(tensor if counts is None else counts) == 1:
         return [tensor]
     return tensor.split(1 if counts is None else counts)

@@ -1,8 +1,8 @@
-"""The rasterizer as a trainer needs it: one camera, raw parameters, and nothing written for rows that no pixel needs.
+"""The rasterizer for a trainer: one camera, raw parameters, and intermediate results of visible Gaussians only.
 
-`rasterization` gives every intermediate tensor to its caller, with rows for all Gaussians. Here scales and opacities
-come as logarithms and logits, whose activations and adjoints happen in the kernels, intermediate rows are written for
-visible Gaussians only, and the gradients of the parameters are the only tensors of N rows that the backward fills.
+`rasterization` returns every intermediate tensor with rows for all Gaussians. Here scales and opacities are given as
+logarithms and logits, and the kernels contain the activations and their adjoints. Intermediate rows are written for
+visible Gaussians only. The gradients of the parameters are the only tensors with N rows that the backward pass fills.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from .autograd import check_shapes
 from .runtime.arguments import as_kernels_read, camera_centre, check_tensors, planes
 from .runtime.buffers import floats, ints, zeros
-from .runtime.constants import FACTOR, TILE, blocks, tiles
+from .runtime.constants import FACTOR_FLOATS, TILE, blocks, tiles
 from .runtime.optimizations import active_optimizations
 from .stages.compose import compose, pair_sums
 from .stages.project import Limits, Projected, project_forward
@@ -36,12 +36,13 @@ from .stages.structs import (
 from .training.factored_gradient import Factors
 from .training.lazy_adam import LazyAdam
 
-EPS2D = 0.3  # added to the 2D covariance's diagonal, square pixels
+# Added to the diagonal of the 2D covariance, in square pixels. All 3DGS trainers use this low-pass filter.
+EPS2D = 0.3
 
 
 @dataclass
 class _View:
-    """Raw Gaussians in one camera: rows [N, ...] of which only the visible ones are written, and which these are."""
+    """Gaussians projected into one camera: tensors with N rows, of which only the visible rows are written."""
 
     camera: Camera
     antialiased: bool
@@ -50,7 +51,7 @@ class _View:
 
     @property
     def splats(self) -> Splats:
-        """What the blend reads."""
+        """The projected splats that the blend reads."""
         p = self.projected
         return Splats(p.means2d, p.depths, p.conics, p.opacities, p.sigmas)
 
@@ -75,40 +76,43 @@ def rasterize_splats(
     lazy: LazyAdam | None = None,
     with_rows: bool = True,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Renders raw parameters of 3DGS into one camera, as `rasterization` renders their activations.
+    """Render raw 3DGS parameters into one camera. `rasterization` renders the same image from activated parameters.
 
-    Differentiable in means, quats, log_scales, logits, sh0 and shN; bit-equal for any number of threads.
+    Differentiable in means, quats, log_scales, logits, sh0 and shN. Bit-equal for any number of threads.
 
     Args:
         means: Centres in world space.
         quats: Rotations w, x, y, z of any length.
         log_scales: Logarithms of the standard deviations in world units.
-        logits: Of the opacities.
-        sh0: Constant band of the colours.
-        shN: The other bands.
-        viewmat: World to camera.
-        K: Intrinsics in pixels.
+        logits: Logits of the opacities.
+        sh0: SH coefficients of degree 0.
+        shN: SH coefficients of the higher degrees.
+        viewmat: World to camera, x right, y down, z forward.
+        K: Intrinsics in pixels; pixel centres lie at +0.5.
         width: Image width in pixels.
         height: Image height in pixels.
-        sh_degree: 0 to 3.
-        near_plane: Gaussians nearer than this are left out, world units; those behind the camera always are.
-        far_plane: Gaussians farther than this are left out, world units.
-        background: Colour behind everything; black if None.
-        antialiased: Scale opacities by the area lost to the blur of 0.3 square pixels.
-        absgrad: Also add up |gradient| of the 2D means over pixels, in `info["means2d"].absgrad`.
-        lazy: The optimizer of `shN`, where this is its parameter. Visible rows are caught up before they are read, and
-            the backward pass hands the gradient to it in factors, past autograd, which asks for all numbers.
-        with_rows: Whether the dictionary has a row for each of M visible Gaussians, as densification and optimizers of
-            visible rows want it; `absgrad` needs it.
+        sh_degree: Degree of the SH that are evaluated, 0 to 3.
+        near_plane: Gaussians nearer than this are culled, world units. Gaussians behind the camera always are.
+        far_plane: Gaussians farther than this are culled, world units.
+        background: Colour behind all Gaussians; black if None.
+        antialiased: Scale opacities down for the area that the low-pass filter of 0.3 square pixels adds
+            (Mip-Splatting).
+        absgrad: Also sum the absolute gradients of the 2D means over pixels (AbsGS), in `info["means2d"].absgrad`.
+            Needs `with_rows`.
+        lazy: The optimizer of `shN`, if it is a `LazyAdam`. Visible rows are caught up before they are read. The
+            backward pass hands the gradient of `shN` to it in factors and not through autograd, which would need all
+            its numbers.
+        with_rows: Whether the dictionary has tensors with a row for each of the M visible Gaussians. Densification and
+            optimizers of visible rows need them.
 
     Returns:
-        Image [H, W, 3], transmittance [H, W], which is 1 - alpha, and a dictionary as gsplat's packed mode has it:
-        camera_ids [M], gaussian_ids [M], radii [M, 2], means2d [M, 2], a leaf with a gradient after the backward pass,
-        all four only `with_rows`; width, height, n_cameras.
+        Image [H, W, 3], transmittance [H, W] (1 - alpha), and a dictionary with entries of gsplat's packed mode: width,
+        height, n_cameras and, if `with_rows`, camera_ids [M], gaussian_ids [M], radii [M, 2] and means2d [M, 2], a leaf
+        that has a gradient after the backward pass.
 
     Raises:
-        ValueError: A shape, dtype or device does not fit, the camera is not finite or cannot be inverted, or a plane is
-            no number.
+        ValueError: A shape, dtype or device is wrong, the camera is not finite or not invertible, or a plane is not a
+            number.
     """
     tensors = (means, quats, log_scales, logits, sh0, shN)
     check_tensors(
@@ -136,7 +140,7 @@ def rasterize_splats(
     }
     centres = absolute = None
     if with_rows:
-        # A leaf that goes in with the parameters, so that its gradient comes out with theirs.
+        # A leaf that is an input beside the parameters, so that the backward pass returns its gradient with theirs.
         centres = take_rows(view.projected.means2d, visible)
         centres.requires_grad_(torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
         if absgrad:
@@ -157,9 +161,10 @@ def rasterize_splats(
 
 
 class _Render(torch.autograd.Function):
-    """Image [H, W, 3] of projected Gaussians and the transmittance [H, W] behind it.
+    """Blends projected Gaussians to an image [H, W, 3] and a transmittance map [H, W].
 
-    `absolute` [M, 2] receives the sum over pixels of |v_centres| when it is not None, `lazy` the gradient of `shN`.
+    If `absolute` [M, 2] is not None, the backward pass adds the sum over pixels of |v_means2d| to it. If `lazy` is not
+    None, it receives the gradient of `shN`.
     """
 
     @staticmethod
@@ -192,7 +197,7 @@ class _Render(torch.autograd.Function):
         ctx.view, ctx.colors, ctx.absolute = view, colors, absolute
         ctx.with_centres = centres is not None
         ctx.sh = position, layout, lazy
-        ctx.set_materialize_grads(False)  # the transmittance has a gradient where there is a background
+        ctx.set_materialize_grads(False)  # the transmittance has a gradient only if there is a background
         return image, transmittance
 
     @staticmethod
@@ -204,14 +209,14 @@ class _Render(torch.autograd.Function):
         view: _View = ctx.view
         position, layout, lazy = ctx.sh
         absolute, with_centres, degree = ctx.absolute, ctx.with_centres, layout["degree"]
-        # Three channels are one pass.
+        # Three channels need a single pass.
         passes = pair_sums(ctx.composed, ctx.colors, transmittance, v_image, v_transmittance, absolute is not None)
         ((_, sums),) = passes
         v_gaussians = GaussianGradients(floats(*means.shape), floats(*quats.shape), floats(*log_scales.shape))
         v_logits, v_sh0 = floats(*logits.shape), floats(*sh0.shape)
         v_shN = floats(*shN.shape) if lazy is None else floats(0)
         rows = view.visible.rows if lazy is not None and degree > 0 else view.visible.rows[:0]
-        factors = FactorOutput(floats(len(rows), FACTOR), floats(len(rows), FACTOR))
+        factors = FactorOutput(floats(len(rows), FACTOR_FLOATS), floats(len(rows), FACTOR_FLOATS))
         v_centres = floats(len(sums.rows) if with_centres else 0, 2)
         splat_adjoint(
             sums=sums,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.fallback_raster.oracle.torch_reference_projection import spherical_harmonics
-from skipgs_plug.fallback_raster.runtime.constants import FACTOR
+from skipgs_plug.fallback_raster.runtime.constants import FACTOR_FLOATS
 from skipgs_plug.fallback_raster.training.adam import adam_step
 from skipgs_plug.fallback_raster.training.factored_gradient import FactoredGradient, Factors
 from skipgs_plug.fallback_raster.training.optimizer import Adam
@@ -21,7 +21,7 @@ SHAPE = torch.Size((7, 15, 3))
 def some(seed: int = 0, degree: int = 3) -> FactoredGradient:
     generator = torch.Generator().manual_seed(seed)
     rows = torch.tensor([1, 2, 5], dtype=torch.int32)
-    directions, colors = torch.randn(2, 3, FACTOR, generator=generator)
+    directions, colors = torch.randn(2, 3, FACTOR_FLOATS, generator=generator)
     directions[:, :3] /= directions[:, :3].norm(dim=1, keepdim=True)
     colors[1, :3] = 0.0
     directions[1] = torch.nan

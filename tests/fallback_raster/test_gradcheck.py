@@ -42,7 +42,7 @@ def test_finite_differences(case: str) -> None:
 
 def test_boxes_hold_every_pixel_above_the_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reference leaves Gaussians out where their boxes do not reach; blending all of them is the same."""
-    monkeypatch.setattr(torch_reference, "BLOCK", 4)  # small blocks, many boxes left out
+    monkeypatch.setattr(torch_reference, "SQUARE", 4)  # small squares, many boxes left out
     scene = leaves(random_scene(cameras=2, sh_degree=1), torch.float64)
     image, alpha, _ = rasterization_reference(**scene)
     monkeypatch.setattr(

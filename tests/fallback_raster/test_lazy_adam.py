@@ -13,9 +13,9 @@ from torch import Tensor
 
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
-from skipgs_plug.fallback_raster.runtime.constants import FACTOR
+from skipgs_plug.fallback_raster.runtime.constants import FACTOR_FLOATS
 from skipgs_plug.fallback_raster.training.factored_gradient import FactoredGradient, Factors
-from skipgs_plug.fallback_raster.training.lazy_adam import STEPS, LazyAdam
+from skipgs_plug.fallback_raster.training.lazy_adam import MAX_MISSED_STEPS, LazyAdam
 from skipgs_plug.fallback_raster.training.optimizer import Adam
 
 EPS = 1e-15
@@ -40,10 +40,10 @@ def parameter(shape: tuple[int, ...], generator: torch.Generator) -> torch.nn.Pa
 def gradient(shape: tuple[int, ...], share: float, generator: torch.Generator) -> FactoredGradient:
     """For a share of the rows, of all sizes from row to row, zero in some numbers and in some rows."""
     rows = torch.nonzero(torch.rand(shape[0], generator=generator) < share)[:, 0].to(torch.int32)
-    directions = torch.randn(len(rows), FACTOR, generator=generator)
+    directions = torch.randn(len(rows), FACTOR_FLOATS, generator=generator)
     directions[torch.rand(directions.shape, generator=generator) < 0.2] = 0.0
     directions /= directions[:, :3].norm(dim=1, keepdim=True)
-    colors = torch.randn(len(rows), FACTOR, generator=generator)
+    colors = torch.randn(len(rows), FACTOR_FLOATS, generator=generator)
     colors *= 10.0 ** torch.randint(-14, 4, (len(rows), 1), generator=generator)
     nothing = torch.rand(len(rows), generator=generator) < 0.2
     colors[nothing | directions.isnan().any(1), :3] = 0.0
@@ -159,7 +159,7 @@ def test_rows_that_are_asked_for_are_up_to_date() -> None:
 
 
 def test_more_steps_than_it_keeps_rates_of() -> None:
-    lazy, dense = train((7, 15, 3), 2 * STEPS + 10, 0.002)
+    lazy, dense = train((7, 15, 3), 2 * MAX_MISSED_STEPS + 10, 0.002)
     lazy.catch_up()
     assert_equal(lazy, dense)
 

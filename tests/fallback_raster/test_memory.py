@@ -73,7 +73,7 @@ def test_little_more_is_mapped_than_was_in_use_at_one_time(pool: Pool) -> None:
     del both
     for count in (2 * PAGE, 4 * PAGE, PAGE // 2, 3 * PAGE):  # as densification makes them
         tensor = numbers(pool, count)
-        assert pool.mapped <= most + most // memory.SPARE
+        assert pool.mapped <= most + most // memory.SPARE_DIVISOR
         del tensor
 
 
@@ -123,7 +123,7 @@ def test_tensors_may_die_in_any_thread(pool: Pool) -> None:
 
 
 def test_large_tensors_of_the_rasterizer_lie_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(buffers, "LARGE", 4 * PAGE)
+    monkeypatch.setattr(buffers, "POOLED_BYTES", 4 * PAGE)
     monkeypatch.setattr(buffers, "_memory", Pool())
     small = buffers.floats(PAGE - 1)
     assert buffers._memory.mapped == 0

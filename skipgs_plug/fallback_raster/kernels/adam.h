@@ -1,6 +1,6 @@
-// One step for all rows, or for those that are wanted.
+// One Adam step for all rows, or for the rows that `wanted` marks.
 //
-// Reads `gradient`. Changes the parameter and its moments, of its own rows; nobody else writes there.
+// Reads `gradient`. Updates the parameter and both moments of its own rows. No other thread writes to these rows.
 #pragma once
 #include "lib/adam_step.h"
 static constexpr auto adam = [](const int* wanted, const float* gradient, const Moments& parameter, const Decay& decay,
@@ -10,7 +10,7 @@ static constexpr auto adam = [](const int* wanted, const float* gradient, const 
             ++row;
             continue;
         }
-        // A run of rows is one line of floats.
+        // Neighbouring rows are one contiguous run of floats.
         const long long begin = (long long)row * width;
         if (only_some) while (row < last && wanted[row]) ++row;
         else row = last;
@@ -18,7 +18,8 @@ static constexpr auto adam = [](const int* wanted, const float* gradient, const 
         for (long long i = begin; i < whole; i += 16) {
             const v16 g = load(gradient + i);
             v16 m = load(parameter.mean + i), s = load(parameter.square + i);
-            // Nothing changes where there never was a gradient: without writing it takes two thirds of the time.
+            // Where gradient and moments are zero the step changes nothing. Skipping the stores saves a third of the
+            // time.
             if (!bits((g != 0.0f) | (m != 0.0f) | (s != 0.0f)) && decay.eps > 0.0f) continue;
             v16 x = load(parameter.values + i);
             adam_step(decay, g, m, s, x, rate, root);

@@ -1,13 +1,13 @@
-// Adjoint of blend_forward, back to front, one tile at a time.
+// Adjoint of blend_forward: one tile at a time, back to front.
 //
-// Reads the lists of its own tiles as far as they were blended, and the gradients of their pixels. Writes the sums of each
-// pair that was blended to a slot of its own, and the number of the slot; nobody else writes there.
+// Reads the blended part of the lists of its own tiles, and the gradients of their pixels. Writes the sums of each
+// blended pair to a slot that belongs to the pair, and the number of that slot. No other thread writes to these slots.
 #pragma once
 #include "lib/blend_tile.h"
 #include "lib/patches.h"
-// A Gaussian in a patch on the way back.
+// One Gaussian in one patch, as the adjoint sees it.
 struct Visit : Falloff {
-    vpatch full;  // alpha before it is clamped
+    vpatch full;  // alpha before the clamp to ALPHA_MAX
     Visit(const Tile& tile, int patch, const Record& r) : Falloff(tile, patch, r), full(exp2(log2_alpha)) {}
 };
 static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedList& far, const BackwardPairs& pairs,
@@ -17,27 +17,27 @@ static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedL
     for (int t = first; t < last; ++t) {
         const Tile tile(t, near.tile_start, grid);
 
-        // behind = (the colour one would see without the current Gaussian and those before it) . v_image, so that it is not
-        // divided by 1 - alpha; at the end of the list that is what alpha and background receive. All are 0 outside the image,
-        // where no list has a Gaussian before its first.
+        // behind = v_image . (the colour that a pixel would show without this Gaussian and all Gaussians in front of
+        // it). Keeping this product avoids a division by 1 - alpha. At the end of the list it is the gradient that
+        // alpha and background receive. All values are 0 outside the image, where every list is empty.
         alignas(64) vpatch T[PATCHES], behind[PATCHES], v[PATCHES][D];
         alignas(64) ipatch stop[PATCHES];
         for (int b = 0; b < PATCHES; ++b) behind[b] = (vpatch)0.0f;
-        for (int q = 0; q < QUADS; ++q) {
+        for (int q = 0; q < TILE_QUADS; ++q) {
             const Quad quad(tile, q, grid.width);
             read_patches(v_pixels.image + channels.first, quad, channels.stride, channels.number, v[0], D);
             read_patches(pixels.transmittance, quad, 1, 1, T, 1);
             if (with_transmittance) read_patches(v_pixels.transmittance, quad, 1, 1, behind, 1);
             read_patches((const float*)pixels.pixel_stop, quad, 1, 1, (vpatch*)stop, 1);
         }
-        unsigned open = 0;  // patches with incoming gradient
+        unsigned open = 0;  // bit b: some pixel of patch b has a gradient
         for (int b = 0; b < PATCHES; ++b) {
             ipatch wanted = behind[b] != 0.0f;
             for (int c = 0; c < D; ++c) wanted |= v[b][c] != 0.0f;
-            // A patch without incoming gradient adds exact zeros.
+            // A patch whose gradients are all zero would add exact zeros.
             if (any(wanted) || !(optimizations & ZERO_GRADIENT)) open |= 1u << b;
         }
-        // The part of the list that was blended last comes first.
+        // Back to front: the part that was blended last comes first.
         for (int part = parts - 1; part >= 0; --part) {
             const Record* const records = (const Record*)(part ? far.records : near.records);
             const int begin = part ? far.tile_start[t] : tile.begin;
@@ -50,12 +50,13 @@ static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedL
                 vpatch m[8], abs_x = (vpatch)0.0f, abs_y = (vpatch)0.0f, v_color[D];
                 for (int j = 0; j < 8; ++j) m[j] = (vpatch)0.0f;
                 for (int c = 0; c < D; ++c) v_color[c] = (vpatch)0.0f;
-                // Spread over the lanes once. Left to Clang, colours stay packed in one register, and each patch takes
-                // them apart again.
+                // Broadcast each channel to all lanes once. Otherwise Clang keeps the channels packed in one register
+                // and unpacks them again for every patch.
                 vpatch color[D];
                 for (int c = 0; c < D; ++c) color[c] = (vpatch)r.color[c];
                 unsigned todo = pairs.pair_patches[k] & open;
-                // What the next patch sees is on its way while this one's chain of instructions waits for itself.
+                // Start the arithmetic of the next patch now: it runs while this patch's chain of dependent
+                // instructions waits.
                 int b = todo ? __builtin_ctz(todo) : 0;
                 Visit visit(tile, b, r);
                 while (todo) {
@@ -68,12 +69,12 @@ static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedL
                     const vpatch alpha = hit ? vmin((vpatch)ALPHA_MAX, visit.full) : (vpatch)0.0f;
                     vpatch shade = color[0] * v[b][0];
                     for (int c = 1; c < D; ++c) shade += color[c] * v[b][c];
-                    const vpatch before = T[b] / (1.0f - alpha);  // from behind the Gaussian to before it
-                    // Zero where it was not blended: a store of some lanes only takes long on some processors.
+                    const vpatch before = T[b] / (1.0f - alpha);  // transmittance in front of the Gaussian
+                    // Zero where the Gaussian was not blended. Masked stores are slow on some processors.
                     const vpatch weight = alpha * before, less = hit ? behind[b] - shade : (vpatch)0.0f;
                     T[b] = before;
                     behind[b] = behind[b] - alpha * less;
-                    // Where alpha is clamped, neither opacity nor shape moves it.
+                    // Where alpha is clamped, its derivative by opacity and shape is zero.
                     const vpatch v_sigma = visit.full <= ALPHA_MAX ? weight * less : (vpatch)0.0f;
                     for (int c = 0; c < D; ++c) v_color[c] += weight * v[b][c];
                     const vpatch v_x = v_sigma * visit.dx, v_y = v_sigma * visit.dy;
@@ -85,8 +86,9 @@ static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedL
                     m[5] += v_y * visit.dy;
                     if (ABSGRAD) {
                         abs_x += vabs(v_sigma * visit.p);
-                        // One of the products is rounded by itself, with one channel the other than with more: Clang's
-                        // choice of old, kept so that gradients stay equal to the bit.
+                        // One of the two products is rounded before the sum: which one differs between one channel and
+                        // more. Clang used to choose so; the choice is kept because it keeps gradients equal to the
+                        // bit.
                         const vpatch along_y = D == 1 ? r.slant * visit.p + rounded_product(r.across, visit.w)
                                                       : rounded_product(r.slant, visit.p) + r.across * visit.w;
                         abs_y += vabs(v_sigma * along_y);
@@ -96,7 +98,7 @@ static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedL
                 }
                 slots.pair_slot[pairs.tile_pair[k]] = slot--;
                 PairSum& out = ((PairSum*)slots.sums)[slot];
-                // The moments and two channels in one go.
+                // One folded sum gives six moments and the first two channels.
                 static_assert(__builtin_offsetof(PairSum, color) == 6 * sizeof(float), "the channels follow the moments");
                 for (int c = 0; c < D && c < 2; ++c) m[6 + c] = v_color[c];
                 *(v8*)out.moment = sum8(m);

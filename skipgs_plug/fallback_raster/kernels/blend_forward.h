@@ -1,19 +1,21 @@
 // Front-to-back compositing, one tile at a time.
 //
-// Reads records and lists of its own tiles. Writes their pixels, and of their pairs which patches blended them; nobody else
-// writes there.
+// Reads the records and lists of its own tiles. Writes the pixels of these tiles and, for each pair, the patches that
+// blended it. No other thread writes to these tiles.
 #pragma once
 #include "lib/blend_tile.h"
 #include "lib/patches.h"
 #include "lib/reached_patches.h"
 #include "lib/sorted_tile.h"
-static constexpr int GROUP = 64;  // Gaussians that are looked through at a time: a bit of a 64-bit mask each
-// Gaussians in the chains of one patch. With 2, 3, 5 or 6 the kernel took 13, 6, 36 and 5 % longer.
+// Gaussians of a group, whose patches are found before any is blended: one bit each of a 64-bit mask.
+static constexpr int GROUP_SIZE = 64;
+// Gaussians of a patch whose instruction chains are interleaved. With 2, 3, 5 or 6 the kernel took 13, 6, 36 and 5 %
+// longer.
 static constexpr int SIDE_BY_SIDE = 4;
 typedef unsigned char bytes __attribute__((ext_vector_type(32)));
 typedef bool b32 __attribute__((ext_vector_type(32)));
-typedef unsigned some_masks __attribute__((ext_vector_type(TESTED)));
-typedef unsigned char some_bytes __attribute__((ext_vector_type(TESTED)));
+typedef unsigned some_masks __attribute__((ext_vector_type(TESTED_AT_ONCE)));
+typedef unsigned char some_bytes __attribute__((ext_vector_type(TESTED_AT_ONCE)));
 // Bit l of the result's word k is bit k of byte l.
 static constexpr auto transpose_bits = [](const unsigned char* from, unsigned* words) INLINE {
     bytes a = *(const bytes*)from;
@@ -49,9 +51,10 @@ static constexpr auto blend_forward = [](const float* packed, const TileLists& l
             stop[b] = (ipatch)begin;
             if (any(inside)) open |= 1u << b;
         }
-        // What lies behind the lists of an earlier pass counts its pairs from `before` on.
+        // Continue an earlier pass. Its `pixel_stop` counts pairs of both passes, of which `before` lie in the earlier
+        // one.
         if (part.continued) {
-            for (int q = 0; q < QUADS; ++q) {
+            for (int q = 0; q < TILE_QUADS; ++q) {
                 const Quad quad(tile, q, grid.width);
                 read_patches(pixels.image + channels.first, quad, channels.stride, channels.number, C[0], D);
                 read_patches(pixels.product_left, quad, 1, 1, P, 1);
@@ -63,36 +66,36 @@ static constexpr auto blend_forward = [](const float* packed, const TileLists& l
                 if (!any(P[b] > TRANSMITTANCE_MIN)) open &= ~(1u << b);
             }
         }
-        // A record lies anywhere. Those of a group are sent for one by one while the group before it is looked through: all at
-        // once are more than a core can wait for.
-        const auto send_for = [&](int k) INLINE { __builtin_prefetch(records + lists.tile_record[k]); };
-        list.sort(GROUP);
-        for (int k = begin; k < smaller(begin + GROUP, end); ++k) send_for(k);
+        // Records are scattered in memory. They are prefetched one by one while the group before is processed, because
+        // a core cannot keep as many loads in flight as a group has.
+        const auto prefetch = [&](int k) INLINE { __builtin_prefetch(records + lists.tile_record[k]); };
+        list.sort(GROUP_SIZE);
+        for (int k = begin; k < smaller(begin + GROUP_SIZE, end); ++k) prefetch(k);
         int blended_here = 0;
-        for (int base = begin; base < end && open; base += GROUP) {
-            alignas(64) Record group[GROUP + 1];                         // their records, and one that no pixel sees
-            alignas(32) unsigned char reached[PATCHES / 8][GROUP] = {};  // the patches that each reaches, eight to a byte
-            const int count = smaller(GROUP, end - base);
-            list.sort(base - begin + 2 * GROUP);
+        for (int base = begin; base < end && open; base += GROUP_SIZE) {
+            alignas(64) Record group[GROUP_SIZE + 1];  // records of the group, and one of opacity zero as padding
+            alignas(32) unsigned char reached[PATCHES / 8][GROUP_SIZE] = {};  // patches that each reaches, 8 to a byte
+            const int count = smaller(GROUP_SIZE, end - base);
+            list.sort(base - begin + 2 * GROUP_SIZE);
             const int listed = lists.sorted ? end : begin + list.done;
-            clear((float*)(group + GROUP), RECORD);
-            group[GROUP].log2_opacity = -100.0f;
-            for (int j = 0; j < count; j += TESTED) {
-                const Record* r[TESTED];
-                alignas(some_masks) unsigned patches[TESTED];
-                for (int g = 0; g < TESTED; ++g) {
+            clear((float*)(group + GROUP_SIZE), RECORD_FLOATS);
+            group[GROUP_SIZE].log2_opacity = -100.0f;
+            for (int j = 0; j < count; j += TESTED_AT_ONCE) {
+                const Record* r[TESTED_AT_ONCE];
+                alignas(some_masks) unsigned patches[TESTED_AT_ONCE];
+                for (int g = 0; g < TESTED_AT_ONCE; ++g) {
                     const int k = base + j + g;
                     r[g] = records + lists.tile_record[smaller(k, listed - 1)];
                     store((float*)(group + j + g), load((const float*)r[g]));
-                    send_for(smaller(k + GROUP, listed - 1));
+                    prefetch(smaller(k + GROUP_SIZE, listed - 1));
                     patches[g] = ~0u;
                 }
                 if (optimizations & PATCH_BOUNDS) reached_patches(r, tile.x0, tile.y0, patches);
                 for (int i = 0; i < PATCHES / 8; ++i)
                     *(some_bytes*)(reached[i] + j) = __builtin_convertvector(*(const some_masks*)patches >> 8 * i, some_bytes);
             }
-            unsigned long long live[PATCHES];  // by patch, the Gaussians of the group that reach it
-            const unsigned long long here = ~0ull >> (GROUP - count);
+            unsigned long long live[PATCHES];  // by patch: bit i is set if Gaussian i of the group reaches it
+            const unsigned long long here = ~0ull >> (GROUP_SIZE - count);
             for (int i = 0; i < PATCHES / 8; ++i) {
                 unsigned low[8], high[8];
                 transpose_bits(reached[i], low);
@@ -102,20 +105,20 @@ static constexpr auto blend_forward = [](const float* packed, const TileLists& l
             const unsigned visited = open;
             for (unsigned todo = open; todo; todo &= todo - 1) {
                 const int b = __builtin_ctz(todo);
-                // Several Gaussians at a time, step by step: a processor looks too few instructions ahead to find the next
-                // Gaussian behind the long chain of one. What chains them is short: nothing is selected on the way of the
-                // product, which goes on in finished pixels, below TRANSMITTANCE_MIN.
+                // Process several Gaussians at a time, step by step: a processor cannot look far enough ahead to
+                // overlap the long chains of single Gaussians. The chain between Gaussians is short because the product
+                // has no select in it: it also continues in finished pixels, where it falls below TRANSMITTANCE_MIN.
                 vpatch product = P[b], transmitted = T[b], color[D];
                 ipatch stopped = stop[b];
                 unsigned long long taken = 0;
                 for (int c = 0; c < D; ++c) color[c] = C[b][c];
                 for (unsigned long long remaining = live[b]; remaining;) {
-                    int member[SIDE_BY_SIDE];  // of the group
+                    int member[SIDE_BY_SIDE];  // index in the group
                     const Record* r[SIDE_BY_SIDE];
                     vpatch t[SIDE_BY_SIDE], alpha[SIDE_BY_SIDE];
 #pragma clang loop unroll(full)
                     for (int i = 0; i < SIDE_BY_SIDE; ++i) {
-                        member[i] = remaining ? __builtin_ctzll(remaining) : GROUP;
+                        member[i] = remaining ? __builtin_ctzll(remaining) : GROUP_SIZE;
                         r[i] = group + member[i];
                         remaining &= remaining - 1;
                     }
@@ -129,17 +132,18 @@ static constexpr auto blend_forward = [](const float* packed, const TileLists& l
                         const vpatch weight = alpha[i] * product;
                         product = product - weight;
                         const ipatch hit = (t[i] >= LOG2_ALPHA_MIN) & (product > TRANSMITTANCE_MIN);
-                        // Selected, not multiplied by zero: a NaN colour stays in the pixels that it touches.
+                        // Select instead of multiplying by zero, so that a NaN colour stays in the pixels that it
+                        // covers.
                         for (int c = 0; c < D; ++c) color[c] = hit ? color[c] + weight * r[i]->color[c] : color[c];
                         transmitted = hit ? product : transmitted;
                         stopped = hit ? (ipatch)(base + member[i] + 1) : stopped;
-                        taken |= (unsigned long long)any(hit) << (member[i] & (GROUP - 1));
+                        taken |= (unsigned long long)any(hit) << (member[i] & (GROUP_SIZE - 1));
                     }
                     if ((optimizations & SATURATION) && !any(product > TRANSMITTANCE_MIN)) {
                         open &= ~(1u << b);
                         break;
                     }
-                    product = vmax(product, (vpatch)1e-20f);  // subnormal numbers are slow
+                    product = vmax(product, (vpatch)1e-20f);  // arithmetic on subnormal numbers is slow
                 }
                 P[b] = product;
                 T[b] = transmitted;
@@ -147,11 +151,11 @@ static constexpr auto blend_forward = [](const float* packed, const TileLists& l
                 live[b] = taken;
                 for (int c = 0; c < D; ++c) C[b][c] = color[c];
             }
-            // The patches in which each was blended: what the adjoint visits.
-            alignas(32) unsigned char by_patch[GROUP / 8][32] = {};
+            // The patches in which each Gaussian was blended. The adjoint visits only these.
+            alignas(32) unsigned char by_patch[GROUP_SIZE / 8][32] = {};
             for (unsigned todo = visited; todo; todo &= todo - 1) {
                 const int b = __builtin_ctz(todo);
-                for (int i = 0; i < GROUP / 8; ++i) by_patch[i][b] = (unsigned char)(live[b] >> 8 * i);
+                for (int i = 0; i < GROUP_SIZE / 8; ++i) by_patch[i][b] = (unsigned char)(live[b] >> 8 * i);
             }
             for (int i = 0; 8 * i < count; ++i) {
                 unsigned patches[8];
@@ -172,7 +176,7 @@ static constexpr auto blend_forward = [](const float* packed, const TileLists& l
         }
         blended.tile_stop[t] = tile_end;
         blended.tile_blended[t] = blended_here;
-        for (int q = 0; q < QUADS; ++q) {
+        for (int q = 0; q < TILE_QUADS; ++q) {
             const Quad quad(tile, q, grid.width);
             write_patches(pixels.image + channels.first, quad, channels.stride, channels.number, C[0], D);
             write_patches(pixels.transmittance, quad, 1, 1, T, 1);

@@ -1,7 +1,7 @@
-// What the forks of Inria's rasterizer count inside their blend, one tile at a time, without the colours.
+// Per-Gaussian and per-pixel counts that forks of Inria's rasterizer collect while they blend; no colours are computed.
 //
-// Reads records and sorted lists of its own tiles. Writes the sums of their pairs and the maps of their pixels; nobody else
-// writes there.
+// Reads the records and sorted lists of its own tiles. Writes the sums of their pairs and the maps of their pixels. No
+// other thread writes to these tiles.
 #pragma once
 #include "lib/blend_tile.h"
 #include "lib/patches.h"
@@ -15,21 +15,21 @@ static constexpr auto blend_statistics = [](const SortedLists& lists, const floa
         unsigned open = 0;  // patches with an unfinished pixel
         for (int b = 0; b < PATCHES; ++b) {
             const ipatch inside = tile.inside(b);
-            // The sign of T marks pixels that take no more: finished ones and those outside the image.
+            // A negative T marks a pixel that accepts no more Gaussians: it is finished, or outside the image.
             T[b] = inside ? (vpatch)1.0f : (vpatch)-1.0f;
             value[b] = most[b] = (vpatch)0.0f;
             count[b] = (ipatch)0;
             who[b] = (ipatch)-1;
             if (any(inside)) open |= 1u << b;
         }
-        for (int q = 0; q < QUADS; ++q) {
+        for (int q = 0; q < TILE_QUADS; ++q) {
             const Quad quad(tile, q, grid.width);
             read_patches(values, quad, 1, 1, value, 1);
         }
 
         for (int k = tile.begin; k < tile.end; ++k) {
-            vpatch sums[SUMS];
-            for (int s = 0; s < SUMS; ++s) sums[s] = (vpatch)0.0f;
+            vpatch sums[STATISTICS_FLOATS];
+            for (int s = 0; s < STATISTICS_FLOATS; ++s) sums[s] = (vpatch)0.0f;
             for (unsigned todo = open; todo; todo &= todo - 1) {
                 const int b = __builtin_ctz(todo);
                 const Falloff falloff(tile, b, records[lists.tile_record[k]]);
@@ -53,9 +53,9 @@ static constexpr auto blend_statistics = [](const SortedLists& lists, const floa
                 who[b] = leads ? (ipatch)lists.tile_row[k] : who[b];
                 if (any(finished) && !any(T[b] > 0.0f)) open &= ~(1u << b);
             }
-            *(v8*)(pair_sums + (long long)SUMS * k) = sum8(sums);
+            *(v8*)(pair_sums + (long long)STATISTICS_FLOATS * k) = sum8(sums);
         }
-        for (int q = 0; q < QUADS; ++q) {
+        for (int q = 0; q < TILE_QUADS; ++q) {
             const Quad quad(tile, q, grid.width);
             write_patches((float*)maps.contributions, quad, 1, 1, (const vpatch*)count, 1);
             write_patches((float*)maps.strongest, quad, 1, 1, (const vpatch*)who, 1);

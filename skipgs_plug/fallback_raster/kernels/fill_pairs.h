@@ -1,8 +1,9 @@
-// Lists the pairs of each tile, as yet in the order of the rows: depth in the upper half, number of the pair in the lower.
-// Pairs are numbered by row and tile. Depths are positive, so their bits sort like integers.
+// Lists the pairs of each tile in row order; sorting follows. A list entry holds the depth in its upper 32 bits and the
+// pair's number in its lower 32. Pairs are numbered by row, then tile. Depths are positive, so their bits sort like
+// integers.
 //
-// Reads records and footprints of its own slices. Writes `pairs` where `scan_pairs` made room for them, and moves the next
-// free places in `counts`; nobody else writes there.
+// Reads the records and footprints of its own slices. Writes `pairs` at the positions that `scan_pairs` reserved, and
+// advances the next free positions in `counts`. No other thread writes to these positions.
 #pragma once
 #include "lib/ellipse.h"
 #include "lib/tile_lists.h"
@@ -21,7 +22,7 @@ static constexpr auto fill_pairs = [](const int* visible, const float* splat_dep
         int* next = counts.of_tiles + (long long)s * (tiles_x * grid.tiles_y + SPARE_COUNTS);
         int pair = (int)counts.of_slices[s];
         const int begin = slice_begin(s, m, slices), end = slice_begin(s + 1, m, slices);
-        // Not inlined: few are large, and the loop of the others has registers enough without it.
+        // Not inlined: few Gaussians are large, and the loop over the others needs the registers.
         const auto list_larger = [=](int k, int* next, long long key, int pair) __attribute__((noinline)) -> int {
             const bool all = !(optimizations & EXACT_TILES);
             each_tile(records[k], boxes[k], width, tiles_x, all, [&](int tile) INLINE {
@@ -34,11 +35,11 @@ static constexpr auto fill_pairs = [](const int* visible, const float* splat_dep
         int i = begin;
         for (int k = begin; k < begin + packed.listed_count[s]; ++k) {
             while (i <= packed.listed[k]) pairs.start[i++] = pair;
-            const int meets = footprints.tiles[(long long)FOOTPRINT * k + 1];
+            const int meets = footprints.tiles[(long long)FOOTPRINT_INTS * k + 1];
             const int depth = ((const int*)splat_depths)[visible[packed.listed[k]]];
             const long long key = (long long)depth << 32;
             if (meets >= 0) {
-                int* corner = next + footprints.tiles[(long long)FOOTPRINT * k];
+                int* corner = next + footprints.tiles[(long long)FOOTPRINT_INTS * k];
                 for (int remaining = meets; remaining; remaining &= remaining - 1) {
                     pair_record[pair] = k;
                     unsorted[corner[tile_of.offset[__builtin_ctz(remaining)]]++] = key | (unsigned)pair++;

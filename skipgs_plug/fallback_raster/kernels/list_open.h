@@ -1,14 +1,15 @@
-// Visible rows that may reach tiles which are still open, at depths that were left out there.
+// Finds the visible rows that may reach a tile that is still open, at depths that the first pass left out.
 //
-// `open_before` [tiles_y + 1, tiles_x + 1] counts the open tiles above and to the left of a corner.
+// `open_before` [tiles_y + 1, tiles_x + 1] is a summed-area table: the number of open tiles above and to the left of a
+// corner.
 //
-// Reads the projected splats of visible rows. Writes `found` of its own block; nobody else writes there.
+// Reads the projected splats of visible rows. Writes `found` of its own block. No other thread writes to that block.
 #pragma once
 #include "lib/simd.h"
 static constexpr auto list_open = [](const RowList& visible, const Splats& splats, const int* open_before,
                                      const BlockRows& found, const Grid& grid, int n, int least, int first, int last) INLINE {
     const int tiles_x = grid.tiles_x, tiles_y = grid.tiles_y;
-    int found_end = BLOCK * first;
+    int found_end = BLOCK_ROWS * first;
     const int end = visible.block_start[first + 1];
     for (int i = visible.block_start[first]; i < end; i += 16) {
         const int lanes = smaller(16, end - i);
@@ -19,7 +20,7 @@ static constexpr auto list_open = [](const RowList& visible, const Splats& splat
         v16 centre[2], sigma[2];
         gather2(splats.means2d, row, centre);
         gather2(splats.sigmas, row, sigma);
-        // A pixel more than the box that its lists are made of.
+        // One pixel more on each side than the box that the tile lists are made from.
         const v16 reach = log2(vmax(gather(splats.opacities, row, 1, 0), (v16)1e-20f)) - LOG2_ALPHA_MIN;
         const v16 half = 1.001f * vsqrt(vmax(2.0f * reach / LOG2_E, (v16)0.0f)) + 1e-3f;
         const auto tile = [](v16 x, int most) INLINE -> i16 {
@@ -39,5 +40,5 @@ static constexpr auto list_open = [](const RowList& visible, const Splats& splat
                        > open_before[corner[1][l]] - open_before[corner[0][l]];
         }
     }
-    found.counts[first] = found_end - BLOCK * first;
+    found.counts[first] = found_end - BLOCK_ROWS * first;
 };

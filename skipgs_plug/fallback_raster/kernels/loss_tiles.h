@@ -1,22 +1,29 @@
-// |image - target| and 1 - SSIM summed over each tile, and the gradient of the loss.
+// Sums |image - target| and 1 - SSIM over each tile, and computes the gradient of the loss.
 //
-// A tile goes down its rows once. What the window needs of the rows above stays in two rings of rows: x, d,
-// x^2 + y^2 and d^2, all less the shifts and blurred along the row; and the slopes of 1 - SSIM, likewise blurred. Blurring
-// both down the rows gives SSIM RADIUS rows later, and the gradient another RADIUS rows later.
+// A tile is processed once, from its first row to its last. Two ring buffers of rows hold the inputs of the vertical
+// blurs: the first holds x, d, x^2 + y^2 and d^2 of shifted images, the second three coefficients of the gradient of 1
+// - SSIM, all blurred along the row. Blurring the first ring vertically gives SSIM, WINDOW_RADIUS rows late; blurring
+// the second gives the gradient, another WINDOW_RADIUS rows late.
 //
-// Reads both images. Writes sums and gradient of its own tiles; nobody else writes there.
+// Reads both images. Writes the sums and the gradient of its own tiles. No other thread writes to these tiles.
 #pragma once
 #include "lib/simd.h"
-static constexpr float w[WINDOW] = {0.00102838f, 0.00759876f, 0.03600077f, 0.10936069f, 0.21300554f, 0.26601172f,
+// Weights of SSIM's Gaussian window of sigma 1.5 pixels. They add up to 1.
+static constexpr float w[SSIM_WINDOW] = {0.00102838f, 0.00759876f, 0.03600077f, 0.10936069f, 0.21300554f, 0.26601172f,
                                     0.21300554f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
-static constexpr int RADIUS = WINDOW / 2;
-static constexpr int MOST = (RADIUS * LOSS_CHANNELS + 15) / 16;  // vectors that the window reaches to one side
-static constexpr int STEP = 4;  // rows at a time: their windows share most of what they read
-static constexpr int RING = WINDOW - 1 + STEP;
-static constexpr int AHEAD = RING * 64;  // rows above an image have numbers below zero
-static_assert(4 * RADIUS % STEP == 0, "the gradient begins with the first row of a tile");
-// Numbers of an image, 16 at a time. Bytes count in 255ths: the first of two parts of 1 / 255 has so few digits that its
-// product is exact, so that the sum is rounded as the quotient is.
+static constexpr int WINDOW_RADIUS = SSIM_WINDOW / 2;  // pixels
+// Vectors of 16 floats that the window reaches to one side of a tile, for the largest number of channels.
+static constexpr int MAX_REACH_VECTORS = (WINDOW_RADIUS * MAX_LOSS_CHANNELS + 15) / 16;
+// Vectors of a row of a tile with the window's reach on both sides, and floats of a row with twice that reach.
+static constexpr int WIDEST = LOSS_TILE_VECTORS + 2 * MAX_REACH_VECTORS;
+static constexpr int SHIFTED = 16 * (LOSS_TILE_VECTORS + 4 * MAX_REACH_VECTORS);
+static constexpr int ROWS_AT_ONCE = 4;  // rows blurred vertically together: their windows share most of their inputs
+static constexpr int RING_ROWS = SSIM_WINDOW - 1 + ROWS_AT_ONCE;  // rows that one vertical blur reads
+// Added to the number of a row to make its ring index positive: rows above an image have negative numbers.
+static constexpr int RING_OFFSET = RING_ROWS * 64;
+static_assert(4 * WINDOW_RADIUS % ROWS_AT_ONCE == 0, "the gradient begins with the first row of a tile");
+// Loads 16 values of an image. A byte is divided by 255 with two products: the first factor has so few digits that its
+// product is exact, so the sum rounds as the quotient does.
 typedef unsigned char c16 __attribute__((ext_vector_type(16), aligned(1)));
 static constexpr auto numbers = [](const auto* p) INLINE -> v16 {
     if constexpr (sizeof(*p) == sizeof(float)) return load(p);
@@ -25,50 +32,51 @@ static constexpr auto numbers = [](const auto* p) INLINE -> v16 {
         return a * 0x1.01p-8f + a * 0x1.010102p-24f;
     }
 };
-// The window down the rows, for STEP of them. Its halves are equal: sums of two rows, then half as many products.
+// Blurs ROWS_AT_ONCE rows vertically. The window is symmetric: adding two rows first halves the number of products.
 static constexpr auto blur_down = [](const v16* const* from, int at, v16* sums) INLINE {
-    v16 row[RING];
+    v16 row[RING_ROWS];
 #pragma clang loop unroll(full)
-    for (int k = 0; k < RING; ++k) row[k] = from[k][at];
+    for (int k = 0; k < RING_ROWS; ++k) row[k] = from[k][at];
 #pragma clang loop unroll(full)
-    for (int r = 0; r < STEP; ++r) sums[r] = w[RADIUS] * row[RADIUS + r];
+    for (int r = 0; r < ROWS_AT_ONCE; ++r) sums[r] = w[WINDOW_RADIUS] * row[WINDOW_RADIUS + r];
 #pragma clang loop unroll(full)
-    for (int k = 0; k < RADIUS; ++k)
-        for (int r = 0; r < STEP; ++r) sums[r] += w[k] * (row[k + r] + row[WINDOW - 1 - k + r]);
+    for (int k = 0; k < WINDOW_RADIUS; ++k)
+        for (int r = 0; r < ROWS_AT_ONCE; ++r) sums[r] += w[k] * (row[k + r] + row[SSIM_WINDOW - 1 - k + r]);
 };
-// The window along a row, around `p[0]` to `p[15]`.
+// Blurs a row horizontally, for the 16 values that begin at `p`.
 static constexpr auto blur_along = [](const float* p, int channels) INLINE -> v16 {
 #ifdef __AVX512F__
-    // A load that is not aligned takes longer than moving numbers between registers.
+    // Shuffling registers is faster than unaligned loads.
     if (channels == 3) {
-#define FOUR(i) i, i + 1, i + 2, i + 3
-#define SIXTEEN(i) FOUR(i), FOUR(i + 4), FOUR(i + 8), FOUR(i + 12)
-#define BOTH_SIDES(i) __builtin_shufflevector(a, b, SIXTEEN(16 - i)) + __builtin_shufflevector(b, c, SIXTEEN(i))
+#define NEXT_4(i) i, i + 1, i + 2, i + 3
+#define NEXT_16(i) NEXT_4(i), NEXT_4(i + 4), NEXT_4(i + 8), NEXT_4(i + 12)
+#define BOTH_SIDES(i) __builtin_shufflevector(a, b, NEXT_16(16 - i)) + __builtin_shufflevector(b, c, NEXT_16(i))
         const v16 a = load(p - 16), b = load(p), c = load(p + 16);
-        v16 sum = w[RADIUS] * b;
-        sum += w[RADIUS - 1] * (BOTH_SIDES(3));
-        sum += w[RADIUS - 2] * (BOTH_SIDES(6));
-        sum += w[RADIUS - 3] * (BOTH_SIDES(9));
-        sum += w[RADIUS - 4] * (BOTH_SIDES(12));
-        sum += w[RADIUS - 5] * (BOTH_SIDES(15));
+        v16 sum = w[WINDOW_RADIUS] * b;
+        sum += w[WINDOW_RADIUS - 1] * (BOTH_SIDES(3));
+        sum += w[WINDOW_RADIUS - 2] * (BOTH_SIDES(6));
+        sum += w[WINDOW_RADIUS - 3] * (BOTH_SIDES(9));
+        sum += w[WINDOW_RADIUS - 4] * (BOTH_SIDES(12));
+        sum += w[WINDOW_RADIUS - 5] * (BOTH_SIDES(15));
         return sum;
     }
 #endif
-    v16 sum = w[RADIUS] * load(p);
+    v16 sum = w[WINDOW_RADIUS] * load(p);
 #pragma clang loop unroll(full)
-    for (int k = 1; k <= RADIUS; ++k) sum += w[RADIUS - k] * (load(p - k * channels) + load(p + k * channels));
+    for (int k = 1; k <= WINDOW_RADIUS; ++k) sum += w[WINDOW_RADIUS - k] * (load(p - k * channels) + load(p + k * channels));
     return sum;
 };
 static constexpr auto loss_tiles = [](const float* image, const auto* target, float* gradient, float* sums, const ImageSize& size,
                                       const LossWeights& weights, int tiles, int valid, int with_gradient, int first,
                                       int last) INLINE {
     const int height = size.height, channels = size.channels;
-    const int span = size.width * channels, vectors = (span + 15) / 16, reach = RADIUS * channels, side = (reach + 15) / 16;
-    // Tiles of equal size, so that no core waits for another's.
-    const int bands = (height + LOSS_ROWS - 1) / LOSS_ROWS, band = (height + bands - 1) / bands;
-    const int chunks = (vectors + LOSS_VECTORS - 1) / LOSS_VECTORS, chunk = (vectors + chunks - 1) / chunks;
-    // The gradient needs slopes beyond the tile, in rows and in vectors.
-    const int more_rows = with_gradient ? RADIUS : 0, more = with_gradient ? side : 0;
+    const int span = size.width * channels, vectors = (span + 15) / 16;  // floats, and vectors of 16, in a row
+    const int reach = WINDOW_RADIUS * channels, side = (reach + 15) / 16;  // of the window to one side
+    // Tiles of equal size keep all cores equally busy.
+    const int bands = (height + LOSS_TILE_ROWS - 1) / LOSS_TILE_ROWS, band = (height + bands - 1) / bands;
+    const int chunks = (vectors + LOSS_TILE_VECTORS - 1) / LOSS_TILE_VECTORS, chunk = (vectors + chunks - 1) / chunks;
+    // The gradient needs coefficients beyond the tile's edges, in rows and in vectors.
+    const int more_rows = with_gradient ? WINDOW_RADIUS : 0, more = with_gradient ? side : 0;
     for (int item = first; item < last; ++item) {
         const int top = smaller(item / chunks % bands * band, height), bottom = smaller(top + band, height);
         const int begin = smaller(item % chunks * chunk, vectors), own = smaller(begin + chunk, vectors) - begin;
@@ -76,8 +84,8 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
         const float* x = image + start * span;
         const auto* y = target + start * span;
         const int wide = own + 2 * more, all = wide + 2 * side;
-        const int left = 16 * (begin - more);  // column of the first slope, and beyond by `side` vectors of the first pixel
-        // Numbers `i` to `i + 15` of a row, black beyond its ends.
+        const int left = 16 * (begin - more);  // column of the first coefficient; pixels begin `side` vectors before it
+        // Values `i` to `i + 15` of a row, zero beyond its ends.
         const auto piece = [&](const auto* row, int i) INLINE -> v16 {
             if (i >= 0 && i + 16 <= span) return numbers(row + i);
             __remove_cvref(decltype(*row)) some[16] = {};
@@ -85,10 +93,10 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
             return numbers(some);
         };
 
-        // What x and d are counted from: about their mean in the tile, by channel.
-        alignas(64) float shift_x[16 * (LOSS_VECTORS + 4 * MOST)], shift_d[16 * (LOSS_VECTORS + 4 * MOST)];
+        // Shifts that are subtracted from x and d: approximate means of the tile, by channel.
+        alignas(64) float shift_x[SHIFTED], shift_d[SHIFTED];
         {
-            float mean_x[LOSS_CHANNELS], mean_y[LOSS_CHANNELS], counted[LOSS_CHANNELS];
+            float mean_x[MAX_LOSS_CHANNELS], mean_y[MAX_LOSS_CHANNELS], counted[MAX_LOSS_CHANNELS];
             for (int c = 0; c < channels; ++c) mean_x[c] = mean_y[c] = counted[c] = 0.0f;
             for (int vector = begin; vector < begin + own; ++vector) {
                 v16 a = (v16)0.0f, b = a;
@@ -109,7 +117,7 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
                 mean_y[c] *= share;
             }
             const int column = left - 16 * side;
-            for (int j = 0, c = (column + 64 * MOST * channels) % channels; j < 16 * all; ++j) {
+            for (int j = 0, c = (column + 64 * MAX_REACH_VECTORS * channels) % channels; j < 16 * all; ++j) {
                 shift_x[j] = mean_x[c];
                 shift_d[j] = mean_x[c] - mean_y[c];
                 c = c + 1 < channels ? c + 1 : 0;
@@ -117,14 +125,14 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
         }
 
         v16 l1 = (v16)0.0f, unlike = (v16)0.0f;
-        alignas(64) float maps[4][16 * (LOSS_VECTORS + 4 * MOST)], slopes[STEP][3][16 * (LOSS_VECTORS + 2 * MOST)];
-        alignas(64) v16 blurred[RING * (LOSS_VECTORS + 2 * MOST) * 4], sloping[RING * LOSS_VECTORS * 3];
-        // Without a gradient the rows are grouped as with one, so that sums are added in the same order.
-        const int start_row = top - 2 * RADIUS + (RADIUS - more_rows) / STEP * STEP;
-        // Rows before the first are read and count for nothing.
-        for (int i = 0; i < RING * wide * 4; ++i) blurred[i] = (v16)0.0f;
-        for (int first_row = start_row; first_row < bottom + more_rows + RADIUS; first_row += STEP) {
-            for (int row = first_row; row < first_row + STEP; ++row) {
+        alignas(64) float maps[4][SHIFTED], slopes[ROWS_AT_ONCE][3][16 * WIDEST];
+        alignas(64) v16 blurred[RING_ROWS * WIDEST * 4], sloping[RING_ROWS * LOSS_TILE_VECTORS * 3];
+        // Rows are grouped alike with and without a gradient, so that sums are added in the same order.
+        const int start_row = top - 2 * WINDOW_RADIUS + (WINDOW_RADIUS - more_rows) / ROWS_AT_ONCE * ROWS_AT_ONCE;
+        // Windows of the first groups read rows that were never computed: zeros, which do not count.
+        for (int i = 0; i < RING_ROWS * wide * 4; ++i) blurred[i] = (v16)0.0f;
+        for (int first_row = start_row; first_row < bottom + more_rows + WINDOW_RADIUS; first_row += ROWS_AT_ONCE) {
+            for (int row = first_row; row < first_row + ROWS_AT_ONCE; ++row) {
                 const bool inside = row >= 0 && row < height, own_row = row >= top && row < bottom;
                 const float* line_x = x + (long long)row * span;
                 const auto* line_y = y + (long long)row * span;
@@ -134,9 +142,9 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
                     if (inside) {
                         a = piece(line_x, i);
                         b = piece(line_y, i);
-                        // Rows lie on pages of their own, where nothing foresees what is read next.
-                        __builtin_prefetch(line_x + i + STEP * span);
-                        __builtin_prefetch(line_y + i + STEP * span);
+                        // The hardware prefetcher does not cross pages, and each row lies on a page of its own.
+                        __builtin_prefetch(line_x + i + ROWS_AT_ONCE * span);
+                        __builtin_prefetch(line_y + i + ROWS_AT_ONCE * span);
                     }
                     if (own_row && vector >= more + side && vector < more + side + own) l1 += vabs(a - b);
                     const v16 from_x = load(shift_x + 16 * vector), from_d = load(shift_d + 16 * vector);
@@ -148,28 +156,30 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
                     store(maps[2] + 16 * vector, a * a + b * b);
                     store(maps[3] + 16 * vector, d * d);
                 }
-                v16* out = blurred + (row + AHEAD) % RING * wide * 4;
+                v16* out = blurred + (row + RING_OFFSET) % RING_ROWS * wide * 4;
                 for (int vector = 0; vector < wide; ++vector)
                     for (int m = 0; m < 4; ++m) out[4 * vector + m] = blur_along(maps[m] + 16 * (vector + side), channels);
             }
 
-            const int centre = first_row - RADIUS;  // and the next ones
-            if (centre + STEP <= top - more_rows) continue;
-            const v16* line[RING];
-            for (int k = 0; k < RING; ++k) line[k] = blurred + (first_row + STEP + k + AHEAD) % RING * wide * 4;
-            bool own_row[STEP], row_counts[STEP];
-            for (int r = 0; r < STEP; ++r) {
+            const int centre = first_row - WINDOW_RADIUS;  // first of ROWS_AT_ONCE rows whose SSIM is computed
+            if (centre + ROWS_AT_ONCE <= top - more_rows) continue;
+            const v16* line[RING_ROWS];
+            const int oldest = first_row + ROWS_AT_ONCE + RING_OFFSET;
+            for (int k = 0; k < RING_ROWS; ++k) line[k] = blurred + (oldest + k) % RING_ROWS * wide * 4;
+            bool own_row[ROWS_AT_ONCE], row_counts[ROWS_AT_ONCE];
+            for (int r = 0; r < ROWS_AT_ONCE; ++r) {
                 own_row[r] = centre + r >= top && centre + r < bottom;
-                row_counts[r] = centre + r >= (valid ? RADIUS : 0) && centre + r < (valid ? height - RADIUS : height);
+                row_counts[r] = centre + r >= (valid ? WINDOW_RADIUS : 0)
+                             && centre + r < (valid ? height - WINDOW_RADIUS : height);
             }
             for (int vector = 0; vector < wide; ++vector) {
                 const int i = left + 16 * vector;
                 const v16 column = lane + (float)i;
                 const i16 in_row = (column < (float)(valid ? span - reach : span)) & (column >= (float)(valid ? reach : 0));
                 const v16 from_x = load(shift_x + 16 * (vector + side)), from_d = load(shift_d + 16 * (vector + side));
-                v16 blurs[4][STEP];
+                v16 blurs[4][ROWS_AT_ONCE];
                 for (int m = 0; m < 4; ++m) blur_down(line, 4 * vector + m, blurs[m]);
-                for (int r = 0; r < STEP; ++r) {
+                for (int r = 0; r < ROWS_AT_ONCE; ++r) {
                     const v16 blur[4] = {blurs[0][r], blurs[1][r], blurs[2][r], blurs[3][r]};
                     const i16 counts = row_counts[r] ? in_row : (i16)0;
                     const v16 mean_x = blur[0] + from_x, mean_d = blur[1] + from_d, mean_y = mean_x - mean_d;
@@ -182,7 +192,8 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
                     if (own_row[r] && vector >= more && vector < more + own)
                         unlike += counts ? luminance + (1.0f - luminance) * structure : (v16)0.0f;
                     if (!with_gradient) continue;
-                    // The gradient of 1 - SSIM is blur(offset) + (d - shift_d) blur(slope_d) + (x - shift_x) blur(slope_x).
+                    // The gradient of 1 - SSIM is blur(offset) + (d - shift_d) blur(slope_d) + (x - shift_x)
+                    // blur(slope_x).
                     const v16 slope_d = 2.0f * b2 * (1.0f - luminance), slope_x = -structure * slope_d;
                     const v16 offset = 2.0f * (1.0f - structure) * b1 * mean_d * (1.0f - mean_x * mean_d * b1)
                                    - blur[1] * slope_d - blur[0] * slope_x;
@@ -192,20 +203,21 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
                 }
             }
             if (!with_gradient) continue;
-            for (int r = 0; r < STEP; ++r) {
-                v16* out = sloping + (centre + r + AHEAD) % RING * LOSS_VECTORS * 3;
+            for (int r = 0; r < ROWS_AT_ONCE; ++r) {
+                v16* out = sloping + (centre + r + RING_OFFSET) % RING_ROWS * LOSS_TILE_VECTORS * 3;
                 for (int vector = 0; vector < own; ++vector)
                     for (int m = 0; m < 3; ++m) out[3 * vector + m] = blur_along(slopes[r][m] + 16 * (vector + more), channels);
             }
 
-            const int done = centre - RADIUS;  // and the next ones
+            const int done = centre - WINDOW_RADIUS;  // first of ROWS_AT_ONCE rows whose gradient is computed
             if (done < top) continue;
-            for (int k = 0; k < RING; ++k) line[k] = sloping + (centre + STEP + k + AHEAD) % RING * LOSS_VECTORS * 3;
+            const int oldest_slope = centre + ROWS_AT_ONCE + RING_OFFSET;
+            for (int k = 0; k < RING_ROWS; ++k) line[k] = sloping + (oldest_slope + k) % RING_ROWS * LOSS_TILE_VECTORS * 3;
             for (int vector = 0; vector < own; ++vector) {
                 const int i = 16 * (begin + vector), at = 16 * (vector + more + side);
-                v16 blurs[3][STEP];
+                v16 blurs[3][ROWS_AT_ONCE];
                 for (int m = 0; m < 3; ++m) blur_down(line, 3 * vector + m, blurs[m]);
-                for (int r = 0; r < smaller(STEP, bottom - done); ++r) {
+                for (int r = 0; r < smaller(ROWS_AT_ONCE, bottom - done); ++r) {
                     const v16 blur[3] = {blurs[0][r], blurs[1][r], blurs[2][r]};
                     const long long row = done + r;
                     const v16 a = piece(x + row * span, i), d = a - piece(y + row * span, i);

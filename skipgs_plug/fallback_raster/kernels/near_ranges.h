@@ -1,9 +1,11 @@
-// How deep the lists of each tile go at first: as far as a sample of the rows says that its pixels are filled, and more.
+// Chooses how deep the first lists of each tile go, from a sample of the rows.
 //
-// What a Gaussian takes of the light of all pixels, the volume 2 pi opacity sqrt(det) under it, is added up by cells of
-// tiles and by depth. A tile that this leaves open goes on later, so any depth gives the same image.
+// The volume under a splat, 2 pi opacity sqrt(det cov2d), says how much light it takes from all pixels together. The
+// kernel adds up the volumes by cell and depth layer, and ends a cell's lists where they cover the cell
+// NEAR_OPTICAL_DEPTH times. Tiles that are still open there are continued in a second pass, so every choice gives the
+// same image.
 //
-// Reads the projected splats. Writes `taken`, `ranges` and `share`, alone.
+// Reads the projected splats. Writes `taken`, `ranges` and `share`. It runs on one thread.
 #pragma once
 #include "lib/simd.h"
 static constexpr auto near_ranges = [](const int* visible, const Splats& splats, float* taken, int* ranges, float* share,
@@ -11,19 +13,20 @@ static constexpr auto near_ranges = [](const int* visible, const Splats& splats,
     constexpr float TAU = 6.2831853f;
     const int tiles_x = grid.tiles_x, tiles_y = grid.tiles_y;
     const float width = grid.width, height = grid.height;
-    const int columns = (tiles_x + CELL - 1) / CELL, rows = (tiles_y + CELL - 1) / CELL;
-    const int stride = larger(1, m / SAMPLES);
+    const int columns = (tiles_x + CELL_TILES - 1) / CELL_TILES, rows = (tiles_y + CELL_TILES - 1) / CELL_TILES;
+    const int stride = larger(1, m / MIN_SAMPLED_ROWS);
     const float *const conics = splats.conics, *const means2d = splats.means2d;
     const int* const depths = (const int*)splats.depths;  // as bits
     const auto volume = [&](int g) INLINE -> float {
         const float det = conics[3 * g] * conics[3 * g + 2] - conics[3 * g + 1] * conics[3 * g + 1];
-        // No more than one of its opacity over a whole cell.
-        return fminf(TAU / __builtin_sqrtf(fmaxf(det, 1e-12f)), (float)TILE * TILE * CELL * CELL) * splats.opacities[g];
+        // At most its opacity over the area of one cell.
+        const float most = (float)TILE * TILE * CELL_TILES * CELL_TILES;
+        return fminf(TAU / __builtin_sqrtf(fmaxf(det, 1e-12f)), most) * splats.opacities[g];
     };
-    // A few rows tell whether there is anything to be gained.
+    // One sampled row in 16 is enough to see whether limiting the lists can save anything.
     float total = 0.0f;
     for (int i = 0; i < m; i += 16 * stride) total += volume(visible[i]);
-    if (total * 16 * stride < 1.5f * ENOUGH * width * height) {
+    if (total * 16 * stride < 1.5f * NEAR_OPTICAL_DEPTH * width * height) {
         share[0] = 1.0f;
         return;
     }
@@ -33,28 +36,30 @@ static constexpr auto near_ranges = [](const int* visible, const Splats& splats,
         least = smaller(least, depth), most = larger(most, depth);
     }
     least = larger(least, 0);
-    const float scale = LAYERS / ((float)most - (float)least + 1.0f);
-    const auto layer = [&](int depth) { return larger(0, smaller(LAYERS - 1, (int)(((float)depth - (float)least) * scale))); };
-    clear(taken, (long long)columns * rows * LAYERS);
+    const float scale = CELL_LAYERS / ((float)most - (float)least + 1.0f);
+    const auto layer = [&](int depth) {
+        return larger(0, smaller(CELL_LAYERS - 1, (int)(((float)depth - (float)least) * scale)));
+    };
+    clear(taken, (long long)columns * rows * CELL_LAYERS);
     for (int i = 0; i < m; i += stride) {
         const int g = visible[i];
-        const int x = smaller(columns - 1, (int)(fminf(fmaxf(means2d[2 * g], 0.0f), width) / (TILE * CELL)));
-        const int y = smaller(rows - 1, (int)(fminf(fmaxf(means2d[2 * g + 1], 0.0f), height) / (TILE * CELL)));
-        taken[(y * columns + x) * LAYERS + layer(depths[g])] += volume(g);
+        const int x = smaller(columns - 1, (int)(fminf(fmaxf(means2d[2 * g], 0.0f), width) / (TILE * CELL_TILES)));
+        const int y = smaller(rows - 1, (int)(fminf(fmaxf(means2d[2 * g + 1], 0.0f), height) / (TILE * CELL_TILES)));
+        taken[(y * columns + x) * CELL_LAYERS + layer(depths[g])] += volume(g);
     }
-    // The first depth that is left out, by cell.
+    // By cell: the first layer that is left out. It is stored in the cell's first layer.
     for (int cell = 0; cell < columns * rows; ++cell) {
-        const int x = cell % columns * CELL * TILE, y = cell / columns * CELL * TILE;
-        const float pixels = (fminf(x + CELL * TILE, width) - x) * (fminf(y + CELL * TILE, height) - y);
-        float sum = 0.0f, *of_cell = taken + cell * LAYERS;
+        const int x = cell % columns * CELL_TILES * TILE, y = cell / columns * CELL_TILES * TILE;
+        const float pixels = (fminf(x + CELL_TILES * TILE, width) - x) * (fminf(y + CELL_TILES * TILE, height) - y);
+        float sum = 0.0f, *of_cell = taken + cell * CELL_LAYERS;
         int l = 0;
-        while (l < LAYERS && sum * stride < ENOUGH * pixels) sum += of_cell[l++];
+        while (l < CELL_LAYERS && sum * stride < NEAR_OPTICAL_DEPTH * pixels) sum += of_cell[l++];
         of_cell[0] = (float)l;
     }
     for (int t = 0; t < tiles_x * tiles_y; ++t) {
-        const int l = (int)taken[(t / tiles_x / CELL * columns + t % tiles_x / CELL) * LAYERS];
+        const int l = (int)taken[(t / tiles_x / CELL_TILES * columns + t % tiles_x / CELL_TILES) * CELL_LAYERS];
         ranges[2 * t] = -0x7fffffff;
-        ranges[2 * t + 1] = l < LAYERS ? least + (int)((float)l / scale) : 0x7fffffff;
+        ranges[2 * t + 1] = l < CELL_LAYERS ? least + (int)((float)l / scale) : 0x7fffffff;
     }
     int listed = 0, all = 0;
     for (int i = 0; i < m; i += stride, ++all) {

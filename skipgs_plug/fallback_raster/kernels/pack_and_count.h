@@ -1,8 +1,9 @@
-// Records of the visible rows that have pairs, one after the other, their footprints on the tiles, and the number of pairs of
-// each tile, by slice of the rows. Where `depths` are limited, only pairs whose depths lie in the range of their tile count.
+// Packs the records of the visible rows that have pairs, finds their footprints on the tiles, and counts the pairs of
+// each tile, by slice of the rows. Where `depths` are limited, it counts only pairs whose depth lies in the range of
+// their tile.
 //
-// Reads the projected splats and `colors`. Writes records, footprints and counts of its own slices, and `tiles_per_gauss` of
-// their rows; nobody else writes there.
+// Reads the projected splats and `colors`. Writes the records, footprints and counts of its own slices, and
+// `tiles_per_gauss` of their rows. No other thread writes to these slices.
 #pragma once
 #include "lib/ellipse.h"
 #include "lib/tile_lists.h"
@@ -49,25 +50,27 @@ static constexpr auto pack_and_count =
             const v16 a = conic[0], b = conic[1], c = conic[2], mx = centre[0], my = centre[1];
             v16 log2_opacity = log2(vmax(gather(splats.opacities, row, 1, 0), (v16)1e-20f));
             v16 reach = log2_opacity - LOG2_ALPHA_MIN;
-            // a dx^2 + 2 b dx dy + c dy^2 = a (dx + b / a dy)^2 + dy^2 / sigma_y^2: no needle rounds to a negative value.
+            // a dx^2 + 2 b dx dy + c dy^2 = a (dx + b / a dy)^2 + dy^2 / sigma_y^2: a sum of squares stays positive for
+            // any needle.
             v16 along = vsqrt(0.5f * LOG2_E * a), across = vsqrt((v16)(0.5f * LOG2_E)) / sigma[1];
-            // Half axes of the box around alpha >= ALPHA_MIN, a hair wider than exact: the blend tests every pixel itself.
+            // Half sides of the box around alpha >= ALPHA_MIN, slightly larger than exact: the blend tests every pixel
+            // itself.
             v16 half = vsqrt(vmax(2.0f * reach / LOG2_E, (v16)0.0f)) * 1.0001f + 1e-3f;
             const v16 half_w = half * sigma[0], half_h = half * sigma[1];
             const v16 slope = b / a, steepness = b / c;
 
-            // Pixels whose centres the box holds.
+            // Columns and rows of pixels whose centres lie in the box.
             const i16 left = clamped(__builtin_elementwise_ceil(mx - half_w - 0.5f), 0.0f, width);
             const i16 right = clamped(__builtin_elementwise_floor(mx + half_w - 0.5f), -1.0f, width - 1.0f);
             const i16 top = clamped(__builtin_elementwise_ceil(my - half_h - 0.5f), 0.0f, height);
             const i16 bottom = clamped(__builtin_elementwise_floor(my + half_h - 0.5f), -1.0f, height - 1.0f);
             static_assert(TILE == 16, "pixels to tiles");
             const i16 empty = (left > right) | (top > bottom);
-            alignas(64) int box[BOX][16];  // by field of a TileBox
+            alignas(64) int box[BOX_INTS][16];  // fields of the `TileBox` of each lane
             const i16 first_column = left >> 4, last_column = right >> 4, first_row = top >> 4, last_row = bottom >> 4;
             *(i16*)box[0] = first_column, *(i16*)box[1] = last_column, *(i16*)box[2] = first_row;
             *(i16*)box[3] = last_row;
-            // Which tiles of a small box the ellipse meets.
+            // The tiles of a small box that the ellipse meets.
             const i16 columns = last_column - first_column, lines = last_row - first_row;
             const i16 small = (columns < BOX_COLUMNS) & (lines < BOX_ROWS);
             Records16 record = {mx, my, along, along * slope, across, log2_opacity, half_h, half_w, {}, -slope, -steepness, reach,
@@ -81,7 +84,7 @@ static constexpr auto pack_and_count =
                 left = vmax(left - first_column, (i16)0);
                 right = vmin(right - first_column, vmin(columns, (i16)(BOX_COLUMNS - 1)));
                 const i16 hit = small & (r <= lines) & (left <= right);
-                left = hit ? left : (i16)0, right = hit ? right : (i16)0;  // no number is shifted by less than 0
+                left = hit ? left : (i16)0, right = hit ? right : (i16)0;  // shifts by negative numbers are undefined
                 meets |= hit & ((((i16)2 << right) - ((i16)1 << left)) << BOX_COLUMNS * r);
                 met += hit & (right - left + 1);
             }
@@ -89,7 +92,8 @@ static constexpr auto pack_and_count =
             met = meets > 0 ? met : (i16)0;
             const i16 corner = first_row * tiles_x + first_column;
 
-            // All tiles of a large ellipse are found with its record, to count them where `dense`.
+            // The tiles of a large ellipse are counted from its record. With `dense` it gets one even if its depth is
+            // out of range.
             const i16 wanted = (meets != 0) & (near | ((meets < 0) & (dense ? -1 : 0)));
             if (dense) scatter((float*)tiles_per_gauss, row, (v16)met, lanes);
             const unsigned chosen = bits(wanted) & ((1u << lanes) - 1);
@@ -99,21 +103,22 @@ static constexpr auto pack_and_count =
                 for (int k = 0; k < channels.number; ++k) record.color[k] = gather(colors, row, channels.stride, k);
             v16* const by_lane = (v16*)&record;
             transpose(by_lane);
-            // By lane: first tile and tiles met; pairs in the upper two tiles, and in the lower two, wherever these are.
-            alignas(64) int footprint[16][FOOTPRINT], upper[16][2], lower[16][2], below[16], key[16];
+            // By lane: first tile and tiles met; pairs in the two upper tiles; pairs in the two lower tiles, which
+            // begin at `below`.
+            alignas(64) int footprint[16][FOOTPRINT_INTS], upper[16][2], lower[16][2], below[16], key[16];
             interleave2((v16)corner, (v16)meets, (float*)footprint[0]);
             interleave2((v16)(meets & 1), (v16)(meets >> 1 & 1), (float*)upper[0]);
             interleave2((v16)(meets >> BOX_COLUMNS & 1), (v16)(meets >> (BOX_COLUMNS + 1) & 1), (float*)lower[0]);
             *(i16*)below = last_row > first_row ? corner + tiles_x : (i16)tiles;
             *(i16*)key = depth;
-            const unsigned tiny = bits((meets & ~TWO_BY_TWO) == 0);  // a tile of each or two, in both directions
+            const unsigned tiny = bits((meets & ~TWO_BY_TWO) == 0);  // lanes whose box is at most 2 x 2 tiles
             if (chosen == 0xffff && tiny == 0xffff && !limited) {
-                int* own = footprints.tiles + (long long)FOOTPRINT * (begin + found);
+                int* own = footprints.tiles + (long long)FOOTPRINT_INTS * (begin + found);
                 for (int l = 0; l < 16; ++l) {
-                    *(v2*)(own + FOOTPRINT * l) = *(const v2*)footprint[l];
+                    *(v2*)(own + FOOTPRINT_INTS * l) = *(const v2*)footprint[l];
                     store((float*)(records + begin + found + l), by_lane[l]);
                     packed.listed[begin + found + l] = i + l;
-                    // Two counters at a time: a branch for each would often be taken the wrong way.
+                    // Add to two counters at a time: a branch for each would often be mispredicted.
                     add_two(count + footprint[l][0], upper[l]);
                     add_two(count + below[l], lower[l]);
                 }
@@ -124,7 +129,7 @@ static constexpr auto pack_and_count =
             for (unsigned remaining = chosen; remaining; remaining &= remaining - 1) {
                 const int l = __builtin_ctz(remaining), corner = footprint[l][0];
                 int own_meets = footprint[l][1], pairs = 0;
-                Record& own_record = records[begin + found];  // the next one's where this has no pairs
+                Record& own_record = records[begin + found];  // overwritten by the next record if this one has no pairs
                 store((float*)&own_record, by_lane[l]);
                 if (!limited && (tiny >> l & 1)) {
                     add_two(count + corner, upper[l]);
@@ -148,8 +153,8 @@ static constexpr auto pack_and_count =
                     if (dense) tiles_per_gauss[row[l]] = met;
                 }
                 of_slice += pairs;
-                footprints.tiles[(long long)FOOTPRINT * (begin + found)] = corner;
-                footprints.tiles[(long long)FOOTPRINT * (begin + found) + 1] = own_meets;
+                footprints.tiles[(long long)FOOTPRINT_INTS * (begin + found)] = corner;
+                footprints.tiles[(long long)FOOTPRINT_INTS * (begin + found) + 1] = own_meets;
                 packed.listed[begin + found] = i + l;
                 found += pairs > 0;
             }

@@ -1,6 +1,7 @@
-// Puts the channels of a pass over the colours into the records.
+// Replaces the colours in the records by the channels of the next pass.
 //
-// Reads `colors` of the listed rows. Writes the colours of the records of its own slices; nobody else writes there.
+// Reads `colors` of the listed rows. Writes the colours in the records of its own slices. No other thread writes to
+// them.
 #pragma once
 #include "lib/record.h"
 #include "lib/tile_lists.h"

@@ -1,7 +1,7 @@
-// One launch: on the caller's thread, and on those of helpers that come before it is done here. Without a function the
-// helpers are dismissed.
+// Runs one launch on the caller's thread and on every helper that joins before the caller has finished. A null function
+// dismisses the helpers.
 //
-// Writes the launch into `pool`, alone, and the state, as all threads do.
+// Writes the launch into `pool`; no other thread does. All threads update `pool.state`.
 #pragma once
 #include "lib/thread_pool.h"
 static constexpr auto pool_run = [](ThreadPool& pool, void (*function)(void*, void*), void* bounds, void* arguments,
@@ -21,16 +21,17 @@ static constexpr auto pool_run = [](ThreadPool& pool, void (*function)(void*, vo
     pool.arguments = arguments;
     pool.finished = 0;
     const unsigned long long launch = (unsigned)(pool.state >> 32) + 1;
-    __atomic_store_n(&pool.state, launch << 32 | OPEN, __ATOMIC_SEQ_CST);
+    __atomic_store_n(&pool.state, launch << 32 | ACCEPTS_HELPERS, __ATOMIC_SEQ_CST);
     wake();
     pool.function(pool.bounds, pool.arguments);
-    // Who has not come by now would find nothing left.
-    const int joined = (int)(__atomic_fetch_and(&pool.state, ~OPEN, __ATOMIC_SEQ_CST) & (OPEN - 1));
+    // Close the launch: a helper that has not joined yet would find no work left.
+    const int joined = (int)(__atomic_fetch_and(&pool.state, ~ACCEPTS_HELPERS, __ATOMIC_SEQ_CST) & (ACCEPTS_HELPERS - 1));
     const auto done = [&]() { return __atomic_load_n(&pool.finished, __ATOMIC_SEQ_CST) == joined; };
     for (int spins = 0; spins < patience && !done(); ++spins) PAUSE();
     while (!done()) {
         __atomic_store_n(&pool.caller_sleeps, 1, __ATOMIC_SEQ_CST);
-        // The last helper may have looked before: then nobody calls, unless it sees the mark after all.
+        // The last helper may have read the mark before it was set. Then it wakes nobody, and the caller must not
+        // sleep.
         if (!done() || !__atomic_exchange_n(&pool.caller_sleeps, 0, __ATOMIC_SEQ_CST))
             pool.caller.acquire(pool.caller.lock, 1);
     }

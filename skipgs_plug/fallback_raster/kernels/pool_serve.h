@@ -1,6 +1,6 @@
-// What a helper does until it is dismissed.
+// The loop of a helper: it waits for launches and joins them until it is dismissed.
 //
-// Reads the launch in `pool`. Writes its own line there, the number of helpers that finished, and, as all threads do, the state.
+// Reads the launch in `pool`. Writes its own cache line there, and adds to `finished`. All threads update `pool.state`.
 #pragma once
 #include "lib/thread_pool.h"
 static constexpr auto pool_serve = [](ThreadPool& pool, int number, int patience) INLINE {
@@ -15,7 +15,8 @@ static constexpr auto pool_serve = [](ThreadPool& pool, int number, int patience
                 PAUSE();
                 continue;
             }
-            // The caller announces a launch before it looks who sleeps: one of both sees what the other did.
+            // The caller writes `state` before it reads `sleeps`, the helper writes `sleeps` before it reads `state`:
+            // at least one of them sees the other's write.
             __atomic_store_n(&own.sleeps, 1, __ATOMIC_SEQ_CST);
             const bool called = (unsigned)(__atomic_load_n(&pool.state, __ATOMIC_SEQ_CST) >> 32) != last
                              || __atomic_load_n(&pool.stop, __ATOMIC_SEQ_CST);
@@ -24,7 +25,7 @@ static constexpr auto pool_serve = [](ThreadPool& pool, int number, int patience
         }
         if (__atomic_load_n(&pool.stop, __ATOMIC_SEQ_CST)) break;
         last = (unsigned)(state >> 32);
-        while ((state & OPEN) && (unsigned)(state >> 32) == last) {
+        while ((state & ACCEPTS_HELPERS) && (unsigned)(state >> 32) == last) {
             if (!__atomic_compare_exchange_n(&pool.state, &state, state + 1, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST))
                 continue;
             pool.function(pool.bounds, pool.arguments);

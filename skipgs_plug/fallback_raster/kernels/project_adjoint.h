@@ -1,6 +1,7 @@
-// Gradients of means, rotations, scales and the camera.
+// Gradients of means, rotations, scales and the camera's pose.
 //
-// Reads the gradients of visible rows. Writes `v_gaussians` and the sum `v_poses` of its own block; nobody else writes there.
+// Reads the gradients of visible rows. Writes `v_gaussians` and the partial sum `v_poses` of its own block. No other
+// thread writes to that block.
 #pragma once
 #include "lib/project_adjoint.h"
 static constexpr auto project_adjoint = [](const Gaussians& gaussians, const Camera& camera, const RowList& visible,

@@ -1,13 +1,14 @@
-// Centre, depth, inverse covariance and extent on the image plane of one block of rows, and which of them are visible.
+// Projects one block of rows: 2D mean, depth, conic and extent of each Gaussian, and the list of visible rows.
 //
-// Reads the Gaussians and the camera. Writes `projected` and `found`, of the rows of its own block; nobody else writes there.
+// Reads the Gaussians and the camera. Writes `projected` and `found` for the rows of its own block. No other thread
+// writes to that block.
 #pragma once
 #include "lib/geometry.h"
 static constexpr auto project_forward = [](const Gaussians& gaussians, const float* opacities, const Camera& camera,
                                            const Limits& limits, const Projected& projected, const BlockRows& found, int n,
                                            int antialiased, int raw, int dense, int with_radii, int optimizations,
                                            int first, int last) INLINE {
-    const int block = first, row_begin = BLOCK * block, row_end = smaller(row_begin + BLOCK, n);
+    const int block = first, row_begin = BLOCK_ROWS * block, row_end = smaller(row_begin + BLOCK_ROWS, n);
     int end = row_begin;
     for (int base = row_begin; base < row_end; base += 16) {
         const int lanes = smaller(16, row_end - base);
@@ -17,8 +18,9 @@ static constexpr auto project_forward = [](const Gaussians& gaussians, const flo
         gather3(gaussians.scales, row, n, S);
         const Centers center = centers(camera, gaussians.means, row, n);
         const v16 z = center.z, iz = 1.0f / z;
-        // What lies outside even as a sphere of its longest axis needs no rotation. Neighbours in space that are neighbours
-        // in memory are left out 16 at a time. Written so that NaN goes on to the full test.
+        // Cull 16 rows without their rotations if all lie outside the image even as spheres of their longest axis.
+        // Gaussians near each other in space often lie near each other in memory. The tests let NaN through to the full
+        // test below.
         v16 longest = vmax(vmax(vabs(S[0]), vabs(S[1])), vabs(S[2]));
         if (raw) longest = vexp(vmax(vmax(S[0], S[1]), S[2]));
         i16 outside = (z < limits.near_plane) | (z > limits.far_plane);
@@ -43,7 +45,7 @@ static constexpr auto project_forward = [](const Gaussians& gaussians, const flo
         v16 opacity = gather(opacities, row, 1, 0);
         if (raw) opacity = sigmoid(opacity);
         if (antialiased) opacity *= compensation;
-        // Written so that a NaN anywhere fails the test and the Gaussian is left out.
+        // Each comparison is false for NaN, so a Gaussian with a NaN anywhere is culled.
         i16 visible = (z >= limits.near_plane) & (z <= limits.far_plane) & (cov.det > 0.0f) & (opacity >= ALPHA_MIN);
         v16 reach = vmin((v16)3.33f, vsqrt(LN_4 * log2(255.0f * vmax(opacity, (v16)1e-3f))));
         const float* K = camera.K;
@@ -51,7 +53,8 @@ static constexpr auto project_forward = [](const Gaussians& gaussians, const flo
         v16 sigma_x = vsqrt(cov.xx), sigma_y = vsqrt(cov.yy);
         v16 radius_x = vmin((v16)1e9f, __builtin_elementwise_ceil(reach * sigma_x));
         v16 radius_y = vmin((v16)1e9f, __builtin_elementwise_ceil(reach * sigma_y));
-        // Thinner than a millionth of a pixel (only without eps2d): it meets no pixel centre, but overflows gradients.
+        // Thinner than a millionth of a pixel, which only happens without eps2d: it meets no pixel centre, and its
+        // gradient would overflow.
         visible &= (cov.conic_a < 1e12f) & (cov.conic_c < 1e12f);
         visible &= (radius_x > limits.radius_clip) | (radius_y > limits.radius_clip);
         visible &= (u + radius_x > 0.0f) & (u - radius_x < camera.width);

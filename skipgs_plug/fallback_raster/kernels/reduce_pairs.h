@@ -1,7 +1,7 @@
-// Adds up the pairs of each row, and turns their moments into gradients.
+// Adds up the sums of each row's pairs, and turns their moments into gradients.
 //
-// Reads the slots of the pairs. Writes `v_splats` of its own block, and adds to it from the second pass over the channels
-// on; nobody else writes there.
+// Reads the slots of the pairs. Writes `v_splats` of its own block; from the second pass over the channels on it adds
+// to them. No other thread writes to that block.
 #pragma once
 #include "lib/reduce_pairs.h"
 static constexpr auto reduce_pairs = [](const PairSums& sums, const float* conics, const float* opacities,

@@ -1,7 +1,8 @@
-// Counts become starts: where each tile's list begins, where each slice begins in it, where each slice's pairs begin.
-// The total is counted in 64 bits; where 32 do not hold it, the starts mean nothing and must not be used.
+// Turns counts into start positions: of each tile's list, of each slice's part of that list, and of each slice's pairs.
+// The total is counted in 64 bits. If it exceeds 32 bits the start positions are invalid, and the caller raises an
+// error.
 //
-// Reads and overwrites `counts`, and writes `tile_start`, alone.
+// Reads and overwrites `counts`, and writes `tile_start`. It runs on one thread.
 #pragma once
 #include "lib/simd.h"
 static constexpr auto scan_pairs = [](const PairCounts& counts, int* tile_start, const Grid& grid, int slices, int first,

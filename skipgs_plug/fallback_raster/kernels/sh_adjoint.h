@@ -1,7 +1,7 @@
-// Gradients of means, all bands and the camera's position.
+// Gradients of means, SH coefficients and the camera's position.
 //
-// Reads the gradients of the colours of visible rows. Writes `v_means`, `v_sh` and the sum `v_positions` of its own block;
-// nobody else writes there.
+// Reads the gradients of the colours of visible rows. Writes `v_means`, `v_sh` and the partial sum `v_positions` of its
+// own block. No other thread writes to that block.
 #pragma once
 #include "lib/sh_adjoint.h"
 static constexpr auto sh_adjoint = [](const float* means, const Harmonics& sh, const RowList& visible, const float* colors,

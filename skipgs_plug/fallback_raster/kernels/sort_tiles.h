@@ -1,6 +1,7 @@
-// Sorts whole lists.
+// Sorts whole tile lists front to back.
 //
-// Reads and reorders the unsorted pairs of its own tiles, and writes their sorted lists; nobody else writes there.
+// Reads and reorders the unsorted pairs of its own tiles, and writes their sorted lists. No other thread writes to
+// these tiles.
 #pragma once
 #include "lib/sorted_tile.h"
 static constexpr auto sort_tiles = [](const TileLists& lists, const Grid& grid, int first, int last) INLINE {

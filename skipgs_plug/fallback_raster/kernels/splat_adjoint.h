@@ -1,7 +1,8 @@
-// Gradients of raw parameters from the sums of pairs, for one block of rows: what lies between stays in the cache.
+// Gradients of raw parameters from the sums of pairs, one block of rows at a time. Intermediate gradients stay in the
+// cache.
 //
-// Reads the slots of the pairs, and parameters and results of the forward pass of visible rows. Writes all gradients of its
-// own block, and adds to `v_centers.absolute`; nobody else writes there.
+// Reads the slots of the pairs, and the parameters and forward results of visible rows. Writes all gradients of its own
+// block, and adds to `v_centers.absolute`. No other thread writes to that block.
 #pragma once
 #include "lib/project_adjoint.h"
 #include "lib/reduce_pairs.h"
@@ -11,14 +12,16 @@ static constexpr auto splat_adjoint =
        const Rendered& rendered, const GaussianGradients& v_gaussians, float* v_logits, const HarmonicsGradients& v_sh,
        const FactorOutput& factors, const CenterGradients& v_centers, int n, int antialiased,
        int with_centers, int absgrad, int parts, int optimizations, int first, int last) INLINE {
-        // Kernels count rows from the first of all; what a vector reads behind the last one does not matter.
-        alignas(64) float center[2 * BLOCK], conic[3 * BLOCK + 16], alpha[BLOCK], color[3 * BLOCK + 16], magnitude[2 * BLOCK];
+        // The functions below index rows from row 0 of all, so these buffers of one block are addressed relative to it.
+        // Vector loads may read the padding behind the last row; its content does not matter.
+        alignas(64) float center[2 * BLOCK_ROWS], conic[3 * BLOCK_ROWS + 16], alpha[BLOCK_ROWS];
+        alignas(64) float color[3 * BLOCK_ROWS + 16], magnitude[2 * BLOCK_ROWS];
         const auto counted = [=](float* p, int width) INLINE -> float* {
-            return (float*)((unsigned long long)p - sizeof(float) * width * BLOCK * first);
+            return (float*)((unsigned long long)p - sizeof(float) * width * BLOCK_ROWS * first);
         };
         const SplatGradients v_splats = {counted(center, 2), counted(conic, 3), counted(alpha, 1), counted(magnitude, 2),
                                          counted(color, 3)};
-        if (absgrad) clear(magnitude, 2 * BLOCK);
+        if (absgrad) clear(magnitude, 2 * BLOCK_ROWS);
         const Channels channels = {/* stride */ 3, /* first */ 0, /* number */ 3};
         reduce_block_pairs(first, sums, rendered.conics, rendered.opacities, v_splats, n, channels, /* dense */ 0, absgrad,
                            parts);
@@ -28,7 +31,7 @@ static constexpr auto splat_adjoint =
                 if (absgrad) v_centers.absolute[2 * i + j] += v_splats.absolute[2 * sums.rows[i] + j];
             }
         const RowList visible = {sums.rows, sums.block_start};
-        // The layout of raw parameters, in constants.
+        // Strides of raw parameters as constants, so that the compiler drops the other cases.
         const Harmonics raw_sh = {sh.position, sh.sh0, sh.shN, /* sh0_stride */ 3, sh.shN_stride, /* shN_offset */ 0, sh.degree};
         sh_block_adjoint(first, gaussians.means, raw_sh, visible, rendered.colors, v_splats.colors, v_gaussians.means, v_sh,
                          factors, /* v_position */ nullptr, n, v_sh.factored, /* with_position */ 0, optimizations);

@@ -1,6 +1,7 @@
-// Norms of the gradients of packed 2D means, added to the sums of their rows.
+// Adds the norm of each packed gradient of a 2D mean to the sum of its row, and counts it.
 //
-// Reads `gradient`. Adds to `norms` and `counts` of the rows of its own items; no row comes twice, so nobody else does.
+// Reads `gradient`. Adds to `norms` and `counts` of the listed rows. No row is listed twice, so no other thread writes
+// to it.
 #pragma once
 #include "lib/simd.h"
 static constexpr auto sum_norms = [](const int* rows, const float* gradient, float* norms, float* counts, int n,

@@ -1,6 +1,6 @@
-// Some rows of an array, packed.
+// Copies the listed rows of an array to a packed array.
 //
-// Reads the named rows of `source`. Writes `taken` of its own places; nobody else writes there.
+// Reads the listed rows of `source`. Writes `taken` at its own positions. No other thread writes to these positions.
 #pragma once
 #include "lib/simd.h"
 static constexpr auto take_rows = [](const int* rows, const float* source, float* taken, int n, int width, int first,

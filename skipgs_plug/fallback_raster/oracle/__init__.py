@@ -1,1 +1,1 @@
-"""The renderer in plain torch and float64 that tests compare the kernels with."""
+"""The reference renderer in plain torch, with which tests compare the kernels in float64."""

@@ -1,9 +1,9 @@
-"""Gaussian splatting in plain PyTorch, for every dtype: the oracle of the fast rasterizer.
+"""Gaussian splatting in plain PyTorch, for every dtype: the oracle with which the fast rasterizer is compared.
 
-It restates the mathematics of gsplat 1.5.3's CUDA kernels as directly as possible: project every
-Gaussian, sort by depth, composite every Gaussian into every pixel its box can touch. Autograd writes the
-backward pass, so there is little to get wrong; it is slow and meant for small images.
-In float64 its error is far below what a float32 rasterizer can reach.
+It restates the mathematics of gsplat 1.5.3's CUDA kernels as directly as possible: it projects every Gaussian, sorts by
+depth, and blends every Gaussian into every pixel that its box can touch. Autograd derives the backward pass, so there
+is little to get wrong. It is slow and meant for small images. In float64 its error is far below the rounding error of a
+float32 rasterizer.
 """
 
 from __future__ import annotations
@@ -18,9 +18,13 @@ from torch.utils.checkpoint import checkpoint
 
 from .torch_reference_projection import ALPHA_THRESHOLD, Projected, project, spherical_harmonics, tiles
 
+# Cut-offs of gsplat and Inria's rasterizer, without units. Alpha is clamped at ALPHA_MAX. The first Gaussian that would
+# reduce the transmittance to TRANSMITTANCE_STOP or less ends the pixel and is not blended.
 ALPHA_MAX = 0.999
-TRANSMITTANCE_STOP = 1e-4  # the Gaussian that would go below ends the pixel, uncounted
-BLOCK = 16  # pixels are blended in squares of this side, which bounds the memory
+TRANSMITTANCE_STOP = 1e-4
+# Pixels along each side of the squares that are blended at a time. This bounds the memory, which is a few tensors of
+# SQUARE^2 x M numbers for the M Gaussians that reach the square.
+SQUARE = 16
 
 
 def rasterization_reference(
@@ -81,11 +85,12 @@ def rasterization_reference(
             radius_clip,
         )
 
-    # The culled leave before anything is differentiated: their depth may be 0, their gradient is 0.
+    # Remove culled Gaussians before anything is differentiated: their gradient is 0, and a depth of 0 would make it
+    # NaN.
     every_row = torch.cartesian_prod(torch.arange(n_cameras), torch.arange(n_gaussians)).to(means.device)
     with torch.no_grad():
-        seen = (project_rows(*every_row.T).radii > 0).all(dim=-1)
-    camera_ids, gaussian_ids = every_row[seen].T
+        visible = (project_rows(*every_row.T).radii > 0).all(dim=-1)
+    camera_ids, gaussian_ids = every_row[visible].T
     rows = project_rows(camera_ids, gaussian_ids)
 
     if sh_degree is None:
@@ -95,9 +100,9 @@ def rasterization_reference(
         directions = means[gaussian_ids] - torch.inverse(viewmats)[camera_ids, :3, 3]
         features = (spherical_harmonics(sh_degree, directions, coeffs) + 0.5).clamp_min(0.0)
 
-    places = torch.arange(len(camera_ids))  # of each row in the info's tensors, flattened
+    row_ids = torch.arange(len(camera_ids))  # row of each visible Gaussian in the tensors of `info`, flattened
     if not packed:  # [M, ...] -> [C, N, ...], zero where culled
-        places = camera_ids * n_gaussians + gaussian_ids
+        row_ids = camera_ids * n_gaussians + gaussian_ids
         shape = n_cameras, n_gaussians
         rows = Projected(*(t.new_zeros(*shape, *t.shape[1:]).index_put((camera_ids, gaussian_ids), t) for t in rows))
     flat = rows if packed else Projected(*(t.flatten(0, 1) for t in rows))
@@ -110,7 +115,7 @@ def rasterization_reference(
     images, alphas = [], []
     for camera in range(n_cameras):
         here = camera_ids == camera
-        projected = Projected(*(t[places[here]] for t in flat))
+        projected = Projected(*(t[row_ids[here]] for t in flat))
         values = {
             "RGB": [features[here]],
             "D": [projected.depths[:, None]],
@@ -118,9 +123,9 @@ def rasterization_reference(
         }[render_mode.replace("+", "").replace("ED", "D")]
         background = means.new_zeros(sum(v.shape[-1] for v in values))
         if backgrounds is not None:
-            colored = len(background) - n_depth  # depth is rendered onto 0
+            colored = len(background) - n_depth  # depth has a background of 0
             background = torch.cat([backgrounds[camera, :colored], background[colored:]])
-        image, alpha = composite(projected, torch.cat(values, -1), background, width, height, places[here], absolute)
+        image, alpha = composite(projected, torch.cat(values, -1), background, width, height, row_ids[here], absolute)
         if render_mode.endswith("ED"):
             expected = image[..., -1:] / alpha.clamp(min=1e-10)
             image = torch.cat([image[..., :-1], expected], dim=-1)
@@ -144,17 +149,17 @@ def rasterization_reference(
 
 
 class _OneCopyPerPixel(torch.autograd.Function):
-    """[M, 2] -> [P, M, 2]; its backward sees every pixel's own gradient, whose absolute values are wanted."""
+    """Copies [M, 2] to [P, M, 2], so that the backward pass sees each pixel's gradient and can sum absolute values."""
 
     @staticmethod
-    def forward(ctx: Any, means2d: Tensor, n_pixels: int, places: Tensor, absolute: Tensor | None) -> Tensor:
-        ctx.places, ctx.absolute = places, absolute
+    def forward(ctx: Any, means2d: Tensor, n_pixels: int, row_ids: Tensor, absolute: Tensor | None) -> Tensor:
+        ctx.row_ids, ctx.absolute = row_ids, absolute
         return means2d.expand(n_pixels, *means2d.shape)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None, None]:
         if ctx.absolute is not None:
-            ctx.absolute.index_add_(0, ctx.places, grads[0].abs().sum(0))
+            ctx.absolute.index_add_(0, ctx.row_ids, grads[0].abs().sum(0))
         return grads[0].sum(0), None, None, None
 
 
@@ -164,15 +169,15 @@ def composite(
     background: Tensor,  # [D]
     width: int,
     height: int,
-    places: Tensor,  # [M] rows of `absolute`
-    absolute: Tensor | None,  # [R, 2] collects sums of absolute gradients of means2d
+    row_ids: Tensor,  # [M] rows of `absolute`
+    absolute: Tensor | None,  # [R, 2] receives the sums of absolute gradients of means2d
 ) -> tuple[Tensor, Tensor]:
     """Blend all rows into all pixels front to back. Returns image [H, W, D] and alpha [H, W, 1]."""
     by_depth = torch.sort(projected.depths.detach(), stable=True).indices
 
     def blend(pixels: Tensor, order: Tensor, *rows: Tensor) -> Tensor:
         means2d, conics, opacities, features = rows
-        copies = _OneCopyPerPixel.apply(means2d, len(pixels), places[order], absolute)
+        copies = _OneCopyPerPixel.apply(means2d, len(pixels), row_ids[order], absolute)
         alpha = _alphas(pixels, copies, conics, opacities)
         alpha = torch.where(alpha >= ALPHA_THRESHOLD, alpha.clamp_max(ALPHA_MAX), 0.0)
         with torch.no_grad():
@@ -182,23 +187,24 @@ def composite(
         color = (alpha * after[:, :-1]) @ features + after[:, -1:] * background
         return torch.cat([color, 1 - after[:, -1:]], dim=1)
 
-    def block(pixels: Tensor) -> Tensor:
+    def blend_square(pixels: Tensor) -> Tensor:
         order = by_depth[_reaches(projected, pixels)[by_depth]]
         rows = (projected.means2d, projected.conics, projected.opacities, features)
         return checkpoint(blend, pixels, order, *(t[order] for t in rows), use_reentrant=False)
 
-    image = _image_of_blocks(block, width, height, background)
+    image = _image_of_squares(blend_square, width, height, background)
     return image[..., :-1], image[..., -1:]
 
 
 @torch.no_grad()
 def near_cutoff(info: dict[str, Any], relative: float = 1e-3, depth_relative: float = 1e-6) -> Tensor:
-    """Pixels whose value or gradient may jump under rounding: a comparison should leave them out.
+    """Mask pixels whose value or gradient may jump under rounding. A comparison should leave these pixels out.
 
     Args:
-        info: What `rasterization_reference` returned beside the images.
-        relative: Distance of an alpha to 1/255 or 0.999, and of a transmittance to 1e-4, as a share of it.
-        depth_relative: Two Gaussians in one pixel this close in depth may change places.
+        info: The dictionary that `rasterization_reference` returned.
+        relative: Masks pixels in which an alpha is this close to 1/255 or 0.999, or a transmittance to 1e-4, relative
+            to it.
+        depth_relative: Two Gaussians in one pixel whose depths are this close, relative to the depth, may be swapped.
 
     Returns:
         Boolean mask. [C, H, W]
@@ -210,12 +216,12 @@ def near_cutoff(info: dict[str, Any], relative: float = 1e-3, depth_relative: fl
         else:
             index = info["camera_ids"] == camera
         projected = Projected(*(info[name][index].detach() for name in Projected._fields))
-        block = partial(_near_cutoff_in_block, projected, relative, depth_relative)
-        masks.append(_image_of_blocks(block, info["width"], info["height"], projected.depths)[..., 0])
+        blend_square = partial(_near_cutoff_in_square, projected, relative, depth_relative)
+        masks.append(_image_of_squares(blend_square, info["width"], info["height"], projected.depths)[..., 0])
     return torch.stack(masks)
 
 
-def _near_cutoff_in_block(projected: Projected, relative: float, depth_relative: float, pixels: Tensor) -> Tensor:
+def _near_cutoff_in_square(projected: Projected, relative: float, depth_relative: float, pixels: Tensor) -> Tensor:
     order = torch.sort(projected.depths, stable=True).indices
     order = order[_reaches(projected, pixels)[order]]
     if len(order) == 0:
@@ -227,18 +233,18 @@ def _near_cutoff_in_block(projected: Projected, relative: float, depth_relative:
     alpha = torch.where(alpha >= ALPHA_THRESHOLD, alpha.clamp_max(ALPHA_MAX), 0.0)
     transmittance = torch.cumprod(1 - alpha, dim=1)
     near |= (transmittance / TRANSMITTANCE_STOP - 1).abs() < relative
-    # The depth of the nearest contributing Gaussian in front, carried along the sorted row.
+    # Depth of the nearest blended Gaussian in front, as a running maximum along the sorted row.
     contributing = torch.where(alpha > 0, depths, -torch.inf)
     in_front = torch.cummax(contributing, dim=1).values[:, :-1]
     tie = (alpha > 0)[:, 1:] & (depths[1:] - in_front <= depth_relative * depths[1:].abs())
-    # What lies behind the stop is never seen.
+    # Gaussians behind the stop are never blended.
     near[:, 1:] |= tie
-    seen = transmittance > 0.5 * TRANSMITTANCE_STOP
-    return (near & seen).any(dim=1, keepdim=True)
+    reached = transmittance > 0.5 * TRANSMITTANCE_STOP
+    return (near & reached).any(dim=1, keepdim=True)
 
 
 def _reaches(projected: Projected, pixels: Tensor) -> Tensor:
-    """Which Gaussians' boxes touch the pixels' box: outside its own, no alpha is above the threshold."""
+    """Mask the Gaussians whose boxes touch the box of the pixels. Outside its box an alpha is below 1/255."""
     means2d, radii = projected.means2d.detach(), projected.radii
     touching = (means2d + radii >= pixels.amin(dim=0)) & (means2d - radii <= pixels.amax(dim=0))
     return touching.all(dim=-1)
@@ -248,19 +254,19 @@ def _alphas(pixels: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor) 
     dx, dy = (pixels[:, None, :] - means2d).unbind(-1)  # [P, M]
     a, b, c = conics.unbind(-1)
     sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    # Clamped as well as selected: the exponential of what rounding left below zero may be infinite.
+    # Clamp as well as select: where rounding made sigma negative, the exponential may be infinite.
     return torch.where(sigma >= 0, opacities * torch.exp(-sigma.clamp_min(0.0)), 0.0)
 
 
-def _image_of_blocks(block: Callable[[Tensor], Tensor], width: int, height: int, like: Tensor) -> Tensor:
-    """Put together [H, W, X] from what `block` makes, [P, X], of the centres of a square of pixels [P, 2]."""
+def _image_of_squares(blend_square: Callable[[Tensor], Tensor], width: int, height: int, like: Tensor) -> Tensor:
+    """Assemble an image [H, W, X] from squares. `blend_square` maps pixel centres [P, 2] of a square to [P, X]."""
     rows = []
-    for top in range(0, height, BLOCK):
-        y = torch.arange(top, min(top + BLOCK, height)).to(like) + 0.5
+    for top in range(0, height, SQUARE):
+        y = torch.arange(top, min(top + SQUARE, height)).to(like) + 0.5
         squares = []
-        for left in range(0, width, BLOCK):
-            x = torch.arange(left, min(left + BLOCK, width)).to(like) + 0.5
+        for left in range(0, width, SQUARE):
+            x = torch.arange(left, min(left + SQUARE, width)).to(like) + 0.5
             pixels = torch.cartesian_prod(y, x).flip(-1)
-            squares.append(block(pixels).reshape(len(y), len(x), -1))
+            squares.append(blend_square(pixels).reshape(len(y), len(x), -1))
         rows.append(torch.cat(squares, dim=1))
     return torch.cat(rows)

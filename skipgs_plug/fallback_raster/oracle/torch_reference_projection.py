@@ -1,4 +1,4 @@
-"""The per-Gaussian half of the reference rasterizer: projection, colors and tiles, in plain PyTorch."""
+"""The per-Gaussian half of the reference rasterizer in plain PyTorch: projection, colours and tiles."""
 
 from __future__ import annotations
 
@@ -9,22 +9,25 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-ALPHA_THRESHOLD = 1.0 / 255.0  # a fainter contribution is dropped
-RADIUS_SIGMAS = 3.33  # sqrt(2 ln 255), rounded up: where opacity 1 falls to ALPHA_THRESHOLD
+# A contribution with a smaller alpha is dropped, as in gsplat and Inria's rasterizer: it is less than a step of 8 bits.
+ALPHA_THRESHOLD = 1.0 / 255.0
+# Half extent of a Gaussian in standard deviations, at most: sqrt(2 ln 255) = 3.329, where a Gaussian of opacity 1 falls
+# to ALPHA_THRESHOLD. gsplat rounds it up to 3.33.
+RADIUS_SIGMAS = 3.33
 
 
 class Projected(NamedTuple):
-    """Gaussians on the image plane, one row for each Gaussian a camera sees."""
+    """Gaussians on the image plane, one row for each visible (camera, Gaussian) pair."""
 
     means2d: Tensor  # [M, 2] pixels
     depths: Tensor  # [M]
     conics: Tensor  # [M, 3] inverse 2D covariance: xx, xy, yy
     opacities: Tensor  # [M] compensated in antialiased mode
-    radii: Tensor  # [M, 2] int32 half extents in pixels, 0 where culled
+    radii: Tensor  # [M, 2] int32 half extents in pixels; 0 where culled
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotations of quaternions w, x, y, z of any length. [M, 4] -> [M, 3, 3]; zero gives the identity."""
+    """Return rotation matrices [M, 3, 3] of quaternions w, x, y, z [M, 4] of any length. Zero gives the identity."""
     w, x, y, z = F.normalize(quats, dim=-1, eps=torch.finfo(quats.dtype).tiny).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -49,12 +52,12 @@ def project(
     far_plane: float,
     radius_clip: float,
 ) -> Projected:
-    """EWA projection (Zwicker et al. 2001), each Gaussian with the camera of its row."""
+    """Project Gaussians onto image planes (EWA splatting, Zwicker et al. 2001), each with the camera of its row."""
     rotation = viewmats[:, :3, :3]
     x, y, z = (torch.einsum("mij,mj->mi", rotation, means) + viewmats[:, :3, 3]).unbind(-1)
     axes = rotation @ (rotation_matrices(quats) * scales[:, None, :])  # [M, 3, 3]
 
-    # The Jacobian is taken no further out than 15 % of the image beyond its border.
+    # The Jacobian is evaluated at most 15 % of the image's size beyond its border.
     fx, fy, cx, cy = Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]
     margin_x, margin_y = 0.3 * 0.5 * width / fx, 0.3 * 0.5 * height / fy
     tan_x = torch.clamp(x / z, min=-(cx / fx + margin_x), max=(width - cx) / fx + margin_x)
@@ -65,7 +68,7 @@ def project(
     covariance = flat @ flat.transpose(-1, -2)  # [M, 2, 2]
 
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    # det(A A^T) as the squared area that A's rows span: no cancellation where a needle is seen.
+    # det(A A^T) as the squared area that A's rows span: no cancellation for thin needles.
     sharp_determinant = torch.linalg.cross(flat[:, 0], flat[:, 1]).square().sum(dim=-1)
     determinant = sharp_determinant + eps2d * (xx + yy) + eps2d**2
     xx, yy = xx + eps2d, yy + eps2d
@@ -85,7 +88,16 @@ def project(
 
 
 def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
-    """Real spherical harmonics (Sloan, JCGT 2013). [M, 3], [M, K, 3] -> [M, 3]; K >= (degree + 1)^2."""
+    """Evaluate real spherical harmonics (Sloan, JCGT 2013).
+
+    Args:
+        degree: Highest degree that is evaluated, 0 to 3.
+        directions: Directions of any length. [M, 3]
+        coeffs: Coefficients of D channels, K >= (degree + 1)^2. [M, K, D]
+
+    Returns:
+        Sums over the basis functions. [M, D]
+    """
     x, y, z = F.normalize(directions, dim=-1).unbind(-1)
     basis = [torch.full_like(x, 0.2820947917738781)]
     if degree >= 1:
@@ -115,7 +127,7 @@ def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor) -> Tens
 def tiles(
     rows: Projected, image_ids: Tensor, n_images: int, width: int, height: int, tile_size: int
 ) -> dict[str, int | Tensor]:
-    """The tiles every Gaussian's box touches, sorted by image, tile and depth, in gsplat's encoding."""
+    """List the tiles that each Gaussian's box touches, sorted by image, tile and depth, in gsplat's encoding."""
     tile_width, tile_height = math.ceil(width / tile_size), math.ceil(height / tile_size)
     grid = torch.tensor([tile_width, tile_height])
     means2d, radii = rows.means2d.reshape(-1, 2), rows.radii.reshape(-1, 2)
@@ -128,8 +140,8 @@ def tiles(
     tile_ids = (first[flatten_ids, 1] + step // columns) * tile_width + first[flatten_ids, 0] + step % columns
     tile_bits = (tile_width * tile_height).bit_length()
     depth_bits = rows.depths.reshape(-1).float().view(torch.int32).long()[flatten_ids] & 0xFFFFFFFF
-    places = (image_ids[flatten_ids] << tile_bits) | tile_ids
-    isect_ids, order = torch.sort((places << 32) | depth_bits, stable=True)
+    tile_keys = (image_ids[flatten_ids] << tile_bits) | tile_ids
+    isect_ids, order = torch.sort((tile_keys << 32) | depth_bits, stable=True)
     n_tiles = tile_width * tile_height
     per_tile = torch.bincount(image_ids[flatten_ids] * n_tiles + tile_ids, minlength=n_images * n_tiles)
     return {

@@ -1,1 +1,1 @@
-"""Whatever compiles, checks and runs kernels: launch, threads, cache, guard zones, memory."""
+"""Compiles, checks and runs kernels: launches, threads, the cache on disk, guard zones and memory."""

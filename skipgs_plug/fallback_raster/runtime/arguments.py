@@ -1,4 +1,4 @@
-"""What `rasterization` refuses, in one sentence that names the argument."""
+"""Checks of the arguments of `rasterization`. Each refusal is one sentence that names the argument."""
 
 import functools
 import math
@@ -10,18 +10,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# Kernels count rows, channels of rows and pixels in 32 bits, and place pixel centres in float32.
+# Most elements of a tensor, and most pixels of an image: kernels index both with 32-bit ints.
 MAX_NUMBERS = 2**31 - 1
+# Most pixels along a side of an image: kernels compute pixel centres, at +0.5, in float32, which is exact up to 2^23.
 MAX_SIDE = 2**23
 
 Shape = tuple[int, ...]
 
 
 def refuse_unsupported(**used: bool) -> None:
-    """Names the first option of gsplat's that is used and not supported here.
+    """Refuse options of gsplat that are used but not supported here.
 
     Raises:
-        NotImplementedError: One is used.
+        NotImplementedError: An option is used. The message names the first.
     """
     for name, in_use in used.items():
         if in_use:
@@ -29,37 +30,37 @@ def refuse_unsupported(**used: bool) -> None:
 
 
 def as_float(name: str, value: Any) -> float:
-    """Returns a number of any kind as kernels take it.
+    """Return a real number of any type as a float.
 
     Raises:
-        ValueError: It is none, or NaN.
+        ValueError: The value is not a number, or is NaN.
     """
-    # Asking for the type spares asking the abstract class, which takes as long as a small kernel.
+    # The first comparison avoids the check against the abstract class, which takes as long as a small kernel.
     if (type(value) is not float and not isinstance(value, numbers.Real)) or math.isnan(value):
         raise ValueError(f"{name} must be a number, got {value!r}.")
     return float(value)
 
 
 def planes(near_plane: Any, far_plane: Any) -> tuple[float, float]:
-    """Returns the clipping planes as kernels take them.
+    """Return the clipping planes as floats, with the near plane at 0 or more.
 
-    What lies behind a camera is never drawn: kernels sort by the bits of depths, which orders positive ones only.
+    Gaussians behind a camera are never drawn: kernels sort by the bits of depths, which orders only positive depths.
 
     Raises:
-        ValueError: One is no number.
+        ValueError: A plane is not a number.
     """
     return max(as_float("near_plane", near_plane), 0.0), as_float("far_plane", far_plane)
 
 
 def camera_centre(viewmat: Tensor) -> Tensor:
-    """Returns where a camera [4, 4] stands in world space [3], differentiable.
+    """Return the position [3] of a camera in world space, given its matrix [4, 4]. Differentiable.
 
     Raises:
         ValueError: The matrix has no inverse.
     """
     rows = viewmat.tolist()
     if not viewmat.requires_grad and rows[3] == [0.0, 0.0, 0.0, 1.0]:
-        # By Cramer's rule, in float64: torch takes longer to look the matrix over than some kernels run.
+        # Cramer's rule in float64: torch's checks of the matrix take longer than some kernels run.
         *axes, shift = zip(*rows[:3], strict=True)
         across = [_cross(axes[1], axes[2]), _cross(axes[2], axes[0]), _cross(axes[0], axes[1])]
         volume = _dot(axes[0], across[0])
@@ -80,12 +81,12 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 
 
 def as_kernels_read(*tensors: Tensor) -> list[Tensor]:
-    """Returns tensors as contiguous float32, those that are so already as they are."""
+    """Return tensors as contiguous float32. Tensors that are so already are returned as they are."""
     return [t if t.dtype is torch.float32 and t.is_contiguous() else t.to(torch.float32).contiguous() for t in tensors]
 
 
 def as_int(value: Any) -> Any:
-    """Returns a whole number of any kind, such as NumPy's, as kernels take it, and all else as it is."""
+    """Return a whole number of any type, such as NumPy's, as an int, and any other value unchanged."""
     try:
         return operator.index(value)
     except TypeError:
@@ -101,15 +102,15 @@ def check_tensors(
     viewmats: Tensor,
     Ks: Tensor,
     sh_degree: int | None,
-    sh_rest: Tensor | None,
+    shN: Tensor | None,
     backgrounds: Tensor | None,
     width: int,
     height: int,
 ) -> None:
-    """Compares kinds, devices and shapes with what `rasterization` documents, and sizes with what kernels can count.
+    """Check types, devices and shapes as `rasterization` documents them, and sizes against the limits of the kernels.
 
     Raises:
-        ValueError: Something does not fit.
+        ValueError: An argument does not fit. The message names it.
     """
     tensors = {
         "means": means,
@@ -122,8 +123,8 @@ def check_tensors(
     }
     if backgrounds is not None:
         tensors["backgrounds"] = backgrounds
-    if sh_rest is not None:
-        tensors["colors[1]"] = sh_rest
+    if shN is not None:
+        tensors["colors[1]"] = shN
     for name, tensor in tensors.items():
         if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
             kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
@@ -134,14 +135,14 @@ def check_tensors(
         raise ValueError(f"sh_degree must be 0 to 3 on the CPU, got {sh_degree!r}.")
     if not (isinstance(width, int) and isinstance(height, int) and width > 0 and height > 0):
         raise ValueError(f"width and height must be whole numbers of at least 1, got {width!r} and {height!r}.")
-    shapes = (None if t is None else t.shape for t in (means, quats, scales, opacities, colors, viewmats, Ks, sh_rest))
+    shapes = (None if t is None else t.shape for t in (means, quats, scales, opacities, colors, viewmats, Ks, shN))
     _check_shapes(*shapes, None if backgrounds is None else backgrounds.shape, sh_degree, width, height)
     for name, cameras in (("viewmats", viewmats), ("Ks", Ks)):
         if not all(math.isfinite(number) for camera in cameras.tolist() for row in camera for number in row):
             raise ValueError(f"{name} holds NaN or infinity: a camera must be finite.")
 
 
-@functools.lru_cache(maxsize=64)  # those of the last images: looking again takes as long as a small kernel
+@functools.lru_cache(maxsize=64)  # shapes of the last images: checking them again takes as long as a small kernel
 def _check_shapes(
     means: Shape,
     quats: Shape,
@@ -150,7 +151,7 @@ def _check_shapes(
     colors: Shape,
     viewmats: Shape,
     Ks: Shape,
-    sh_rest: Shape | None,
+    shN: Shape | None,
     backgrounds: Shape | None,
     sh_degree: int | None,
     width: int,
@@ -181,13 +182,13 @@ def _check_shapes(
         channels = shape[-1]
     else:
         terms = (sh_degree + 1) ** 2
-        if sh_rest is not None:
-            rest = list(sh_rest)
-            if shape != [n, 1, 3] or len(rest) != 3 or rest[0] != n or rest[2] != 3:
+        if shN is not None:
+            higher = list(shN)
+            if shape != [n, 1, 3] or len(higher) != 3 or higher[0] != n or higher[2] != 3:
                 raise ValueError(
-                    f"colors as a pair must have shapes [{n}, 1, 3], [{n}, K - 1, 3], got {shape}, {rest}."
+                    f"colors as a pair must have shapes [{n}, 1, 3], [{n}, K - 1, 3], got {shape}, {higher}."
                 )
-            shape = [n, 1 + rest[1], 3]
+            shape = [n, 1 + higher[1], 3]
         if shape[-1:] != [3] or shape[:-2] not in ([n], [n_cameras, n]) or shape[-2] < terms:
             raise ValueError(
                 f"colors must have shape [{n}, K, 3] or [{n_cameras}, {n}, K, 3] with K >= {terms} for "
@@ -201,6 +202,6 @@ def _check_shapes(
             f"An image may have at most {MAX_SIDE:,} pixels along a side and {MAX_NUMBERS:,} in all, "
             f"got {width}x{height}."
         )
-    widest = max(4, channels if sh_degree is None else 3) + 1  # quaternions, or colours and depth
+    widest = max(4, channels if sh_degree is None else 3) + 1  # columns of quaternions, or of colours and depth
     if n * widest > MAX_NUMBERS:
         raise ValueError(f"{n:,} Gaussians with {widest} numbers each are more than {MAX_NUMBERS:,} numbers.")

@@ -1,4 +1,4 @@
-"""Tensors that kernels write to: on the CPU, in memory that is not given back between iterations."""
+"""Tensors that kernels write to. They lie on the CPU, and the memory of large ones is kept between iterations."""
 
 import math
 import threading
@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from . import guard
-from .memory import LARGE, SUPPORTED, Pool
+from .memory import POOLED_BYTES, SUPPORTED, Pool
 from .threads import LOCK
 
-# Asked for a tensor like one of these, torch takes half the time that it takes to look through options.
+# `new_empty` of an existing tensor takes half the time of `torch.empty` with options.
 _FLOAT, _INT, _LONG = (torch.empty(0, dtype=dtype, device="cpu") for dtype in (torch.float32, torch.int32, torch.int64))
 
 _scratch = threading.local()
@@ -18,43 +18,43 @@ _memory = Pool()
 
 
 def floats(*shape: int) -> Tensor:
-    """A float32 tensor with undefined content, whatever the default dtype and device of the process."""
+    """Return a float32 tensor with undefined content. The default dtype and device of the process do not matter."""
     return _empty(shape, _FLOAT)
 
 
 def ints(*shape: int) -> Tensor:
-    """An int32 tensor with undefined content."""
+    """Return an int32 tensor with undefined content."""
     return _empty(shape, _INT)
 
 
 def _empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
-    if not SUPPORTED or math.prod(shape) * like.itemsize < LARGE:
+    if not SUPPORTED or math.prod(shape) * like.itemsize < POOLED_BYTES:
         return guard.poison(like.new_empty(*shape))
     with LOCK:
         return guard.poison(_memory.empty(shape, like.dtype))
 
 
 def release_memory() -> None:
-    """Gives memory back to the system that tensors of the rasterizer lay in and none lies in now."""
+    """Return memory that no tensor of the rasterizer uses any more to the operating system."""
     with LOCK:
         _memory.release()
 
 
 def longs(*shape: int) -> Tensor:
-    """An int64 tensor with undefined content."""
+    """Return an int64 tensor with undefined content."""
     return _empty(shape, _LONG)
 
 
 def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """A tensor of zeros."""
+    """Return a tensor of zeros."""
     return torch.zeros(shape, dtype=dtype, device="cpu")
 
 
 def scratch(name: str, *shape: int) -> Tensor:
-    """A float buffer with undefined content that this thread reuses whenever it asks for the same name again.
+    """Return a float32 buffer with undefined content, which this thread reuses for every call with the same name.
 
-    Fresh memory of many megabytes costs a page fault per 4 KiB, as much as some kernels take. The buffer must not
-    outlive the call that asked for it.
+    New memory of many megabytes costs a page fault per 4 KiB, as much time as some kernels take. The buffer must not
+    outlive the call that requested it.
     """
     buffers: dict[str, Tensor] = _scratch.__dict__
     size = math.prod(shape)

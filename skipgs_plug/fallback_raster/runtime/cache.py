@@ -1,7 +1,7 @@
-"""Warp's cache of compiled kernels, when it is damaged or cannot be written.
+"""Protects Warp's cache of compiled kernels against damaged files and folders that cannot be written.
 
-Warp loads whatever object file it finds, and code with a few wrong bytes is native code that does anything. A checksum
-beside each object file tells; what does not fit or does not load is thrown away and compiled again.
+Warp loads any object file that it finds, and damaged native code may do anything. A checksum beside each object file
+detects damage. A file whose checksum differs, or that does not load, is deleted and compiled again.
 """
 
 import hashlib
@@ -20,10 +20,10 @@ _SUM = "sha256"
 
 @contextmanager
 def say_unwritable() -> Iterator[None]:
-    """Turns the failure to write a kernel inside the block into a sentence.
+    """Turn a failure to write a kernel inside the `with` statement into one clear sentence.
 
     Raises:
-        WriteError: Names the file and the way out.
+        WriteError: The cache cannot be written. The message names the file and the fix.
     """
     try:
         yield
@@ -36,18 +36,18 @@ def say_unwritable() -> Iterator[None]:
 
 
 def load_or_rebuild(folder: Path, load: Callable[[], Any], forget: Callable[[], None]) -> Any:
-    """Loads a kernel, from `folder` where Warp has compiled it before.
+    """Load a kernel from `folder`, or compile it again if it is missing or damaged.
 
     Args:
-        folder: Where Warp keeps what it compiles from this source.
-        load: Compiles if there is nothing in the folder, loads, and returns the loaded kernel.
-        forget: Makes Warp look into the folder again.
+        folder: Folder where Warp keeps the object file of this source.
+        load: Compiles the kernel if the folder is empty, loads it, and returns it.
+        forget: Makes Warp forget the kernel, so that it reads the folder again.
 
     Returns:
-        What `load` returns.
+        The kernel that `load` returned.
 
     Raises:
-        WriteError: It has to be compiled, and the folder cannot be written.
+        WriteError: The kernel has to be compiled, but the folder cannot be written.
     """
     if any(_checksum(path) != _expected(path) for path in folder.glob("*.o") if _expected(path) is not None):
         shutil.rmtree(folder, ignore_errors=True)
@@ -78,7 +78,7 @@ def _expected(path: Path) -> str | None:
 
 
 def _write(path: Path, text: str) -> None:
-    """A cache that cannot be written works without checksums."""
+    """Write a file atomically. A failure is ignored: the cache also works without checksums."""
     aside = path.with_name(f"{path.name}.{threading.get_ident()}.{os.getpid()}")
     try:
         aside.write_text(text)

@@ -1,68 +1,71 @@
-"""Numbers that Python and the kernels share; the text of every kernel gets them by name."""
+"""Constants that Python and the kernels share. The text of every kernel begins with their C++ definitions."""
 
 import math
 
-# Pixels along the side of a tile, as in gsplat and Inria's rasterizer. A tile is patches of 4 x 4 or 4 x 2 pixels
-# (`kernels/lib/blend_tile.h`).
+# Pixels along each side of a tile. gsplat and Inria's rasterizer use the same size. A tile consists of
+# patches of 4 x 4 or 4 x 2 pixels (`kernels/lib/blend_tile.h`).
 TILE = 16
 
-# Rows of a block: Gaussians whose gradients one core clears and fills at a time, so that they are still in its cache
-# when they are filled, and which one partial sum of the camera's gradients covers.
-BLOCK = 512
+# Rows (Gaussians) of a block. One thread clears and fills the gradients of one block at a time, about 30 KB without
+# SH coefficients, so that they are still in its cache when they are filled. One partial sum of the camera's gradients
+# covers one block, so results depend on this number in their last bits.
+BLOCK_ROWS = 512
 
-# Floats of a `Record`: a Gaussian as the blend reads it, one cache line (`kernels/lib/record.h`).
-RECORD = 16
+# Floats of a `Record`, the data of a Gaussian that the blend reads: one cache line (`kernels/lib/record.h`).
+RECORD_FLOATS = 16
 
-# Ints of a Gaussian's footprint on the tiles: the first tile of the box around it, and which tiles of the box it meets,
-# as bits, where these are few (`kernels/lib/tile_lists.h`); -1 where they are more.
-FOOTPRINT = 2
+# Ints of the footprint of a Gaussian: the first tile of its box, and the tiles of the box that it meets, as bits
+# (`kernels/lib/tile_lists.h`). The second int is -1 if the box is too large for the bits.
+FOOTPRINT_INTS = 2
 
-# Ints of a `TileBox`, the box of tiles around a larger Gaussian (`kernels/lib/ellipse.h`).
-BOX = 4
+# Ints of a `TileBox`, the box of tiles around a larger Gaussian (`kernels/lib/ellipse.h`): two columns and two rows.
+BOX_INTS = 4
 
-# Counters of a slice that belong to no tile: tiles are counted two at a time, the last of them with one of these.
+# Counters of a slice beyond those of its tiles: counting two neighbouring tiles at a time may touch these two.
 SPARE_COUNTS = 2
 
-# Floats of a `PairSum`: what one tile adds to a Gaussian's gradient, one cache line (`kernels/lib/record.h`).
-PAIR = 16
+# Floats of a `PairSum`, the part of a Gaussian's gradient from one tile: one cache line (`kernels/lib/record.h`).
+PAIR_FLOATS = 16
 
-# Bands of SH of degree 3 beside the constant one.
-BANDS = 15
+# SH coefficients of degree 1 to 3 for each channel: (3 + 1)^2 - 1, all but the constant one.
+HIGHER_BANDS = 15
 
-# Floats of a row of either factor of a `FactoredGradient`: three of a direction or a colour, and one that nobody reads,
-# so that rows move as vectors.
-FACTOR = 4
+# Floats in a row of each factor of a `FactoredGradient`: three of a direction or a colour, and one unused, so that rows
+# move as vectors of four.
+FACTOR_FLOATS = 4
 
-# Buckets of equal ranges of depth into which a tile deals its pairs at most before it sorts them. It takes two for each
-# pair; the ends of 8192 fill a first-level cache of 32 KiB.
-BUCKETS = 8192
+# Most buckets into which the pairs of a tile are distributed by depth before they are sorted. A tile takes at least two
+# buckets per pair up to this number, whose 8192 bucket ends fill a first-level cache of 32 KiB.
+MAX_BUCKETS = 8192
 
-# Channels that one pass blends, the room for colours in a record; wider colours take several passes.
+# Most channels that one pass blends: a record has room for four. Wider colours take several passes.
 MAX_CHANNELS = 4
 
-# Cut-offs of gsplat and of Inria's rasterizer: alpha is clamped at the first, a contribution under the second is
-# dropped, and a pixel is finished when the next Gaussian would bring its transmittance to the third or less.
+# Cut-offs of gsplat and Inria's rasterizer, without units. Alpha is clamped at ALPHA_MAX. A contribution with an alpha
+# below ALPHA_MIN is dropped. A pixel is finished when the next Gaussian would reduce its transmittance to
+# TRANSMITTANCE_MIN or less.
 ALPHA_MAX = 0.999
 ALPHA_MIN = 1.0 / 255.0
 TRANSMITTANCE_MIN = 1e-4
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 
-# Pixels along the side of SSIM's window, as in its paper and in all trainers.
-WINDOW = 11
+# Pixels along each side of SSIM's window, as in its paper (Wang et al. 2004) and in all 3DGS trainers.
+SSIM_WINDOW = 11
 
-# Rows, and vectors of 16 floats in a row, of a tile of the loss at most. Its buffers stay in the first two caches.
-LOSS_ROWS = 128
-LOSS_VECTORS = 16
+# Most rows of a tile of the loss, and most vectors of 16 floats in each row: 128 rows of 256 floats. The buffers of
+# such a tile fit into the first two caches.
+LOSS_TILE_ROWS = 128
+LOSS_TILE_VECTORS = 16
 
-# Most channels of an image that the loss takes: its buffers have room for a window of as many beside a tile.
-LOSS_CHANNELS = 32
+# Most channels of an image that the loss takes: its buffers have room for the window's reach of 5 pixels on each side.
+MAX_LOSS_CHANNELS = 32
 
 
 def blocks(n: int) -> int:
-    """Blocks of rows that `n` rows make."""
-    return -(-n // BLOCK)
+    """Number of blocks of BLOCK_ROWS rows that hold `n` rows."""
+    return -(-n // BLOCK_ROWS)
 
 
 def tiles(width: int, height: int) -> tuple[int, int]:
-    """Tiles along the sides of an image."""
+    """Numbers of tiles along the width and the height of an image of this size in pixels."""
     return -(-width // TILE), -(-height // TILE)

@@ -1,4 +1,4 @@
-"""How many cores this process may use: those it is bound to, and the share of them that its control group grants."""
+"""The number of cores that this process may use: its affinity mask, limited by the quota of its control group."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ CGROUP_V1 = ("sys/fs/cgroup/cpu/cpu.cfs_quota_us", "sys/fs/cgroup/cpu/cpu.cfs_pe
 
 
 def usable_cores(root: Path = Path("/")) -> int:
-    """Return the number of threads worth starting, at least 1.
+    """Return the number of threads that can run at the same time, at least 1.
 
-    A container with a quota of two CPUs on a machine of 64 cores is bound to all 64; as many threads would be
-    stopped by the scheduler most of the time.
+    A container with a quota of two CPUs on a machine with 64 cores sees all 64 in its affinity mask. The scheduler
+    would stop 64 threads most of the time.
 
     Args:
-        root: Where the file system of the kernel is mounted.
+        root: Root folder of the operating system's files.
     """
     bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quota = _quota(root)
@@ -25,7 +25,7 @@ def usable_cores(root: Path = Path("/")) -> int:
 
 
 def _quota(root: Path) -> float | None:
-    """CPUs that the control group grants; None without a limit, or where nothing can be read."""
+    """Return the CPUs that the control group grants. None if there is no limit, or if it cannot be read."""
     try:
         if (root / CGROUP_V2).is_file():
             quota, period = (root / CGROUP_V2).read_text().split()

@@ -1,6 +1,6 @@
-"""Kernels of C++, compiled and loaded by Warp.
+"""C++ kernels, compiled and loaded by Warp.
 
-Warp brings a Clang of its own, so no compiler has to be installed. Kernels are cached on disk.
+Warp brings a Clang of its own, so no compiler has to be installed. Compiled kernels are cached on disk.
 """
 
 import ctypes
@@ -22,25 +22,25 @@ from .cache import load_or_rebuild, say_unwritable
 
 
 class Kernel(NamedTuple):
-    """A loaded kernel: `kernel(kernel.pack(*values))` runs it on this thread, without the interpreter lock."""
+    """A loaded kernel. `kernel(kernel.pack(*values))` runs it on the calling thread, without the interpreter lock."""
 
     run: Callable[..., None]
     bounds: Any
-    pack: Callable[..., bytes]  # makes the structure of its arguments, from these in their order
+    pack: Callable[..., bytes]  # makes the structure of arguments from their values, in order
     addresses: tuple[int, int]  # of the function and of the bounds
-    command: Any  # of Warp; the code stays loaded as long as it lives
+    command: Any  # Warp's command, which keeps the code loaded while it lives
 
     def __call__(self, arguments: bytes) -> None:
-        """Run it with these arguments, which it reads only."""
+        """Run the kernel with packed arguments. It only reads them."""
         self.run(self.bounds, arguments)  # ctypes passes the address of the bytes
 
 
 def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:
-    """Compile a kernel, or take it from the cache.
+    """Load a kernel from the cache, or compile it.
 
     Args:
-        name: Its name in files and messages.
-        parameters: Warp's types by name, which `code` knows them by.
+        name: Name of the kernel in files and messages.
+        parameters: Warp's type of each parameter, by the name that `code` uses.
         code: The body of a C++ function.
 
     Raises:
@@ -50,7 +50,7 @@ def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:
     signature = ", ".join(f"{parameter}: {kind}" for parameter, kind in parameters.items())
     source = f"def {name}_body({signature}): ...\n"
     source += f"def {name}({signature}):\n    {name}_body({', '.join(parameters)})\n"
-    # Warp reads a kernel's source back through `inspect`, which finds generated code in `linecache`.
+    # Warp reads a kernel's source through `inspect`, which finds generated code in `linecache`.
     filename = f"<skipgs_plug {name}>"
     linecache.cache[filename] = (len(source), None, source.splitlines(keepends=True), filename)
     namespace: dict[str, Any] = {"wp": wp, "__name__": f"{__package__}.{name}"}
@@ -59,7 +59,7 @@ def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:
     namespace[f"{name}_body"] = wp.func_native(code)(body)
     kernel = wp.kernel(enable_backward=False)(namespace[name])
     inputs = [0] * len(parameters)
-    # Warp compiles for blocks of one thread on the CPU.
+    # Warp's module identifier depends on the number of threads per block, which is 1 on the CPU.
     folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(1)
 
     def load() -> Any:
@@ -75,22 +75,22 @@ def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:
 
 
 def _packer(name: str, kinds: dict[str, Any]) -> Callable[..., bytes]:
-    """Makes structures of these fields, of the simple types of ctypes, from their values."""
+    """Return a function that makes the bytes of a structure from its values. `kinds` are ctypes' types by name."""
     structure = type(name, (ctypes.Structure,), {"_fields_": list(kinds.items())})
-    # ctypes looks for the names of fields one by one, far from the caches.
+    # ctypes sets fields one by one, by name, which is slow.
     layout = struct.Struct("".join(kind._type_ for kind in kinds.values()))
 
     def pack(*values: int | float) -> bytes:
         try:
             return layout.pack(*values)
-        except OverflowError:  # beyond float32, which is infinite to ctypes
+        except OverflowError:  # a value beyond float32, which ctypes makes infinite
             return bytes(structure(*values))
 
     return pack
 
 
-# Kernels load on several threads at once. Two threads that start Warp together make it two runtimes, and the second one
-# keeps its kernels in a folder inside the first one's, where no later process looks for them.
+# Kernels load on several threads at once. Two threads that start Warp at the same time would make it two runtimes. The
+# second would keep its kernels in a folder inside the first one's, where no later process looks.
 _starting = threading.Lock()
 
 
@@ -114,13 +114,13 @@ def _started_warp() -> Any:
 
 @contextmanager
 def _quiet_stderr() -> Iterator[None]:
-    """Drops what native code writes to stderr inside the block.
+    """Discard output of native code to stderr inside the `with` statement.
 
-    Warp's library warns there that it found no CUDA driver, which a rasterizer for machines without one expects.
+    Warp's library warns there that it found no CUDA driver, which is normal for this rasterizer.
     """
     try:
         kept = os.dup(2)
-    except OSError:  # closed, as of programs without a window on Windows: nothing to drop
+    except OSError:  # stderr is closed, as in programs without a console on Windows: there is nothing to discard
         yield
         return
     if sys.stderr is not None:

@@ -1,7 +1,7 @@
-"""Parameters of kernels: arrays and numbers, by themselves or grouped in structs that Python and C++ know by one name.
+"""Parameters of kernels: arrays and numbers, single or grouped in structs that have one name in Python and C++.
 
-A struct is a `NamedTuple` whose fields are annotated like the parameters of a kernel. Python passes one of its
-instances, C++ receives a `struct` of the same name with the same fields. A kernel of thirty tensors has ten parameters.
+A struct is a `NamedTuple` whose fields are annotated like parameters of a kernel. Python passes an instance, and C++
+receives a `struct` of the same name with the same fields. So a kernel with thirty tensors has about ten parameters.
 """
 
 import inspect
@@ -16,60 +16,59 @@ class ArrayKind(NamedTuple):
     """A contiguous tensor on the CPU, which a kernel sees as a pointer."""
 
     dtype: torch.dtype
-    element: str  # in C++
+    element: str  # type of an element in C++
 
     @property
     def cpp(self) -> str:
-        """The parameter's type in C++."""
+        """Type of the parameter in C++."""
         return f"{self.element}*"
 
 
-# Annotate `Annotated[FloatArray, "n, 3"]` to declare the size, too (`guard.Sizes`). A kernel reads an array and writes
-# an output; the compiler refuses to write into an array.
+# `Annotated[FloatArray, "n, 3"]` also declares the size, which `guard.Sizes` checks. A kernel reads an array and writes
+# an output. The compiler refuses code that writes to an array.
 FloatArray: TypeAlias = Annotated[Tensor, ArrayKind(torch.float32, "const float")]
 IntArray: TypeAlias = Annotated[Tensor, ArrayKind(torch.int32, "const int")]
-LongArray: TypeAlias = Annotated[Tensor, ArrayKind(torch.int64, "const long long")]
 ByteArray: TypeAlias = Annotated[Tensor, ArrayKind(torch.uint8, "const unsigned char")]
 FloatOutput: TypeAlias = Annotated[Tensor, ArrayKind(torch.float32, "float")]
 IntOutput: TypeAlias = Annotated[Tensor, ArrayKind(torch.int32, "int")]
 LongOutput: TypeAlias = Annotated[Tensor, ArrayKind(torch.int64, "long long")]
 
-# Numbers, whose types in Warp and C++ have 32 bits. Arrays travel to Warp as addresses: describing them takes longer
-# than some kernels run.
+# Numbers have 32 bits in Warp and C++. Arrays travel to Warp as addresses, because describing arrays to Warp takes
+# longer than some kernels run.
 _NUMBERS = {int: "int", float: "float"}
 _WARP = {int: "wp.int32", float: "wp.float32"}
 
 
 class Field(NamedTuple):
-    """One array or number of a kernel."""
+    """An array or a number of a kernel."""
 
-    path: str  # "n", or "camera.width" for the field of a struct
+    path: str  # "n", or "camera.width" for a field of a struct
     kind: ArrayKind | type
-    shape: str | None  # declared size of an array
+    shape: str | None  # declared sizes of an array's dimensions
 
     @property
     def symbol(self) -> str:
-        """Name of the parameter that Warp passes it in."""
+        """Name of the Warp parameter that carries the field."""
         return self.path.replace(".", "_") + ("_address" if isinstance(self.kind, ArrayKind) else "")
 
     @property
     def warp(self) -> str:
-        """Type of that parameter."""
+        """Type of that Warp parameter."""
         return "wp.uint64" if isinstance(self.kind, ArrayKind) else _WARP[self.kind]
 
     @property
     def cpp(self) -> str:
-        """Its type in C++."""
+        """Type of the field in C++."""
         return self.kind.cpp if isinstance(self.kind, ArrayKind) else _NUMBERS[self.kind]
 
     @property
     def value(self) -> str:
-        """C++ expression that makes it of Warp's parameter."""
+        """C++ expression that converts the Warp parameter to the field."""
         return f"({self.cpp}){self.symbol}"
 
 
 class Parameter(NamedTuple):
-    """A parameter of a kernel: a field, or a struct of several."""
+    """A parameter of a kernel: a single field, or a struct of several fields."""
 
     name: str
     struct: type | None
@@ -77,28 +76,28 @@ class Parameter(NamedTuple):
 
     @property
     def definition(self) -> str:
-        """C++ that defines it from Warp's parameters."""
+        """C++ code that defines the parameter from Warp's parameters."""
         if self.struct is None:
             (field,) = self.fields
-            # A number is Warp's parameter itself.
+            # A number needs no definition: it is Warp's parameter itself.
             return f"{field.cpp} const {self.name} = {field.value};\n" if field.symbol != self.name else ""
         values = ", ".join(field.value for field in self.fields)
         return f"const {self.struct.__name__} {self.name} = {{{values}}};\n"
 
 
 def parameters_of(stub: Callable[..., Any]) -> tuple[Parameter, ...]:
-    """The parameters that a stub declares."""
+    """Return the parameters that a stub declares."""
     hints = get_type_hints(stub, include_extras=True)
     return tuple(_parameter(name, hints[name]) for name in inspect.signature(stub).parameters)
 
 
 def structs_of(parameters: tuple[Parameter, ...]) -> list[type]:
-    """The structs among the parameters, each once."""
+    """Return the structs among the parameters, each once."""
     return list(dict.fromkeys(p.struct for p in parameters if p.struct is not None))
 
 
 def declare_struct(struct: type) -> str:
-    """C++ that declares a struct."""
+    """Return C++ code that declares a struct."""
     fields = "".join(
         f"    {field.cpp} {field.path};{f'  // [{field.shape}]' if field.shape else ''}\n"
         for field in _fields(struct, "")
@@ -107,7 +106,7 @@ def declare_struct(struct: type) -> str:
 
 
 def group(parameters: tuple[Parameter, ...], values: Iterable[Any]) -> dict[str, Any]:
-    """The arguments of a call, by name, from their fields, one after the other."""
+    """Rebuild the arguments of a call, by name, from the values of all fields in order."""
     following = iter(values)
     return {
         p.name: next(following) if p.struct is None else p.struct(*(next(following) for _ in p.fields))
@@ -118,15 +117,16 @@ def group(parameters: tuple[Parameter, ...], values: Iterable[Any]) -> dict[str,
 def call_reader(
     name: str, parameters: tuple[Parameter, ...], by_name: bool
 ) -> Callable[..., tuple[int | float, ...] | None]:
-    """Makes a function that turns the arguments of a call into addresses of tensors, and numbers, field after field.
+    """Make a function that turns the arguments of a call into one flat tuple of addresses and numbers.
 
-    It returns None if an argument or a field is not of its kind. Python checks the names of the arguments. A launch
-    takes a few microseconds, most of them here: everything is written out, and nothing is collected on the way.
+    The function returns None if an argument or a field does not have the declared kind. Python itself checks the names.
+    A launch takes a few microseconds, most of them here, so the function is generated code without loops or
+    collections.
 
     Args:
-        name: That of the function, for messages.
-        parameters: Those of the function.
-        by_name: Whether arguments have to be named.
+        name: Name of the generated function, for error messages.
+        parameters: Parameters of the generated function.
+        by_name: Whether callers must name the arguments.
     """
     namespace: dict[str, Any] = {"SMALLEST": -(2**31), "LARGEST": 2**31 - 1}
     structs: list[str] = []
@@ -145,7 +145,7 @@ def call_reader(
             if isinstance(field.kind, ArrayKind):
                 namespace[f"dtype{i}"] = field.kind.dtype
                 fits = f"{given}.dtype is dtype{i} and {given}.is_cpu and {given}.is_contiguous()"
-                # A tensor that is not empty and has no address keeps its numbers elsewhere.
+                # A non-empty tensor without an address, such as a subclass's, keeps its numbers elsewhere.
                 conditions.append(f"{fits} and ((a{i} := {given}.data_ptr()) or not {given}.numel())")
                 values.append(f"a{i}")
             else:

@@ -1,9 +1,9 @@
-"""The text of the kernels: C++ in `kernels/*.h`, joined here, with the constants that Python shares.
+"""Assembles the C++ text of each kernel from `kernels/*.h` and from the constants that Python declares.
 
-A file in `kernels/` defines the function of its name, one in `kernels/lib/` what several of them use. Each includes
-the files that it needs and can be read by itself, given the constants and structs that Python declares
-(`declarations.py`). Warp takes one text: includes are put in place here, each file once. `#line` lets Clang name
-our file and line where something does not compile.
+A file in `kernels/` defines the function of its name. A file in `kernels/lib/` defines functions that several kernels
+use. Each file includes the files that it needs. Together with the constants and structs that Python declares
+(`declarations.py`), each file can be read by itself. Warp takes a single text, so includes are resolved here, each file
+once. `#line` directives let Clang name our file and line in error messages.
 """
 
 import math
@@ -16,19 +16,19 @@ from .optimizations import OPTIMIZATIONS
 KERNELS = Path(__file__).parent.parent / "kernels"
 
 _INCLUDE = re.compile(r'^#include "([\w/]+\.h)"$', re.MULTILINE)
-_FIRST = "lib/simd.h"  # which precedes everything else in every kernel
+_FIRST = "lib/simd.h"  # the first file of every kernel
 
 
 def read_kernel(name: str) -> str:
-    """Return the text of `kernels/<name>` with its includes in place; a path in one starts at the file's own folder."""
+    """Return the text of `kernels/<name>` with its includes resolved. Paths are relative to the including file."""
     return _read(name, {_FIRST})
 
 
 def _read(name: str, done: set[str]) -> str:
-    """Return the text of a file, and of those it includes that are not `done`."""
+    """Return the text of a file and of its includes, except for those already in `done`."""
     done.add(name)
     text = (KERNELS / name).read_text(encoding="utf-8").replace("#pragma once\n", "\n")
-    # Relative to the package: the text decides which cached build fits, wherever the package lies.
+    # Relative to the package: the cache is keyed by the text, which must not depend on where the package is installed.
     file = f"skipgs_plug/fallback_raster/kernels/{name}"
 
     def include(match: re.Match[str]) -> str:
@@ -42,7 +42,7 @@ def _read(name: str, done: set[str]) -> str:
 
 
 def declare(values: dict[str, int | float]) -> str:
-    """C++ constants of these names and values."""
+    """Return C++ definitions of constants with these names and values."""
     return "".join(
         f"static constexpr int {name} = {int(value)};\n"
         if isinstance(value, int)
@@ -51,7 +51,7 @@ def declare(values: dict[str, int | float]) -> str:
     )
 
 
-# What precedes the constants in every kernel.
+# The text before the constants in every kernel.
 PRELUDE = read_kernel(_FIRST)
 
 SHARED = {name: value for name, value in vars(constants).items() if name.isupper()} | {

@@ -1,8 +1,9 @@
-"""Threads that run kernels beside the one that calls, without the interpreter.
+"""Helper threads that run kernels together with the calling thread, without the interpreter lock.
 
-A helper spends its life in one call of native code (`kernels/pool_serve.h`). Between two kernels it looks for the next
-one for some microseconds, and then sleeps until it is called. As threads of Python, helpers and caller wanted the
-interpreter at the same moments, and every launch waited several times for the system to wake somebody.
+A helper spends its life in one call of native code (`kernels/pool_serve.h`). After a launch it spins for some
+microseconds in case another follows, and then sleeps until it is woken. If helpers were ordinary Python threads, they
+and the caller would need the interpreter lock at the same moments, and every launch would wait several times for the
+system to wake a thread.
 """
 
 import _thread
@@ -14,18 +15,18 @@ from .cores import usable_cores
 from .native import Kernel, load_kernel
 from .source import PRELUDE, read_kernel
 
-# How often a thread looks for what it waits for before it sleeps: for 100 to 200 microseconds on x86. Looking longer
-# takes processor time from others, looking less makes launches late.
-_PATIENCE = 5000
+# Times that a thread checks for a launch before it sleeps: 100 to 200 us on x86. More spins take processor time from
+# other programs, fewer delay launches.
+_SPINS = 5000
 
-# Bytes of a cache line, of which `kernels/lib/thread_pool.h` gives each thread its own: threads that wrote into one
-# line would pass it to and fro.
-_LINE = 64
-_CALLER, _HELPERS = 2, 3  # which of them are the caller's and the first helper's
-# Bytes from the beginning of a thread's line to its lock, as in the struct of `kernels/lib/thread_pool.h`.
-_LOCK = 8
+# Bytes of a cache line. Each thread has a line of its own in `kernels/lib/thread_pool.h`: threads that write to a
+# shared line would pass it to and fro.
+_LINE_BYTES = 64
+_CALLER_LINE, _FIRST_HELPER_LINE = 2, 3  # index of the caller's line, and of the first helper's
+# Bytes from the start of a thread's line to its lock, as in the struct of `kernels/lib/thread_pool.h`.
+_LOCK_OFFSET = 8
 
-# Locks of Python work on every system, and without the interpreter.
+# CPython's locks work on every system, and without the interpreter lock.
 _allocate = ctypes.PYFUNCTYPE(ctypes.c_void_p)(("PyThread_allocate_lock", ctypes.pythonapi))
 _acquire = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int)(("PyThread_acquire_lock", ctypes.pythonapi))
 _release = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)(("PyThread_release_lock", ctypes.pythonapi))
@@ -36,7 +37,7 @@ _kernels: tuple[Kernel, Kernel] | None = None
 
 
 class ThreadPool:
-    """Helpers that run kernels along with the thread that calls `run`, of which there is one at a time.
+    """Helpers that run kernels together with the thread that calls `run`. Only one thread may call at a time.
 
     Args:
         count: Number of helpers.
@@ -44,23 +45,23 @@ class ThreadPool:
 
     def __init__(self, count: int) -> None:
         self._count = count
-        # With more threads than cores, one that looks keeps another from its work.
-        self._patience = _PATIENCE if count < usable_cores() else 0
+        # With more threads than cores, a spinning thread would keep another from its work.
+        self._patience = _SPINS if count < usable_cores() else 0
         self._server, self._launcher = load_pool_kernels()
-        self._memory = (ctypes.c_char * (_LINE * (_HELPERS + count + 1)))()
-        self._address = -(-ctypes.addressof(self._memory) // _LINE) * _LINE
-        self._locks = [self._put_lock(line) for line in range(_CALLER, _HELPERS + count)]
+        self._memory = (ctypes.c_char * (_LINE_BYTES * (_FIRST_HELPER_LINE + count + 1)))()
+        self._address = -(-ctypes.addressof(self._memory) // _LINE_BYTES) * _LINE_BYTES
+        self._locks = [self._put_lock(line) for line in range(_CALLER_LINE, _FIRST_HELPER_LINE + count)]
         self._alive = list(range(count))
         for number in range(count):
             _thread.start_new_thread(self._serve, (number,))
 
     def run(self, kernel: Kernel, arguments: bytes) -> None:
-        """Run it on all of them and here; none of them is at it any more when this returns."""
+        """Run a kernel on all helpers and on the calling thread, and wait until all have finished."""
         held = (ctypes.c_char * len(arguments)).from_buffer_copy(arguments)
         self._launch(*kernel.addresses, ctypes.addressof(held))
 
     def dismiss(self) -> None:
-        """Wait until all are gone; may be called again when an exception ended it."""
+        """Stop all helpers and wait for them. If an exception interrupts this, it may be called again."""
         self._launch(0, 0, 0)
         while self._alive:
             time.sleep(0.0005)
@@ -68,11 +69,11 @@ class ThreadPool:
             _free(self._locks.pop())
 
     def _put_lock(self, line: int) -> int:
-        """A lock that is held, and the functions to use it, written into a line."""
+        """Write a new lock, already held, and its functions into a cache line. Returns the lock's address."""
         lock: int = _allocate()
         _acquire(lock, 1)
         functions = (ctypes.cast(function, ctypes.c_void_p).value for function in (_acquire, _release))
-        written = (ctypes.c_void_p * 3).from_address(self._address + _LINE * line + _LOCK)
+        written = (ctypes.c_void_p * 3).from_address(self._address + _LINE_BYTES * line + _LOCK_OFFSET)
         written[:] = [lock, *functions]
         return lock
 
@@ -87,7 +88,7 @@ class ThreadPool:
 
 
 def load_pool_kernels() -> tuple[Kernel, Kernel]:
-    """Load the kernels of helpers and of launches, unless that is done; any thread may."""
+    """Load the kernels `pool_serve` and `pool_run`, once. Any thread may call this."""
     global _kernels
     with _loading:
         if _kernels is None:
@@ -101,7 +102,7 @@ def load_pool_kernels() -> tuple[Kernel, Kernel]:
 
 
 def _load(name: str, pointers: dict[str, str], numbers: list[str]) -> Kernel:
-    """The kernel of a name, which takes pointers, each with the C++ cast that makes it of an address, and ints."""
+    """Load a kernel whose parameters are pointers, each given with the C++ cast from its address, and ints."""
     parameters = dict.fromkeys((f"{pointer}_address" for pointer in pointers), "wp.uint64")
     given = [f"{cast}{pointer}_address" for pointer, cast in pointers.items()]
     call = f"{name}({', '.join([*given, *numbers])});\n"

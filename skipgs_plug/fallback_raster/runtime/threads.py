@@ -1,7 +1,7 @@
-"""How many threads kernels run on, and whose turn it is.
+"""The number of threads that kernels run on, and the lock that lets one launch run at a time.
 
-One launch takes place at a time, under `LOCK`. KeyboardInterrupt and what signal handlers raise may come between any
-two steps of the main thread, but not while a kernel runs, which is one call of native code on all threads.
+Launches run one at a time, under `LOCK`. A KeyboardInterrupt or an exception of a signal handler may be raised between
+any two steps of the main thread, but not while a kernel runs: that is one call of native code on all threads.
 """
 
 import atexit
@@ -18,19 +18,19 @@ from .thread_pool import ThreadPool
 LOCK = threading.RLock()
 _num_threads = usable_cores()
 _pool: ThreadPool | None = None
-_forked = False  # this process inherited torch's OpenMP without its threads, and has not been told so
+_forked = False  # this process is a fork of one in which torch had several threads, and has not warned about it yet
 
 
 def get_num_threads() -> int:
-    """Number of threads that the CPU rasterizer runs on; all cores this process may use unless set."""
+    """Return the number of threads of the CPU rasterizer. By default it is the number of cores this process may use."""
     return _num_threads
 
 
 def set_num_threads(n: int) -> None:
-    """Sets the number of threads of the CPU rasterizer. Images and gradients are bit-equal for any number.
+    """Set the number of threads of the CPU rasterizer. Images and gradients are bit-equal for every number.
 
     Args:
-        n: At least 1.
+        n: Number of threads, at least 1.
 
     Raises:
         ValueError: `n` is not a whole number of at least 1.
@@ -51,7 +51,7 @@ def set_num_threads(n: int) -> None:
 
 
 def on_threads(count: int, kernel: Kernel, arguments: bytes) -> None:
-    """Runs a kernel on one thread, this one, or on all, and returns when it is done. The caller holds `LOCK`."""
+    """Run a kernel on the calling thread if `count` is 1, else on all, and wait for it. The caller holds `LOCK`."""
     global _pool
     if _forked:
         _warn_after_fork()
@@ -65,7 +65,7 @@ def on_threads(count: int, kernel: Kernel, arguments: bytes) -> None:
 
 @atexit.register
 def _dismiss() -> None:
-    """No thread runs a kernel when this returns."""
+    """Stop the helper threads. When this returns, no thread runs a kernel."""
     global _pool
     with LOCK:
         if _pool is not None:
@@ -85,13 +85,13 @@ def _warn_after_fork() -> None:
 
 
 def _after_fork_in_child() -> None:
-    """Threads do not survive a fork: a child starts its own."""
+    """Forget the helper threads, which do not survive a fork. The child starts its own."""
     global _pool, _forked
     _pool = None
     _forked = torch.get_num_threads() > 1
     LOCK.release()
 
 
-# A child must not inherit the lock from a thread that renders; so a fork waits until it has finished.
+# A child must not inherit a lock that another thread holds, so a fork waits until the running launch is finished.
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=_after_fork_in_child)

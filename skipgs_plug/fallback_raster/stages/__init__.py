@@ -1,1 +1,1 @@
-"""Stages of rendering, each a few kernels: project, bin, blend, spherical harmonics, and their adjoints."""
+"""The stages of rendering: project, bin, blend, spherical harmonics, and their adjoints. Each is a few kernels."""

@@ -1,9 +1,10 @@
-"""Which Gaussians touch which tile, front to back.
+"""Lists the Gaussians that touch each tile, front to back.
 
-Rows are taken in their order twice, to count the pairs of each tile and to list them, and every tile then sorts its own
-list, only as far as its pixels take it (`kernels/lib/sorted_tile.h`): behind the surface of a scene of a million
-Gaussians most of a list is never looked at. Equal depths keep the order of the input. A tile is listed only where the
-ellipse at alpha = 1/255 really crosses it (exact bounds per row of tiles, `kernels/lib/ellipse.h`).
+The kernels go through the visible rows twice: once to count the pairs of each tile, once to list them. Each tile then
+sorts its own list, and only as far as its pixels need it (`kernels/lib/sorted_tile.h`). In a scene of a million
+Gaussians most of a list lies behind a surface and is never read. Gaussians of equal depth keep the order of the input.
+A Gaussian is listed only in tiles that its ellipse alpha = 1/255 crosses (exact bounds per row of tiles,
+`kernels/lib/ellipse.h`).
 """
 
 from dataclasses import dataclass
@@ -12,74 +13,75 @@ from typing import Annotated, NamedTuple
 from torch import Tensor
 
 from ..runtime.buffers import floats, ints, longs
-from ..runtime.constants import BOX, FOOTPRINT, MAX_CHANNELS, RECORD, SPARE_COUNTS
+from ..runtime.constants import BOX_INTS, FOOTPRINT_INTS, MAX_CHANNELS, RECORD_FLOATS, SPARE_COUNTS
 from ..runtime.launch import worker
 from ..runtime.optimizations import active_optimizations
 from ..runtime.parameters import FloatArray, FloatOutput, IntArray, IntOutput, LongOutput
 from ..runtime.threads import get_num_threads
 from .structs import Channels, Grid, Splats, grid
 
-# Pairs that a list can hold: they are numbered in 32 bits.
+# Most (tile, Gaussian) pairs of an image: kernels number pairs with 32-bit ints.
 MAX_PAIRS = 2**31 - 1
 
-# Slices of the rows that each thread counts and lists: a few, so that none waits for another's expensive rows.
-SLICES = 4
+# Slices of the rows for each thread. Several slices keep threads from waiting for one with expensive rows. Their number
+# does not change the lists.
+SLICES_PER_THREAD = 4
 
 
 class RecordList(NamedTuple):
-    """What the blend reads of each of `m` visible Gaussians that has pairs, by slice of these Gaussians."""
+    """Records of those of the `m` visible Gaussians that have pairs. Each slice begins where its Gaussians begin."""
 
-    records: Annotated[FloatOutput, "m, RECORD"]  # a `Record` each, from where their slice begins
-    listed: Annotated[IntOutput, "m"]  # index of each among the visible Gaussians
-    listed_count: Annotated[IntOutput, "slices"]  # records of each slice
+    records: Annotated[FloatOutput, "m, RECORD_FLOATS"]  # a `Record` each
+    listed: Annotated[IntOutput, "m"]  # index of each record's Gaussian among the visible ones
+    listed_count: Annotated[IntOutput, "slices"]  # number of records in each slice
 
 
 class Footprints(NamedTuple):
-    """Which tiles each record covers, as far as its box tells."""
+    """The box of tiles around each record, and the tiles of a small box that the ellipse meets."""
 
-    tiles: Annotated[IntOutput, "m, FOOTPRINT"]
-    boxes: Annotated[IntOutput, "m, BOX"]  # a `TileBox`, only of larger ones
+    tiles: Annotated[IntOutput, "m, FOOTPRINT_INTS"]
+    boxes: Annotated[IntOutput, "m, BOX_INTS"]  # a `TileBox` each, written only for larger boxes
 
 
 class PairCounts(NamedTuple):
-    """Numbers of pairs, which `scan_pairs` turns into where they begin."""
+    """Numbers of pairs by slice. `scan_pairs` turns them into start positions."""
 
     of_tiles: Annotated[IntOutput, "slices, grid.tiles_x * grid.tiles_y + SPARE_COUNTS"]
     of_slices: Annotated[LongOutput, "slices + 1"]
 
 
 class DepthRanges(NamedTuple):
-    """Depths, as bits of float32, that each tile lists."""
+    """The range of depths, as bits of float32, that each tile lists."""
 
-    ranges: Annotated[IntArray, "grid.tiles_x * grid.tiles_y if limited else 0, 2"]  # the first, and the first beyond
-    limited: int  # whether there are ranges; all depths otherwise
+    ranges: Annotated[IntArray, "grid.tiles_x * grid.tiles_y if limited else 0, 2"]  # first depth, and end
+    limited: int  # 1 if there are ranges; 0 lists all depths
 
 
 class Pairs(NamedTuple):
-    """(tile, Gaussian) pairs, numbered by row and tile."""
+    """The (tile, Gaussian) pairs, numbered by row, then tile."""
 
-    start: Annotated[IntOutput, "m + 1"]  # number of the first pair of each visible Gaussian
+    start: Annotated[IntOutput, "m + 1"]  # number of each visible Gaussian's first pair
     record: Annotated[IntOutput, "P"]
-    unsorted: Annotated[LongOutput, "P"]  # depth and number of the pairs of each tile
+    unsorted: Annotated[LongOutput, "P"]  # by tile: depth in the upper 32 bits, number of the pair in the lower
 
 
 class TileLists(NamedTuple):
-    """Pairs of each tile, to be sorted front to back, all or as far as the pixels take them."""
+    """The pairs of each tile, which kernels sort front to back, whole or as far as the pixels need."""
 
     tile_start: Annotated[IntArray, "grid.tiles_x * grid.tiles_y + 1"]
     pair_record: Annotated[IntArray, "P"]
     unsorted: Annotated[LongOutput, "P"]
     buffer: Annotated[LongOutput, "0 if sorted else P"]  # scratch
-    tile_record: Annotated[IntOutput, "P"]  # out, record of each pair, in the order of the tiles
-    tile_pair: Annotated[IntOutput, "P"]  # out, its number
-    sorted: int  # whether they are
+    tile_record: Annotated[IntOutput, "P"]  # output: record of each pair, by tile
+    tile_pair: Annotated[IntOutput, "P"]  # output: number of each pair
+    sorted: int  # 1 if the lists are sorted already
 
 
 @worker(file="pack_colors.h", items="slices", grain="1")
 def _pack_colors(
     *,
     visible: Annotated[IntArray, "m"],
-    packed: RecordList,  # the channels are replaced
+    packed: RecordList,  # the kernel replaces the colours
     colors: Annotated[FloatArray, "n, channels.stride"],
     channels: Channels,
     m: int,
@@ -112,7 +114,7 @@ def pack_and_count(
 @worker(file="scan_pairs.h", items="1", grain="1")
 def scan_pairs(
     *,
-    counts: PairCounts,  # in: numbers of pairs; out: where each slice begins in each tile's list, and its first pair
+    counts: PairCounts,  # input: numbers of pairs; output: start of each slice in each tile's list, and its first pair
     tile_start: Annotated[IntOutput, "grid.tiles_x * grid.tiles_y + 1"],
     grid: Grid,
     slices: int,
@@ -127,7 +129,7 @@ def fill_pairs(
     packed: RecordList,
     footprints: Footprints,
     depths: DepthRanges,
-    counts: PairCounts,  # the next free place in each tile's list
+    counts: PairCounts,  # next free position of each slice in each tile's list
     pairs: Pairs,
     grid: Grid,
     m: int,
@@ -147,13 +149,13 @@ class Bins:
 
     Attributes:
         visible: [M] int32, rows of the visible Gaussians.
-        packed: Records of each of them that has pairs.
-        tile_start: [tiles + 1] int32, begin of each tile's part of the lists, row-major.
-        tile_record: [P] int32, records, front to back in every tile as far as it is sorted.
-        tile_pair: [P] int32, number of the pair; pairs are numbered by row and tile.
-        pairs: First pairs of Gaussians; records and depths of pairs, which go once the lists are sorted.
-        tiles_per_gauss: [R] int32, number of tiles of every row.
-        grid: The tiles.
+        packed: Records of the visible Gaussians that have pairs.
+        tile_start: [tiles + 1] int32, start of each tile's part of the lists, row-major.
+        tile_record: [P] int32, record of each pair, front to back in each tile as far as it is sorted.
+        tile_pair: [P] int32, number of each pair; pairs are numbered by row, then tile.
+        pairs: First pair of each Gaussian; records and depths of pairs, which are freed once the lists are sorted.
+        tiles_per_gauss: [R] int32, number of tiles of each row.
+        grid: The image and its tiles.
     """
 
     visible: Tensor
@@ -166,7 +168,7 @@ class Bins:
     grid: Grid
 
     def lists(self, sorted: bool) -> TileLists:
-        """The lists as kernels take them, with room to sort them unless they are sorted."""
+        """Return the lists for a kernel, with a buffer to sort them unless they are sorted."""
         buffer = longs(0 if sorted else len(self.tile_record))
         return TileLists(
             tile_start=self.tile_start,
@@ -179,11 +181,11 @@ class Bins:
         )
 
     def sort(self) -> None:
-        """Sorts the lists of all tiles to their ends."""
+        """Sort the whole lists of all tiles."""
         sort_tiles(lists=self.lists(sorted=False), grid=self.grid)
 
     def pack_colors(self, colors: Tensor, channels: Channels) -> None:
-        """Puts some channels of `colors` [R, D] into the records."""
+        """Copy some channels of `colors` [R, D] to the records."""
         _pack_colors(
             visible=self.visible,
             packed=self.packed,
@@ -205,10 +207,21 @@ def bin_gaussians(
     ranges: Tensor | None = None,  # [tiles, 2] int32
     before: int = 0,
 ) -> Bins:
-    """Lists the visible Gaussians of one image per tile, not yet sorted by depth, with their first channels.
+    """List the visible Gaussians of one image per tile, not yet sorted by depth.
 
-    With `ranges`, only at depths, as bits of float32, that lie between the two numbers of the tile; other lists hold
-    `before` pairs. `tiles_per_gauss` is empty unless `dense`, and counts all tiles.
+    Args:
+        visible: Rows of the visible Gaussians, ascending.
+        splats: Projected Gaussians, R rows.
+        colors: Their colours. The records receive the first MAX_CHANNELS channels.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        dense: Whether to count the tiles of all rows in `tiles_per_gauss`, including pairs outside `ranges`.
+        ranges: Depths that each tile lists, as bits of float32: from the first of two numbers up to the second,
+            exclusive. None lists all depths.
+        before: Pairs in other lists of the same image. They count towards the limit.
+
+    Returns:
+        The lists.
 
     Raises:
         ValueError: There are more (tile, Gaussian) pairs than can be listed.
@@ -216,11 +229,11 @@ def bin_gaussians(
     m = visible.numel()
     tiling = grid(width, height)
     n, channels = colors.shape
-    # Any number of slices gives the same lists; some per thread keep all busy.
-    slices = 1 if m < 1024 or get_num_threads() == 1 else SLICES * get_num_threads()
+    # A few rows are not worth several slices.
+    slices = 1 if m < 1024 or get_num_threads() == 1 else SLICES_PER_THREAD * get_num_threads()
     depths = DepthRanges(ints(0) if ranges is None else ranges, int(ranges is not None))
-    packed = RecordList(floats(m, RECORD), ints(m), ints(slices))
-    footprints = Footprints(ints(m, FOOTPRINT), ints(m, BOX))
+    packed = RecordList(floats(m, RECORD_FLOATS), ints(m), ints(slices))
+    footprints = Footprints(ints(m, FOOTPRINT_INTS), ints(m, BOX_INTS))
     tile_count = tiling.tiles_x * tiling.tiles_y
     counts = PairCounts(ints(slices, tile_count + SPARE_COUNTS), longs(slices + 1))
     tile_start, pair_start = ints(tile_count + 1), ints(m + 1)

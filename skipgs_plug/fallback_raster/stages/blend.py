@@ -1,18 +1,19 @@
-"""Front-to-back compositing of one image and its adjoint, one tile at a time, a patch of pixels as one value.
+"""Front-to-back compositing of one image and its adjoint, one tile at a time.
 
-Cut-offs as in gsplat and Inria's rasterizer: alpha is at most 0.999, a contribution under 1/255 is dropped, and a
-pixel is finished when the next Gaussian would bring its transmittance to 1e-4 or less.
+The cut-offs are those of gsplat and Inria's rasterizer. Alpha is at most 0.999. A contribution with an alpha under
+1/255 is dropped. A pixel is finished when the next Gaussian would reduce its transmittance to 1e-4 or less.
 
-A tile is 16 patches of 4 x 4 pixels, or 32 of 4 x 2 where registers hold eight floats, and a patch is one value: small
-Gaussians fill more of a square than of a row. Which patches a Gaussian reaches is found for several Gaussians at once
-(`kernels/lib/reached_patches.h`). The forward pass then takes patch after patch, so that its pixels stay in registers
-while the Gaussians pass, four of them side by side.
+A tile is divided into 16 patches of 4 x 4 pixels, or 32 of 4 x 2 on processors whose registers hold eight floats. A
+patch is one vector: small Gaussians fill more of a square than of a row. The patches that a Gaussian reaches are found
+for several Gaussians at once (`kernels/lib/reached_patches.h`). The forward pass then processes one patch after the
+other, so that the pixels of the patch stay in registers, and interleaves four Gaussians at a time.
 
-The adjoint walks the same lists back to front, Gaussian after Gaussian, so that here its sums stay in registers, and
-visits only patches in which the forward pass blended the Gaussian. It needs, beside the colour, the moments of v_sigma
-about the centre: of 1, dx, dy, dx^2, dx dy and dy^2. Each (tile, Gaussian) pair that was blended writes its sums to a
-slot of its own, in the order of the lists, and `reduce_pairs` adds a Gaussian's pairs in a fixed order and makes
-gradients of them: no atomics, and bit-equal for any thread count.
+The adjoint goes through the same lists back to front, one Gaussian after the other, so that the sums of the Gaussian
+stay in registers. It visits only patches in which the forward pass blended the Gaussian. Besides the gradient of the
+colour it needs the moments of v_sigma about the 2D mean: those of 1, dx, dy, dx^2, dx dy and dy^2. Each blended (tile,
+Gaussian) pair writes its sums to a slot of its own, in the order of the lists. `reduce_pairs` adds up the pairs of each
+Gaussian in a fixed order and turns them into gradients. There are no atomic additions, so gradients are bit-equal for
+any number of threads.
 """
 
 from typing import Annotated, NamedTuple
@@ -24,75 +25,75 @@ from .structs import Channels, Grid, PairSums, SplatGradients
 
 
 class Pixels(NamedTuple):
-    """What the forward pass writes for each pixel."""
+    """Per-pixel outputs of the forward pass."""
 
     image: Annotated[FloatOutput, "grid.height, grid.width, channels.stride"]
-    transmittance: Annotated[FloatOutput, "grid.height, grid.width"]  # behind the last Gaussian blended
+    transmittance: Annotated[FloatOutput, "grid.height, grid.width"]  # behind the last blended Gaussian
     alpha: Annotated[FloatOutput, "grid.height if with_alpha else 0, grid.width"]  # 1 - transmittance
-    pixel_stop: Annotated[IntOutput, "grid.height, grid.width"]  # index in the lists behind the last Gaussian blended
-    # Where a pass over the lists left off, for the next one: the transmittance that goes on in finished pixels, too;
-    # by tile whether some pixel is not finished.
+    pixel_stop: Annotated[IntOutput, "grid.height, grid.width"]  # list index behind the last blended Gaussian
+    # The state at the end of a pass over the lists, for the next pass: the product of all 1 - alpha so far, which also
+    # continues in finished pixels; and, by tile, whether some pixel is not finished.
     product_left: Annotated[FloatOutput, "grid.height if part.unfinished or part.continued else 0, grid.width"]
     still_open: Annotated[IntOutput, "grid.tiles_x * grid.tiles_y if part.unfinished or part.continued else 0"]
 
 
 class BlendedPairs(NamedTuple):
-    """Which pairs were blended."""
+    """The pairs that were blended."""
 
-    tile_stop: Annotated[IntOutput, "grid.tiles_x, grid.tiles_y"]  # the greatest `pixel_stop` of a tile
-    tile_blended: Annotated[IntOutput, "grid.tiles_x, grid.tiles_y"]  # their number
-    pair_patches: Annotated[IntOutput, "lists.P"]  # patches where each was blended, as bits; nothing beyond `tile_stop`
+    tile_stop: Annotated[IntOutput, "grid.tiles_x, grid.tiles_y"]  # largest `pixel_stop` of each tile
+    tile_blended: Annotated[IntOutput, "grid.tiles_x, grid.tiles_y"]  # number of blended pairs of each tile
+    pair_patches: Annotated[IntOutput, "lists.P"]  # bits of patches that blended each pair, up to `tile_stop`
 
 
 class ListPart(NamedTuple):
-    """Which part of two-pass lists these are."""
+    """The part of two-pass lists that a launch blends."""
 
-    before: int  # pairs of the lists in front of these, where an earlier pass ended
-    continued: int  # whether there was one
-    unfinished: int  # whether there may be a later one
+    before: int  # number of pairs in the lists of an earlier pass
+    continued: int  # 1 if there was an earlier pass
+    unfinished: int  # 1 if there may be a later pass
 
 
 class BlendedList(NamedTuple):
-    """A part of the lists, as far as it was blended."""
+    """The blended part of the lists of one pass."""
 
-    records: Annotated[FloatArray, "M, RECORD"]
+    records: Annotated[FloatArray, "M, RECORD_FLOATS"]
     tile_start: Annotated[IntArray, "grid.tiles_x * grid.tiles_y + 1"]
     tile_stop: Annotated[IntArray, "grid.tiles_x, grid.tiles_y"]
 
 
 class BackwardPairs(NamedTuple):
-    """Pairs of all parts of the lists, as the adjoint walks them."""
+    """The pairs of all passes, for the adjoint."""
 
     tile_record: Annotated[IntArray, "P"]
     tile_pair: Annotated[IntArray, "P"]
     pair_patches: Annotated[IntArray, "P"]
-    slot_end: Annotated[IntArray, "parts * grid.tiles_x * grid.tiles_y"]  # of each tile, in the order of the lists
+    slot_end: Annotated[IntArray, "parts * grid.tiles_x * grid.tiles_y"]  # end of the slots of each tile
 
 
 class FinalPixels(NamedTuple):
-    """What the adjoint reads of the forward pass."""
+    """Per-pixel results of the forward pass that the adjoint reads."""
 
     transmittance: Annotated[FloatArray, "grid.height, grid.width"]
     pixel_stop: Annotated[IntArray, "grid.height, grid.width"]
 
 
 class PixelGradients(NamedTuple):
-    """Gradients of the pixels."""
+    """Gradients of the loss with respect to the pixels."""
 
     image: Annotated[FloatArray, "grid.height, grid.width, channels.stride"]
-    transmittance: Annotated[FloatArray, "grid.height if with_transmittance else 0, grid.width"]  # of the final one
+    transmittance: Annotated[FloatArray, "grid.height if with_transmittance else 0, grid.width"]
 
 
 class PairSlots(NamedTuple):
-    """Sums of pairs, in the order of the lists."""
+    """The slots of the sums of blended pairs, in the order of the lists."""
 
-    pair_slot: Annotated[IntOutput, "pairs.P"]  # zeros before; 1 + the slot of each pair, 0 if it was not blended
-    sums: Annotated[FloatOutput, "Q, PAIR"]  # a `PairSum` each
+    pair_slot: Annotated[IntOutput, "pairs.P"]  # 1 + slot of each pair; 0, as before the call, if it was not blended
+    sums: Annotated[FloatOutput, "Q, PAIR_FLOATS"]  # a `PairSum` each
 
 
 def blend_forward(
     *,
-    packed: Annotated[FloatArray, "M, RECORD"],
+    packed: Annotated[FloatArray, "M, RECORD_FLOATS"],
     lists: TileLists,
     pixels: Pixels,
     blended: BlendedPairs,
@@ -102,13 +103,13 @@ def blend_forward(
     with_alpha: int,
     optimizations: int,
 ) -> None:
-    """The stub of the forward kernels."""
+    """Stub of the forward kernels."""
 
 
 def blend_adjoint(
     *,
     near: BlendedList,
-    far: BlendedList,  # the second part of the lists, if there is one
+    far: BlendedList,  # lists of the second pass; `near` again if there was none
     pairs: BackwardPairs,
     pixels: FinalPixels,
     v_pixels: PixelGradients,
@@ -119,11 +120,11 @@ def blend_adjoint(
     parts: int,
     optimizations: int,
 ) -> None:
-    """The stub of their adjoints."""
+    """Stub of the adjoint kernels."""
 
 
-# Channels that kernels are compiled for. One and three are the common cases (depth, colour); four serve colour + depth
-# and wider features.
+# Numbers of channels that kernels are compiled for. One (depth) and three (colour) are the common cases. Four serve
+# colour with depth, and wider features.
 _WIDTHS = (1, 3, 4)
 _TILES = "grid.tiles_x * grid.tiles_y"
 
@@ -147,18 +148,18 @@ ADJOINT = {
 
 
 def compiled_width(channels: int) -> int:
-    """The number of channels, of those that kernels are compiled for, that fits `channels` (1 to MAX_CHANNELS) best."""
+    """Return the smallest number of channels with a compiled kernel that holds `channels` (1 to MAX_CHANNELS)."""
     return min(width for width in _WIDTHS if width >= channels)
 
 
-@worker(file="reduce_pairs.h", items="(n + BLOCK - 1) / BLOCK", grain="1")
+@worker(file="reduce_pairs.h", items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS", grain="1")
 def reduce_pairs(
     *,
     sums: PairSums,
     conics: Annotated[FloatArray, "n, 3"],
     opacities: Annotated[FloatArray, "n"],
-    # Zeros where not visible; added to from the second pass over the channels on, but for the colours, which have their
-    # own channels.
+    # Zeros for rows that are not visible. From the second pass over the channels on, the kernel adds to all but the
+    # colours, of which each pass writes its own channels.
     v_splats: SplatGradients,
     n: int,
     channels: Channels,

@@ -1,4 +1,4 @@
-"""One image composed from its projected Gaussians, and the adjoint, any number of channels."""
+"""Composes one image from projected Gaussians, with any number of channels, and computes the adjoint."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..runtime.buffers import floats, ints, longs, scratch, zeros
-from ..runtime.constants import MAX_CHANNELS, PAIR
+from ..runtime.constants import MAX_CHANNELS, PAIR_FLOATS
 from ..runtime.optimizations import active_optimizations
 from .binning import Bins, bin_gaussians
 from .blend import (
@@ -30,12 +30,12 @@ from .two_pass import bin_behind, near_ranges
 
 @dataclass
 class Pass:
-    """Lists of one image, and what of them was blended.
+    """The tile lists of one pass over an image, and the pairs that it blended.
 
     Attributes:
-        bins: The lists, sorted as far as the pixels took them.
-        block_start: [blocks + 1] int32, where each block of rows begins among those of `bins`.
-        blended: Their pairs that were blended, by index in the lists.
+        bins: The lists, sorted as far as the pixels needed them.
+        block_start: [blocks + 1] int32, start of each block of rows among the visible rows of `bins`.
+        blended: The blended pairs, by list index.
     """
 
     bins: Bins
@@ -43,7 +43,7 @@ class Pass:
     blended: BlendedPairs
 
     def after(self, near: "Pass") -> "Pass":
-        """This one as the second part of one list of pairs whose first part is `near`."""
+        """Return this pass with its pairs joined behind those of `near`, the first pass."""
         first, own, pairs = near.bins, self.bins, len(near.bins.tile_record)
         bins = replace(
             own,
@@ -60,18 +60,18 @@ class Pass:
         return Pass(bins, self.block_start, blended)
 
     def as_list(self) -> BlendedList:
-        """This part as the adjoint reads it."""
+        """Return the blended part of the lists for the adjoint."""
         return BlendedList(self.bins.packed.records, self.bins.tile_start, self.blended.tile_stop)
 
 
 @dataclass
 class Composed:
-    """What the adjoint of an image needs beside its inputs and the transmittance.
+    """The state that the adjoint of an image needs besides its inputs and the transmittance.
 
     Attributes:
-        near: The lists that were blended first, all there are if they were deep enough.
-        last: Those behind them, with the pairs of both; else `near`.
-        pixel_stop: [H, W] int32, index in the lists behind the last Gaussian blended.
+        near: The first pass. It is the only one if its lists were deep enough.
+        last: The second pass, with the pairs of both passes; `near` if there was none.
+        pixel_stop: [H, W] int32, list index behind the last blended Gaussian.
     """
 
     near: Pass
@@ -80,7 +80,7 @@ class Composed:
 
     @property
     def parts(self) -> int:
-        """Of the lists: 1 or 2."""
+        """Number of passes: 1 or 2."""
         return 1 if self.last is self.near else 2
 
 
@@ -92,10 +92,19 @@ def compose(
     height: int,
     dense: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor, Composed]:
-    """Image, the transmittance behind it [H, W], and alpha.
+    """Blend projected Gaussians to one image.
 
-    Where `dense`, image and alpha are [1, H, W, D] and [1, H, W, 1], tiles are counted for all rows, and tensors of
-    rows may have a dimension of one camera in front; else the image is [H, W, D], and alpha is left out.
+    Args:
+        splats: Projected Gaussians. With `dense`, tensors may have a leading dimension of one camera.
+        colors: Their colours, any number of channels.
+        visible: Rows of the visible Gaussians.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        dense: Whether to return the shapes of `rasterization`, and to count tiles for all rows.
+
+    Returns:
+        Image [1, H, W, D], or [H, W, D] without `dense`; transmittance [H, W]; alpha [1, H, W, 1], or empty without
+        `dense`; and the state for the adjoint.
     """
     channels = colors.shape[1]
     ranges = near_ranges(visible.rows, splats, width, height) if channels <= MAX_CHANNELS else None
@@ -119,7 +128,7 @@ def compose(
 
 
 def _passes(channels: int) -> Iterator[Channels]:
-    """The passes that blend so many channels."""
+    """Divide channels into passes of at most MAX_CHANNELS."""
     for first in range(0, channels, MAX_CHANNELS):
         yield Channels(channels, first, min(MAX_CHANNELS, channels - first))
 
@@ -145,7 +154,7 @@ def _blend_lists(bins: Bins, block_start: Tensor, colors: Tensor, pixels: Pixels
             with_alpha=int(len(pixels.alpha) > 0),
             optimizations=active_optimizations(),
         )
-    bins.pairs = bins.pairs._replace(record=ints(0), unsorted=longs(0))  # no longer needed
+    bins.pairs = bins.pairs._replace(record=ints(0), unsorted=longs(0))  # no longer needed: free the memory
     return Pass(bins, block_start, blended)
 
 
@@ -157,7 +166,7 @@ def pair_sums(
     v_transmittance: Tensor | None,  # H W numbers; None for zeros
     with_absolute: bool,
 ) -> Iterator[tuple[Channels, PairSums]]:
-    """Channels and sums of each pass of the adjoint; sums live until the next one."""
+    """Run the adjoint of the blend. Yields the channels and sums of each pass; sums are valid until the next pass."""
     near, last, parts = composed.near, composed.last, composed.parts
     bins, lists = near.bins, last.bins
     grid, channels = bins.grid, colors.shape[1]
@@ -165,7 +174,7 @@ def pair_sums(
         image=zeros(grid.height, grid.width, channels) if v_image is None else v_image.contiguous(),
         transmittance=floats(0, grid.width) if v_transmittance is None else v_transmittance.contiguous(),
     )
-    # Behind the surface most pairs are not blended: they have no sums.
+    # Most pairs behind a surface are not blended, and have no slot.
     per_tile = near.blended.tile_blended
     if parts > 1:
         per_tile = torch.cat([per_tile, last.blended.tile_blended])
@@ -173,7 +182,7 @@ def pair_sums(
     pairs = BackwardPairs(lists.tile_record, lists.tile_pair, last.blended.pair_patches, slot_end)
     slots = PairSlots(
         pair_slot=zeros(len(lists.tile_record), dtype=torch.int32),
-        sums=scratch("pair_sums", int(slot_end[-1]), PAIR),
+        sums=scratch("pair_sums", int(slot_end[-1]), PAIR_FLOATS),
     )
     sums = PairSums(
         rows=bins.visible,
@@ -202,24 +211,24 @@ def pair_sums(
             optimizations=active_optimizations(),
         )
         yield some, sums
-        # The gradient of the transmittance belongs to the first pass alone.
+        # Only the first pass adds the gradient of the transmittance.
         v_pixels = v_pixels._replace(transmittance=floats(0, grid.width))
 
 
 def compose_adjoint(
     composed: Composed,
-    # Inputs of `compose`.
+    # Inputs of `compose`:
     means2d: Tensor,  # [R, 2]
     conics: Tensor,  # [R, 3]
     opacities: Tensor,  # [R]
     colors: Tensor,  # [R, D]
-    # What it returned, and gradients of it.
+    # Outputs of `compose`, and their gradients:
     transmittance: Tensor,  # H W numbers
     v_image: Tensor | None,  # H W D numbers; None for zeros
     v_transmittance: Tensor | None,  # H W numbers; None for zeros
     absolute: Tensor | None,  # [R, 2]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Gradients of means2d, conics, opacities and colors; `absolute` receives the sum over pixels of |v_means2d|."""
+    """Return gradients of means2d, conics, opacities and colors. Adds sums over pixels of |v_means2d| to `absolute`."""
     with_absolute = absolute is not None
     v_splats = SplatGradients(
         means2d=floats(*means2d.shape),

@@ -1,7 +1,7 @@
-"""3D Gaussians to the image plane (EWA splatting, Zwicker et al. 2001; formulas as in gsplat 1.5), 16 at a time.
+"""Projects 3D Gaussians to the image plane, 16 at a time (EWA splatting, Zwicker et al. 2001; formulas of gsplat 1.5).
 
-The raw parameters of a trainer, logarithms of scales and logits of opacities, are read as they are where `raw`.
-How the covariances keep their digits is explained in `kernels/lib/geometry.h`.
+With `raw` the kernels read a trainer's parameters directly: logarithms of scales and logits of opacities.
+`kernels/lib/geometry.h` explains how the covariances keep their digits.
 """
 
 from typing import Annotated, NamedTuple
@@ -12,7 +12,7 @@ from .structs import BlockRows, Camera, GaussianGradients, Gaussians, ProjectedG
 
 
 class Limits(NamedTuple):
-    """What is left out of an image."""
+    """Limits beyond which Gaussians are culled."""
 
     near_plane: float  # Gaussians nearer than this, world units
     far_plane: float  # Gaussians farther than this
@@ -20,22 +20,22 @@ class Limits(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """Gaussians on the image plane, zeros or, unless `dense`, nothing where they are not visible."""
+    """Gaussians on the image plane. Rows that are not visible are zero with `dense`, and undefined without."""
 
     means2d: Annotated[FloatOutput, "n, 2"]
     depths: Annotated[FloatOutput, "n"]
     conics: Annotated[FloatOutput, "n, 3"]  # upper triangle of the inverse 2D covariance
     sigmas: Annotated[FloatOutput, "n, 2"]  # standard deviations along x and y in pixels
-    compensations: Annotated[FloatOutput, "n if antialiased else 0"]  # of opacities, for the area that `eps2d` adds
+    compensations: Annotated[FloatOutput, "n if antialiased else 0"]  # factors of opacities, for `eps2d`
     radii: Annotated[IntOutput, "n if with_radii else 0, 2"]  # pixels
     opacities: Annotated[FloatOutput, "n if raw else 0"]  # activated, and compensated where antialiased
 
 
-@worker(file="project_forward.h", items="(n + BLOCK - 1) / BLOCK", grain="1")
+@worker(file="project_forward.h", items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS", grain="1")
 def project_forward(
     *,
     gaussians: Gaussians,
-    opacities: Annotated[FloatArray, "n"],  # where `raw`, their logits
+    opacities: Annotated[FloatArray, "n"],  # logits if `raw`
     camera: Camera,
     limits: Limits,
     projected: Projected,
@@ -43,7 +43,7 @@ def project_forward(
     n: int,
     antialiased: int,
     raw: int,
-    dense: int,  # whether to write rows that are not visible
+    dense: int,  # 1 writes zeros for rows that are not visible
     with_radii: int,
     optimizations: int,
 ) -> None: ...
@@ -55,12 +55,12 @@ def list_visible(
     found: Annotated[IntArray, "n"],
     block_count: Annotated[IntArray, "blocks"],
     visible: Annotated[IntOutput, "n"],
-    block_start: Annotated[IntOutput, "blocks + 1"],  # where each block of rows begins in `visible`
+    block_start: Annotated[IntOutput, "blocks + 1"],  # start of each block of rows in `visible`
     blocks: int,
 ) -> None: ...
 
 
-@worker(file="project_adjoint.h", items="(n + BLOCK - 1) / BLOCK", grain="1")
+@worker(file="project_adjoint.h", items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS", grain="1")
 def project_adjoint(
     *,
     gaussians: Gaussians,
@@ -68,7 +68,7 @@ def project_adjoint(
     visible: RowList,
     v_projected: ProjectedGradients,
     v_gaussians: GaussianGradients,
-    v_poses: Annotated[FloatOutput, "blocks(n) if with_pose else 0, 3, 4"],  # partial sums of the viewmat's gradient
+    v_poses: Annotated[FloatOutput, "blocks(n) if with_pose else 0, 3, 4"],  # viewmat's gradient, by block
     n: int,
     with_depth: int,
     antialiased: int,

@@ -1,4 +1,4 @@
-"""Lists of visible rows: the rows [M] of one image, and where each block of rows begins among them."""
+"""Lists of visible rows: the rows [M] of one image, and the start of each block of rows among them."""
 
 import math
 from typing import Annotated
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..runtime.buffers import floats, ints
-from ..runtime.constants import BLOCK, blocks
+from ..runtime.constants import BLOCK_ROWS, blocks
 from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, FloatOutput, IntArray
 from .project import list_visible
@@ -25,7 +25,7 @@ def _take_rows(
 ) -> None: ...
 
 
-@worker(file="put_rows.h", items="(n + BLOCK - 1) / BLOCK", grain="1")
+@worker(file="put_rows.h", items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS", grain="1")
 def _put_rows(
     *,
     visible: RowList,
@@ -40,7 +40,7 @@ def take_rows(
     source: Tensor,  # [R, ...], numbers of 32 bits
     rows: Tensor,  # [M] int32
 ) -> Tensor:
-    """`source[rows]`, on all cores; torch's takes as long as some kernels."""
+    """Return `source[rows]`, computed on all cores: torch's indexing takes as long as some kernels."""
     shape = len(rows), *source.shape[1:]
     taken = floats(*shape)
     source_floats = source.contiguous().view(torch.float32)
@@ -53,7 +53,7 @@ def put_rows(
     n: int,
     visible: RowList,
 ) -> Tensor:
-    """The adjoint of `take_rows`: `n` rows, zeros but for the listed ones."""
+    """Return the adjoint of `take_rows`: `n` rows, zero except for the listed ones."""
     shape = n, *packed.shape[1:]
     put = floats(*shape)
     _put_rows(visible=visible, packed=packed.contiguous(), put=put, n=n, width=math.prod(shape[1:]))
@@ -61,7 +61,7 @@ def put_rows(
 
 
 def visible_rows(found: BlockRows) -> RowList:
-    """The rows that a kernel found in each block, one after the other."""
+    """Join the rows that a kernel found in each block to one list."""
     visible, block_start = ints(len(found.rows)), ints(len(found.counts) + 1)
     list_visible(
         found=found.rows,
@@ -74,6 +74,6 @@ def visible_rows(found: BlockRows) -> RowList:
 
 
 def all_rows(n: int) -> RowList:
-    """All of `n` rows."""
-    starts = torch.arange(0, BLOCK * (blocks(n) + 1), BLOCK, dtype=torch.int32, device="cpu").clamp(max=n)
+    """Return the list of all `n` rows."""
+    starts = torch.arange(0, BLOCK_ROWS * (blocks(n) + 1), BLOCK_ROWS, dtype=torch.int32, device="cpu").clamp(max=n)
     return RowList(torch.arange(n, dtype=torch.int32, device="cpu"), starts)

@@ -1,7 +1,7 @@
-"""Gradients of raw parameters, from the sums of pairs to the last product in one kernel.
+"""Computes the gradients of raw parameters from the sums of pairs in a single kernel.
 
-What it does for one block of rows after the other, `reduce_pairs`, `sh_adjoint` and `project_adjoint` do one after
-the other for all rows, where torch wants the gradients in between.
+The kernel applies `reduce_pairs`, `sh_adjoint` and `project_adjoint` to one block of rows at a time. These run one
+after the other over all rows when torch needs the gradients in between.
 """
 
 from typing import Annotated, NamedTuple
@@ -24,7 +24,7 @@ from .structs import (
 
 
 class Rendered(NamedTuple):
-    """Results of the forward pass, of visible rows."""
+    """Results of the forward pass for visible rows."""
 
     colors: Annotated[FloatArray, "n, 3"]
     conics: Annotated[FloatArray, "n, 3"]
@@ -32,15 +32,16 @@ class Rendered(NamedTuple):
 
 
 class CenterGradients(NamedTuple):
-    """Gradients of the 2D means of visible Gaussians, packed."""
+    """Packed gradients of the 2D means of visible Gaussians."""
 
     centers: Annotated[FloatOutput, "sums.M if with_centers else 0, 2"]
-    absolute: Annotated[FloatOutput, "sums.M if absgrad else 0, 2"]  # |v_means2d| summed over pixels, added to
+    # The kernel adds the sum over pixels of |v_means2d|.
+    absolute: Annotated[FloatOutput, "sums.M if absgrad else 0, 2"]
 
 
 @worker(
     file="splat_adjoint.h",
-    items="(n + BLOCK - 1) / BLOCK",
+    items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS",
     grain="1",
     structs=(Channels, ProjectedGradients, RowList, SplatGradients),
 )

@@ -1,4 +1,4 @@
-"""What the forks of Inria's rasterizer count inside their blend, by a walk through sorted tile lists."""
+"""Counts that forks of Inria's rasterizer collect while they blend, computed from sorted tile lists."""
 
 from typing import Annotated, NamedTuple
 
@@ -6,33 +6,40 @@ from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, FloatOutput, IntArray, IntOutput
 from .structs import Grid
 
-SUMS = 8  # floats per (tile, Gaussian) pair; the kernel uses six, and adds up eight at a time
+# Floats per (tile, Gaussian) pair. The kernel uses six, and adds up eight vectors at a time.
+STATISTICS_FLOATS = 8
 
 
 class SortedLists(NamedTuple):
-    """Tile lists of one image, sorted to their ends."""
+    """The tile lists of one image, sorted whole."""
 
-    records: Annotated[FloatArray, "M, RECORD"]
+    records: Annotated[FloatArray, "M, RECORD_FLOATS"]
     tile_start: Annotated[IntArray, "grid.tiles_x * grid.tiles_y + 1"]
     tile_record: Annotated[IntArray, "P"]  # record of each pair
-    tile_row: Annotated[IntArray, "P"]  # its Gaussian
+    tile_row: Annotated[IntArray, "P"]  # Gaussian of each pair
 
 
 class StatisticsMaps(NamedTuple):
-    """What is counted for each pixel."""
+    """Per-pixel counts."""
 
-    contributions: Annotated[IntOutput, "grid.height, grid.width"]  # Gaussians that contribute
-    strongest: Annotated[IntOutput, "grid.height, grid.width"]  # the one with the largest share; -1 where there is none
+    contributions: Annotated[IntOutput, "grid.height, grid.width"]  # number of Gaussians that contribute
+    # The Gaussian with the largest weight; -1 if none contributes.
+    strongest: Annotated[IntOutput, "grid.height, grid.width"]
 
 
-@worker(file="blend_statistics.h", items="grid.tiles_x * grid.tiles_y", grain="2", constants={"SUMS": SUMS})
+@worker(
+    file="blend_statistics.h",
+    items="grid.tiles_x * grid.tiles_y",
+    grain="2",
+    constants={"STATISTICS_FLOATS": STATISTICS_FLOATS},
+)
 def blend_statistics(
     *,
     lists: SortedLists,
     values: Annotated[FloatArray, "grid.height, grid.width"],
-    # Of each pair: pixels, and sums over them of the share of their colour, the light that reaches the Gaussian, the
-    # values, values times share, and distances from its centre.
-    pair_sums: Annotated[FloatOutput, "lists.P, SUMS"],
+    # For each pair the number of pixels, and sums over these pixels of the Gaussian's weight in the colour, the
+    # transmittance in front of it, the values, values times weight, and the distance in pixels from its centre.
+    pair_sums: Annotated[FloatOutput, "lists.P, STATISTICS_FLOATS"],
     maps: StatisticsMaps,
     grid: Grid,
 ) -> None: ...

@@ -1,7 +1,7 @@
-"""Structs that several kernels share; in C++ they have the same names and fields (`runtime/parameters.py`).
+"""Structs that several kernels share. Their C++ versions have the same names and fields (`runtime/parameters.py`).
 
-Sizes are expressions as `guard.Sizes` checks them: `n` is the number of Gaussians, `blocks(n)` that of their blocks of
-BLOCK rows. A gradient of the loss is named after what it belongs to, `v_` in front.
+Sizes are expressions that `guard.Sizes` checks: `n` is the number of Gaussians, and `blocks(n)` the number of their
+blocks of BLOCK_ROWS rows. The gradient of the loss with respect to a quantity has its name with `v_` in front.
 """
 
 from typing import Annotated, NamedTuple
@@ -11,7 +11,7 @@ from ..runtime.parameters import FloatArray, FloatOutput, IntArray, IntOutput
 
 
 class Gaussians(NamedTuple):
-    """Parameters of Gaussians; where `raw`, scales are logarithms."""
+    """Parameters of Gaussians. With `raw`, scales are logarithms."""
 
     means: Annotated[FloatArray, "n, 3"]  # world space
     quats: Annotated[FloatArray, "n, 4"]  # w, x, y, z, of any length
@@ -29,7 +29,7 @@ class Camera(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """An image and its tiles."""
+    """The size of an image, and its numbers of tiles."""
 
     width: int  # pixels
     height: int  # pixels
@@ -38,26 +38,26 @@ class Grid(NamedTuple):
 
 
 def grid(width: int, height: int) -> Grid:
-    """The tiles of an image of this size in pixels."""
+    """Return the tiles of an image of this size in pixels."""
     return Grid(width, height, *tiles(width, height))
 
 
 class RowList(NamedTuple):
-    """Some rows, ascending, and where each block of rows begins among them."""
+    """A list of row numbers, ascending, and the start of each block of rows in the list."""
 
     rows: Annotated[IntArray, "block_start[-1]"]
     block_start: Annotated[IntArray, "blocks(n) + 1"]
 
 
 class BlockRows(NamedTuple):
-    """Rows that a kernel finds in each block, from where the block begins, and their number."""
+    """Rows that a kernel finds in each block, written from the block's first row on, and their number."""
 
     rows: Annotated[IntOutput, "n"]
     counts: Annotated[IntOutput, "blocks(n)"]
 
 
 class Splats(NamedTuple):
-    """Gaussians on the image plane, as tile lists and blend read them."""
+    """Gaussians on the image plane, which tile lists and blend read."""
 
     means2d: Annotated[FloatArray, "n, 2"]  # pixels, the first pixel centre at 0.5
     depths: Annotated[FloatArray, "n"]
@@ -67,23 +67,23 @@ class Splats(NamedTuple):
 
 
 class SplatGradients(NamedTuple):
-    """Gradients of what the blend reads of each Gaussian."""
+    """Gradients of the splats and colours that the blend reads."""
 
     means2d: Annotated[FloatOutput, "n, 2"]
     conics: Annotated[FloatOutput, "n, 3"]
     opacities: Annotated[FloatOutput, "n"]
-    absolute: Annotated[FloatOutput, "n if absgrad else 0, 2"]  # |v_means2d| summed over pixels, added to
+    absolute: Annotated[FloatOutput, "n if absgrad else 0, 2"]  # kernels add the sum over pixels of |v_means2d|
     colors: Annotated[FloatOutput, "n, channels.stride"]
 
 
 class ProjectedGradients(NamedTuple):
-    """Gradients of what the projection gives."""
+    """Gradients of the outputs of the projection."""
 
     means2d: Annotated[FloatArray, "n, 2"]
     depths: Annotated[FloatArray, "n if with_depth else 0"]
     conics: Annotated[FloatArray, "n, 3"]
     compensations: Annotated[FloatArray, "n if antialiased else 0"]
-    opacities: Annotated[FloatArray, "0"]  # of raw parameters, which only `splat_adjoint` has
+    opacities: Annotated[FloatArray, "0"]  # used only by `splat_adjoint`, which passes it inside C++
 
 
 class GaussianGradients(NamedTuple):
@@ -95,10 +95,10 @@ class GaussianGradients(NamedTuple):
 
 
 class Harmonics(NamedTuple):
-    """SH coefficients and the position that they are seen from.
+    """SH coefficients, and the position from which they are evaluated.
 
-    The constant band of Gaussian g lies at `sh0_stride` g of `sh0`, the others at `shN_stride` g + `shN_offset` of
-    `shN`, which may be the same array.
+    The constant band of Gaussian g begins at index `sh0_stride` * g of `sh0`. Its higher bands begin at index
+    `shN_stride` * g + `shN_offset` of `shN`, which may be the same array.
     """
 
     position: Annotated[FloatArray, "3"]  # of the camera in world space
@@ -111,37 +111,38 @@ class Harmonics(NamedTuple):
 
 
 class HarmonicsGradients(NamedTuple):
-    """Gradients of the coefficients, in their layout."""
+    """Gradients of the SH coefficients, in the layout of `Harmonics`."""
 
     sh0: Annotated[FloatOutput, "n, sh.sh0_stride"]
-    shN: Annotated[FloatOutput, "0 if factored else n, sh.shN_stride"]  # sh0 itself where both are one array
-    factored: int  # whether a `FactorOutput` gets the gradient of the higher bands instead
+    # The same array as sh0 if the coefficients share one.
+    shN: Annotated[FloatOutput, "0 if factored else n, sh.shN_stride"]
+    factored: int  # 1 if a `FactorOutput` receives the gradient of the higher bands instead
 
 
 class FactorOutput(NamedTuple):
-    """The gradient of the higher bands in factors, in place of `HarmonicsGradients.shN`; see `FactoredGradient`."""
+    """Factors of the gradient of the higher bands, in place of `HarmonicsGradients.shN`. See `FactoredGradient`."""
 
-    directions: Annotated[FloatOutput, "sums.M if v_sh.factored and sh.degree else 0, FACTOR"]
-    colors: Annotated[FloatOutput, "sums.M if v_sh.factored and sh.degree else 0, FACTOR"]
+    directions: Annotated[FloatOutput, "sums.M if v_sh.factored and sh.degree else 0, FACTOR_FLOATS"]
+    colors: Annotated[FloatOutput, "sums.M if v_sh.factored and sh.degree else 0, FACTOR_FLOATS"]
 
 
 class Channels(NamedTuple):
-    """Channels of one pass over the colours."""
+    """The channels that one pass over the colours blends."""
 
-    stride: int  # all there are
-    first: int
-    number: int  # at most MAX_CHANNELS
+    stride: int  # number of all channels
+    first: int  # first channel of the pass
+    number: int  # channels of the pass, at most MAX_CHANNELS
 
 
 class PairSums(NamedTuple):
-    """Sums of the pairs that were blended, as kernels read them that add up those of a row."""
+    """Sums of the blended pairs, and the indices with which kernels add up those of each row."""
 
     rows: Annotated[IntArray, "M"]  # visible Gaussians
-    block_start: Annotated[IntArray, "blocks(n) + 1"]  # where each block of rows begins among them
-    pair_start: Annotated[IntArray, "M + 1"]  # number of the first pair of each
-    # The same three of the second part of the lists, if there is one.
+    block_start: Annotated[IntArray, "blocks(n) + 1"]  # start of each block of rows among them
+    pair_start: Annotated[IntArray, "M + 1"]  # number of the first pair of each row
+    # The same three for the lists of the second pass, if there is one.
     far_rows: Annotated[IntArray, "F"]
     far_block_start: Annotated[IntArray, "blocks(n) + 1"]
     far_pair_start: Annotated[IntArray, "F + 1"]
     pair_slot: Annotated[IntArray, "P"]  # 1 + the slot of each pair, 0 if it was not blended
-    slots: Annotated[FloatArray, "Q, PAIR"]  # a `PairSum` each
+    slots: Annotated[FloatArray, "Q, PAIR_FLOATS"]  # a `PairSum` each

@@ -1,4 +1,4 @@
-"""One step of Adam on all cores, for whole parameters or for some rows of them."""
+"""One step of Adam on all cores, for all rows of a parameter or for some of them."""
 
 from typing import Annotated, NamedTuple
 
@@ -8,48 +8,48 @@ from torch import Tensor
 from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, FloatOutput, IntArray
 
-_ALL = torch.empty(0, dtype=torch.int32, device="cpu")  # in place of a mask
+_ALL = torch.empty(0, dtype=torch.int32, device="cpu")  # in place of a mask: every row
 
 
 class Moments(NamedTuple):
-    """A parameter and the running means that Adam keeps of its gradient, all changed by a step."""
+    """A parameter and the two moments that Adam keeps of its gradient. A step changes all three."""
 
     values: Annotated[FloatOutput, "n, width"]
-    mean: Annotated[FloatOutput, "n, width"]  # of the gradient
-    square: Annotated[FloatOutput, "n, width"]  # of its square
+    mean: Annotated[FloatOutput, "n, width"]  # running mean of the gradient
+    square: Annotated[FloatOutput, "n, width"]  # running mean of the squared gradient
 
 
 class Decay(NamedTuple):
-    """The numbers of Adam that stay the same from step to step."""
+    """The coefficients of Adam that are the same in every step."""
 
-    take1: float  # 1 - the decay of the mean, which loses digits when it is computed in float32
-    keep2: float  # decay of the mean of the squares
-    take2: float  # 1 - keep2
+    take1: float  # 1 - beta1, computed in float64: the difference would lose digits in float32
+    keep2: float  # beta2
+    take2: float  # 1 - beta2, computed in float64
     eps: float
 
 
 def decay(betas: tuple[float, float], eps: float) -> Decay:
-    """The numbers of these decays of the two means."""
+    """Return the coefficients for these decays of the two moments."""
     return Decay(float(1 - betas[0]), float(betas[1]), float(1 - betas[1]), float(eps))
 
 
 @worker(file="adam.h", items="n", grain="larger(1, 16384 / width)")
 def _adam(
     *,
-    wanted: Annotated[IntArray, "n if only_some else 0"],  # rows that get a step
+    wanted: Annotated[IntArray, "n if only_some else 0"],  # not zero for rows that get a step
     gradient: Annotated[FloatArray, "n, width"],
     parameter: Moments,
     decay: Decay,
     n: int,
     width: int,
     only_some: int,
-    rate: float,  # divided by the bias correction of the mean
-    root: float,  # divides the root of the squares
+    rate: float,  # learning rate, divided by the bias correction of the mean
+    root: float,  # square root of the bias correction of the squares
 ) -> None: ...
 
 
 def adam_step(
-    wanted: Tensor | None,  # [N], all rows without
+    wanted: Tensor | None,  # [N] int32
     values: Tensor,
     gradient: Tensor,
     mean: Tensor,
@@ -59,22 +59,23 @@ def adam_step(
     betas: tuple[float, float],
     eps: float,
 ) -> None:
-    """One step of Adam in place, float32, contiguous.
+    """Apply one step of Adam (Kingma and Ba 2015) in place to contiguous float32 tensors, on all cores.
 
-    Rounded as torch's fused implementation, to the bit but for means smaller than 1.2e-38, which become zero, and for
-    the last numbers of a parameter, which torch does not compute as vectors. Torch's default differs from both by a
-    rounding in one number of a thousand: its square root is not the nearest float.
+    The result equals torch's fused implementation to the bit, with two exceptions: means smaller than 1.2e-38 become
+    zero, and the last few numbers of a parameter differ, which torch does not compute as vectors. Torch's default
+    implementation differs from both by one rounding in about one number of a thousand, because its square root is not
+    correctly rounded.
 
     Args:
-        wanted: Not zero for each row to update; None for all rows.
+        wanted: Not zero for each row to update. None updates all rows.
         values: The parameter. The step changes it in place.
         gradient: Its gradient, of the same shape.
         mean: Running mean of the gradient, of the same shape. The step changes it in place.
         square: Running mean of the squared gradient, of the same shape. The step changes it in place.
-        rate: Learning rate, divided by the bias correction of the mean if there is any.
-        root: Divides the root of `square`: the root of its bias correction, or 1.
-        betas: Decay of the two means.
-        eps: Added to the root.
+        rate: Learning rate, divided by the bias correction of the mean if there is one.
+        root: Square root of the bias correction of `square`, or 1 without a correction.
+        betas: Decays of the two means.
+        eps: Added to the square root of `square`.
     """
     if values.numel() == 0:
         return
@@ -90,7 +91,7 @@ def adam_step(
         rate=float(rate),
         root=float(root),
     )
-    # Past torch's count of changes, by which it knows what is out of date in a backward pass.
+    # Kernels bypass torch's version counter, with which it detects outdated tensors in a backward pass.
     torch.autograd.graph.increment_version(values)
 
 
@@ -104,18 +105,18 @@ def adam_rows(
     betas: tuple[float, float],
     eps: float,
 ) -> None:
-    """One step of Adam without bias correction for the rows that are visible, on all cores.
+    """Apply one step of Adam without bias correction to the visible rows, on all cores.
 
-    As the CUDA kernels of Taming 3DGS and gsplat's SelectiveAdam: other rows keep value and moments.
+    Other rows keep their values and moments, as with the CUDA kernels of Taming 3DGS and gsplat's SelectiveAdam.
 
     Args:
         visibility: Rows to update.
-        param: Parameter with a gradient, float32; elsewhere than on the CPU plain torch updates it.
-        mean: Its running mean of gradients.
-        square: Its running mean of squared gradients.
+        param: Parameter with a gradient, float32. On devices other than the CPU, plain torch updates it.
+        mean: Running mean of its gradient.
+        square: Running mean of its squared gradient.
         rate: Learning rate.
-        betas: Decay of the two means.
-        eps: Added to the root of the squares.
+        betas: Decays of the two means.
+        eps: Added to the square root of `square`.
     """
     assert param.grad is not None
     if param.device.type != "cpu":

@@ -1,7 +1,7 @@
-"""The gradient of the higher bands as it comes about: of each row an outer product, which nobody has to write down.
+"""The gradient of the higher SH bands in factors: each row is an outer product that is never written out.
 
-The colour of a Gaussian is linear in its coefficients, so their gradient is the basis in the direction from the camera
-times the gradient of the colour: 3 and 3 numbers instead of 45.
+The colour of a Gaussian is linear in its SH coefficients. So their gradient is the outer product of the basis functions
+in the direction from the camera and the gradient of the colour: 3 + 3 numbers instead of 45.
 """
 
 from typing import Any, NamedTuple
@@ -10,19 +10,19 @@ import torch
 from torch import Tensor
 
 from ..runtime.buffers import floats, zeros
-from ..runtime.constants import BANDS
+from ..runtime.constants import HIGHER_BANDS
 from ..stages.sh import sh_bands
 
 
 class Factors(NamedTuple):
-    """Rows of a gradient [N, K, 3] that are not zero, and what they are products of.
+    """The non-zero rows of a gradient [N, K, 3], as factors of outer products.
 
     Attributes:
-        rows: [M] int32, none of them twice.
-        directions: [M, FACTOR] float32, of which the first three count, of length 1; undefined where a row of `colors`
-            is zero.
-        colors: [M, FACTOR] float32, of which the first three count.
-        degree: of the SH that have a gradient; that of higher bands is zero.
+        rows: [M] int32, row numbers without repetition.
+        directions: [M, FACTOR_FLOATS] float32, unit vectors in the first three columns; undefined where the row of
+            `colors` is zero.
+        colors: [M, FACTOR_FLOATS] float32, gradients of the colours in the first three columns.
+        degree: Highest SH degree that has a gradient. The gradient of higher degrees is zero.
     """
 
     rows: Tensor
@@ -32,9 +32,9 @@ class Factors(NamedTuple):
 
 
 class FactoredGradient(Tensor):
-    """A gradient [N, K, 3] in factors. To torch it is a dense tensor, which it becomes when it is changed in place."""
+    """A gradient [N, K, 3] in factors. Torch treats it as a dense tensor. Changing it in place makes it dense."""
 
-    _content: list[Factors | Tensor]  # one thing, shared with what was detached from this
+    _content: list[Factors | Tensor]  # a single element, shared with detached copies
 
     @staticmethod
     def __new__(cls, shape: torch.Size, content: list[Factors | Tensor]) -> "FactoredGradient":
@@ -46,17 +46,17 @@ class FactoredGradient(Tensor):
 
     @property
     def factors(self) -> Factors | None:
-        """What it is made of, until it was changed in place."""
+        """The factors; None once the gradient was changed in place."""
         (content,) = self._content
         return None if isinstance(content, Tensor) else content
 
     def dense(self) -> Tensor:
-        """All its numbers, as a plain tensor."""
+        """Return all elements [N, K, 3] as a plain tensor."""
         (content,) = self._content
         if isinstance(content, Tensor):
             return content
         rows, directions, colors, degree = content
-        bands = floats(len(rows), BANDS)
+        bands = floats(len(rows), HIGHER_BANDS)
         sh_bands(directions=directions, bands=bands, n=len(rows), degree=degree)
         product = bands[:, : self.shape[1], None] * colors[:, None, :3]
         product = torch.where((colors[:, :3] != 0).any(1)[:, None, None], product, 0.0)
@@ -64,7 +64,7 @@ class FactoredGradient(Tensor):
 
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
-        """Operations see the dense tensor; copies stay factors, and what changes it keeps what it is then."""
+        """Run operations on the dense tensor. Copies stay factors. An operation in place stores the dense tensor."""
         if func is torch.ops.aten.detach.default:
             return cls(args[0].shape, args[0]._content)
         if func is torch.ops.aten.clone.default and args[0].factors is not None:
@@ -77,5 +77,5 @@ class FactoredGradient(Tensor):
 
 
 def plain(value: Any) -> Any:
-    """What is dense of a `FactoredGradient`, and all else as it is."""
+    """Return the dense tensor of a `FactoredGradient`, and any other value unchanged."""
     return value.dense() if isinstance(value, FactoredGradient) else value

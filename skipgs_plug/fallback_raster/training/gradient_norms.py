@@ -1,4 +1,4 @@
-"""What densification knows of a Gaussian: how far the views that show it would move it on their images."""
+"""Sums of the gradients of 2D means, by which densification decides which Gaussians to split or clone."""
 
 from typing import Annotated
 
@@ -11,10 +11,10 @@ from ..runtime.parameters import FloatArray, FloatOutput, IntArray
 @worker(file="sum_norms.h", items="n", grain="4096")
 def _sum_norms(
     *,
-    rows: Annotated[IntArray, "n"],  # none of them twice
+    rows: Annotated[IntArray, "n"],  # no row twice
     gradient: Annotated[FloatArray, "n, 2"],
-    norms: Annotated[FloatOutput, "R"],  # the kernel adds to these
-    counts: Annotated[FloatOutput, "R"],  # and to these
+    norms: Annotated[FloatOutput, "R"],  # the kernel adds to it
+    counts: Annotated[FloatOutput, "R"],  # the kernel adds to it
     n: int,
     scale_x: float,
     scale_y: float,
@@ -22,13 +22,21 @@ def _sum_norms(
 
 
 def sum_norms(
-    rows: Tensor,  # [M] int32, none of them twice
+    rows: Tensor,  # [M] int32, no row twice
     gradient: Tensor,  # [M, 2] float32, of the 2D means
-    scale: tuple[float, float],  # by which both columns are multiplied first
+    scale: tuple[float, float],  # factors of the two columns
     norms: Tensor,  # [N] float32, changed in place
     counts: Tensor,  # [N] float32, changed in place
 ) -> None:
-    """Add the norms of gradients to `norms` and 1 to `counts`, for the rows that an image shows."""
+    """Add the norm of each gradient to `norms` and 1 to `counts`, for the rows that are visible in an image.
+
+    Args:
+        rows: Rows of the visible Gaussians.
+        gradient: Gradients of their 2D means.
+        scale: Factors of x and y, applied before the norm, such as half the image's size in pixels.
+        norms: Sums of norms. Changed in place.
+        counts: Numbers of images. Changed in place.
+    """
     _sum_norms(
         rows=rows,
         gradient=gradient.contiguous(),

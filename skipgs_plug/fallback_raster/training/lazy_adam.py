@@ -1,4 +1,4 @@
-"""Adam for a parameter of many rows of which few are needed at a time: the others are caught up when they are."""
+"""Adam for a parameter with many rows of which few are needed at a time. Other rows are caught up when needed."""
 
 import math
 from typing import Annotated, Any, NamedTuple
@@ -8,29 +8,29 @@ from numpy import float32
 from torch import Tensor
 
 from ..runtime.buffers import floats, zeros
-from ..runtime.constants import BANDS
+from ..runtime.constants import HIGHER_BANDS
 from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, IntArray, IntOutput
 from .adam import Decay, Moments, decay
 from .factored_gradient import FactoredGradient, Factors, plain
 from .optimizer import Adam, moments, next_step
 
-# Steps that a row may miss before all rows are caught up: their rates are kept, 12 bytes a step.
-STEPS = 1024
-# Steps of a row between two looks at how small its numbers have become.
+# Steps that a row may miss before all rows are caught up. Three floats are kept for each step, 12 KiB in all.
+MAX_MISSED_STEPS = 1024
+# Missed steps that are applied between two checks that the numbers of a row are still in the safe range.
 STEPS_PER_CHECK = 32
 
 
 class GradientFactors(NamedTuple):
-    """A gradient as outer products, see `Factors`."""
+    """A gradient as factors of outer products. See `Factors`."""
 
-    directions: Annotated[FloatArray, "m if with_gradient else 0, FACTOR"]
-    colors: Annotated[FloatArray, "m if with_gradient else 0, FACTOR"]
+    directions: Annotated[FloatArray, "m if with_gradient else 0, FACTOR_FLOATS"]
+    colors: Annotated[FloatArray, "m if with_gradient else 0, FACTOR_FLOATS"]
     degree: int
 
 
 class MissedSteps(NamedTuple):
-    """What `adam_step` takes as `rate` and `root` in each of the steps."""
+    """The arguments `rate` and `root` of `adam_step` for each missed step."""
 
     rates: Annotated[FloatArray, "steps"]
     roots: Annotated[FloatArray, "steps"]
@@ -38,10 +38,10 @@ class MissedSteps(NamedTuple):
 
 
 class SafeRange(NamedTuple):
-    """Between which sizes of a row's numbers nothing comes near underflow or overflow in STEPS_PER_CHECK steps."""
+    """Bounds of a row's numbers within which STEPS_PER_CHECK steps come near neither underflow nor overflow."""
 
-    grow: float  # 1 / sqrt(keep2)
-    longest_rate: float  # of all steps; infinite where decay makes steps longer
+    grow: float  # 1 / sqrt(beta2)
+    longest_rate: float  # largest rate of all steps; infinite if steps can grow although the mean decays
     least_mean: float
     most_mean: float
     least_square: float
@@ -50,8 +50,8 @@ class SafeRange(NamedTuple):
 @worker(file="catch_up.h", items="m", grain=256, constants={"STEPS_PER_CHECK": STEPS_PER_CHECK})
 def _catch_up(
     *,
-    rows: Annotated[IntArray, "m"],  # none of them twice
-    done: Annotated[IntOutput, "n"],  # steps that each row has
+    rows: Annotated[IntArray, "m"],  # no row twice
+    done: Annotated[IntOutput, "n"],  # number of steps that each row received
     factors: GradientFactors,
     parameter: Moments,
     missed: MissedSteps,
@@ -60,36 +60,36 @@ def _catch_up(
     m: int,
     n: int,
     width: int,
-    now: int,  # steps that rows get before the one with a gradient
+    now: int,  # number of steps before the one with a gradient
     with_gradient: int,
 ) -> None: ...
 
 
 class _Missed:
-    """The steps since all rows were up to date, and how many of them each row has."""
+    """The steps since all rows were up to date, and how many of them each row received."""
 
     def __init__(self, param: Tensor, betas: tuple[float, float], eps: float) -> None:
         self.param, self.betas, self.eps = param, betas, eps
         self.done = zeros(len(param), dtype=torch.int32)
-        self.rates, self.roots, self.inverse_roots = floats(STEPS), floats(STEPS), floats(STEPS)
+        self.rates, self.roots, self.inverse_roots = (floats(MAX_MISSED_STEPS) for _ in range(3))
         self._arrays = [tensor.numpy() for tensor in (self.rates, self.roots, self.inverse_roots)]
         self.now = 0
         self._least, self._most = math.inf, 0.0
 
     def require(self, param: Tensor) -> None:
-        """Raise RuntimeError unless these are the steps of this parameter."""
+        """Raise RuntimeError if the parameter was replaced."""
         if param is not self.param:
             raise RuntimeError("The parameter of a LazyAdam was replaced: call catch_up() before that.")
 
     def add(self, rate: float, root: float) -> None:
-        """Note a step; it is complete when `now` is raised."""
+        """Record a step. It counts once `now` is increased."""
         for array, value in zip(self._arrays, (rate, root, 1.0 / float32(root)), strict=True):
             array[self.now] = value
         self._least = min(self._least, abs(rate) or math.inf)
         self._most = max(self._most, abs(rate))
 
     def advance(self, rows: Tensor, gradient: Factors | None, state: dict[str, Tensor]) -> None:
-        """Bring rows [n] to `now`, and on by the step that was noted last where there is a gradient of them."""
+        """Apply the steps up to `now` to rows [n], and the step recorded last if `gradient` is given."""
         directions, colors, degree = (floats(0), floats(0), 0) if gradient is None else gradient[1:]
         beta1, beta2 = self.betas
         smallest = self._least * beta1 ** (STEPS_PER_CHECK + 1)
@@ -114,25 +114,26 @@ class _Missed:
             now=self.now,
             with_gradient=int(gradient is not None),
         )
-        # Past torch's count of changes, by which it knows what is out of date in a backward pass.
+        # Kernels bypass torch's version counter, with which it detects outdated tensors in a backward pass.
         torch.autograd.graph.increment_version(self.param)
 
 
 class LazyAdam(Adam):
-    """`Adam` for one parameter [N, K, 3], to the bit, that advances only those rows that are asked for.
+    """`Adam` for one parameter [N, K, 3] that updates a row only when it is needed, with the same result to the bit.
 
-    Rows that a `FactoredGradient` does not name miss the step: with a gradient of zero their moments decay and the
-    parameter moves on. `catch_up` makes up for that, whenever it is called and for whatever rows, with the same result.
-    Before a row of the parameter is used, or anything of the optimizer's `state`, it has to be called.
+    A row that the `FactoredGradient` of a step does not list has a gradient of zero. In `Adam` its moments would decay
+    and its values would move. Here the row misses the step. `catch_up` applies missed steps later; when it is called,
+    and for which rows, does not change the result. It must be called before rows of the parameter, or the optimizer's
+    `state`, are read.
 
     Args:
-        params: One float32 parameter on the CPU, or a group with one, of at most 16 bands.
-        lr: Learning rate, which may change from step to step.
-        betas: Decay of the two means; the second is not 0.
-        eps: Added to the root, more than 0.
+        params: One contiguous float32 parameter [N, K, 3] on the CPU with K of 1 to 15, or a group with one.
+        lr: Learning rate. It may change from step to step.
+        betas: Decays of the two moments. The second must not be 0.
+        eps: Added to the square root of the second moment, more than 0.
 
     Raises:
-        ValueError: It is not one parameter of that kind, or `eps` is 0.
+        ValueError: `params` is not one such parameter, or `eps` is not more than 0.
     """
 
     def __init__(
@@ -143,18 +144,18 @@ class LazyAdam(Adam):
         given = [param for group in self.param_groups for param in group["params"]]
         if len(given) != 1 or not _fits(given[0]):
             raise ValueError(
-                f"LazyAdam takes one contiguous float32 parameter [N, K, 3] on the CPU with K of 1 to {BANDS}, got "
-                f"{[(tuple(param.shape), param.dtype, param.device.type) for param in given]}; use Adam for others."
+                f"LazyAdam takes one contiguous float32 parameter [N, K, 3] on the CPU with K of 1 to {HIGHER_BANDS}, "
+                f"got {[(tuple(param.shape), param.dtype, param.device.type) for param in given]}; use Adam for others."
             )
         if not eps > 0:
             raise ValueError(f"LazyAdam needs eps > 0, got {eps}: rows without any gradient would become NaN.")
 
     @torch.no_grad()
     def catch_up(self, rows: Tensor | None = None) -> None:
-        """Bring rows up to date.
+        """Apply the missed steps to rows.
 
         Args:
-            rows: Their numbers [M], int32, none twice; all rows without.
+            rows: Row numbers [M], int32, no row twice. None stands for all rows.
 
         Raises:
             RuntimeError: The parameter was replaced while rows of it were behind.
@@ -172,23 +173,23 @@ class LazyAdam(Adam):
 
     @torch.no_grad()
     def receive(self, gradient: Factors) -> None:
-        """Add to the gradient of the parameter, which is a `FactoredGradient` unless it has one already."""
+        """Add a gradient to that of the parameter. It stays in factors if the parameter had none before."""
         (param,) = self.param_groups[0]["params"]
         more = FactoredGradient(param.shape, [gradient])
         param.grad = more if param.grad is None else plain(param.grad) + plain(more)
 
     def state_dict(self) -> dict[str, Any]:
-        """As torch's, of rows that are all up to date."""
+        """Return torch's state dictionary, with all rows up to date."""
         self.catch_up()
         return super().state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """As torch's."""
+        """Load a state dictionary of torch's Adam, after applying missed steps."""
         self.catch_up()
         super().load_state_dict(state_dict)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What copies and pickles hold: rows that are all up to date."""
+        """Return the state for copies and pickles, with all rows up to date."""
         self.catch_up()
         return super().__getstate__()
 
@@ -208,7 +209,7 @@ class LazyAdam(Adam):
             return
         missed, state = self._missed, moments(self, param)
         betas, eps = group["betas"], group["eps"]
-        if missed is not None and (missed.now == STEPS or (missed.betas, missed.eps) != (betas, eps)):
+        if missed is not None and (missed.now == MAX_MISSED_STEPS or (missed.betas, missed.eps) != (betas, eps)):
             self.catch_up()
             missed = None
         if missed is None:
@@ -227,6 +228,6 @@ def _fits(param: Tensor) -> bool:
         and param.is_contiguous()
         and param.dim() == 3
         and len(param) > 0
-        and 1 <= param.shape[1] <= BANDS
+        and 1 <= param.shape[1] <= HIGHER_BANDS
         and param.shape[2] == 3
     )

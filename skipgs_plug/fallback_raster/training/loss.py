@@ -1,21 +1,21 @@
-"""The 3DGS loss, (1 - w) L1 + w (1 - SSIM), value and gradient in one go.
+"""The 3DGS loss, (1 - w) L1 + w (1 - SSIM). One kernel computes its value and its gradient.
 
-SSIM (Wang et al. 2004) with an 11x11 Gaussian window of sigma 1.5 and the constants 0.01^2 and 0.03^2. In terms of
-the difference d = x - y of the images, with means m, variances v and covariance c inside a window,
+SSIM (Wang et al. 2004) uses an 11x11 Gaussian window of sigma 1.5 pixels and the constants C1 = 0.01^2 and C2 = 0.03^2.
+In terms of the difference d = x - y of the images, with means m, variances v and covariance c in a window,
 
     luminance  1 - (2 m_x m_y + C1) / (m_x^2 + m_y^2 + C1) = m_d^2 / (m_x^2 + m_y^2 + C1)
     structure  1 - (2 c + C2) / (v_x + v_y + C2)           = v_d   / (v_x + v_y + C2)
 
-so that 1 - SSIM and its gradient come out of small numbers instead of differences of large ones. Every tile also
+so that 1 - SSIM and its gradient are computed from small numbers and not as differences of large ones. Each tile also
 subtracts its mean before it squares, because E[x^2] - E[x]^2 loses digits in float32 where an image is bright and flat.
-For the same reason the parts of the gradient count x and d from there: where both images are flat they are thousands of
-times larger than their sum.
+The terms of the gradient use the shifted x and d for the same reason: where both images are flat, terms of unshifted
+values would be thousands of times larger than their sum.
 
-Images stay channels-last, as the rasterizer returns them: a blur along a row is a blur with stride C over a flat
-row. A tile is at most 256 floats wide and 128 rows high, and is gone through once for value and gradient: what the
-windows need of rows above stays in two rings in the first two caches, of which four rows at a time read most numbers
-once. Tiles compute what they need beyond their borders themselves, a fifth more, which costs less than writing it down
-for another pass: no core reads what another one wrote.
+Images stay channels-last, as the rasterizer returns them: a blur along a row with C channels is a blur with stride C
+over a flat row. A tile is at most 256 floats wide and 128 rows high. It is processed once for value and gradient. Rows
+that later windows need stay in two ring buffers in the first two caches, and four rows at a time are blurred
+vertically, which reads most numbers once. Each tile computes the values beyond its borders that it needs itself. That
+is a fifth more work, but costs less than writing them for a second pass, and no core reads data that another one wrote.
 """
 
 import math
@@ -27,11 +27,12 @@ from torch.autograd.function import once_differentiable
 
 from ..runtime.arguments import as_kernels_read
 from ..runtime.buffers import floats
-from ..runtime.constants import LOSS_CHANNELS, LOSS_ROWS, LOSS_VECTORS, WINDOW
+from ..runtime.constants import LOSS_TILE_ROWS, LOSS_TILE_VECTORS, MAX_LOSS_CHANNELS, SSIM_WINDOW
 from ..runtime.launch import Worker, worker
 from ..runtime.parameters import ByteArray, FloatArray, FloatOutput
 
-# Numbers in a row of an image: kernels find columns in float32, which counts no further exactly.
+# Most numbers (pixels times channels) in a row of an image: kernels compute columns in float32, which is exact up to
+# 2^24.
 MAX_ROW = 2**24
 
 
@@ -45,7 +46,7 @@ class ImageSize(NamedTuple):
 
 
 class LossWeights(NamedTuple):
-    """What |image - target| and 1 - SSIM of each number count in the loss."""
+    """Weights of |image - target| and of 1 - SSIM of each element in the loss."""
 
     l1: float
     ssim: float
@@ -69,10 +70,10 @@ def _loss_tiles(name: str, pixels: Any) -> Worker[...]:
     return loss_tiles
 
 
-BYTES = torch.uint8  # of photographs
+PHOTO_DTYPE = torch.uint8  # dtype in which photographs are kept: a quarter of the memory of float32
 _LOSS_TILES = {
     torch.float32: _loss_tiles("loss_tiles", FloatArray),
-    BYTES: _loss_tiles("loss_tiles_bytes", ByteArray),
+    PHOTO_DTYPE: _loss_tiles("loss_tiles_bytes", ByteArray),
 }
 
 
@@ -83,8 +84,8 @@ class _L1Ssim(torch.autograd.Function):
         images = image.numel() // (height * width * channels)
         size = ImageSize(images, height, width, channels)
         with_gradient = ctx.needs_input_grad[0]
-        tiles = images * -(-height // LOSS_ROWS) * -(-width * channels // (16 * LOSS_VECTORS))
-        border = WINDOW - 1 if valid else 0
+        tiles = images * -(-height // LOSS_TILE_ROWS) * -(-width * channels // (16 * LOSS_TILE_VECTORS))
+        border = SSIM_WINDOW - 1 if valid else 0
         windows = images * (height - border) * (width - border) * channels
         weights = LossWeights((1.0 - ssim_lambda) / image.numel(), ssim_lambda / windows)
         gradient, sums = floats(*image.shape) if with_gradient else floats(0), floats(tiles, 2)
@@ -100,7 +101,7 @@ class _L1Ssim(torch.autograd.Function):
             with_gradient=int(with_gradient),
         )
         ctx.save_for_backward(gradient)
-        # Tiles were summed in float32; adding them in float64, in a fixed order, keeps the last digits of the mean.
+        # Each tile was summed in float32. Adding tiles in float64 in a fixed order keeps the last digits of the mean.
         l1, unlike = map(math.fsum, zip(*sums.tolist(), strict=True))
         return torch.tensor(weights.l1 * l1 + weights.ssim * unlike, dtype=torch.float32, device="cpu")
 
@@ -117,25 +118,25 @@ def l1_ssim_loss(
     ssim_lambda: float = 0.2,
     padding: Literal["same", "valid"] = "same",
 ) -> Tensor:
-    """The 3DGS training loss (Kerbl et al. 2023, eq. 7), fused, in float32 on all cores.
+    """Compute the 3DGS training loss (Kerbl et al. 2023, eq. 7) in one kernel, in float32 on all cores.
 
-    (1 - ssim_lambda) mean |image - target| + ssim_lambda (1 - mean SSIM), bit-equal for any number of threads.
-    Differentiable in `image`; the gradient is computed along with the value, so going back costs nothing more.
+    The loss is (1 - ssim_lambda) mean |image - target| + ssim_lambda (1 - mean SSIM). It is bit-equal for any number of
+    threads. It is differentiable in `image`; its gradient is computed together with the value, so the backward pass is
+    free.
 
     Args:
         image: Rendered image, usually in [0, 1].
-        target: Photograph of the same shape; as uint8 it counts in 255ths, to the bit what `target / 255` gives.
+        target: Photograph of the same shape, float, or uint8 for values in [0, 255] that are divided by 255.
         ssim_lambda: Weight of the SSIM term.
-        padding: "same" continues the images with black (Inria, fused_ssim's default); "valid" averages SSIM over
-            windows inside the image only (gsplat).
+        padding: "same" continues the images with black (Inria, and the default of fused_ssim). "valid" averages SSIM
+            over windows inside the image only (gsplat).
 
     Returns:
         Scalar.
 
     Raises:
         ValueError: Shapes differ, there are more than 32 channels, a row has more than 2^24 numbers, an image is too
-            small for "valid", a tensor is of another kind or not on the CPU, or a gradient with respect to `target` is
-            asked for.
+            small for "valid", a tensor has another dtype or is not on the CPU, or `target` requires a gradient.
 
     Example:
         A grey image against a black photograph.
@@ -158,9 +159,9 @@ def l1_ssim_loss(
         raise ValueError(
             f"image and target must have one shape [..., H, W, C], got {list(image.shape)} and {list(target.shape)}."
         )
-    if image.shape[-1] > LOSS_CHANNELS:
+    if image.shape[-1] > MAX_LOSS_CHANNELS:
         raise ValueError(
-            f"images may have at most {LOSS_CHANNELS} channels, got {image.shape[-1]}; are they [H, W, C]?"
+            f"images may have at most {MAX_LOSS_CHANNELS} channels, got {image.shape[-1]}; are they [H, W, C]?"
         )
     if image.shape[-2] * image.shape[-1] > MAX_ROW:
         raise ValueError(
@@ -169,9 +170,9 @@ def l1_ssim_loss(
         )
     if padding not in ("same", "valid"):
         raise ValueError(f"padding must be 'same' or 'valid', got {padding!r}.")
-    if padding == "valid" and min(image.shape[-3:-1]) < WINDOW:
+    if padding == "valid" and min(image.shape[-3:-1]) < SSIM_WINDOW:
         raise ValueError(
-            f"padding='valid' needs images of at least {WINDOW}x{WINDOW} pixels, got "
+            f"padding='valid' needs images of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, got "
             f"{image.shape[-2]}x{image.shape[-3]}; use padding='same'."
         )
     if target.requires_grad:

@@ -1,4 +1,4 @@
-"""`torch.optim.Adam` on all cores, as a class of its own and in place of torch's function."""
+"""`torch.optim.Adam` on all cores: as a class, and as a replacement for the function that torch's class calls."""
 
 import importlib
 import inspect
@@ -11,21 +11,21 @@ from torch import Tensor
 
 from .adam import adam_step
 
-ADAM_REPLACED = "torch.optim.adam.adam"  # the function that `torch.optim.Adam` steps with
-# Numbers of one parameter that our kernel steps, at most: it counts them in 32 bits. Larger parameters are stepped by
-# torch.
+ADAM_REPLACED = "torch.optim.adam.adam"  # the function that `torch.optim.Adam` calls in each step
+# Most elements of a parameter that the kernel steps, because it indexes them in 32 bits. Torch steps larger parameters.
 MAX_NUMBERS = 2**30
-# Options of torch's Adam that are left to torch, and all that a group of parameters has, but `betas`.
+# Options of torch's Adam that only torch's function supports, and all options of a group of parameters but `betas`.
 _TORCHS = ("amsgrad", "maximize", "weight_decay", "capturable", "differentiable", "has_complex")
 _OPTIONS = (*_TORCHS[:-1], "lr", "eps", "foreach", "fused", "decoupled_weight_decay")
 
-_module: Any = importlib.import_module("torch.optim.adam")  # torch.optim deletes its own name for it
+# Imported by name, because torch.optim deletes its attribute for the module.
+_module: Any = importlib.import_module("torch.optim.adam")
 _torchs_adam = _module.adam
 _torchs_base: Any = importlib.import_module("torch.optim.optimizer")
 
 
 class Adam(torch.optim.Adam):
-    """`torch.optim.Adam` whose steps are those of `adam` below: options, state, state_dict and hooks are torch's.
+    """`torch.optim.Adam` that steps with `adam` below. Options, state, state_dict and hooks are those of torch.
 
     Example:
         >>> import torch
@@ -37,14 +37,15 @@ class Adam(torch.optim.Adam):
         0.01
     """
 
-    # Torch wraps these two, and its wrapper loads the compiler: 75 MB and 800 modules that training has no use for.
+    # Torch wraps these two methods, and its wrapper loads torch's compiler: 75 MB and 800 modules that training does
+    # not use.
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
-        """As torch's."""
+        """Add a group of parameters, as torch's optimizers do."""
         inspect.unwrap(torch.optim.Optimizer.add_param_group)(self, param_group)
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """As torch's."""
+        """Reset all gradients, as torch's optimizers do."""
         if not set_to_none:
             inspect.unwrap(torch.optim.Optimizer.zero_grad)(self, set_to_none)
             return
@@ -56,14 +57,14 @@ class Adam(torch.optim.Adam):
         """Update every parameter that has a gradient.
 
         Args:
-            closure: Computes the loss anew, as torch's optimizers take it.
+            closure: Function that recomputes and returns the loss, as for torch's optimizers.
 
         Returns:
-            What `closure` returns.
+            The loss that `closure` returns; None without a closure.
         """
         if torch.autograd._profiler_enabled():
             return self._profiled_step(closure)
-        # Hooks as torch's wrapper calls them, without the note for a profiler that it makes in any case.
+        # Call hooks as torch's wrapper does, but without the record for a profiler that it makes even when none runs.
         given: tuple[Any, Any] = (self,) if closure is None else (self, closure), {}
         for hook in (*_torchs_base._global_optimizer_pre_hooks.values(), *self._optimizer_step_pre_hooks.values()):
             given = hook(self, *given) or given
@@ -73,7 +74,7 @@ class Adam(torch.optim.Adam):
             hook(self, args, kwargs)
         return loss
 
-    # Torch wraps a step that does not say so, for its hooks and its profiler, which takes as long as a small step.
+    # Keeps torch from wrapping this method for hooks and profiler: the wrapper takes as long as a small step.
     step.hooked = True  # type: ignore[attr-defined]
 
     def _plain_step(self, closure: Any = None) -> Any:
@@ -111,14 +112,14 @@ class Adam(torch.optim.Adam):
     def _advance_param(self, param: Tensor, *numbers: Any) -> bool:
         if param.grad is None:
             return True
-        if not self.state.get(param) and not _fits(param, param):  # torch's own step makes the state
+        if not self.state.get(param) and not _fits(param, param):  # torch's own step creates the state
             return False
         state = moments(self, param)
         return _advance(param, param.grad, state["exp_avg"], state["exp_avg_sq"], state["step"], *numbers)
 
 
 def moments(optimizer: torch.optim.Optimizer, param: Tensor) -> dict[str, Tensor]:
-    """State of a parameter as `torch.optim.Adam` keeps it: `step`, `exp_avg`, `exp_avg_sq`; zeros the first time."""
+    """Return the state of a parameter in `torch.optim.Adam`: `step`, `exp_avg`, `exp_avg_sq`; zeros at first."""
     state: dict[str, Tensor] = optimizer.state[param]
     if not state:
         state["step"] = torch.tensor(0.0, dtype=torch.float32)
@@ -127,9 +128,9 @@ def moments(optimizer: torch.optim.Optimizer, param: Tensor) -> dict[str, Tensor
 
 
 def next_step(step: Tensor, lr: float, betas: tuple[float, float]) -> tuple[float, float]:
-    """Counts a step; gives `rate` and `root` of `adam_step` for it, with the bias corrections of both means."""
+    """Count a step, and return `rate` and `root` of `adam_step`, which hold the bias corrections of both moments."""
     count = step.item() + 1
-    step.fill_(count)  # half the time of an addition
+    step.fill_(count)  # takes half the time of an addition
     return lr / (1 - betas[0] ** count), (1 - betas[1] ** count) ** 0.5
 
 
@@ -143,17 +144,18 @@ def adam(
     *flags: Any,
     **options: Any,
 ) -> None:
-    """As `torch.optim.adam.adam`: one step in place, on all cores, rounded as `adam_step` says.
+    """Apply one step of Adam in place, on all cores: a replacement for `torch.optim.adam.adam`. Rounds as `adam_step`.
 
-    Whatever is not contiguous float32 on the CPU, and every option but `lr`, `betas` and `eps` (weight decay,
-    amsgrad, maximize, capturable, differentiable, a scaler of gradients), is left to torch.
+    Torch's function steps parameters that are not contiguous float32 tensors on the CPU. It also steps all parameters
+    if an option other than `lr`, `betas` and `eps` is used: weight decay, amsgrad, maximize, capturable,
+    differentiable, or a gradient scaler.
 
     Args:
         params: Parameters, updated in place.
         grads: Their gradients.
         exp_avgs: Running means of the gradients, updated in place.
         exp_avg_sqs: Running means of the squared gradients, updated in place.
-        max_exp_avg_sqs: Greatest of these means so far, which only `amsgrad` uses; passed on to torch.
+        max_exp_avg_sqs: Largest values of these means so far. Only `amsgrad` uses them; passed on to torch.
         state_steps: Number of steps of each parameter so far, updated in place.
         flags: Further positional arguments of torch's function.
         options: Further keyword arguments of torch's function.
@@ -174,7 +176,7 @@ def adam(
 
 @contextmanager
 def instead_of_torchs_adam() -> Iterator[None]:
-    """Let every `torch.optim.Adam` step by `adam` inside the block, whenever it was made."""
+    """Let every `torch.optim.Adam` step with `adam` inside the `with` statement, also those that exist already."""
     before = _module.adam
     _module.adam = adam
     try:
@@ -184,7 +186,7 @@ def instead_of_torchs_adam() -> Iterator[None]:
 
 
 def _plain(options: dict[str, Any], *betas: Any) -> bool:
-    """Whether the options are those that `adam` knows, and the decays numbers."""
+    """Return whether `adam` supports all options that are set, and the decays are numbers."""
     for name in _TORCHS:
         if options.get(name):
             return False
@@ -195,8 +197,8 @@ def _advance(
     param: Tensor, grad: Tensor, mean: Tensor, square: Tensor, step: Tensor, lr: float, betas: tuple[float, float],
     eps: float,
 ) -> bool:  # fmt: skip
-    """Steps a parameter, if the kernel can read all that belongs to it; `step` is the number of steps so far."""
-    # One after the other, without a generator: for small parameters these questions are most of a step.
+    """Step a parameter if the kernel can read all its tensors. Returns whether it did. `step` counts earlier steps."""
+    # Written out without a generator: for small parameters these checks are most of a step.
     if not (step.is_cpu and _fits(param, param) and _fits(grad, param) and _fits(mean, param) and _fits(square, param)):
         return False
     adam_step(None, param, grad, mean, square, *next_step(step, lr, betas), betas, eps)
@@ -204,7 +206,7 @@ def _advance(
 
 
 def _fits(tensor: Tensor, param: Tensor) -> bool:
-    """Whether the kernel can read a tensor along with its parameter."""
+    """Return whether the kernel can read a tensor together with its parameter."""
     return (
         tensor.dtype is torch.float32
         and tensor.layout is torch.strided

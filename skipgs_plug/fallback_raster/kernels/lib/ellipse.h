@@ -44,7 +44,7 @@ struct Ellipses {
 struct TileBox {
     int first_column, last_column, first_row, last_row;
 };
-static_assert(sizeof(TileBox) == sizeof(int) * BOX, "constants.BOX");
+static_assert(sizeof(TileBox) == sizeof(int) * BOX_INTS, "constants.BOX_INTS");
 
 // Tells `take` the tiles of a box that the ellipse of record `r` crosses, row by row, or all of them.
 static constexpr auto each_tile = [](const Record& r, const TileBox& box, float width, int tiles_x, bool all,

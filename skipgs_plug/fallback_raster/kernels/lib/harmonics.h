@@ -1,12 +1,12 @@
-// Real spherical harmonics up to degree 3 with the signs of 3DGS (Kerbl et al. 2023), in 16 unit directions. Rounded
-// operation by operation, so that every kernel finds the same numbers.
+// Real spherical harmonics up to degree 3 with the signs of 3DGS (Kerbl et al. 2023), in 16 unit directions. Products
+// and sums are never fused here, so that every kernel computes the same values.
 #pragma once
 #include "simd.h"
-static constexpr float CONSTANT = 0.28209479177387814f;
+static constexpr float CONSTANT_BASIS = 0.28209479177387814f;  // 1 / (2 sqrt(pi)), the basis function of degree 0
 static constexpr auto harmonics = [](v16 x, v16 y, v16 z, int degree, v16* basis) INLINE {
 #pragma clang fp contract(off)
     const v16 xx = x * x, yy = y * y, zz = z * z;
-    basis[0] = (v16)CONSTANT;
+    basis[0] = (v16)CONSTANT_BASIS;
     if (degree > 0) {
         basis[1] = -0.4886025119029199f * y;
         basis[2] = 0.4886025119029199f * z;

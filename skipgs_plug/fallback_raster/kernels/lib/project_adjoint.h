@@ -1,26 +1,26 @@
-// Adjoint of project_forward for one block of rows, 16 of those that received a gradient at a time.
+// Adjoint of project_forward for one block of rows: 16 rows that received a gradient at a time.
 #pragma once
 #include "geometry.h"
 
-// Raw parameters, of which `scales` and `opacities` are logarithms and logits, come after the adjoint of the colours, whose
-// part of the gradient of the means is added to. The others know neither opacities nor their gradients.
+// With `raw`, scales and opacities are logarithms and logits, and the gradient of the means is added to the one that
+// the adjoint of the colours wrote before. Without `raw`, opacities and their gradients are not used.
 //
-// Constants in place of the flags, and null pointers, leave out what they rule out: this is inlined.
+// This function is inlined, so callers that pass constant flags and null pointers drop the other cases.
 static constexpr auto project_block_adjoint =
     [](int block, const Gaussians& gaussians, const float* opacities, const Camera& camera, const RowList& visible,
        const ProjectedGradients& v_projected, const GaussianGradients& v_gaussians, float* v_opacities, float* v_poses, int n,
        int raw, int with_depth, int antialiased, int with_pose, int optimizations) INLINE {
     v16 pose[12] = {};
-    // Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
-    const int row_begin = BLOCK * block, rows = smaller(BLOCK, n - row_begin);
+    // Clear one block at a time, so that it is still in the cache when the gradients are written.
+    const int row_begin = BLOCK_ROWS * block, rows = smaller(BLOCK_ROWS, n - row_begin);
     const bool empty = visible.block_start[block] == visible.block_start[block + 1];
     const auto clear_rows = [=](float* p, long long n) { empty ? clear_past_caches(p, n) : clear(p, n); };
     if (!raw) clear_rows(v_gaussians.means + 3ll * row_begin, 3 * rows);
     clear_rows(v_gaussians.quats + 4ll * row_begin, 4 * rows);
     clear_rows(v_gaussians.scales + 3ll * row_begin, 3 * rows);
     if (raw) clear_rows(v_opacities + row_begin, rows);
-    // Few of the rows that are visible received a gradient where most lie behind others; the zeros of the rest are in place.
-    alignas(64) int received[BLOCK];
+    // Where most visible rows lie behind others, few received a gradient. All other rows are zero already.
+    alignas(64) int received[BLOCK_ROWS];
     int count = 0;
     for (int i = visible.block_start[block]; i < visible.block_start[block + 1]; i += 16) {
         const int lanes = smaller(16, visible.block_start[block + 1] - i);
@@ -59,7 +59,7 @@ static constexpr auto project_block_adjoint =
         const Centers center = centers(camera, gaussians.means, row, n);
         const v16 x = center.x, y = center.y, iz = 1.0f / center.z;
         const Projection p = project_rows(camera, gaussians.quats, row, center, iz, S);
-        // Copies: with references Clang fuses other products, and gradients change in their last bits.
+        // Copies on purpose: with references Clang fuses other products, which changes the last bits of gradients.
         const Covariances cov = p.cov;
         const SplatAxes axes = p.axes;
         const Rotations rotation = p.rotation;
@@ -70,8 +70,9 @@ static constexpr auto project_block_adjoint =
             scatter(v_opacities, row, v_opacity * opacity * (1.0f - opacity), lanes);
         }
 
-        // Extreme cameras (a principal point 1e5 images away) leave float's range: a huge gradient is better than
-        // infinity, and infinity less infinity is NaN. No gradient of a usual scene comes near these bounds.
+        // Extreme cameras, with a principal point 1e5 image widths away, leave the range of float. A huge gradient is
+        // better than infinity, because infinity minus infinity is NaN. Gradients of usual scenes stay far below these
+        // bounds.
         auto saturated = [](v16 v, float most) -> v16 { return v > most ? (v16)most : (v < -most ? (v16)-most : v); };
         v_u = saturated(v_u, 1e20f); v_v = saturated(v_v, 1e20f);
         va = saturated(va, 1e12f); vb = saturated(vb, 1e12f); vc = saturated(vc, 1e12f);
@@ -110,7 +111,7 @@ static constexpr auto project_block_adjoint =
         v16 inside_x = axes.ux == x * iz ? (v16)1.0f : (v16)0.0f, inside_y = axes.uy == y * iz ? (v16)1.0f : (v16)0.0f;
         v16 v_tx = v_u - inside_x * v_J02 * iz, v_ty = v_v - inside_y * v_J12 * iz;
         v16 v_x = saturated(camera.K[0] * iz * v_tx, 1e20f), v_y = saturated(camera.K[4] * iz * v_ty, 1e20f);
-        // Fused by hand, as which product Clang fuses with a sum depends on what stands around it.
+        // Fused by hand: which product Clang fuses with a sum depends on the surrounding code.
         const v16 along_J =
             __builtin_elementwise_fma(axes.J00, v_J00, axes.J02 * v_J02) + axes.J11 * v_J11 + axes.J12 * v_J12;
         v16 v_z = v_depth - iz * (x * v_x + y * v_y) - iz * along_J;

@@ -1,11 +1,12 @@
-// The patches of a tile that the ellipses at ALPHA_MIN of some Gaussians reach, as bits; a little more than exact, because
-// every pixel is tested again.
+// Finds the patches of a tile that the ellipses alpha = ALPHA_MIN of some Gaussians reach, as bits. It finds slightly
+// more than the exact patches, because every pixel is tested again.
 //
-// A lane is a Gaussian and a line of patches. The part of an ellipse inside a line is convex, so it meets the columns between
-// its leftmost and its rightmost point: that of the whole ellipse, or as near to it as the line allows.
+// A lane stands for one Gaussian and one line of patches. The part of an ellipse inside a line is convex, so it meets
+// all columns between its leftmost and its rightmost point. These are the extreme points of the whole ellipse, clamped
+// to the line.
 #pragma once
 #include "blend_tile.h"
-static constexpr int TESTED = 16 / LINES;  // Gaussians at a time
+static constexpr int TESTED_AT_ONCE = 16 / PATCH_LINES;  // Gaussians that fill the 16 lanes
 #ifdef __AVX512F__
 static constexpr v16 line = {0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f, 0.f, 1.f, 2.f, 3.f};
 #else
@@ -13,7 +14,7 @@ static constexpr v16 line = {0.f, 1.f, 2.f, 3.f, 4.f, 5.f, 6.f, 7.f, 0.f, 1.f, 2
 #endif
 static constexpr auto reached_patches = [](const Record* const* r, int x0, int y0, unsigned* reached) INLINE {
 #pragma clang fp contract(fast)
-    // One field of each record, once for each line.
+    // One field of each record, repeated for each line.
     auto column = [r](int c) INLINE -> v16 {
 #ifdef __AVX512F__
         v4 of[4];
@@ -32,14 +33,14 @@ static constexpr auto reached_patches = [](const Record* const* r, int x0, int y
 #define FIELD(name) column(__builtin_offsetof(Record, name) / sizeof(float))
     const v16 half_h = FIELD(half_height), slope = FIELD(row_slope), across = FIELD(across), chord = FIELD(inverse_along);
     const v16 extreme = FIELD(column_slope) * FIELD(half_width), reach = FIELD(reach) + 0.01f;
-    // From the centre to the first and to the last row of pixels.
-    const v16 first = (float)ROWS * line + (y0 + 0.5f) - FIELD(y);
-    const v16 low = vmax(first, -half_h), high = vmin(first + (ROWS - 1.0f), half_h);
+    // Distance from the centre to the first and to the last row of pixels of the line.
+    const v16 first = (float)PATCH_ROWS * line + (y0 + 0.5f) - FIELD(y);
+    const v16 low = vmax(first, -half_h), high = vmin(first + (PATCH_ROWS - 1.0f), half_h);
     const v16 dy_left = vmin(vmax(-extreme, low), high), dy_right = vmin(vmax(extreme, low), high);
     const v16 w_left = across * dy_left, w_right = across * dy_right;
     const v16 half_left = vsqrt(vmax(reach - w_left * w_left, (v16)0.0f));
     const v16 half_right = vsqrt(vmax(reach - w_right * w_right, (v16)0.0f));
-    // In columns of patches, whose first pixels have their centres at whole numbers.
+    // In units of patch columns, measured from the centre of the first pixel of the tile.
     const v16 centre = FIELD(x) - (x0 + 0.5f);
     const v16 left = 0.25f * (centre + slope * dy_left - chord * half_left) - (0.75f + 0.005f);
     const v16 right = 0.25f * (centre + slope * dy_right + chord * half_right) + 0.005f;
@@ -49,7 +50,7 @@ static constexpr auto reached_patches = [](const Record* const* r, int x0, int y
     columns = low <= high ? columns << 4 * __builtin_convertvector(line, i16) : (i16)0;
     columns |= __builtin_shufflevector(columns, columns, 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14);
     columns |= __builtin_shufflevector(columns, columns, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13);
-    if (LINES == 8)
+    if (PATCH_LINES == 8)
         columns |= __builtin_shufflevector(columns, columns, 4, 5, 6, 7, 0, 1, 2, 3, 12, 13, 14, 15, 8, 9, 10, 11);
-    for (int g = 0; g < TESTED; ++g) reached[g] = (unsigned)columns[LINES * g];
+    for (int g = 0; g < TESTED_AT_ONCE; ++g) reached[g] = (unsigned)columns[PATCH_LINES * g];
 };

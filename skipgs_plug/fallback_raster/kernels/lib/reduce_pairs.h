@@ -1,26 +1,26 @@
-// The sums of the pairs of each row of a block, added up in a fixed order, and their moments as gradients.
+// Adds up the sums of each row's pairs in a fixed order, for one block of rows, and turns their moments into gradients.
 #pragma once
 #include "record.h"
 #include "simd.h"
 
-// Of all rows where `dense`, which is then written whole, else of visible ones. Constants in place of the flags leave out
-// what they rule out: this is inlined.
+// With `dense` the whole block is written, with zeros for rows without pairs; else only visible rows are. This function
+// is inlined, so callers that pass constant flags drop the other cases.
 static constexpr auto reduce_block_pairs = [](int block, const PairSums& sums, const float* conics, const float* opacities,
                                               const SplatGradients& v_splats, int n, const Channels& channels, int dense,
                                               int absgrad, int parts) INLINE {
-    const int row_begin = BLOCK * block, rows_here = smaller(BLOCK, n - row_begin);
-    const bool more = channels.first > 0;  // an earlier pass over the channels was here
+    const int row_begin = BLOCK_ROWS * block, rows_here = smaller(BLOCK_ROWS, n - row_begin);
+    const bool more = channels.first > 0;  // an earlier pass over the channels wrote gradients here
     const int stride = channels.stride;
     const PairSum* const slots = (const PairSum*)sums.slots;
     if (!more && dense) {
-        // Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
+        // Clear one block at a time, so that it is still in the cache when the gradients are written.
         clear(v_splats.means2d + 2ll * row_begin, 2 * rows_here);
         clear(v_splats.conics + 3ll * row_begin, 3 * rows_here);
         clear(v_splats.opacities + row_begin, rows_here);
         clear(v_splats.colors + (long long)stride * row_begin, (long long)stride * rows_here);
     }
-    // Pairs between a prefetch and the use of its sums: 16 and 64 took as long.
-    constexpr int AHEAD = 32;
+    // Pairs between the prefetch of a slot and its use. 16 and 64 took as long.
+    constexpr int PREFETCH_PAIRS = 32;
     alignas(64) const PairSum nothing = {};
     int j = parts > 1 ? sums.far_block_start[block] : 0;
     const int far_end = parts > 1 ? sums.far_block_start[block + 1] : 0;
@@ -29,11 +29,11 @@ static constexpr auto reduce_block_pairs = [](int block, const PairSums& sums, c
         const int g = sums.rows[i];
         v16 total = (v16)0.0f;
         int received = 0;
-        // Slots follow the lists: those of a row lie anywhere. Which pairs were blended nobody can foresee, so that sums of
-        // zero cost less than a branch.
+        // Slots are in the order of the lists, so the slots of one row are scattered. Whether a pair was blended is
+        // unpredictable: adding zeros costs less than a mispredicted branch.
         const auto add = [&](int from, int to, int last) INLINE {
             for (int p = from; p < to; ++p) {
-                __builtin_prefetch(slots + larger(sums.pair_slot[smaller(p + AHEAD, last)] - 1, 0));
+                __builtin_prefetch(slots + larger(sums.pair_slot[smaller(p + PREFETCH_PAIRS, last)] - 1, 0));
                 const int slot = sums.pair_slot[p];
                 const PairSum* own = slot ? slots + (slot - 1) : &nothing;
                 total += load((const float*)own);

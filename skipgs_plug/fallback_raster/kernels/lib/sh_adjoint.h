@@ -1,31 +1,31 @@
-// Adjoint of sh_forward for one block of rows, 16 of those that received a gradient at a time.
+// Adjoint of sh_forward for one block of rows: 16 rows that received a gradient at a time.
 #pragma once
 #include "sh.h"
 
-// Where `with_position`, `v_position` gets this block's part of the gradient of the camera's position. Where `factored`, the
-// gradient of the higher bands goes to `factors`, a row for each visible Gaussian. Constants in place of the flags leave out
-// what they rule out: this is inlined.
+// With `with_position`, `v_position` receives this block's part of the gradient of the camera's position. With
+// `factored`, the gradient of the higher bands goes to `factors`, one row for each visible Gaussian. This function is
+// inlined, so callers that pass constant flags drop the other cases.
 static constexpr auto sh_block_adjoint =
     [](int block, const float* means, const Harmonics& sh, const RowList& visible, const float* colors, const float* v_colors,
        float* v_means, const HarmonicsGradients& v_sh, const FactorOutput& factors, float* v_position, int n, int factored,
        int with_position, int optimizations) INLINE {
     const int degree = sh.degree;
     float position_sum[3] = {0.0f, 0.0f, 0.0f};
-    // Cleared here and not all at once, so that the memory is still in the cache when the gradients follow.
-    const long long row_begin = (long long)BLOCK * block;
-    const int rows = smaller(BLOCK, n - (int)row_begin);
+    // Clear one block at a time, so that it is still in the cache when the gradients are written.
+    const long long row_begin = (long long)BLOCK_ROWS * block;
+    const int rows = smaller(BLOCK_ROWS, n - (int)row_begin);
     const int begin = visible.block_start[block], listed = visible.block_start[block + 1] - begin;
     const bool empty = listed == 0;
     const auto clear_rows = [=](float* p, long long n) { empty ? clear_past_caches(p, n) : clear(p, n); };
     clear_rows(v_means + 3 * row_begin, 3 * rows);
     clear_rows(v_sh.sh0 + sh.sh0_stride * row_begin, sh.sh0_stride * rows);
     const bool with_factors = factored && degree > 0;
-    if (with_factors) clear(factors.colors + (long long)FACTOR * begin, FACTOR * listed);
+    if (with_factors) clear(factors.colors + (long long)FACTOR_FLOATS * begin, FACTOR_FLOATS * listed);
     else if (!factored && v_sh.shN != v_sh.sh0) clear_rows(v_sh.shN + sh.shN_stride * row_begin, sh.shN_stride * rows);
     const int terms = (degree + 1) * (degree + 1);
-    int received[BLOCK], target[BLOCK], count = 0;  // rows, where their gradients go, and their number
+    int received[BLOCK_ROWS], target[BLOCK_ROWS], count = 0;  // rows, destination rows of their gradients, number of both
     for (int i = begin; i < begin + listed; ++i) {
-        // Where the colour was clamped at zero, and where nothing blended the Gaussian, there is no gradient.
+        // A row has no gradient where its colour was clamped at zero, and where no pixel blended it.
         const int g = visible.rows[i];
         bool any = !(optimizations & CONTRIBUTED_ONLY);
         for (int k = 0; k < 3; ++k) any |= (colors[3 * g + k] > 0.0f) & (v_colors[3 * g + k] != 0.0f);
@@ -47,7 +47,7 @@ static constexpr auto sh_block_adjoint =
         const Directions d = directions(means, row, n, sh.position);
         const v16 x = d.x, y = d.y, z = d.z;
         const v16 xx = x * x, yy = y * y, zz = z * z;
-        const v16 v_constant[3] = {CONSTANT * v[0], CONSTANT * v[1], CONSTANT * v[2]};
+        const v16 v_constant[3] = {CONSTANT_BASIS * v[0], CONSTANT_BASIS * v[1], CONSTANT_BASIS * v[2]};
         if (sh.sh0_stride == 3) scatter3(v_sh.sh0, row, v_constant[0], v_constant[1], v_constant[2], lanes);
         else put_bands(v_sh.sh0, row, sh.sh0_stride, 3, v_constant, lanes);
         if (with_factors) {
@@ -84,10 +84,10 @@ static constexpr auto sh_block_adjoint =
             vz += 2.890611442640554f * x * y * along[10] - 3.6563663957157264f * z * (y * along[11] + x * along[13])
                 + 1.1195289977703462f * (2.0f * zz - xx - yy) * along[12] + 1.445305721320277f * (xx - yy) * along[14];
         }
-        // Through the normalisation of the direction.
+        // Adjoint of the normalisation of the direction.
         const v16 back = d.norm * d.shrink;
-        // One of two products is rounded by itself, the other one where the camera has no gradient: Clang's choice of old in
-        // either kernel, kept so that gradients stay equal to the bit.
+        // One of the two products is rounded before the sum: which one differs with and without the camera's gradient.
+        // Clang used to choose so in the two kernels; the choice is kept because it keeps gradients equal to the bit.
         const v16 radial = with_position ? vx * x + rounded_product(vy, y) + vz * z
                                          : rounded_product(vx, x) + vy * y + vz * z;
         const v16 v_direction[3] = {(vx - radial * x) * back, (vy - radial * y) * back, (vz - radial * z) * back};

@@ -1,19 +1,21 @@
-// Vector code that every kernel begins with.
+// Vector types and functions. Every kernel begins with this file.
 //
-// Warp compiles kernels with its own Clang, also on machines without a compiler, and takes C++ that may use Clang's
-// vector extension. A value of `v16` holds 16 Gaussians (or 16 neighbouring pixels); arithmetic on it reads like scalar
-// code and becomes one AVX-512 instruction, two of AVX2 or four of SSE or NEON. Scalar Warp code does not vectorise
-// across pixels. The blends keep most values in registers and use as many floats as these hold (`vpatch`).
+// Warp compiles kernels with a Clang of its own, also on machines without a compiler. That Clang accepts C++ with its
+// vector extension. A value of type `v16` holds 16 Gaussians or 16 neighbouring pixels. Arithmetic on it reads like
+// scalar code and becomes one AVX-512 instruction, two of AVX2, or four of SSE or NEON. Kernels in Warp's Python
+// dialect would not be vectorised across pixels. The blends keep most values in registers and use vectors as wide as a
+// register (`vpatch`).
 //
-// Warp puts a kernel's text into the body of one function, where C++ allows no other: functions are lambdas without
-// captures, which an editor reads as a file of its own. The text of this file comes first in every kernel, then follow the
-// constants of `constants.py` and the structs that the kernel takes, by name.
+// Warp puts the text of a kernel into the body of one function. C++ allows no functions there, so functions are lambdas
+// without captures, and each file can still be read by itself. After this file follow the constants of `constants.py`
+// and the structs that the kernel takes.
 #pragma once
 
-// Lets Clang fuse a * b + c into one instruction, which is faster and rounds once; Warp leaves it off. It reaches into
-// lambdas but not into member functions, which say it again.
+// Lets Clang fuse a * b + c into one instruction, which is faster and rounds once. Warp leaves it off. The pragma
+// reaches into lambdas but not into member functions, which repeat it.
 #pragma clang fp contract(fast)
-// Inlined before Clang optimises: which products it fuses with which sums then depends less on where its text was cut.
+// Functions are inlined before Clang optimises. Otherwise moving code between functions changes which products Clang
+// fuses.
 #define INLINE __attribute__((always_inline))
 
 typedef float v16 __attribute__((ext_vector_type(16), aligned(4)));
@@ -34,11 +36,11 @@ static constexpr auto any = [](auto mask) -> bool { return __builtin_reduce_or(m
 static constexpr auto bits = [](i16 mask) -> unsigned {
     return __builtin_bit_cast(unsigned short, __builtin_convertvector(mask != 0, b16));
 };
-// One instruction each; where one of the two is NaN, the second is taken.
+// One instruction each. If either argument is NaN, the result is the second.
 static constexpr auto vmin = [](auto a, decltype(a) b) { return a < b ? a : b; };
 static constexpr auto vmax = [](auto a, decltype(a) b) { return a > b ? a : b; };
 static constexpr auto vabs = [](auto a) { return __builtin_elementwise_abs(a); };
-// Clamped before they become integers: what lies far outside is beyond them.
+// Clamps before the conversion to integers, which is undefined for values beyond their range.
 static constexpr auto clamped = [](v16 x, float low, float high) INLINE -> i16 {
     return __builtin_convertvector(vmin(vmax(x, (v16)low), (v16)high), i16);
 };
@@ -48,7 +50,7 @@ static constexpr auto rounded_product = [](auto a, auto b) INLINE -> decltype(b)
     return a * b;
 };
 static constexpr auto vsqrt = [](auto a) { return __builtin_elementwise_sqrt(a); };
-// Pairwise, so that the order of additions (and the result to the bit) is fixed.
+// Adds lanes pairwise, so that the order of additions, and with it the result to the bit, is fixed.
 static constexpr auto sum = [](auto a) -> float {
     v8 b;
     if constexpr (sizeof(a) == sizeof(v8)) b = a;
@@ -57,14 +59,15 @@ static constexpr auto sum = [](auto a) -> float {
     auto d = c.lo + c.hi;
     return d.x + d.y;
 };
-// Numbers of each quarter of `a` (0 to 3) and of `b` (4 to 7), quarter by quarter.
+// A quarter is four neighbouring floats of a v16: 128 bits. Within each quarter, picks floats of `a` (0 to 3) and `b`
+// (4 to 7).
 #define QUARTER(q, i) (i) + 4 * (q) + ((i) < 4 ? 0 : 12)
 #define QUARTERS(q, i, j, k, l) QUARTER(q, i), QUARTER(q, j), QUARTER(q, k), QUARTER(q, l)
 #define SHUFFLE_QUARTERS(a, b, ...) \
     __builtin_shufflevector(a, b, QUARTERS(0, __VA_ARGS__), QUARTERS(1, __VA_ARGS__), QUARTERS(2, __VA_ARGS__), \
                             QUARTERS(3, __VA_ARGS__))
-// Eight sums at a time, folded together: a third of the instructions of eight calls of `sum`. First inside quarters, two
-// values and then four to a quarter, then across them.
+// Eight calls of `sum` folded together, with a third of the instructions: first within quarters, until each holds parts
+// of four sums, then across quarters.
 static constexpr auto sum8 = [](const auto* a) INLINE -> v8 {
     if constexpr (sizeof(a[0]) == sizeof(v8)) {
         v8 b[4], c[2];
@@ -89,7 +92,8 @@ static constexpr auto sum8 = [](const auto* a) INLINE -> v8 {
 };
 static constexpr auto load = [](const float* p) -> v16 { return *(const v16*)p; };
 static constexpr auto store = [](float* p, v16 a) { *(v16*)p = a; };
-// The first `lanes` numbers; one that is chosen by a variable would go through memory each time.
+// Stores the first `lanes` floats. It goes through an array, because indexing a vector by a variable would do so each
+// time.
 static constexpr auto store_some = [](float* p, v16 a, int lanes) INLINE {
     if (lanes == 16) {
         store(p, a);
@@ -102,7 +106,8 @@ static constexpr auto store_some = [](float* p, v16 a, int lanes) INLINE {
 static constexpr auto clear = [](float* p, long long n) {
     for (long long i = 0; i < n; ++i) p[i] = 0.0f;
 };
-// The same past the caches, for memory that nobody reads soon: what is written is not read from memory first.
+// `clear` with non-temporal stores, for memory that is not read soon: they bypass the caches and need not read memory
+// first.
 static constexpr auto clear_past_caches = [](float* p, long long n) {
     typedef float whole __attribute__((ext_vector_type(16), aligned(64)));
     long long i = 0;
@@ -110,7 +115,7 @@ static constexpr auto clear_past_caches = [](float* p, long long n) {
     for (; i + 16 <= n; i += 16) __builtin_nontemporal_store((whole)0.0f, (whole*)(p + i));
     for (; i < n; ++i) p[i] = 0.0f;
 };
-// Columns of 16 rows of two or three numbers as these lie in memory.
+// Interleaves columns: 16 rows of two or three floats, as they lie in memory.
 static constexpr auto interleave2 = [](v16 x, v16 y, float* to) INLINE {
     store(to, __builtin_shufflevector(x, y, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23));
     store(to + 16, __builtin_shufflevector(x, y, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31));
@@ -123,11 +128,11 @@ static constexpr auto interleave3 = [](v16 x, v16 y, v16 z, float* to) INLINE {
     store(to + 16, __builtin_shufflevector(b, z, 0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15));
     store(to + 32, __builtin_shufflevector(c, z, 26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31));
 };
-// Whether 16 rows, which ascend, lie one after the other, so that vectors move them as they lie. Where there are fewer, the
-// last one is repeated.
+// Whether 16 ascending row numbers are consecutive, so that whole vectors can be loaded. A list of fewer than 16 rows
+// repeats its last row, which makes this false.
 static constexpr auto in_a_row = [](const int* row) INLINE -> bool { return row[15] - row[0] == 15 && row[14] < row[15]; };
-// 16 rows of a list of which `lanes` are left, the last one repeated; and those of the lanes that `mask` has a bit of, put
-// behind the `count` rows of a list.
+// `next_rows` takes 16 row numbers from a list of which `lanes` are left; the last one is repeated. `append_rows`
+// appends the rows of the lanes in `mask` to a list of `count` rows.
 static constexpr auto next_rows = [](const int* list, int lanes, int* row) INLINE {
     for (int l = 0; l < 16; ++l) row[l] = list[smaller(l, lanes - 1)];
 };
@@ -139,7 +144,7 @@ static constexpr auto append_rows = [](int* list, int& count, const int* row, un
     }
     for (; mask; mask &= mask - 1) list[count++] = row[__builtin_ctz(mask)];
 };
-// 16 rows of an array of structures, column `c`; `row` names the row of each lane.
+// Column `c` of 16 rows of an array with `width` columns. `row` holds the row number of each lane.
 static constexpr auto gather = [](const float* p, const int* row, int width, int c) INLINE -> v16 {
     if (width == 1 && in_a_row(row)) return load(p + row[0]);
     v16 a;
@@ -151,12 +156,12 @@ static constexpr auto scatter = [](float* p, const int* row, v16 a, int lanes) {
     store(all, a);
     for (int l = 0; l < lanes; ++l) p[row[l]] = all[l];
 };
-// The columns of 16 rows of three or four numbers, and the other way round; `row` ascends. Rows move as a whole, four to a
-// vector, and 4 x 4 numbers are transposed inside each quarter: a third of the instructions of number by number. Where
-// rows lie one after the other it is a quarter of these.
+// `gather2`, `gather3` and `gather4` load 16 rows of two to four floats as columns; `scatter2` to `scatter4` store
+// them. `row` ascends. A row moves as one vector, four rows share a v16, and 4 x 4 floats are transposed: a third of
+// the instructions of moving single floats. Consecutive rows need a quarter of these.
 typedef float v4 __attribute__((ext_vector_type(4), aligned(4)));
 typedef float v2 __attribute__((ext_vector_type(2), aligned(4)));
-// A row of a few numbers: what the compiler knows the width of needs no loop.
+// Copies a row of `width` floats. For the usual widths the compiler emits no loop.
 static constexpr auto copy_row = [](float* to, const float* from, int width) INLINE {
     switch (width) {
         case 1: *to = *from; return;
@@ -170,8 +175,8 @@ static constexpr auto copy_row = [](float* to, const float* from, int width) INL
             for (int j = 0; j < width; ++j) to[j] = from[j];
     }
 };
-// 4 x 4 numbers of each quarter of four vectors.
-static constexpr auto transpose_quarters = [](const v16* a, v16* b) INLINE {
+// Transposes the 4 x 4 floats that a quarter has in four vectors, for each of the four quarters.
+static constexpr auto transpose_4x4 = [](const v16* a, v16* b) INLINE {
     v16 low[2], high[2];
     for (int i = 0; i < 2; ++i) {
         low[i] = SHUFFLE_QUARTERS(a[2 * i], a[2 * i + 1], 0, 4, 1, 5);
@@ -195,17 +200,17 @@ static constexpr auto gather_four_columns = [](const float* p, const int* row, i
         for (int k = 0; k < 4; ++k) r[k] = *(const v4*)(p + row[4 * k + i] * width);
         a[i] = join(r);
     }
-    transpose_quarters(a, columns);
+    transpose_4x4(a, columns);
 };
 static constexpr auto gather4 = [](const float* p, const int* row, v16* columns) INLINE {
     if (!in_a_row(row)) return gather_four_columns(p, row, 4, columns);
     v16 rows[4], a[4];
     for (int i = 0; i < 4; ++i) rows[i] = load(p + 4 * row[0] + 16 * i);
-    transpose_quarters(rows, a);  // lane 4 q + i has row 4 i + q
+    transpose_4x4(rows, a);  // lane 4 q + i holds row 4 i + q
     for (int c = 0; c < 4; ++c)
         columns[c] = __builtin_shufflevector(a[c], a[c], 0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
 };
-// Of `n` rows in all: a fourth number is read along with a row, which is that of the next one.
+// The array has `n` rows: a load of three floats also reads a fourth, which belongs to the next row.
 static constexpr auto gather3 = [](const float* p, const int* row, int n, v16* columns) INLINE {
     if (in_a_row(row)) {
         const v16 a = load(p + 3 * row[0]), b = load(p + 3 * row[0] + 16), c = load(p + 3 * row[0] + 32);
@@ -243,7 +248,7 @@ static constexpr auto gather2 = [](const float* p, const int* row, v16* columns)
 };
 static constexpr auto scatter_rows = [](float* p, const int* row, int width, const v16* columns, int lanes) INLINE {
     alignas(64) v16 a[4];
-    transpose_quarters(columns, a);
+    transpose_4x4(columns, a);
     const float* moved = (const float*)a;
     for (int l = 0; l < lanes; ++l) {
         const float* from = moved + 16 * (l & 3) + 4 * (l >> 2);
@@ -267,7 +272,7 @@ static constexpr auto scatter4 = [](float* p, const int* row, v16 x, v16 y, v16 
     const v16 columns[4] = {x, y, z, w};
     scatter_rows(p, row, 4, columns, lanes);
 };
-// Rows become columns in four rounds: rows `step` apart exchange the lanes that lie `step` apart.
+// Transposes 16 x 16 floats in four rounds: rows that are `step` apart exchange the lanes that are `step` apart.
 static constexpr auto transpose = [](v16* a) INLINE {
     auto exchange = [a](int step, auto low, auto high) INLINE {
 #pragma clang loop unroll(full)
@@ -300,8 +305,8 @@ static constexpr auto transpose = [](v16* a) INLINE {
     exchange(1, low1, high1);
 };
 
-// 2^t for t in [-126, 126]: the rounded integer goes into the exponent, a degree-5 minimax polynomial gives the rest in
-// [-0.5, 0.5] (relative error 7.5e-8).
+// 2^t for t in [-126, 126]. The rounded integer goes to the exponent; a minimax polynomial of degree 5 gives 2^f for
+// the rest f in [-0.5, 0.5], with a relative error of 7.5e-8.
 static constexpr auto exp2 = [](auto t) INLINE {
     using V = decltype(t);
     using I = decltype(t < t);
@@ -324,7 +329,7 @@ static constexpr auto exp2 = [](auto t) INLINE {
     const V r = t + magic;
     return (V)((I)fraction(t - (r - magic)) + ((I)r << 23));
 };
-// e^x, with the product by log2(e) in two parts; saturates where float's range ends.
+// e^x. The product with log2(e) has two parts for accuracy. Saturates at the ends of the range of float.
 static constexpr auto vexp = [](v16 x) INLINE -> v16 {
 #pragma clang fp contract(off)
     const v16 magic = (v16)12582912.0f;
@@ -336,7 +341,7 @@ static constexpr auto vexp = [](v16 x) INLINE -> v16 {
 };
 static constexpr auto sigmoid = [](v16 x) INLINE -> v16 { return 1.0f / (1.0f + vexp(-x)); };
 
-// log2(a) for positive, normal a: exponent bits plus the atanh series of the mantissa in [sqrt(1/2), sqrt(2)).
+// log2(a) for positive, normal `a`: the exponent's bits plus the atanh series of the mantissa in [sqrt(1/2), sqrt(2)).
 static constexpr auto log2 = [](v16 a) -> v16 {
     i16 bits = (i16)a + (0x3f800000 - 0x3f3504f3);
     v16 exponent = __builtin_convertvector((bits >> 23) - 127, v16);

@@ -1,58 +1,59 @@
-// The list of one tile, sorted front to back as far as somebody asks: behind what fills its pixels nobody does.
+// The list of one tile, sorted front to back on demand: the pairs behind the one that fills the tile's pixels are never
+// sorted.
 //
-// Pairs are dealt into buckets of equal ranges of the depth's bits, and buckets are sorted when their turn comes. Equal
-// depths keep the order of the rows, which is that of the numbers in the lower half.
+// Pairs are distributed to buckets of equal ranges of the depth's bits, and 16 buckets are sorted at a time. Pairs of
+// equal depth keep the order of the rows, which is the order of the numbers in their lower 32 bits.
 #pragma once
 #include "simd.h"
 
-// Pairs in a bucket above which it is dealt again: sorting a bucket takes as many rounds as it has pairs.
+// Pairs in a bucket above which it is distributed again: sorting takes as many rounds as the fullest bucket has pairs.
 #ifdef __AVX2__
-static constexpr int LARGE = 16;
+static constexpr int MAX_BUCKET_PAIRS = 16;
 #else
-static constexpr int LARGE = 8;  // registers hold two pairs, so that rounds take longer
+static constexpr int MAX_BUCKET_PAIRS = 8;  // a register holds only two pairs, so a round takes longer
 #endif
 struct SortedTile {
-    long long *dealt, *other;  // the tile's pairs in buckets, and as much room again
-    int *record, *pair;        // out: record and number of each pair
+    long long *dealt, *other;  // the tile's pairs in buckets, and scratch of the same size
+    int *record, *pair;        // outputs: record and number of each pair
     const int* pair_record;
-    int count, done, next, shift;  // pairs, those that are sorted, the next bucket, and bits of depth in one
-    int bound[BUCKETS + 2];        // where each bucket begins, and the last one ends
+    int count, done, next, shift;  // pairs; sorted pairs; next bucket; log2 of the range of a bucket
+    int bound[MAX_BUCKETS + 2];        // start of each bucket, and end of the last one
 
     SortedTile(int begin, int end, const TileLists& lists)
         : dealt(lists.buffer + begin), other(lists.unsorted + begin), record(lists.tile_record + begin),
           pair(lists.tile_pair + begin), pair_record(lists.pair_record), count(end - begin), done(0), next(0) {
-        // Twice as many buckets as pairs: most of them hold one or none.
+        // At least twice as many buckets as pairs: most buckets hold one pair or none.
         int buckets = 64;
-        while (buckets < 2 * count && buckets < BUCKETS) buckets *= 2;
+        while (buckets < 2 * count && buckets < MAX_BUCKETS) buckets *= 2;
         bound[0] = 0;
         shift = deal(other, dealt, count, bound + 1, buckets);
     }
 
-    // Sorts at least the first `wanted` pairs, or all.
+    // Sorts at least the first `wanted` pairs, or all if there are fewer.
     void sort(int wanted) {
         wanted = smaller(wanted, count);
         if (done >= wanted) return;
         int longest = 0;
-        while (bound[next] < wanted) {  // 16 buckets at a time, which their number is a multiple of
+        while (bound[next] < wanted) {  // 16 buckets at a time; their number is a multiple of 16
             const int most = __builtin_reduce_max(*(const i16*)(bound + next + 1) - *(const i16*)(bound + next));
-            if (most > LARGE && shift > 0)
+            if (most > MAX_BUCKET_PAIRS && shift > 0)
                 for (int b = next; b < next + 16; ++b)
-                    if (bound[b + 1] - bound[b] > LARGE) refine(bound[b], bound[b + 1]);
+                    if (bound[b + 1] - bound[b] > MAX_BUCKET_PAIRS) refine(bound[b], bound[b + 1]);
             longest = larger(longest, most);
             next += 16;
         }
         const int end = bound[next];
-        // A full bucket that was not dealt again holds one depth, in order.
-        settle(done, end, smaller(longest, LARGE));
+        // A bucket that is still too full after `refine` holds a single depth and is in order.
+        settle(done, end, smaller(longest, MAX_BUCKET_PAIRS));
         for (int i = done; i < end; ++i) pair[i] = (int)dealt[i];
         for (int i = done; i < end; ++i) record[i] = pair_record[pair[i]];
         done = end;
     }
 
   private:
-    // Sorts where no pair is farther from its place than a bucket of `longest` pairs allows: neighbours trade places, each
-    // pair with the next and then with the one before (odd-even transposition, Habermann 1972). Which of them do nobody
-    // can foresee, so that comparing all costs less than a branch for each.
+    // Sorts pairs that are at most `longest` positions from where they belong: neighbours trade places, first (0, 1),
+    // (2, 3)..., then (1, 2), (3, 4)... (odd-even transposition sort, Habermann 1972). Whether two trade is
+    // unpredictable: comparing all with vector minimum and maximum costs less than mispredicted branches.
     void settle(int begin, int end, int longest) {
         typedef long long l8 __attribute__((ext_vector_type(8), aligned(8)));
         for (int round = 0; round <= longest; ++round) {
@@ -70,8 +71,8 @@ struct SortedTile {
         }
     }
 
-    // Moves pairs into buckets of equal ranges; `bucket` [buckets + 1] gets the end of each, the result is the width of
-    // the ranges in bits.
+    // Distributes pairs to buckets of equal ranges of depth. `bucket` [buckets + 1] receives the end of each. Returns
+    // log2 of the range.
     static int deal(const long long* from, long long* to, int count, int* bucket, int buckets) {
         int least = 0x7fffffff, most = 0, shift = 0;
         for (int i = 0; i < count; ++i) {
@@ -97,7 +98,7 @@ struct SortedTile {
         return shift;
     }
 
-    // Deals a full bucket again, over its own range: eight bits less each time, so four times at most.
+    // Distributes a full bucket again over its own range. Each level resolves 6 or 8 more bits of depth.
     void refine(int begin, int end) {
         int bucket[257];
         const int buckets = end - begin > 32 ? 256 : 64;
@@ -105,6 +106,6 @@ struct SortedTile {
         for (int i = begin; i < end; ++i) dealt[i] = other[i];
         if (width > 0)
             for (int b = 0, from = begin; b < buckets; from = begin + bucket[b++])
-                if (begin + bucket[b] - from > LARGE) refine(from, begin + bucket[b]);
+                if (begin + bucket[b] - from > MAX_BUCKET_PAIRS) refine(from, begin + bucket[b]);
     }
 };

@@ -1,18 +1,20 @@
-// What the thread that calls kernels and its helpers share. No line of memory is written to by both at a time, but for
-// `state`, on which they agree.
+// Memory that the calling thread and its helpers share. Each cache line has one writer, except for the line of `state`,
+// which all threads update, and the line of `finished`.
 #pragma once
 #include "simd.h"
 #if defined(__x86_64__) || defined(__i386__)
 #define PAUSE() __builtin_ia32_pause()
 #elif defined(__aarch64__)
-#define PAUSE() __builtin_arm_yield()  // the compiler inside Warp has no assembler for this processor
+#define PAUSE() __builtin_arm_yield()  // Warp's Clang has no assembler for this processor
 #else
 #define PAUSE()
 #endif
 
-static constexpr unsigned long long OPEN = 1u << 31;  // of a state; below it the helpers that joined, above it the launch
+// Bit 31 of `state`: helpers may join. The bits below count the helpers that joined, the 32 bits above number the
+// launch.
+static constexpr unsigned long long ACCEPTS_HELPERS = 1u << 31;
 
-struct Lock {  // of Python, and its functions, which need no interpreter lock
+struct Lock {  // a lock of CPython and its functions, which work without the interpreter lock
     void* lock;
     auto (*acquire)(void*, int) -> int;
     void (*release)(void*);

@@ -1,23 +1,24 @@
-// Where the pairs of a Gaussian go: slices of the rows, tiles of a small box as bits, and depths that a tile lists.
+// Index arithmetic of the tile lists: slices of the rows, small boxes of tiles as bits, and ranges of depth.
 #pragma once
 #include "simd.h"
 
-// The first of `n` rows that belongs to slice `s`; the slice before it ends there.
+// The first of `n` rows of slice `s`. The slice before it ends there.
 static constexpr auto slice_begin = [](int s, int n, int slices) -> int { return (int)((long long)s * n / slices); };
 
-// Tiles of a box of a few of them, as bits of an int that is not negative, row by row.
+// A small box of tiles as the bits of a non-negative int, row by row: 6 x 5 tiles use 30 of its 31 bits.
 static constexpr int BOX_COLUMNS = 6, BOX_ROWS = 5;
-static constexpr int TWO_BY_TWO = 3 | 3 << BOX_COLUMNS;
+static constexpr int TWO_BY_TWO = 3 | 3 << BOX_COLUMNS;  // bits of the first two tiles of the first two rows
 struct BoxTiles {
-    int offset[BOX_COLUMNS * BOX_ROWS];  // from the first tile to that of each bit
+    int offset[BOX_COLUMNS * BOX_ROWS];  // index of the tile of each bit, minus that of the first tile
 
     explicit BoxTiles(int tiles_x) {
         for (int j = 0; j < BOX_COLUMNS * BOX_ROWS; ++j) offset[j] = j / BOX_COLUMNS * tiles_x + j % BOX_COLUMNS;
     }
 };
 
-// Depths, as bits, that are listed in a tile: from the first of its two numbers up to the second, exclusive.
+// Bits of a depth greater than every finite float's: the largest int.
 static constexpr int NO_DEPTH = 0x7fffffff;
+// Whether a tile lists a depth, given as bits: from the first of the tile's two numbers up to the second, exclusive.
 static constexpr auto in_range = [](const int* ranges, int tile, int depth) INLINE -> bool {
     return depth >= ranges[2 * tile] && depth < ranges[2 * tile + 1];
 };
