@@ -1,4 +1,4 @@
-"""Stand-in for `diff_gaussian_rasterization_abs` of AbsGS: absolute gradients, and blend weights."""
+"""Stand-in for `diff_gaussian_rasterization_abs` of AbsGS, which returns absolute gradients and blend weights."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
 
 class GaussianRasterizer(RasterizerModule):
-    """Returns (color [3, H, W], radii [N], gs_w [N] blend weights summed over the pixels).
+    """Returns (color [3, H, W], radii [N], gs_w [N]), where gs_w is the sum of blend weights over the pixels.
 
-    `means2D` is [N, 4]: columns 2 and 3 receive absolute gradients.
+    `means2D` is [N, 4]. Columns 2 and 3 receive absolute gradients.
     """
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:

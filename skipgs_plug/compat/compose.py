@@ -1,8 +1,8 @@
-"""One differentiable render call behind every stand-in, in the conventions of the Inria CUDA modules.
+"""The differentiable render call behind every stand-in, with the conventions of the Inria CUDA modules.
 
-The modules take transposed matrices and half field-of-view tangents, return channels-first images, and
-send the screen-space gradient in normalised device coordinates into a dummy tensor `means2D`. Here that
-call is translated to `rasterization` (gsplat's signature) and back.
+The CUDA modules take transposed matrices and tangents of half the field of view. They return channels-first images, and
+write the gradient of the 2D means, in normalised device coordinates, to a dummy tensor `means2D`. This module
+translates between these conventions and `rasterization`, which has gsplat's signature.
 """
 
 from __future__ import annotations
@@ -16,29 +16,31 @@ from torch import Tensor
 from .pairs import squared_gradients
 from .statistics import Footprint
 
-NEAR_PLANE = 0.2  # `in_frustum` of the CUDA code
-EPS2D = 0.3  # its low-pass filter, added to the 2D covariance
+# Gaussians nearer than this are culled, world units: `in_frustum` of the CUDA code.
+NEAR_PLANE = 0.2
+# Added to the diagonal of the 2D covariance, square pixels: the low-pass filter of the CUDA code.
+EPS2D = 0.3
 
 
 def backend() -> Any:
-    """The rasterizer in force, with gsplat's signature; imported on first use because Warp is heavy."""
+    """Return the rasterizer, which has gsplat's signature. Imported on first use, because Warp loads slowly."""
     from skipgs_plug.fallback_raster import rasterization
 
     return rasterization
 
 
 class Splats(NamedTuple):
-    """What one call may differentiate. Exactly one of `shs` and `colors` is set."""
+    """The differentiable inputs of one call. Exactly one of `shs` and `colors` is set."""
 
     means3D: Tensor  # [N, 3]
-    means2D: Tensor  # [N, 3], or [N, 4] to get absolute gradients in columns 2 and 3; values are not read
+    means2D: Tensor  # [N, 3], or [N, 4] for absolute gradients in columns 2 and 3; its values are ignored
     opacities: Tensor  # [N, 1]
     scales: Tensor  # [N, 3]
     rotations: Tensor  # [N, 4] quaternions w, x, y, z
-    dc: Tensor | None = None  # [N, 1, 3] degree 0, when kept apart from the rest
+    dc: Tensor | None = None  # [N, 1, 3] degree 0, if separate from the higher degrees
     shs: Tensor | None = None  # [N, K, 3]
     colors: Tensor | None = None  # [N, 3]
-    scores: Tensor | None = None  # [N, 1], receives summed squared gradients (Speedy-Splat)
+    scores: Tensor | None = None  # [N, 1], receives sums of squared gradients (Speedy-Splat)
 
 
 def splats(
@@ -53,11 +55,11 @@ def splats(
     cov3D_precomp: Tensor | None = None,
     scores: Tensor | None = None,
 ) -> Splats:
-    """Check the arguments of a `GaussianRasterizer` call and drop the empty ones.
+    """Check the arguments of a `GaussianRasterizer` call, and drop empty ones.
 
     Raises:
-        ValueError: Colours are given twice or not at all.
-        NotImplementedError: 3D covariances are precomputed; the rasterizer wants scales and rotations.
+        ValueError: Both or neither of `shs` and `colors_precomp` are given.
+        NotImplementedError: 3D covariances are given in place of scales and rotations.
     """
     optional = (dc, shs, colors_precomp, scales, rotations, cov3D_precomp)
     dc, shs, colors, scales, rotations, covariances = (None if t is None or not len(t) else t for t in optional)
@@ -70,7 +72,7 @@ def splats(
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera in gsplat's terms, from the settings of an Inria-style call."""
+    """A pinhole camera in gsplat's convention, made from the settings of an Inria-style call."""
 
     viewmat: Tensor  # [4, 4] world to camera
     K: Tensor  # [3, 3] pixels
@@ -82,7 +84,7 @@ class Camera:
         """Read `viewmatrix`, `projmatrix` (both transposed), `tanfovx/y` and the image size."""
         width, height = int(settings.image_width), int(settings.image_height)
         view = settings.viewmatrix.detach()
-        # ndc = (P00 x + P02 z) / z: what `projmatrix` adds to the view transform holds the principal point.
+        # ndc = (P00 x + P02 z) / z: `projmatrix` without the view transform contains the principal point.
         projection = torch.linalg.solve(view.double(), settings.projmatrix.detach().double())
         K = torch.eye(3)
         K[0, 0], K[1, 1] = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
@@ -91,10 +93,10 @@ class Camera:
 
 
 class Rendering(NamedTuple):
-    """Results every stand-in picks from."""
+    """Results of a call, from which each stand-in returns some."""
 
     color: Tensor  # [3, H, W]
-    radii: Tensor  # [N] int32, pixels: 3 standard deviations, 0 where nothing is drawn
+    radii: Tensor  # [N] int32, pixels: 3 standard deviations; 0 if the Gaussian is not drawn
     footprint: Footprint  # the projected Gaussians, for per-Gaussian statistics
     inverse_depth: Tensor | None  # [1, H, W]
 
@@ -107,7 +109,7 @@ def render(
     eps2d: float = EPS2D,
     absgrad: bool = False,
 ) -> Rendering:
-    """Render `gaussians`, differentiable in every member of `Splats`.
+    """Render Gaussians, differentiable in every member of `Splats`.
 
     Args:
         settings: A `GaussianRasterizationSettings` of any of the families.
@@ -115,8 +117,11 @@ def render(
         antialiased: Compensate opacities for the low-pass filter.
         inverse_depth: Also blend 1 / depth.
         eps2d: Added to the 2D covariance, square pixels.
-        absgrad: Put the sum of both absolute gradients into column 2 of `means2D`'s; where that has four columns,
-            columns 2 and 3 receive them one by one anyway.
+        absgrad: Add the sum of both absolute gradients to column 2 of the gradient of `means2D`. If `means2D` has four
+            columns, columns 2 and 3 receive one absolute gradient each in any case.
+
+    Returns:
+        Image, radii, projected Gaussians, and inverse depth if requested.
     """
     call = _Call(settings, Camera.from_settings(settings), antialiased, inverse_depth, eps2d, absgrad)
     if torch.is_grad_enabled():
@@ -127,7 +132,7 @@ def render(
 
 
 class _Call:
-    """One forward pass; keeps what the backward and the statistics need."""
+    """One forward pass, with the state that the backward pass and the statistics need."""
 
     def __init__(
         self, settings: Any, camera: Camera, antialiased: bool, inverse_depth: bool, eps2d: float, absgrad: bool
@@ -164,7 +169,7 @@ class _Call:
             return color, None
         depth = g.means3D @ self.camera.viewmat[2, :3] + self.camera.viewmat[2, 3]
         inverse = 1.0 / depth.clamp_min(NEAR_PLANE)
-        # Three equal channels, because three is the number every rasterizer is written for.
+        # Three equal channels, because rasterizers are optimized for three.
         inverse, _ = self._pass(g, inverse[:, None].expand(-1, 3), None, None)
         return color, inverse[:1]
 
@@ -192,7 +197,7 @@ class _Call:
 
 
 class _Render(torch.autograd.Function):
-    """Runs the call on detached leaves and differentiates it by hand, to reach the 2D means in between."""
+    """Runs the call on detached leaves and differentiates it explicitly, which gives access to the 2D means."""
 
     @staticmethod
     def forward(ctx: Any, call: _Call, *tensors: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -230,7 +235,7 @@ class _Render(torch.autograd.Function):
 
 
 def _screen_gradient(call: _Call, means2D: Tensor, on_screen: list[Tensor], values: Any) -> Tensor:
-    """Pixel gradients of the 2D means in normalised device coordinates, in the columns of `means2D`."""
+    """Return gradients of the 2D means in normalised device coordinates, in the columns of `means2D`."""
     half = means2D.new_tensor([call.camera.width / 2, call.camera.height / 2])
     gradient = torch.zeros_like(means2D)
     for means2d, value in zip(on_screen, values, strict=True):
@@ -246,7 +251,7 @@ def _screen_gradient(call: _Call, means2D: Tensor, on_screen: list[Tensor], valu
 
 @torch.no_grad()
 def _rgb(call: _Call, g: Splats) -> Tensor:
-    """Colours as the renderer sees them. [N, 3]"""
+    """Return the colours that are blended. [N, 3]"""
     if g.colors is not None:
         return g.colors
     from skipgs_plug.fallback_raster import spherical_harmonics
@@ -258,9 +263,9 @@ def _rgb(call: _Call, g: Splats) -> Tensor:
 
 
 def _radii(conics: Tensor, drawn: Tensor) -> Tensor:
-    """Three standard deviations of the wider axis, as the CUDA preprocessing rounds it. [N] int32"""
+    """Return three standard deviations of the wider axis, rounded up as the CUDA code does. [N] int32"""
     a, b, c = conics.unbind(-1)
-    # The inverse of a 2x2 matrix has the inverse eigenvalues; 0.1 is the CUDA code's floor under the root.
+    # The eigenvalues of the covariance are the inverses of the conic's. The CUDA code's root has a floor of 0.1.
     determinant = torch.where(drawn, a * c - b * b, 1.0)
     middle = 0.5 * (a + c) / determinant
     widest = middle + (middle * middle - 1.0 / determinant).clamp_min(0.1).sqrt()

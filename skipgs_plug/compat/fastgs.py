@@ -1,6 +1,6 @@
-"""Stand-in for `diff_gaussian_rasterization_fastgs`: per-Gaussian counts over a map of poor pixels.
+"""Stand-in for `diff_gaussian_rasterization_fastgs`, which counts per Gaussian the pixels of a map of poor pixels.
 
-`mult` shrinks the box of tiles the CUDA kernel visits; the stand-in draws every tile, as `mult=1` does.
+`mult` shrinks the box of tiles that the CUDA kernel visits. The stand-in visits all tiles, as with `mult=1`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussia
 
 
 class GaussianRasterizationSettings(NamedTuple):
-    """Fields as in the CUDA module."""
+    """Settings of a call, with the fields of the CUDA module."""
 
     image_height: int
     image_width: int
@@ -35,11 +35,11 @@ class GaussianRasterizationSettings(NamedTuple):
     prefiltered: bool
     debug: bool
     get_flag: bool | None
-    metric_map: Tensor | None  # [H * W] 1 where a pixel counts
+    metric_map: Tensor | None  # [H * W], 1 for pixels that count
 
 
 class GaussianRasterizer(RasterizerModule):
-    """Returns (color [3, H, W], radii [N], accum_metric_counts [N], empty without `get_flag`)."""
+    """Returns (color [3, H, W], radii [N], accum_metric_counts [N]). The counts are empty without `get_flag`."""
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
         settings = self.raster_settings

@@ -1,4 +1,4 @@
-"""Stand-in for `diff_gaussian_rasterization_ms` (Mini-Splatting), which GaussianSpa trains with."""
+"""Stand-in for `diff_gaussian_rasterization_ms` of Mini-Splatting, which GaussianSpa uses too."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 class GaussianRasterizer(RasterizerModule):
     """Returns (color, radii, accum_weights [N], accum_weights_count [N], accum_max_count [N]).
 
-    The last counts the pixels in which a Gaussian has the largest blend weight.
+    accum_max_count is the number of pixels in which the Gaussian has the largest blend weight.
     """
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
@@ -32,12 +32,12 @@ class GaussianRasterizer(RasterizerModule):
 
     @torch.no_grad()
     def render_depth(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> dict[str, Tensor]:
-        """Where the view rays meet the strongest Gaussian of their pixel; not differentiable.
+        """Intersect the view ray of each pixel with the Gaussian of the largest blend weight. Not differentiable.
 
         Returns:
-            render [3, H, W], out_pts [3, H, W] world points at the middle of the ray's way through the
-            Gaussian's 3-sigma ellipsoid, rendered_depth [1, H, W], discriminants [1, H, W] of that
-            intersection (negative: missed), gidx [1, H, W] int32, accum_alpha [1, H, W] remaining light.
+            A dictionary: render [3, H, W]; out_pts [3, H, W], world points in the middle of the ray's path through the
+            3-sigma ellipsoid; rendered_depth [1, H, W]; discriminants [1, H, W] of the intersection, negative if the
+            ray misses; gidx [1, H, W] int32, rows of the Gaussians; accum_alpha [1, H, W], remaining transmittance.
         """
         settings = self.raster_settings
         scene = splats(means3D, means2D, opacities, **gaussians)
@@ -48,7 +48,7 @@ class GaussianRasterizer(RasterizerModule):
         index, absorbed = torch.zeros(n_pixels, dtype=torch.int32), torch.zeros(n_pixels)
         for pairs in pairs_by_strip(f):
             hit, along, discriminant = _ray_hits(settings, scene, pairs.gaussian, pairs.pixel)
-            front = along >= 0  # what the ray meets behind the camera is passed over
+            front = along >= 0  # ignore intersections behind the camera
             absorbed.index_add_(0, pairs.pixel[front], torch.log1p(-pairs.alpha[front]))
             rows = strongest(pairs, front)
             pixel = pairs.pixel[rows]
@@ -66,7 +66,7 @@ class GaussianRasterizer(RasterizerModule):
 
 
 def _ray_hits(settings: Any, scene: Splats, gaussian: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Middle of each ray's way through a 3-sigma ellipsoid: point [P, 3], depth [P], discriminant [P]."""
+    """Return the middle of each ray's path through a 3-sigma ellipsoid: point [P, 3], depth [P], discriminant [P]."""
     width, height = int(settings.image_width), int(settings.image_height)
     view = settings.viewmatrix
     x = (2 * (pixel % width + 0.5) / width - 1) * settings.tanfovx

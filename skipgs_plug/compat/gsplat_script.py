@@ -1,4 +1,4 @@
-"""What gsplat's own `simple_trainer.py`, and nerfstudio, need on a machine without CUDA, beyond the rasterizer."""
+"""Replacements that gsplat's `simple_trainer.py` and nerfstudio need without CUDA, besides the rasterizer."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ from .strategy_operations import strategy_on_cpu
 
 @contextmanager
 def gsplat_on_cpu() -> Iterator[None]:
-    """Replace gsplat's rasterizer and the two CUDA functions its MCMC strategy calls.
+    """Replace gsplat's rasterizer and the two CUDA functions that its MCMC strategy calls.
 
-    Where torchvision is missing, torchmetrics' LPIPS is replaced too: the script builds it at the start. The pycolmap
-    that is installed gets the `SceneManager` of the one that gsplat's script wants up to 1.5.3.
+    If torchvision is missing, torchmetrics' LPIPS is replaced too, because the script creates it at the start. Up to
+    1.5.3 the script needs the `SceneManager` of another package named pycolmap. The installed pycolmap gets a stand-in
+    for it.
 
     Raises:
         ImportError: gsplat is not installed.
@@ -39,7 +40,7 @@ def gsplat_on_cpu() -> Iterator[None]:
         replaced.append((torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", AbsentLpips))
     if tuple(map(int, gsplat.__version__.split(".")[:2])) < (1, 5):
         replaced += [(module, "rasterization", rasterization_1_4) for module in (gsplat, gsplat.rendering)]
-    if usable("PIL.Image") and usable("pycolmap"):  # in this order: the other one crashes Python later
+    if usable("PIL.Image") and usable("pycolmap"):  # in this order: the reverse order crashes Python later
         pycolmap = importlib.import_module("pycolmap")
         if not hasattr(pycolmap, "SceneManager"):
             replaced.append((pycolmap, "SceneManager", SceneManager))
@@ -49,21 +50,21 @@ def gsplat_on_cpu() -> Iterator[None]:
 
 @contextmanager
 def _no_cuda_toolkit() -> Iterator[None]:
-    """Keep gsplat from compiling its extension when it is imported, which it does since 1.6 where it finds `nvcc`."""
-    if not usable("torch.utils.cpp_extension"):  # it needs setuptools, and gsplat needs it to compile
+    """Keep gsplat from compiling its CUDA extension on import, as 1.6 and later do if they find `nvcc`."""
+    if not usable("torch.utils.cpp_extension"):  # without it, which needs setuptools, gsplat cannot compile
         yield
         return
-    places: Any = importlib.import_module("torch.utils.cpp_extension")
-    find = places._find_cuda_home
-    places._find_cuda_home = lambda: None
+    extension: Any = importlib.import_module("torch.utils.cpp_extension")
+    find = extension._find_cuda_home
+    extension._find_cuda_home = lambda: None
     try:
         yield
     finally:
-        places._find_cuda_home = find
+        extension._find_cuda_home = find
 
 
 @functools.wraps(rasterization)
 def rasterization_1_4(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """With one radius per Gaussian, as gsplat's strategies read it before 1.5."""
+    """Render with one radius per Gaussian in `info`, as gsplat's strategies before 1.5 expect it."""
     image, alpha, info = rasterization(*args, **kwargs)
     return image, alpha, info | {"radii": info["radii"].amax(dim=-1)}

@@ -1,4 +1,4 @@
-"""Stand-in for the rasterizer of Improved-GS: Taming's results, with weights summed as they are blended."""
+"""Stand-in for the rasterizer of Improved-GS: the results of Taming 3DGS, with weights summed while blending."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussia
 class GaussianRasterizer(RasterizerModule):
     """Returns the CUDA module's 13-tuple, of which the trainer reads color, radii and accum_weights [N].
 
-    Those are `pixel_weights` times blend weight, summed over the pixels; empty without `pixel_weights`, as is all
-    that is not read. `means2D` is [N, 4]: columns 2 and 3 receive absolute gradients.
+    accum_weights is the sum over pixels of `pixel_weights` times blend weight. It is empty without `pixel_weights`, and
+    entries that the trainer does not read are always empty. `means2D` is [N, 4]. Columns 2 and 3 receive absolute
+    gradients.
     """
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
@@ -30,6 +31,6 @@ class GaussianRasterizer(RasterizerModule):
         sums = empty
         if weights is not None and len(weights):
             sums = gather(f, weights).weighted_value
-        centers = f.means2d - 0.5  # the CUDA code has the first pixel centre at 0
+        centers = f.means2d - 0.5  # in the CUDA code the first pixel centre is 0
         unread = (empty,) * 3
         return result.color, result.radii, empty, *unread, centers, f.depths, result.radii, sums, *unread

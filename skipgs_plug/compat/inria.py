@@ -1,7 +1,7 @@
 """Stand-in for `diff_gaussian_rasterization` of Inria's 3D Gaussian Splatting, classic and current.
 
-The two versions differ by one setting: the current one (branch `dr_aa`) passes `antialiasing` and gets
-the inverse depth as a third result, the classic one does neither.
+The two versions differ by one setting. The current one (branch `dr_aa`) passes `antialiasing` and receives the inverse
+depth as a third result.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from .compose import NEAR_PLANE, render, splats
 
 
 class GaussianRasterizationSettings(NamedTuple):
-    """Fields as in the CUDA module; `antialiasing` is None where the caller does not know it."""
+    """Settings of a call, with the fields of the CUDA module. `antialiasing` is None in the classic version."""
 
     image_height: int
     image_width: int
@@ -33,7 +33,7 @@ class GaussianRasterizationSettings(NamedTuple):
 
 
 class RasterizerModule(torch.nn.Module):
-    """What the rasterizer class of every family has in common."""
+    """Base of the rasterizer class of every family."""
 
     def __init__(self, raster_settings: Any) -> None:
         super().__init__()
@@ -41,13 +41,13 @@ class RasterizerModule(torch.nn.Module):
 
     @torch.no_grad()
     def markVisible(self, positions: Tensor) -> Tensor:
-        """Which points lie in front of the near plane. [N, 3] -> [N] bool"""
+        """Mask points [N, 3] that lie beyond the near plane. [N] bool"""
         view = self.raster_settings.viewmatrix
         return positions @ view[:3, 2] + view[3, 2] > NEAR_PLANE
 
 
 class GaussianRasterizer(RasterizerModule):
-    """Returns (color [3, H, W], radii [N]), and inverse depth [1, H, W] when `antialiasing` is set."""
+    """Returns (color [3, H, W], radii [N]), and inverse depth [1, H, W] if `antialiasing` is not None."""
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
         settings = self.raster_settings

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def distCUDA2(points: Tensor) -> Tensor:
-    """Mean squared distance to the three nearest other points. [N, 3] -> [N]
+    """Return the mean squared distance [N] of each point [N, 3] to its three nearest neighbours.
 
     Raises:
         ValueError: There are fewer than four points.

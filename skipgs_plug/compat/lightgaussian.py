@@ -1,4 +1,4 @@
-"""Stand-in for the rasterizer of LightGaussian: `f_count` turns a render into an importance count."""
+"""Stand-in for the rasterizer of LightGaussian, which counts the importance of each Gaussian with `f_count`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .statistics import gather
 
 
 class GaussianRasterizationSettings(NamedTuple):
-    """Fields as in the CUDA module."""
+    """Settings of a call, with the fields of the CUDA module."""
 
     image_height: int
     image_width: int
@@ -31,7 +31,7 @@ class GaussianRasterizationSettings(NamedTuple):
 
 
 class GaussianRasterizer(RasterizerModule):
-    """Returns (color, radii); with `f_count` (gaussians_count [N], important_score [N], color, radii)."""
+    """Returns (color, radii), or with `f_count` (gaussians_count [N], important_score [N], color, radii)."""
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
         settings = self.raster_settings
@@ -41,5 +41,5 @@ class GaussianRasterizer(RasterizerModule):
         with torch.no_grad():  # the CUDA counting pass is outside autograd
             result = render(settings, scene)
         found = gather(result.footprint)
-        # Opacity times the light that arrives: the importance the CUDA kernel adds per pixel.
+        # Per pixel, the CUDA kernel adds opacity times transmittance to the importance.
         return found.pixels, result.footprint.opacities * found.light, result.color, result.radii

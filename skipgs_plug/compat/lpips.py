@@ -1,4 +1,4 @@
-"""Stand-in for `lpips` where its network cannot be had."""
+"""Stand-in for `lpips` if its network is not available."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from torch import Tensor
 
 
 class AbsentLpips(torch.nn.Module):
-    """LPIPS where its network cannot be had: a warning when first asked, and nan for a value."""
+    """LPIPS without its network: it warns and returns NaN."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__()
 
     def forward(self, image: Tensor, target: Tensor) -> Tensor:
-        """Not a number. Shapes are not checked."""
+        """Warn, and return NaN. Shapes are not checked."""
         warnings.warn("LPIPS needs torchvision, which cannot be imported: reporting nan.", stacklevel=2)
         return torch.tensor(torch.nan)
 
 
-LPIPS = AbsentLpips  # its name in the package
+LPIPS = AbsentLpips  # the class's name in the package `lpips`

@@ -1,4 +1,4 @@
-"""Stand-in for the rasterizer of 3DGS-MCMC: classic Inria, which Gaussians were drawn, and relocation."""
+"""Stand-in for the rasterizer of 3DGS-MCMC: classic Inria, with flags of drawn Gaussians and relocation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "compute_reloc
 
 
 class GaussianRasterizer(RasterizerModule):
-    """Returns (color [3, H, W], radii [N], is_used [N] int32, 1 where a Gaussian contributes to a pixel)."""
+    """Returns (color [3, H, W], radii [N], is_used [N] int32, 1 if the Gaussian contributes to a pixel)."""
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
         result = render(self.raster_settings, splats(means3D, means2D, opacities, **gaussians))
@@ -26,5 +26,5 @@ class GaussianRasterizer(RasterizerModule):
 def compute_relocation(
     opacity_old: Tensor, scale_old: Tensor, N: Tensor, binoms: Tensor, n_max: int
 ) -> tuple[Tensor, Tensor]:
-    """Opacity [M] or [M, 1] and scales [M, 3] of Gaussians split into `N` [M] equal ones; see `relocation`."""
+    """Return opacities [M] or [M, 1] and scales [M, 3] of Gaussians that are split into `N` [M] equal ones."""
     return relocation.compute_relocation(opacity_old, scale_old, N, binoms[:n_max, :n_max])

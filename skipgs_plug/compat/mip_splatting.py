@@ -1,4 +1,4 @@
-"""Stand-in for the rasterizer of Mip-Splatting: a 2D filter of a given size that conserves opacity."""
+"""Stand-in for the rasterizer of Mip-Splatting, whose 2D filter has a given size and compensates opacities."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
 
 class GaussianRasterizationSettings(NamedTuple):
-    """Fields as in the CUDA module."""
+    """Settings of a call, with the fields of the CUDA module."""
 
     image_height: int
     image_width: int
@@ -32,14 +32,15 @@ class GaussianRasterizationSettings(NamedTuple):
 
 
 class GaussianRasterizer(RasterizerModule):
-    """Returns (color [3, H, W], radii [N]). The third column of `means2D`'s gradient is the sum of absolute ones.
+    """Returns (color [3, H, W], radii [N]). Column 2 of the gradient of `means2D` is the sum of absolute gradients.
 
-    Opacities are compensated by the root of the ratio of the covariances' determinants, without the CUDA code's 1e-6.
+    Opacities are multiplied by the square root of the ratio of the covariances' determinants, without the small number
+    (1e-6) that the CUDA code has there.
     """
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
         settings = self.raster_settings
         if settings.subpixel_offset.any():
-            raise NotImplementedError("The CPU stand-in has its pixels on a grid: run without --ray_jitter.")
+            raise NotImplementedError("The CPU stand-in has no subpixel offsets: run without --ray_jitter.")
         scene = splats(means3D, means2D, opacities, **gaussians)
         return render(settings, scene, antialiased=True, eps2d=settings.kernel_size, absgrad=True)[:2]

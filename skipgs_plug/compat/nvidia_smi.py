@@ -1,4 +1,4 @@
-"""An answer for scripts that ask the command `nvidia-smi` which GPU is the freest."""
+"""A stand-in for the command `nvidia-smi`, which some scripts run to find the GPU with the most free memory."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 @contextmanager
 def one_free_gpu() -> Iterator[None]:
-    """Put an `nvidia-smi` on the path that knows one unused GPU, where there is none."""
+    """Put an `nvidia-smi` on the path that reports one unused GPU, unless the machine has one."""
     if shutil.which("nvidia-smi") is not None:
         yield
         return

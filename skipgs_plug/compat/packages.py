@@ -1,4 +1,4 @@
-"""Whether packages that trainers import can be imported here."""
+"""Checks whether packages that trainers import can be imported here."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import importlib
 
 
 def usable(package: str) -> bool:
-    """Whether a package can be imported: one that is installed may be of another PyTorch, and broken."""
+    """Return whether a package can be imported. An installed package may be broken, built for another PyTorch."""
     try:
         importlib.import_module(package)
-    except Exception:  # whatever its first lines run into
+    except Exception:  # a broken package may raise anything
         return False
     return True

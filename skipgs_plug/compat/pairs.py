@@ -1,6 +1,7 @@
-"""A footprint expanded to the pixel-Gaussian pairs that contribute to an image, in blending order.
+"""Expands a footprint to the (pixel, Gaussian) pairs that contribute to an image, in blending order.
 
-Slow beside a blend kernel: for what no kernel sums, squared gradients (Speedy-Splat) and view rays (GaussianSpa).
+This is slow compared with a blend kernel. It serves for sums that no kernel computes: squared gradients (Speedy-Splat)
+and intersections of view rays (GaussianSpa).
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from skipgs_plug.fallback_raster.oracle.torch_reference import ALPHA_MAX, ALPHA_
 
 from .statistics import Footprint
 
-ROWS_PER_STRIP = 32  # bounds the memory: the pairs of one strip are held at once
+# Image rows that are expanded at a time. It bounds the memory, because all pairs of a strip are held at once.
+ROWS_PER_STRIP = 32
 
 
 class Pairs(NamedTuple):
@@ -25,23 +27,28 @@ class Pairs(NamedTuple):
     pixel: Tensor  # [P] int64, row-major over the whole image
     offset: Tensor  # [P, 2] pixel centre minus 2D mean
     alpha: Tensor  # [P]
-    transmittance: Tensor  # [P] light that reaches the Gaussian
+    transmittance: Tensor  # [P] in front of the Gaussian
 
     @property
     def weight(self) -> Tensor:
-        """Share of the pixel's colour. [P]"""
+        """Blend weights. [P]"""
         return self.alpha * self.transmittance
 
 
 @torch.no_grad()
 def pairs_by_strip(footprint: Footprint) -> Iterator[Pairs]:
-    """Expand a footprint, a strip of image rows at a time."""
+    """Yield the pairs of a footprint, one strip of image rows at a time."""
     for top in range(0, footprint.height, ROWS_PER_STRIP):
         yield _strip(footprint, top, min(top + ROWS_PER_STRIP, footprint.height))
 
 
 def strongest(pairs: Pairs, candidates: Tensor | None = None) -> Tensor:
-    """Positions of the pairs with the largest weight of their pixel, the front one where two are equal."""
+    """Return indices of the pairs with the largest weight of their pixel. Of equal weights, the front one counts.
+
+    Args:
+        pairs: The pairs of a strip.
+        candidates: Mask of the pairs that count. [P] bool; all if None.
+    """
     rows = torch.arange(len(pairs.pixel)) if candidates is None else candidates.nonzero()[:, 0]
     pixel, weight = pairs.pixel[rows], pairs.weight[rows]
     _, group = torch.unique_consecutive(pixel, return_inverse=True)
@@ -54,16 +61,16 @@ def strongest(pairs: Pairs, candidates: Tensor | None = None) -> Tensor:
 
 @torch.no_grad()
 def squared_gradients(footprint: Footprint, rgb: Tensor, background: Tensor, grad_image: Tensor) -> Tensor:
-    """Sum over pixels of the squared derivative by the falloff value (Speedy-Splat's pruning score).
+    """Sum the squared gradient of each pixel by the Gaussian's falloff (Speedy-Splat's pruning score).
 
     Args:
         footprint: The projected scene.
-        rgb: Colours. [N, 3]
-        background: [3]
-        grad_image: Derivative of the objective by the image. [3, H, W]
+        rgb: Colours of the Gaussians. [N, 3]
+        background: Colour of the background. [3]
+        grad_image: Gradient of the loss by the image. [3, H, W]
 
     Returns:
-        Squares are taken per pixel, before the sum. [N]
+        Sums over pixels of squares. [N]
     """
     grad = grad_image.reshape(3, -1).T.double()  # [H * W, 3]
     behind_all = grad @ background.double()
@@ -86,7 +93,7 @@ def squared_gradients(footprint: Footprint, rgb: Tensor, background: Tensor, gra
 
 def _strip(f: Footprint, top: int, bottom: int) -> Pairs:
     a, b, c = f.conics.unbind(-1)
-    # Where the falloff reaches ALPHA_THRESHOLD, the ellipse's half width is sqrt(2 ln(255 o) * covariance).
+    # The half width of the ellipse alpha = ALPHA_THRESHOLD is sqrt(2 ln(255 opacity) * covariance).
     determinant = torch.where(f.drawn, a * c - b * b, 1.0)
     power = 2 * (f.opacities / ALPHA_THRESHOLD).clamp_min(1.0).log()
     reach = (power[:, None] * torch.stack([c, a], dim=-1) / determinant[:, None]).clamp_min(0.0).sqrt()
@@ -108,12 +115,12 @@ def _strip(f: Footprint, top: int, bottom: int) -> Pairs:
     dx, dy = offset.unbind(-1)
     sigma = 0.5 * (a[gaussian] * dx * dx + c[gaussian] * dy * dy) + b[gaussian] * dx * dy
     alpha = f.opacities[gaussian] * torch.exp(-sigma)
-    seen = (alpha >= ALPHA_THRESHOLD) & (sigma >= 0)
-    gaussian, pixel, offset, alpha = gaussian[seen], (y * f.width + x)[seen], offset[seen], alpha[seen]
+    drawn = (alpha >= ALPHA_THRESHOLD) & (sigma >= 0)
+    gaussian, pixel, offset, alpha = gaussian[drawn], (y * f.width + x)[drawn], offset[drawn], alpha[drawn]
 
     pixel, by_pixel = torch.sort(pixel, stable=True)
     gaussian, offset, alpha = gaussian[by_pixel], offset[by_pixel], alpha[by_pixel].clamp_max(ALPHA_MAX)
-    # Transmittance: a running sum of log(1 - alpha), less what it was where the pixel begins.
+    # log of the transmittance: a running sum of log(1 - alpha), minus its value at the start of the pixel.
     absorbed = torch.log1p(-alpha.double())
     after = absorbed.cumsum(0)
     _, group, lengths = torch.unique_consecutive(pixel, return_inverse=True, return_counts=True)

@@ -1,4 +1,4 @@
-"""Stand-in for the rasterizer of Pixel-GS: pixel counts, and screen gradients that fade near the camera."""
+"""Stand-in for the rasterizer of Pixel-GS: pixel counts, and gradients of 2D means that are reduced near the camera."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
 
 class GaussianRasterizationSettings(NamedTuple):
-    """Fields as in the CUDA module."""
+    """Settings of a call, with the fields of the CUDA module."""
 
     image_height: int
     image_width: int
@@ -22,7 +22,7 @@ class GaussianRasterizationSettings(NamedTuple):
     tanfovy: float
     bg: Tensor
     scale_modifier: float
-    depth_threshold: float | None  # world units; None where no gradient is asked for
+    depth_threshold: float | None  # world units; None without gradients
     viewmatrix: Tensor
     projmatrix: Tensor
     sh_degree: int
@@ -32,9 +32,9 @@ class GaussianRasterizationSettings(NamedTuple):
 
 
 class GaussianRasterizer(RasterizerModule):
-    """Returns (color [3, H, W], radii [N], pixels [N, 1] that each Gaussian contributes to, float).
+    """Returns (color [3, H, W], radii [N], pixels [N, 1] float, the number of pixels that the Gaussian contributes to).
 
-    The gradient that reaches `means2D` is scaled by (depth / depth_threshold)^2, at most 1.
+    The gradient of `means2D` is multiplied by (depth / depth_threshold)^2, at most 1.
     """
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:

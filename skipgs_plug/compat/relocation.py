@@ -1,4 +1,4 @@
-"""What becomes of a Gaussian that MCMC densification splits into equal ones."""
+"""New opacities and scales of a Gaussian that MCMC densification splits into equal ones."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from torch import Tensor
 def compute_relocation(
     opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, min_opacity: float | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Opacity and scales of a Gaussian split into `ratios` equal ones (3DGS-MCMC, equation 9).
+    """Compute opacity and scales of Gaussians that are split into `ratios` equal ones (3DGS-MCMC, equation 9).
 
     Args:
-        opacities: [N], or [N, 1] as nerfstudio keeps them
-        scales: [N, 3]
+        opacities: Opacities [N], or [N, 1] as in nerfstudio.
+        scales: Standard deviations. [N, 3]
         ratios: Number of copies, capped at n_max. [N]
         binoms: Binomial coefficients. [n_max, n_max]
-        min_opacity: Least new opacity; gsplat gives it since 1.6, and bounds it later itself before.
+        min_opacity: Smallest new opacity. gsplat passes it from 1.6 on; earlier versions apply it themselves.
 
     Returns:
-        New opacities, in their old shape, and scales [N, 3]; n copies drawn over each other look like the
+        New opacities, in the shape of the old ones, and scales [N, 3]. The copies, drawn over each other, look like the
         original.
     """
     n_max = len(binoms)

@@ -1,4 +1,4 @@
-"""Stand-ins for what Scaffold-GS imports: its rasterizer, and one function of torch_scatter."""
+"""Stand-ins for the imports of Scaffold-GS: its rasterizer, and one function of torch_scatter."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "scatter_max"]
 
 
 class GaussianRasterizer(inria.GaussianRasterizer):
-    """As Inria's classic one, and a filter for anchors."""
+    """Inria's classic rasterizer, with a filter for anchors."""
 
     @torch.no_grad()
     def visible_filter(self, means3D: Tensor, scales: Tensor, rotations: Tensor, cov3D_precomp: Any = None) -> Tensor:
-        """Radii of Gaussians as they would be drawn if they were opaque, 0 outside the image. [N] int32"""
+        """Return radii in pixels as if all Gaussians were opaque; 0 outside the image. [N] int32"""
         opaque, black = torch.ones(len(means3D), 1), torch.zeros(len(means3D), 3)
         scene = splats(means3D, torch.zeros_like(means3D), opaque, colors_precomp=black, scales=scales,
                        rotations=rotations, cov3D_precomp=cov3D_precomp)  # fmt: skip
@@ -27,7 +27,7 @@ class GaussianRasterizer(inria.GaussianRasterizer):
 
 
 def scatter_max(src: Tensor, index: Tensor, dim: int) -> tuple[Tensor, None]:
-    """Largest value of each group along `dim`; the second result of the real one, positions, is not made.
+    """Return the largest value of each group along `dim`, and None in place of torch_scatter's argmax.
 
     Args:
         src: Values.

@@ -1,6 +1,6 @@
-"""Stand-in for the `SceneManager` of another package called pycolmap, which gsplat's script asks for up to 1.5.3.
+"""Stand-in for the `SceneManager` of another package named pycolmap, which gsplat's script needs up to 1.5.3.
 
-Both packages have the same import name. This one reads with the official one, so that nothing has to be replaced.
+The two packages have the same import name. This one reads models with the official package, so nothing is replaced.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-# COLMAP's camera models by their numbers.
+# Names of COLMAP's camera models, in the order of their numbers.
 MODELS = (
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -26,7 +26,7 @@ MODELS = (
 
 
 class Image(NamedTuple):
-    """A registered image: its pose takes world points to the camera."""
+    """A registered image. Its pose maps world points to camera space."""
 
     name: str
     camera_id: int
@@ -39,10 +39,10 @@ class Image(NamedTuple):
 
 
 class Camera:
-    """A camera: `fx fy cx cy` in pixels, its distortion `k1 k2 p1 ...`, and `camera_type`, the number of its model."""
+    """A camera: `fx fy cx cy` in pixels, distortion `k1 k2 p1 ...`, and `camera_type`, the number of its model."""
 
     def __init__(self, camera: Any) -> None:
-        # gsplat compares it with numbers alone when it warns of distortion.
+        # A number and not a name, because gsplat compares it with numbers only when it warns of distortion.
         self.camera_type = MODELS.index(getattr(camera.model, "name", str(camera.model)))
         self.width, self.height = camera.width, camera.height
         K = camera.calibration_matrix()
@@ -52,17 +52,17 @@ class Camera:
 
 
 class SceneManager:
-    """A COLMAP model, as gsplat's parser reads it.
+    """A COLMAP model with the attributes that gsplat's parser reads.
 
     Attributes:
-        cameras: by id.
-        images: by id.
-        name_to_image_id: of every image.
-        points3D: world points. [P, 3]
-        point3D_colors: [P, 3] uint8
-        point3D_errors: mean reprojection errors, pixels. [P]
-        point3D_id_to_point3D_idx: row of a point by its id.
-        point3D_id_to_images: (image id, place in the image) of every observation, by id. [L, 2]
+        cameras: Cameras by id.
+        images: Registered images by id.
+        name_to_image_id: Id of each image by name.
+        points3D: World points. [P, 3]
+        point3D_colors: Their colours. [P, 3] uint8
+        point3D_errors: Their mean reprojection errors in pixels. [P]
+        point3D_id_to_point3D_idx: Row of each point by id.
+        point3D_id_to_images: (image id, index of the 2D point) of each observation, by id of the point. [L, 2]
     """
 
     def __init__(self, colmap_results_folder: str) -> None:
@@ -88,6 +88,6 @@ class SceneManager:
         }
 
     def load_cameras(self) -> None:
-        """Nothing: all was read at once, as are the next two."""
+        """Do nothing: the constructor has read cameras, images and points."""
 
     load_images = load_points3D = load_cameras

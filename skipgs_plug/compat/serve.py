@@ -1,4 +1,4 @@
-"""Put the stand-ins where a trainer's `import` finds them, for as long as it runs."""
+"""Serves the stand-ins where a trainer's `import` finds them, while the trainer runs."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from .packages import usable
 
 _CLASSES = ("GaussianRasterizationSettings", "GaussianRasterizer")
 _ACCELERATED = (*_CLASSES, "SparseGaussianAdam")
-_Source = dict[str, tuple[str, tuple[str, ...]]]  # module name -> our file, the names it offers
+_Source = dict[str, tuple[str, tuple[str, ...]]]  # module name -> our module, and the names that it offers
 
 _KNN: _Source = {"simple_knn": (".knn", ()), "simple_knn._C": (".knn", ("distCUDA2",))}
 _SSIM: _Source = {"fused_ssim": (".ssim", ("fused_ssim",))}
 _RASTERIZER = "diff_gaussian_rasterization"
-_PIP = "gaussian_splatting."  # the pip package keeps its extensions inside itself
+_PIP = "gaussian_splatting."  # the pip package contains its extensions
 
 FAMILIES: dict[str, _Source] = {
     "inria": {_RASTERIZER: (".inria", _CLASSES), **_KNN, **_SSIM},
-    # Its train.py takes the presence of SparseGaussianAdam for the branch `3dgs_accel` of the rasterizer.
+    # train.py recognises the branch `3dgs_accel` of the rasterizer by SparseGaussianAdam.
     "inria_accelerated": {_RASTERIZER: (".inria_accelerated", _ACCELERATED), **_KNN, **_SSIM},
     "fastgs": {f"{_RASTERIZER}_fastgs": (".fastgs", _ACCELERATED), **_KNN, **_SSIM},
     "taming": {_RASTERIZER: (".taming", _ACCELERATED), **_KNN, **_SSIM},
@@ -51,18 +51,21 @@ FAMILIES: dict[str, _Source] = {
         **_SSIM,
     },
     "gsplat": _SSIM,
-    "nerfstudio": {},  # all of CUDA that splatfacto needs is in gsplat
+    "nerfstudio": {},  # gsplat contains all CUDA code that splatfacto needs
 }
-# What is served besides where torchvision cannot be imported.
+# Modules that are also served if torchvision cannot be imported.
 _WITHOUT_TORCHVISION: dict[str, _Source] = {"scaffold_gs": {"lpips": (".lpips", ("LPIPS",))}}
 
 
 @contextmanager
 def serve(family: str) -> Iterator[None]:
-    """Serve the extension modules of one family of trainers from the CPU rasterizer.
+    """Serve the extension modules of one family of trainers with the CPU rasterizer, inside the `with` statement.
 
-    Where torchvision cannot be imported, the few functions of it that these trainers call come along.
-    Modules of the same names that were imported before are set aside and come back at the end.
+    If torchvision cannot be imported, the few functions of it that these trainers call are served too. Modules of the
+    same names that were imported before are restored at the end.
+
+    Args:
+        family: A key of `FAMILIES`.
 
     Raises:
         ValueError: The family is unknown.
@@ -76,7 +79,7 @@ def serve(family: str) -> Iterator[None]:
         served |= {name: _module(name, *source) for name, source in _WITHOUT_TORCHVISION.get(family, {}).items()}
     before = {name: sys.modules.get(name) for name in served}
     try:
-        # First what torchmetrics is imported for: it must not find a part of torchvision.
+        # `_extras` first: it imports torchmetrics, which must not find the served part of torchvision.
         with _extras(family):
             sys.modules.update(served)
             yield
@@ -89,8 +92,8 @@ def serve(family: str) -> Iterator[None]:
 
 
 def _extras(family: str) -> AbstractContextManager[None]:
-    """What cannot be had by serving modules."""
-    if family in ("gsplat", "nerfstudio"):  # functions are replaced inside gsplat, which is a real package here
+    """Return further replacements that a family needs besides modules."""
+    if family in ("gsplat", "nerfstudio"):  # gsplat is a real package here: its functions are replaced
         from .gsplat_script import gsplat_on_cpu
 
         return gsplat_on_cpu()

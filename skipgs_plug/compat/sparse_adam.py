@@ -1,4 +1,4 @@
-"""Adam that leaves invisible Gaussians alone, as the accelerated rasterizers ship it."""
+"""Adam that does not update invisible Gaussians, as in the accelerated rasterizers."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from skipgs_plug.fallback_raster.training.optimizer import moments
 
 
 class SparseGaussianAdam(torch.optim.Adam):
-    """One parameter per group, first dimension N; no bias correction, as in the CUDA kernel."""
+    """Adam without bias correction, as in the CUDA kernel. Each group has one parameter, with N rows."""
 
     def __init__(self, params: Any, lr: float, eps: float) -> None:
         super().__init__(params=params, lr=lr, eps=eps)
 
     @torch.no_grad()
     def step(self, visibility: Tensor, N: int) -> None:  # type: ignore[override]
-        """Update the rows that `visibility` marks, of every parameter with a gradient.
+        """Update the visible rows of every parameter that has a gradient.
 
         Args:
-            visibility: [N] bool
+            visibility: Rows to update. [N] bool
             N: Number of Gaussians.
         """
         for group in self.param_groups:

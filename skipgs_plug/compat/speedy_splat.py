@@ -1,4 +1,4 @@
-"""Stand-in for the rasterizer of Speedy-Splat: a `scores` input whose gradient is a sum of squares."""
+"""Stand-in for the rasterizer of Speedy-Splat, whose input `scores` receives sums of squared gradients."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
 
 class GaussianRasterizer(RasterizerModule):
-    """Returns (color [3, H, W], radii [N], kernel_times [1] milliseconds of this forward pass)."""
+    """Returns (color [3, H, W], radii [N], kernel_times [1], the milliseconds of this forward pass)."""
 
     def forward(
         self, means3D: Tensor, means2D: Tensor, opacities: Tensor, scores: Tensor | None, **gaussians: Any

@@ -8,13 +8,13 @@ from torch import Tensor
 
 
 def fused_ssim(img1: Tensor, img2: Tensor, padding: Literal["same", "valid"] = "same", train: bool = True) -> Tensor:
-    """Mean structural similarity, 11x11 Gaussian window; differentiable in `img1`.
+    """Return the mean SSIM (Wang et al. 2004, 11x11 Gaussian window). Differentiable in `img1`.
 
     Args:
-        img1: [B, C, H, W]
-        img2: [B, C, H, W]
-        padding: "same" or "valid".
-        train: Accepted as the CUDA module does; gradients are there either way.
+        img1: Rendered images. [B, C, H, W]
+        img2: Photographs. [B, C, H, W]
+        padding: "same" continues images with black; "valid" only averages windows inside the image.
+        train: Accepted for callers of the CUDA module and ignored: gradients are always available.
     """
     from skipgs_plug.fallback_raster import l1_ssim_loss
 

@@ -1,4 +1,4 @@
-"""Stand-ins in the place of names of other packages, for a while."""
+"""Replaces names of other packages by stand-ins, for a while."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-MISSING = object()
+MISSING = object()  # marks a name that the owner did not have
 
 
 @contextmanager
 def stand_ins(replaced: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
-    """Give each (owner, name) its stand-in inside the block; a name that the owner lacks is removed afterwards."""
+    """Replace each (owner, name) by its stand-in inside the `with` statement, and restore all names afterwards."""
     before = [(owner, name, getattr(owner, name, MISSING)) for owner, name, _ in replaced]
     for owner, name, stand_in in replaced:
         setattr(owner, name, stand_in)

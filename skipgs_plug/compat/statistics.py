@@ -1,4 +1,4 @@
-"""Sums over the pixels of each Gaussian that the CUDA forks gather inside their blend kernels."""
+"""Per-Gaussian sums over pixels that the CUDA forks collect inside their blend kernels."""
 
 from __future__ import annotations
 
@@ -34,25 +34,25 @@ class Footprint(NamedTuple):
 
 
 class Statistics(NamedTuple):
-    """Sums over the pixels that a Gaussian contributes to, and two maps."""
+    """Sums over the pixels that each Gaussian contributes to, and two maps."""
 
-    pixels: Tensor  # [N] int32, their number
-    weight: Tensor  # [N] sum of its shares of their colour
-    light: Tensor  # [N] sum of the light that reaches it
+    pixels: Tensor  # [N] int32, number of pixels
+    weight: Tensor  # [N] sum of blend weights
+    light: Tensor  # [N] sum of transmittances in front of the Gaussian
     value: Tensor  # [N] sum of the values given for the pixels
-    weighted_value: Tensor  # [N] sum of value times share
-    distance: Tensor  # [N] sum of the distances of the pixels' centres from its own
-    contributions: Tensor  # [H, W] int32, Gaussians that contribute to a pixel
-    strongest: Tensor  # [H, W] int32, the one with the largest share, the front one of equals; -1 where there is none
+    weighted_value: Tensor  # [N] sum of value times blend weight
+    distance: Tensor  # [N] sum of distances from pixel centres to the 2D mean, pixels
+    contributions: Tensor  # [H, W] int32, number of Gaussians that contribute
+    strongest: Tensor  # [H, W] int32, row with the largest blend weight, the front one of equals; -1 if there is none
 
 
 @torch.no_grad()
 def gather(f: Footprint, values: Tensor | None = None) -> Statistics:
-    """Walk through the blend of an image once more, and sum what is asked of it.
+    """Blend an image once more without colours, and collect statistics.
 
     Args:
         f: The projected scene.
-        values: One number for each pixel, H * W of them in any shape; zeros when left out.
+        values: One number per pixel, H * W numbers in any shape; zeros if None.
     """
     a, b, c = f.conics.unbind(-1)
     determinant = torch.where(f.drawn, a * c - b * b, 1.0)

@@ -1,4 +1,4 @@
-"""The two operations of gsplat's MCMCStrategy that it has in CUDA only."""
+"""Two operations of gsplat's MCMCStrategy that gsplat has only in CUDA."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .stand_ins import stand_ins
 
 @contextmanager
 def strategy_on_cpu() -> Iterator[None]:
-    """Let gsplat's MCMCStrategy run without CUDA inside the block.
+    """Let gsplat's MCMCStrategy run without CUDA inside the `with` statement.
 
     Raises:
         ImportError: gsplat is not installed.
@@ -34,10 +34,17 @@ def quat_scale_to_covar_preci(
     compute_preci: bool = True,
     triu: bool = False,
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Covariance and its inverse, of Gaussians. [N, 4], [N, 3] -> two of [N, 3, 3] or None
+    """Return covariances [N, 3, 3] and their inverses [N, 3, 3], each None unless requested.
+
+    Args:
+        quats: Rotations w, x, y, z of any length. [N, 4]
+        scales: Standard deviations. [N, 3]
+        compute_covar: Whether to compute covariances.
+        compute_preci: Whether to compute their inverses.
+        triu: Not supported.
 
     Raises:
-        NotImplementedError: `triu` is set; the strategies do not.
+        NotImplementedError: `triu` is set, which gsplat's strategies do not do.
     """
     if triu:
         raise NotImplementedError("The CPU stand-in returns whole matrices: leave triu False.")

@@ -1,4 +1,4 @@
-"""Stand-in for the rasterizer of Taming 3DGS: thirteen results, four of them sums over weighted pixels."""
+"""Stand-in for the rasterizer of Taming 3DGS, which returns thirteen results. Four are sums over weighted pixels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussia
 
 
 class GaussianRasterizationSettings(NamedTuple):
-    """Fields as in the CUDA module."""
+    """Settings of a call, with the fields of the CUDA module."""
 
     image_height: int
     image_width: int
@@ -30,15 +30,15 @@ class GaussianRasterizationSettings(NamedTuple):
     campos: Tensor
     prefiltered: bool
     debug: bool
-    pixel_weights: Tensor | None  # [H, W]; None leaves the sums empty
+    pixel_weights: Tensor | None  # [H, W]; without them the sums are empty
 
 
 class GaussianRasterizer(RasterizerModule):
     """Returns the CUDA module's 13-tuple.
 
-    (color, radii, counts [H, W], three lists, centers [N, 2], depths [N], radii [N], accum_weights [N],
-    accum_count [N], accum_blend [N], accum_dist [N]). The lists are empty, as the CUDA code leaves them;
-    counts and sums are empty without `pixel_weights`.
+    (color, radii, counts [H, W], three lists, centers [N, 2], depths [N], radii [N], accum_weights [N], accum_count
+    [N], accum_blend [N], accum_dist [N]). The lists are always empty, as in the CUDA code. Counts and sums are empty
+    without `pixel_weights`.
     """
 
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
@@ -49,6 +49,6 @@ class GaussianRasterizer(RasterizerModule):
         if weights is not None and len(weights):
             found = gather(f, weights)
             counts, sums = found.contributions, (found.value, found.pixels, found.weight, found.distance)
-        centers = f.means2d - 0.5  # the CUDA code has the first pixel centre at 0
+        centers = f.means2d - 0.5  # in the CUDA code the first pixel centre is 0
         lists = (whole, fraction, fraction)
         return result.color, result.radii, counts, *lists, centers, f.depths, result.radii, *sums

@@ -1,7 +1,7 @@
-"""The few functions of torchvision that the trainers of the Inria family call.
+"""The few functions of torchvision that trainers of the Inria family call.
 
-Served only where torchvision is not installed. Its pretrained models cannot be replaced: they are needed
-for LPIPS alone, and asking for one says so.
+They are served only if torchvision is not installed. Its pretrained models are needed only for LPIPS and cannot be
+replaced. A request for one raises an error that says so.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from torch import Tensor
 
 
 def to_tensor(picture: Image.Image) -> Tensor:
-    """Pixels in [0, 1], channels first. [C, H, W] float32"""
+    """Convert a picture to a tensor in [0, 1]. [C, H, W] float32"""
     pixels = torch.from_numpy(np.array(picture))
     pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
     return pixels.permute(2, 0, 1).contiguous().float() / 255.0
 
 
 def to_pil_image(picture: Tensor) -> Image.Image:
-    """An 8-bit picture of a tensor in [0, 1], truncating as torchvision does. [C, H, W] or [H, W]"""
+    """Convert a tensor in [0, 1], [C, H, W] or [H, W], to an 8-bit picture. Truncates as torchvision does."""
     pixels = picture.detach().mul(255).to(torch.uint8)
     pixels = pixels if pixels.ndim == 2 else pixels.permute(1, 2, 0).squeeze(-1)
     return Image.fromarray(pixels.numpy())
 
 
 def save_image(tensor: Tensor, fp: str | Path) -> None:
-    """Write one picture, rounding as torchvision does. [3, H, W]"""
+    """Write a tensor [3, H, W] in [0, 1] to a file. Rounds as torchvision does."""
     pixels = tensor.detach().mul(255).add(0.5).clamp(0, 255).permute(1, 2, 0).to(torch.uint8)
     Image.fromarray(pixels.numpy()).save(fp)
 
@@ -58,7 +58,7 @@ class _Models(ModuleType):
 
 
 def modules() -> dict[str, ModuleType]:
-    """Module objects by import name."""
+    """Return the module objects by import name."""
     top = ModuleType("torchvision", "The part of torchvision that skipgs_plug serves where it is missing.")
     utils, transforms = ModuleType("torchvision.utils"), ModuleType("torchvision.transforms")
     functional, models = ModuleType("torchvision.transforms.functional"), _Models("torchvision.models")
