@@ -136,9 +136,9 @@ def run(
         )
         _, status, used = os.wait4(child.pid, 0)
     code = os.waitstatus_to_exitcode(status)
-    if code:
-        sys.exit(f"The script ended with {code}, and nothing is recorded; its log is {folder / 'log.txt'}.")
     judged = judge(one, folder, scene, data_factor)
+    if code:
+        print(f"The script ended with {code}; its log is {folder / 'log.txt'}.", file=sys.stderr)
     record = {
         "scene": named(scene, data_factor),
         "script": one.label,
