@@ -207,7 +207,7 @@ class SkipGate:
                 if run.failed:
                     raise  # of the loop's own backward
                 self._engine.giving_up.on_error(error, step)
-        now.begin(step)
+        now.begin(step, gated=False)
         now.ran = True
         if not run.made:
             run(*([loss] if isinstance(view, list) else ()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import torch
@@ -45,6 +46,7 @@ class HostCopy:
         return self._value
 
 
+@functools.cache
 def has_events(device: torch.device) -> bool:
     """Whether copies from this device can be waited for one by one."""
     # On MPS a copy that does not block is not in order with events.

@@ -19,9 +19,12 @@ from skipgs_plug.core.errors import SkipGSError
 _ABORT, _POISONED, _RUN, _SKIP = range(4)
 
 
+_AVAILABLE = dist.is_available()  # whether this build of PyTorch has torch.distributed
+
+
 def group_size() -> int:
     """Number of processes that train together; 1 without torch.distributed."""
-    if dist.is_available() and dist.is_initialized():
+    if _AVAILABLE and dist.is_initialized():
         return dist.get_world_size()
     return 1
 

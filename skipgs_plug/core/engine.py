@@ -147,8 +147,7 @@ class Engine:
     @property
     def active(self) -> bool:
         """Whether the present iteration is gated."""
-        step = self.iteration.step
-        return self.config.enabled and step is not None and step >= self.start
+        return self.iteration.gated
 
     @property
     def skipped(self) -> bool:
@@ -181,7 +180,7 @@ class Engine:
             )
         self.iteration.opened += 1
         self.pace.begin(step, None if self.policy is None else self.policy.floor)
-        self.iteration.begin(step)
+        self.iteration.begin(step, self._gates(step))
         self._skipped.clear()
         self.clock.open(post=step >= self.start)
 
@@ -211,7 +210,7 @@ class Engine:
             if not skip:
                 run()
                 self.iteration.ran = True
-                if self.active:
+                if self.iteration.gated:
                     self.rates.ran()
             elif back_from is not None:
                 self._skipped.append(weakref.ref(back_from))
@@ -230,16 +229,16 @@ class Engine:
 
     def _foreseen(self, view: str, signal: float | Tensor, loss: Tensor | None) -> bool | None:
         """Whether the backward is skipped, if that is known without the loss, whose reading would cost a wait."""
-        step = self.iteration.step
-        if not (self.active and loss is not None and isinstance(signal, Tensor) and has_events(signal.device)):
+        now = self.iteration
+        if not (now.gated and loss is not None and isinstance(signal, Tensor) and has_events(signal.device)):
             return None
         # Others are to be asked; gradients of earlier iterations would be dropped with a loss that is not finite.
         if self._accumulates or self._scene_check.running or distributed.group_size() > 1:
             return None
-        assert self.policy is not None and step is not None
-        if self._must_run is not None and self._must_run(step):
+        assert self.policy is not None and now.step is not None
+        if self._must_run is not None and self._must_run(now.step):
             return False
-        return self.policy.foreseen(view, step)
+        return self.policy.foreseen(view, now.step)
 
     def _run_first(self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor | None) -> bool:
         """Launch the backward, then decide; True when its gradients were dropped after all."""
@@ -269,16 +268,15 @@ class Engine:
         now = self.iteration
         assert now.step is not None
         self.stats.iterations += 1
-        if not self.active:
+        if not now.gated:
             now.decision = decision.INACTIVE
             return now.decision
         mean = None if self.trace is None else self.mean(view)
         if signal is None:
             loss, answer = math.nan, decision.OVER
         else:
-            loss = signal.value() if isinstance(signal, HostCopy) else float(_detached(signal))
-            device = signal.device if isinstance(signal, Tensor) else None
-            answer = self._agreed(view, loss, now.step, device)
+            loss = _on_host(signal)
+            answer = self._agreed(view, loss, now.step, signal)
         now.decision = answer
         if self.stats.record(answer, view, None if signal is None else loss) and self._view_names is None:
             warn_unless_recurring(self.stats.n_views, self.stats.gated)
@@ -299,7 +297,7 @@ class Engine:
         """As `SkipGate.state_dict`."""
         if self.policy is None or self._pending_state is not None:
             return dict(self._pending_state or {})
-        self.clock.mark()
+        self.clock.mark(exactly=True)
         return {
             "version": GATE_VERSION,
             "policy": self.policy.state_dict(),
@@ -339,7 +337,11 @@ class Engine:
         # Where nothing pauses, means lag behind a change for long.
         if not self.pace.leaves_out or not self.stats.events:
             self._scene_check.start()
-        self.iteration.begin(step)
+        self.iteration.begin(step, step is not None and self._gates(step))
+
+    def _gates(self, step: int) -> bool:
+        """Whether iteration `step` is gated."""
+        return self.config.enabled and step >= self.start
 
     def _go_on_from_saved(self, step: int) -> None:
         """Load the state of the checkpoint from which training continues with iteration `step`, if there is one."""
@@ -362,12 +364,13 @@ class Engine:
         if state is not None:
             self.pace.load_state_dict(state)
 
-    def _agreed(self, view: str, loss: float, step: int, device: torch.device | None) -> Decision:
+    def _agreed(self, view: str, loss: float, step: int, signal: float | Tensor | HostCopy) -> Decision:
         if distributed.group_size() == 1:
             if not self._ranks_checked:
                 distributed.refuse_unreachable_ranks()
                 self._ranks_checked = True
             return self._own(view, loss, step)
+        device = signal.device if isinstance(signal, Tensor) else None
         try:
             own = self._own(view, loss, step)
         except SkipGSError:
@@ -386,7 +389,9 @@ class Engine:
         self._guard.in_a_row = 0
         if self._must_run is not None and self._must_run(step):
             return decision.FORCED
-        mean = self.mean(view) if self._scene_check.running else None
+        if not self._scene_check.running:
+            return self.policy.decide(view, loss, step)
+        mean = self.mean(view)
         answer = self.policy.decide(view, loss, step)
         if answer is decision.PAUSE:
             self._scene_check.stop()  # means are from before the change
@@ -404,5 +409,8 @@ class Engine:
             )
 
 
-def _detached(signal: float | Tensor) -> float | Tensor:
-    return signal.detach() if isinstance(signal, Tensor) else signal
+def _on_host(signal: float | Tensor | HostCopy) -> float:
+    """Return the value to decide by; a read of the device if it lies there."""
+    if isinstance(signal, Tensor):
+        return float(signal.item())
+    return signal.value() if isinstance(signal, HostCopy) else float(signal)

@@ -13,6 +13,7 @@ class GatedIteration:
 
     Attributes:
         step: its number, None before the first.
+        gated: whether its backward may be skipped, as far as its number decides.
         opened: number of iterations that have begun with this gate.
         decision: the last answer in it.
         ran: a real backward ran in it.
@@ -23,17 +24,18 @@ class GatedIteration:
         ended: `update` was called by hand.
     """
 
-    __slots__ = ("backwards", "decision", "ended", "keys", "opened", "ran", "signal", "step", "stepped", "view")
+    __slots__ = ("backwards", "decision", "ended", "gated", "keys", "opened", "ran", "signal", "step", "stepped", "view")
 
     def __init__(self) -> None:
         self.keys: set[str] = set()
         self.stepped: set[int] = set()
         self.opened = 0
-        self.begin(None)
+        self.begin(None, gated=False)
 
-    def begin(self, step: int | None) -> None:
+    def begin(self, step: int | None, gated: bool) -> None:
         """Forget the previous iteration; `step` is the number of the new one."""
         self.step = step
+        self.gated = gated
         self.decision: Decision = decision.INACTIVE
         self.ran = False
         self.view: Any = None

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from types import TracebackType
 from typing import Any
 
 from skipgs_plug.core import distributed
@@ -70,17 +71,35 @@ class Release:
             self._take_back()
             caution(reason, stacklevel=3)
 
-    @contextmanager
-    def guarded(self, step: Callable[[], int | None] = lambda: None) -> Iterator[None]:
-        """Let go when code of the gate in this block fails; the code behind the block runs on."""
-        try:
-            yield
-        except Exception as error:
-            self.on_error(error, step())
+    def guarded(self, step: Callable[[], int | None] = lambda: None) -> AbstractContextManager[None]:
+        """Return a block of the gate's own code; an error in it releases the gate, and the code after it runs on.
+
+        Args:
+            step: Returns the present iteration for the message; called at an error only.
+        """
+        return _Guard(self, step)
 
     def _take_back(self) -> None:
         for undo in self._undo:
             undo()
+
+
+class _Guard:
+    """A block of code whose errors are told to a `Release`."""
+
+    __slots__ = ("_release", "_step")
+
+    def __init__(self, release: Release, step: Callable[[], int | None]) -> None:
+        self._release, self._step = release, step
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> bool:
+        if not isinstance(error, Exception):
+            return False
+        self._release.on_error(error, self._step())
+        return True
 
 
 class Original:

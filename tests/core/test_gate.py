@@ -234,24 +234,27 @@ def test_clock_separates_the_part_from_start_on() -> None:
     assert 0.0 < stats["t_post"] < stats["t_total"]
 
 
-def test_clocks_are_asked_once_in_an_iteration_and_count_all_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    seconds = iter(range(1000))
-    asked: list[int] = []
+def test_the_processors_clock_is_read_every_10_ms_and_counts_all_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall, readings = 0.0, 0
 
-    def clock_of_the_processor() -> float:
-        asked.append(next(seconds))
-        return float(asked[-1])
+    def processor() -> float:
+        nonlocal readings
+        readings += 1
+        return 2.0 * wall  # two threads are running
 
-    monkeypatch.setattr("time.process_time", clock_of_the_processor)
-    gate = SkipGate(start_iter=2)
+    monkeypatch.setattr("time.perf_counter", lambda: wall)
+    monkeypatch.setattr("time.process_time", processor)
+    gate = SkipGate(start_iter=4)
     counts = []
-    for step in range(5):
+    for step in range(8):
         gate.backward(loss_of(1.0), view="a", step=step)
-        counts.append(len(asked))
-    # Once more in the first iteration, and where the part behind `start_iter` begins.
-    assert counts == [2, 3, 5, 6, 7]
+        counts.append(readings)
+        wall += 0.004
+    # Also in the first iteration, and where the part after `start_iter` begins.
+    assert counts == [1, 1, 1, 2, 3, 3, 3, 4]
     stats = gate.stats()
-    assert (stats["t_total_processor"], stats["t_post_processor"]) == (6.0, 3.0)
+    assert (stats["t_total"], stats["t_post"]) == pytest.approx((0.028, 0.012))
+    assert (stats["t_total_processor"], stats["t_post_processor"]) == pytest.approx((0.056, 0.024))
 
 
 @pytest.mark.parametrize("loss", [1.0, None, "loss"])
