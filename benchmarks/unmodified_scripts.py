@@ -229,6 +229,7 @@ def measure_ply(path: Path, scene: Path, factor: int) -> dict[str, Any]:
     scales, opacities = torch.exp(splats["scales"]), torch.sigmoid(splats["opacities"])
     smoothing = smoothing_filter(path)
     if smoothing is not None:
+        smoothing = smoothing / loaded.frame.unit
         wider = torch.sqrt(scales**2 + smoothing**2)
         opacities = opacities * (scales / wider).prod(dim=1)
         scales = wider
