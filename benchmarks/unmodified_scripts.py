@@ -135,10 +135,10 @@ def run(
             stderr=subprocess.STDOUT,
         )
         _, status, used = os.wait4(child.pid, 0)
-    code = os.waitstatus_to_exitcode(status)
-    judged = judge(one, folder, scene, data_factor)
-    if code:
+    code = child.returncode = os.waitstatus_to_exitcode(status)  # Popen did not wait itself
+    if code:  # said first: there may be no model to judge
         print(f"The script ended with {code}; its log is {folder / 'log.txt'}.", file=sys.stderr)
+    judged = judge(one, folder, scene, data_factor)
     record = {
         "scene": named(scene, data_factor),
         "script": one.label,
@@ -323,8 +323,7 @@ def row(key: tuple[str, str, int], pair: dict[str, dict[str, Any]]) -> str:
         seconds(own),
         seconds(auto),
         f"{100 * auto['seconds'] / own['seconds']:.0f}" if alike else "",
-        f"{own['gaussians']:,}",
-        f"{auto['gaussians']:,}",
+        *("" if run["gaussians"] is None else f"{run['gaussians']:,}" for run in (own, auto)),
         *(f"{run['psnr']:.2f} ({run['ssim']:.4f})" for run in (own, auto)),
         f"{auto['psnr'] - own['psnr']:+.2f}",
     ]

@@ -165,6 +165,7 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert plot.width > 500
     for name in names:
         assert len(PlyData.read(str(out / name / "ply/point_cloud_119.ply"))["vertex"]) > 0
+        assert "\nframe:\n  centre:\n" in (out / name / "cfg.yml").read_text()
 
 
 def test_doctor_renders(capsys: pytest.CaptureFixture[str]) -> None:

@@ -86,7 +86,7 @@ def scene_facts(scene: Scene, config: TrainConfig) -> dict[str, Any]:
         "train_views": len(scene.train),
         "test_views": len(scene.test),
         "points": len(scene.points),
-        "near_plane": near_plane(config, scene) * scene.frame.unit,
+        "near_plane": scene.frame.dataset_length(near_plane(config, scene)),
     }
 
 

@@ -97,11 +97,7 @@ def finish(name: str, trainer: Trainer, folder: RunFolder, progress: bool) -> Re
     trainer.train(progress=progress)
     trainer.on_step = None
     stats = trainer.evaluate("test")
-    folder.write_config(
-        trainer.config,
-        near_plane=trainer.near_plane * trainer.scene.frame.unit,
-        gate=None if gate is None else gate.config.as_dict(),
-    )
+    folder.write_config(trainer, None if gate is None else gate.config.as_dict())
     folder.write_stats(trainer, stats)
     folder.write_ply(trainer)
     if gate is not None:

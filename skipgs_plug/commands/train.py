@@ -60,13 +60,7 @@ def run(args: Args) -> int:
         folder.remove_leftovers()
         if checkpoints:
             first_sound(checkpoints, trainer.load_checkpoint)
-        frame = scene.frame
-        folder.write_config(
-            config,
-            near_plane=trainer.near_plane * frame.unit,
-            frame=frame.as_dict(),
-            gate=None if gate is None else gate.config.as_dict(),
-        )
+        folder.write_config(trainer, None if gate is None else gate.config.as_dict())
         print(
             f"{scene.name}: {len(scene.train)} training views, {len(scene.test)} held out, "
             f"{len(scene.points):,} points, backend {trainer.backend.name}, "

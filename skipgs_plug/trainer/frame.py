@@ -85,6 +85,10 @@ class Frame:
         """Return the entries of skipgs.json and cfg.yml: the vector subtracted from positions, and the divisor."""
         return {"centre": list(self.centre), "unit": self.unit}
 
+    def dataset_length(self, length: float) -> float:
+        """Return a local length in units of the dataset."""
+        return length * self.unit
+
     def to_local(self, positions: np.ndarray) -> np.ndarray:
         """Return positions [M, 3] of the dataset in local coordinates, float64."""
         return (np.asarray(positions, dtype=np.float64) - self.centre) / self.unit

@@ -34,7 +34,7 @@ def near_plane(config: TrainConfig, scene: Scene) -> float:
         chosen = max(chosen, TINY)
     if chosen >= far_plane(config, scene):
         raise InputError(
-            f"The near plane {chosen * scene.frame.unit:g} is not below far_plane={config.far_plane:g}; "
+            f"The near plane {scene.frame.dataset_length(chosen):g} is not below far_plane={config.far_plane:g}; "
             "raise --far-plane or leave it out."
         )
     return chosen

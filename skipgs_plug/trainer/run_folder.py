@@ -16,7 +16,6 @@ import numpy as np
 from torch import Tensor
 
 from skipgs_plug.files import remove_leftovers, write_aside
-from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.files import write_json
 from skipgs_plug.trainer.loop import Trainer
 from skipgs_plug.trainer.scene import View
@@ -34,13 +33,19 @@ class RunFolder:
     def __init__(self, root: str | Path) -> None:
         self.root = Path(root).expanduser()
 
-    def write_config(self, config: TrainConfig, **extra: Any) -> None:
-        """Write cfg.yml."""
+    def write_config(self, trainer: Trainer, gate: dict[str, Any] | None) -> None:
+        """Write cfg.yml: the settings, the near plane in units of the dataset, the frame, and the gate's settings."""
         import yaml
 
+        frame = trainer.scene.frame
+        content = {
+            **dataclasses.asdict(trainer.config),
+            "near_plane": frame.dataset_length(trainer.near_plane),
+            "frame": frame.as_dict(),
+            "gate": gate,
+        }
         with write_aside(self.root / "cfg.yml") as temporary:
-            content = yaml.safe_dump({**dataclasses.asdict(config), **extra}, sort_keys=False)
-            temporary.write_text(content, encoding="utf-8")
+            temporary.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
     def write_checkpoint(self, trainer: Trainer) -> Path:
         """Write a checkpoint, then remove all but the last two."""

@@ -8,11 +8,11 @@ from skipgs_plug import SkipGate
 from skipgs_plug.adapters import base, drift_check, inria, nerfstudio, step_trainer
 from skipgs_plug.adapters.registry import get_adapter
 from skipgs_plug.core import caution
-from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.rates import ScaledRates, _Steps
 from skipgs_plug.core.policy import SkipPolicy
+from tests.entries import ENTRIES
 
 # One of each kind: a script, an object whose strategy is called, callbacks, wrapped trainers, epochs, minibatches.
 KINDS = ("inria", "deformable", "gsplat_default", "nerfstudio_scaled", "step_trainer", "litegs", "faster_gs", "edgs")
@@ -21,16 +21,8 @@ cases = [case for case in CASES if case.name in KINDS]
 assert len(cases) == len(KINDS)
 each = pytest.mark.parametrize("case", cases, ids=lambda case: case.name)
 
-# Entry points of the gate, by name; a trainer calls those that it has.
-ENTRIES = {
-    "iteration": (Engine, "open_iteration"),
-    "backward": (Engine, "gate"),
-    "decision": (SkipPolicy, "decide"),
-    "event": (Engine, "notify_event"),
-    "view": (Hooks, "view"),
-    "signal": (Hooks, "signal"),
-    "graph": (Engine, "free_skipped"),
-}
+# Adapters report further facts through their hooks; a trainer calls the entry points that it has.
+REACHED = {**ENTRIES, "view": (Hooks, "view"), "signal": (Hooks, "signal")}
 
 
 def fail_from(monkeypatch, owner, name, iteration):
@@ -48,13 +40,13 @@ def fail_from(monkeypatch, owner, name, iteration):
     return failed
 
 
-@pytest.mark.parametrize("entry", ENTRIES)
+@pytest.mark.parametrize("entry", REACHED)
 @each
 def test_an_error_at_any_entry_point_releases_the_gate_once(case, entry, monkeypatch, recwarn):
     plain = alone(case)
     new_log()
     trainer, train = case.make()
-    owner, name = ENTRIES[entry]
+    owner, name = REACHED[entry]
     failed = fail_from(monkeypatch, owner, name, case.module.START + 3)
     with SkipGate(trainer, warmup=0, pause_iters=0, min_bwd_ratio=0.0) as gate:
         train()

@@ -10,7 +10,7 @@ from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.optimizers import has_pending_gradient
 from skipgs_plug.core.pace.phased import Phased
-from skipgs_plug.core.policy import SkipPolicy
+from tests.entries import ENTRIES
 
 LAST, FAILS = 80, 40
 VIEWS = ["a.png", "b.png"]
@@ -46,14 +46,7 @@ class Loop:
         return self
 
 
-ENTRIES = {
-    "iteration": (Engine, "open_iteration"),
-    "backward": (Engine, "gate"),
-    "decision": (SkipPolicy, "decide"),
-    "record": (Engine, "decide"),
-    "graph": (Engine, "free_skipped"),
-    "event": (Engine, "notify_event"),
-}
+REACHED = {**ENTRIES, "record": (Engine, "decide")}
 
 
 def fail_from(monkeypatch, owner, name, loop):
@@ -67,18 +60,18 @@ def fail_from(monkeypatch, owner, name, loop):
     monkeypatch.setattr(owner, name, fails)
 
 
-WAYS = [(entry, False) for entry in ENTRIES]
-WAYS += [(entry, True) for entry in ENTRIES if entry != "backward"]  # a batch is decided view by view
+WAYS = [(entry, False) for entry in REACHED]
+WAYS += [(entry, True) for entry in REACHED if entry != "backward"]  # a batch is decided view by view
 
 
 @pytest.mark.parametrize(("entry", "batch"), WAYS)
 def test_an_error_in_any_verb_releases_the_gate_once(entry, batch, monkeypatch, recwarn):
     loop = Loop(batch)
-    fail_from(monkeypatch, *ENTRIES[entry], loop)
+    fail_from(monkeypatch, *REACHED[entry], loop)
     gate = SkipGate(start_iter=0, warmup=0, pause_iters=0, min_bwd_ratio=0.0)
     loop.train(gate, range(LAST))
     said = [str(one.message) for one in recwarn]
-    assert len(said) == 1 and f"ZeroDivisionError: of {ENTRIES[entry][1]}" in said[0] and gate.released == said[0]
+    assert len(said) == 1 and f"ZeroDivisionError: of {REACHED[entry][1]}" in said[0] and gate.released == said[0]
     later = range(FAILS + 6, LAST)
     assert len(loop.stepped) < LAST and [step for step in loop.stepped if step in later] == list(later)
     assert "of" in gate.summary() and gate.stats()["iterations"] >= FAILS

@@ -1,0 +1,75 @@
+"""The runner of other projects' scripts: its command, and the record of a run, with a stand-in for the interpreter."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks import unmodified_scripts
+from benchmarks.script_rows import Row
+
+# In place of Python: logs its arguments, and leaves a report and the pictures that a gsplat run would have written.
+STAND_IN = """#!/bin/sh
+echo "$@"
+for last; do :; done
+cp -r {ready}/. "$last"
+exit {code}
+"""
+REPORT = {"iterations_skipped": 20, "refine_share": 0.4, "growing": {"iterations_skipped": 10, "events_run": 3}}
+
+
+@pytest.fixture
+def checkouts(tmp_path: Path) -> Path:
+    """A folder with a checkout, and a folder with the files that the stand-in's run leaves."""
+    (tmp_path / "checkouts/project").mkdir(parents=True)
+    (tmp_path / "ready/renders").mkdir(parents=True)
+    pair = np.full((16, 32, 3), 100, np.uint8)  # photograph and render side by side
+    pair[:, 16:] = 110
+    Image.fromarray(pair).save(tmp_path / "ready/renders/val_step99_0000.png")
+    (tmp_path / "ready/skipgs.json").write_text(json.dumps(REPORT))
+    return tmp_path / "checkouts"
+
+
+def run(checkouts: Path, monkeypatch: pytest.MonkeyPatch, mode: str = "auto", code: int = 0) -> dict:
+    """Run the row once, and return its record."""
+    folder = checkouts.parent
+    stand_in = folder / "python"
+    stand_in.write_text(STAND_IN.format(ready=folder / "ready", code=code))
+    stand_in.chmod(0o755)
+    row = Row("Tiny", "nobody/tiny", "project", "train.py -s {scene} -n {n} --half {half} -m {out}", pictures=True)
+    monkeypatch.setattr(sys, "executable", str(stand_in))
+    monkeypatch.setitem(unmodified_scripts.ROWS, "tiny", row)
+    monkeypatch.setattr(unmodified_scripts, "named", lambda scene, factor: f"{scene.name} at 1/{factor}")
+    runs = folder / "runs.json"
+    unmodified_scripts.run("tiny", mode, checkouts, folder / "fern", 4, 100, folder / "out", runs)
+    return json.loads(runs.read_text())["runs"][-1]
+
+
+def test_run_is_recorded_with_its_command_seconds_quality_and_report(checkouts, monkeypatch):
+    record = run(checkouts, monkeypatch)
+    assert record["command"] == "skipgs-plug run auto --cpu --share auto -- train.py -s fern -n 100 --half 50 -m OUT"
+    assert (record["scene"], record["script"], record["mode"]) == ("fern at 1/4", "Tiny", "auto")
+    assert record["exit_code"] == 0 and record["views"] == 1 and record["gaussians"] is None
+    assert record["psnr"] == pytest.approx(20 * np.log10(255 / 10), abs=1e-3)
+    assert (record["iterations_run"], record["refine_share"], record["events_run"]) == (70, 0.4, 3)
+    assert record["seconds"] >= 0 and record["peak_rss_gib"] >= 0 and record["project_commit"] is None
+    log = checkouts.parent / "out/tiny.fern.4.100.auto/log.txt"
+    assert log.read_text().startswith("-P -m skipgs_plug run auto --cpu --share auto -- train.py ")
+
+
+def test_second_run_replaces_the_record_of_the_same_mode_alone(checkouts, monkeypatch):
+    assert "--no-gate" in run(checkouts, monkeypatch, "own")["command"]
+    run(checkouts, monkeypatch)
+    run(checkouts, monkeypatch)
+    runs = json.loads((checkouts.parent / "runs.json").read_text())["runs"]
+    runs = [{**one, "seconds": 1.0} for one in runs]  # the stand-in takes none
+    assert [one["mode"] for one in runs] == ["own", "auto"]
+    assert "| Tiny | 100 | 70 |" in unmodified_scripts.table(runs)
+
+
+def test_script_that_fails_is_named_with_its_log(checkouts, monkeypatch, capsys):
+    assert run(checkouts, monkeypatch, code=3)["exit_code"] == 3
+    assert "The script ended with 3; its log is " in capsys.readouterr().err
