@@ -1,14 +1,14 @@
-"""Run time against error of the CPU rasterizer: float32 results beside the float64 reference.
+"""Time and error of the CPU rasterizer: float32 results compared with the float64 reference.
 
     python benchmarks/accuracy.py [--repeats 5]
 
-Prints a table and writes it to `benchmarks/results/accuracy.json`. Time is one forward and backward pass, the
-median of the repeats after one warm-up. Image and alpha errors are the greatest absolute difference (depth: as a
-share of the greatest depth), gradient errors are relative L2. Pixels within 0.01 % of a cut-off (1/255, 0.999,
-transmittance 1e-4), or with two Gaussians at one depth, are left out, since rounding decides there on a jump: the
-column "left out" is their share. A last block compares the reference itself with gsplat's PyTorch functions, both
-in float64. The garden is read from `$SKIPGS_SHARED/data/garden_points.npz` (gsplat's test asset; default `../shared`)
-and left out where that is missing.
+Prints a table and writes it to `benchmarks/results/accuracy.json`. The time is that of one forward and backward pass,
+the median of the repeats after one warm-up. Image and alpha errors are the largest absolute differences (for depth
+relative to the largest depth). Gradient errors are relative L2 errors. Some pixels are left out, because rounding
+decides there on which side of a jump they lie: pixels within 0.01 % of a cut-off (1/255, 0.999, transmittance 1e-4),
+and pixels with two Gaussians at one depth. The column "left out" is their share. A last table compares the reference
+itself with gsplat's PyTorch functions, both in float64. The garden is read from `$SKIPGS_SHARED/data/garden_points.npz`
+(gsplat's test asset; default `../shared`) and left out if the file is missing.
 """
 
 from __future__ import annotations
@@ -39,18 +39,20 @@ from skipgs_plug.fallback_raster.runtime.cores import usable_cores
 
 FILE = RESULTS / "accuracy.json"
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors", "backgrounds", "viewmats")
+# Largest errors that count as accurate: absolute differences of image and alpha, relative L2 errors of gradients.
 IMAGE_LIMIT, GRADIENT_LIMIT = 1e-5, 1e-4
-BAND = 1e-4  # distance to a cut-off, as a share of it, below which a pixel is left out
+# Relative distance to a cut-off below which a pixel is left out: float32 rounds alphas by less.
+BAND = 1e-4
 
 
 def frustum(n: int, width: int, height: int, sh_degree: int | None = None) -> dict[str, Any]:
-    """The scene of the speed benchmarks before a coloured background."""
+    """Return the scene of the speed benchmarks, with a coloured background."""
     background = torch.rand(1, 3, generator=torch.Generator().manual_seed(0))
     return frustum_scene(n, width, height, 0, sh_degree) | {"backgrounds": background}
 
 
 def garden(downscale: int) -> dict[str, Any]:
-    """The scene of the speed benchmarks with no axis of a Gaussian like another, so that rotations matter."""
+    """Return the scene of the speed benchmarks with three different axes per Gaussian, so that rotations matter."""
     scene = garden_scene(downscale)
     n, generator = len(scene["means"]), torch.Generator().manual_seed(0)
     scene["scales"] *= 0.5 + torch.rand(n, 3, generator=generator)
@@ -62,7 +64,7 @@ class Pass(NamedTuple):
     """One forward and backward pass."""
 
     values: dict[str, Tensor]  # image, alpha, and the gradients by name
-    keep: Tensor  # [C, H, W, 1] pixels that count
+    keep: Tensor  # [C, H, W, 1] mask of the pixels that are compared
     seconds: float
 
 
@@ -73,7 +75,7 @@ def run(
     keep: Tensor | None = None,
     **options: Any,
 ) -> Pass:
-    """Render and go back from a random gradient of the pixels in `keep` (found here if None)."""
+    """Run forward and backward pass, with a random gradient for the pixels in `keep`. If None, `keep` is computed."""
     inputs = dict(scene)
     for name, value in scene.items():
         if torch.is_tensor(value):
@@ -94,14 +96,14 @@ def run(
     values = {"image": image.detach() * keep, "alpha": alpha.detach() * keep, "means2d": info["means2d"].grad}
     if options.get("absgrad"):
         values["absgrad"] = info["means2d"].absgrad
-    for name in PARAMETERS:  # colors and backgrounds have none in a picture of depths
+    for name in PARAMETERS:  # colors and backgrounds have no gradient in images of depth
         if inputs[name].grad is not None and inputs[name].grad.any():
             values[name] = inputs[name].grad
     return Pass(values, keep, seconds)
 
 
 def measure(name: str, scene: dict[str, Any], repeats: int, **options: Any) -> dict[str, Any]:
-    """One row of the table."""
+    """Return one row of the table."""
     reference = run(rasterization_reference, scene, torch.float64, **options)
     passes = [run(rasterization, scene, torch.float32, reference.keep, **options) for _ in range(repeats + 1)]
     truth, value = reference.values, passes[-1].values
@@ -119,7 +121,7 @@ def measure(name: str, scene: dict[str, Any], repeats: int, **options: Any) -> d
 
 
 def against_gsplat() -> dict[str, float]:
-    """Relative L2 differences between the reference and gsplat's `_torch_impl`, values and gradients."""
+    """Return relative L2 differences of values and gradients between the reference and gsplat's `_torch_impl`."""
     from gsplat.cuda import _torch_impl as theirs
 
     generator = torch.Generator().manual_seed(0)
@@ -138,9 +140,9 @@ def against_gsplat() -> dict[str, float]:
         inputs |= {name: scene[name].double() for name in ("opacities", "colors", "Ks", "backgrounds")}
         if ours:
             *_, info = rasterization_reference(**inputs, packed=False, rasterize_mode="antialiased")
-            seen = (info["radii"] > 0).all(dim=-1)
-            rows = {name: info[name][seen] for name in ("means2d", "depths", "conics")}
-            rows["compensation"] = info["opacities"][seen]
+            visible = (info["radii"] > 0).all(dim=-1)
+            rows = {name: info[name][visible] for name in ("means2d", "depths", "conics")}
+            rows["compensation"] = info["opacities"][visible]
             axes = rotation_matrices(inputs["quats"]) * inputs["scales"][:, None, :]
             rows["covariance"] = axes @ axes.transpose(-1, -2)
         else:
@@ -149,7 +151,8 @@ def against_gsplat() -> dict[str, float]:
             _, *projected = theirs._fully_fused_projection(
                 inputs["means"], covariance, *camera, calc_compensations=True
             )
-            rows = {k: v[seen] for k, v in zip(("means2d", "depths", "conics", "compensation"), projected, strict=True)}
+            names2d = ("means2d", "depths", "conics", "compensation")
+            rows = {name: value[visible] for name, value in zip(names2d, projected, strict=True)}
             rows["covariance"] = covariance
         sum(row.square().sum() for row in rows.values()).backward()
         results.append(rows | {f"gradient of {name}": inputs[name].grad for name in names})

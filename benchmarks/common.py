@@ -1,4 +1,4 @@
-"""What the benchmarks share: scenes, clocks, errors, provenance, result files."""
+"""Shared by the benchmarks: scenes, clocks, errors, provenance, result files."""
 
 import functools
 import json
@@ -24,19 +24,19 @@ from skipgs_plug.fallback_raster.runtime.parameters import FloatOutput
 from skipgs_plug.trainer.files import write_aside
 
 RESULTS = Path(__file__).parent / "results"
-# What a pass differentiates.
+# Tensors that a pass differentiates.
 PARAMETERS = ("means", "scales", "quats", "opacities", "colors")
 SCENES = Path(os.environ.get("SKIPGS_SHARED", Path(__file__).parents[2] / "shared")) / "data"
 
 
 def frustum_scene(n: int, width: int, height: int, seed: int = 0, sh_degree: int | None = None) -> dict[str, Any]:
-    """N Gaussians spread over the view frustum between depth 2 and 6, 40 to 70 of them blended per pixel.
+    """Return N Gaussians in the view frustum between depth 2 and 6. Each pixel blends 40 to 70 of them.
 
-    Their size shrinks with the cube root of N, so the number of blended pairs hardly depends on N.
+    Their size is proportional to N^(-1/3), so the number of blended pairs hardly depends on N.
     """
     rng = np.random.default_rng(seed)
     focal = 0.9 * width
-    half_x, half_y = 0.55 * width / focal, 0.55 * height / focal  # tangents, 10 % beyond the image's border
+    half_x, half_y = 0.55 * width / focal, 0.55 * height / focal  # tangents; 10 % more than the image
     depth = rng.uniform(2, 6, n)
     room = 4 * half_x * half_y * (6**3 - 2**3) / 3
     means = np.stack([rng.uniform(-half_x, half_x, n) * depth, rng.uniform(-half_y, half_y, n) * depth, depth], 1)
@@ -49,9 +49,9 @@ def frustum_scene(n: int, width: int, height: int, seed: int = 0, sh_degree: int
 
 
 def garden_scene(downscale: int, seed: int = 0, sh_degree: int | None = None) -> dict[str, Any]:
-    """The 138,766 SfM points of Mip-NeRF 360 "garden" as round Gaussians, seen by its first camera.
+    """Return the 138,766 SfM points of Mip-NeRF 360 "garden" as round Gaussians, with its first camera.
 
-    The seed moves every point by about a hundredth of the distance to its neighbours.
+    The seed moves each point by about a hundredth of the distance to its neighbours.
     """
     rng = np.random.default_rng(seed)
     data, spacing = _garden()
@@ -67,7 +67,7 @@ def garden_scene(downscale: int, seed: int = 0, sh_degree: int | None = None) ->
 
 @functools.cache
 def _garden() -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The file's arrays, and the mean distance of every point to its three nearest neighbours [N, 1]."""
+    """Return the arrays of the file, and the mean distance of each point to its three nearest neighbours [N, 1]."""
     from scipy.spatial import cKDTree
 
     with np.load(SCENES / "garden_points.npz") as file:
@@ -100,9 +100,9 @@ def _scene(
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Runs the rasterizer on `count` threads inside a `with` block, and torch on one, as the trainer does.
+    """Run the rasterizer on `count` threads inside the `with` statement, and torch on one, as the trainer does.
 
-    Idle threads of torch would spin beside those of the rasterizer.
+    Idle threads of torch would spin and slow down those of the rasterizer.
     """
     before = get_num_threads(), torch.get_num_threads()
     set_num_threads(count)
@@ -116,7 +116,7 @@ def threads(count: int) -> Iterator[None]:
 
 @contextmanager
 def kernel_seconds() -> Iterator[dict[str, float]]:
-    """Collects the wall time of the rasterizer's kernels by name inside a `with` block."""
+    """Collect the wall time of the rasterizer's kernels by name inside the `with` statement."""
     seconds: dict[str, float] = {}
     original = Worker.__call__
 
@@ -132,7 +132,7 @@ def kernel_seconds() -> Iterator[dict[str, float]]:
         Worker.__call__ = original  # type: ignore[method-assign]
 
 
-# Ten independent chains hide the latency of a multiply-add; the pragma makes it one instruction.
+# Ten independent chains hide the latency of a multiply-add. The pragma makes each one instruction.
 @worker(
     """
 for (int item = first; item < last; ++item) {
@@ -152,7 +152,7 @@ def multiply_add(out: FloatOutput, factor: float, rounds: int, items: int) -> No
 
 
 def multiply_adds_per_second() -> float:
-    """Measured peak of the threads in use, float32 multiply-adds, the best of 7 runs."""
+    """Measure the peak of float32 multiply-adds on the threads in use: the best of 7 runs."""
     items, rounds = 64, 100_000
     out = torch.empty(items)
     best = min(clock(lambda: multiply_add(out, 0.999, rounds, items)) for _ in range(7))
@@ -160,7 +160,7 @@ def multiply_adds_per_second() -> float:
 
 
 def clock(work: Callable[[], Any]) -> float:
-    """Seconds that `work` takes."""
+    """Return the seconds that `work` takes."""
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
@@ -171,30 +171,30 @@ def median_ms(seconds: Sequence[float]) -> float:
 
 
 def exponents(sizes: Sequence[float], values: Sequence[float]) -> dict[str, float]:
-    """How `values` grow with `sizes`: least-squares exponent, and the steepest between two neighbours."""
+    """Return how `values` grow with `sizes`: the least-squares exponent, and the largest between two neighbours."""
     x, y = np.log(np.asarray(sizes, float)), np.log(np.asarray(values, float))
     return {"fitted": float(np.polyfit(x, y, 1)[0]), "steepest": float((np.diff(y) / np.diff(x)).max())}
 
 
 def relative_difference(value: Tensor, truth: Tensor) -> float:
-    """L2 distance as a share of the truth's L2 norm."""
+    """Return the L2 distance relative to the L2 norm of the truth."""
     return ((value.double() - truth.double()).norm() / truth.double().norm().clamp(min=1e-300)).item()
 
 
 def provenance() -> dict[str, Any]:
-    """What a reader needs to repeat or to doubt the figures."""
+    """Return the conditions that a reader needs to repeat the measurement or to doubt it."""
     return {
         "command": shlex.join(["python", *sys.argv]),
         "commit": commit(),
         "cpu": cpu_name(),
         "cores": usable_cores(),
-        "load_before": os.getloadavg()[0],  # above 0.5 something else was running: do not trust the times
+        "load_before": os.getloadavg()[0],  # above 0.5 other programs were running, and times are unreliable
         "versions": versions(),
     }
 
 
 def write_part(path: Path, part: str, rows: Any, about: dict[str, Any]) -> dict[str, Any]:
-    """Replaces one part of a result file and returns the whole; the other parts keep their own provenance."""
+    """Replace one part of a result file and return the whole. Other parts keep their own provenance."""
     whole = json.loads(path.read_text()) if path.exists() else {}
     whole[part] = {"about": about, "rows": rows}
     write_results(path, whole)
@@ -207,7 +207,7 @@ def write_results(path: Path, content: Any) -> None:
 
 
 def leaves(scene: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """A copy of the scene in which the named tensors want gradients."""
+    """Return a copy of the scene in which the named tensors require gradients."""
     copy = {k: v.clone() if isinstance(v, Tensor) else v for k, v in scene.items()}
     for name in names:
         copy[name].requires_grad_()

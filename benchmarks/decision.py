@@ -1,4 +1,4 @@
-"""What one decision costs: SkipPolicy beside an empty function call, and the authors' controller if given.
+"""Time of one decision: SkipPolicy, an empty function call, and the authors' controller if a checkout is given.
 
 python benchmarks/decision.py [--authors PATH_TO_THEIR_CHECKOUT] [--out FILE]
 """
@@ -17,13 +17,14 @@ from pathlib import Path
 from skipgs_plug.core.policy import SkipPolicy
 from skipgs_plug.trainer.files import write_json
 
+# Views of the stream, decisions in each pass, and passes. The fastest pass counts.
 VIEWS, STEPS, REPEATS = 100, 20_000, 15
 
 Decide = Callable[[str, float, int], object]
 
 
 def loss_stream() -> list[tuple[str, float, int]]:
-    """Epochs of shuffled views whose losses fall slowly, with noise."""
+    """Return epochs of shuffled views whose losses fall slowly, with noise."""
     draw = random.Random(0)
     base = [draw.uniform(0.02, 0.3) for _ in range(VIEWS)]
     rows: list[tuple[str, float, int]] = []
@@ -35,7 +36,7 @@ def loss_stream() -> list[tuple[str, float, int]]:
 
 
 def microseconds(make: Callable[[], Decide], rows: list[tuple[str, float, int]]) -> float:
-    """Best of several passes over the stream, per call."""
+    """Return the time of a call: the best of REPEATS passes over the stream."""
     best = float("inf")
     for _ in range(REPEATS):
         decide = make()
@@ -47,11 +48,11 @@ def microseconds(make: Callable[[], Decide], rows: list[tuple[str, float, int]])
 
 
 def empty(view: str, loss: float, step: int) -> None:
-    """A call that does nothing: the floor of this measurement."""
+    """Do nothing. Its time is the lower limit of this measurement."""
 
 
 def authors_controller(checkout: Path) -> Callable[[], Decide]:
-    """Their controller, imported from a checkout of their repository."""
+    """Import the authors' controller from a checkout of their repository."""
     sys.path.insert(0, str(checkout))
     from skipgs import SkipController  # type: ignore[import-not-found]
 

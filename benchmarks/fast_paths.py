@@ -1,11 +1,12 @@
-"""What each fast path of the CPU backend gains, beside what it costs in accuracy.
+"""Time that each fast path of the CPU backend saves, and its error.
 
     python benchmarks/fast_paths.py [--steps 2000] [--seeds 0 1]
 
-One path after the other is switched on, from an exact one: 2^t in float64, the loss by PyTorch's convolutions, Adam.
-Errors are those of one pass over 10,000 random Gaussians against the exact path; fern at 252x189 is then trained with
-each, and its held-out PSNR stands beside the time. What the optimizations of the rasterizer gain is in
-`raster.py --parts optimizations`: they change no result. Writes `benchmarks/results/fast_paths.json`.
+Fast paths are switched on one after the other. The first run uses none: 2^t in float64, the loss by PyTorch's
+convolutions, plain Adam. Errors are those of one pass over 10,000 random Gaussians, relative to the exact pass. fern at
+252x189 is then trained with each, and its PSNR on held-out views is printed with the time. Optimizations of the
+rasterizer that do not change results are measured by `raster.py --parts optimizations`. Writes
+`benchmarks/results/fast_paths.json`.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ from skipgs_plug.trainer import TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.loss import l1_ssim_loss as convolved_loss
 
-# The whole part of t goes into the exponent, 14 terms of the Taylor series give the rest to 1e-17.
+# The integer part of t goes to the exponent; 14 terms of the Taylor series give 2^f of the rest f with an error of
+# 1e-17.
 EXACT_EXP2 = """auto exp2 = [](v16 t) -> v16 {
     typedef double d16 __attribute__((ext_vector_type(16)));
     typedef long long l16 __attribute__((ext_vector_type(16)));
@@ -53,7 +55,7 @@ EXACT_EXP2 = """auto exp2 = [](v16 t) -> v16 {
 
 @contextmanager
 def exact_exponential() -> Iterator[None]:
-    """Blends with 2^t in float64 inside the block."""
+    """Blend with 2^t in float64 inside the `with` statement."""
     workers = [*blend.FORWARD.values(), *blend.ADJOINT.values()]
     kept = launch.PRELUDE, [(worker.name, worker._kernel) for worker in workers]
     launch.PRELUDE = re.sub(r"auto exp2 = .*?\n};\n", EXACT_EXP2, launch.PRELUDE, flags=re.DOTALL)
@@ -100,7 +102,7 @@ PATHS = (
 
 
 def one_pass(path: Path) -> dict[str, Any]:
-    """Image and gradients of the training loss."""
+    """Return the image, and the gradients of the training loss."""
     scene = frustum_scene(10_000, 252, 189)
     target = torch.rand(1, 189, 252, 3, generator=torch.Generator().manual_seed(0))
     inputs = leaves(scene, PARAMETERS)
@@ -111,7 +113,7 @@ def one_pass(path: Path) -> dict[str, Any]:
 
 
 def train(path: Path, steps: int, seed: int) -> tuple[float, float]:
-    """Held-out PSNR and milliseconds per iteration."""
+    """Train, and return PSNR on held-out views in dB and milliseconds per iteration."""
     config = TrainConfig(max_steps=steps, seed=seed, visible_adam=path.selective, grow_grad2d=0.001)
     with path.exponential():
         trainer = Trainer(config, load_scene(SCENES / "fern", data_factor=2), path.backend)

@@ -1,14 +1,14 @@
-"""How far the forecasts of `skipgs-plug estimate` are from whole runs.
+"""Errors of the forecasts of `skipgs-plug estimate`, compared with whole runs.
 
     python benchmarks/forecast.py fern             # half a minute of training, then a whole run with share="auto"
-    python benchmarks/forecast.py lego own         # and one that leaves nothing out
+    python benchmarks/forecast.py lego own         # and a run that leaves nothing out
     python benchmarks/forecast.py compare          # errors of all forecasts whose runs are stored
 
 Numbers of Gaussians are also compared with the runs that `skipgs-plug bench --whole` stored in
-`benchmarks/results/bench`, the mean of their seeds. Runs of a scene share a process and one thread, and are compared in
-processor seconds, which other work on a machine changes less than those on the wall. Scenes and settings are the
-bench's (`--grow-grad2d 0.001`, Lego from 10,000 points). Writes `benchmarks/results/forecast.json` and
-`skipgs_plug/forecast/errors.json`, which the command prints. Run it again when the rule of `share="auto"` has changed.
+`benchmarks/results/bench`, as the mean of their seeds. All runs of a scene share a process and one thread. They are
+compared in processor seconds, which depend less on other programs than wall-clock seconds. Scenes and settings are
+those of the bench (`--grow-grad2d 0.001`, Lego from 10,000 points). Writes `benchmarks/results/forecast.json` and
+`skipgs_plug/forecast/errors.json`, which the command prints. Run it again when the rule of `share="auto"` changes.
 """
 
 import dataclasses
@@ -32,9 +32,9 @@ from skipgs_plug.trainer.files import write_json
 
 FILE = RESULTS / "forecast.json"
 FOLDERS = {"fern": ("fern", 2), "lego": ("lego_200", 1), "bonsai": ("bonsai", 4), "bonsai_large": ("bonsai", 1)}
-LENGTHS = (3000, 7000)  # of the bench on fern and bonsai, and of the runs that are made here
-RUN = 7000
-SECONDS = 30.0
+LENGTHS = (3000, 7000)  # iterations: of the bench's runs on fern and bonsai, and of the runs made here
+RUN = 7000  # iterations of a run made here
+SECONDS = 30.0  # of training from which a forecast is made
 
 
 def settings(name: str, steps: int, load: bool = True) -> tuple[TrainConfig, Scene | None]:
@@ -48,7 +48,7 @@ def settings(name: str, steps: int, load: bool = True) -> tuple[TrainConfig, Sce
 
 
 def measure(name: str, steps: int, how: str) -> dict[str, Any]:
-    """Train to the end, and return what that took."""
+    """Train to the end, and return the measured quantities."""
     config, scene = settings(name, steps)
     assert scene is not None
     trainer = Trainer(config, scene)
@@ -69,19 +69,19 @@ def measure(name: str, steps: int, how: str) -> dict[str, Any]:
 
 
 def pilot(name: str) -> dict[str, Any]:
-    """Return what is forecast from half a minute of training."""
+    """Return the forecasts from half a minute of training."""
     config, scene = settings(name, RUN)
     assert scene is not None
-    seen = run_pilot(config, scene, SECONDS, by_processor=True)
+    trial = run_pilot(config, scene, SECONDS, by_processor=True)
     return {
-        "iterations": len(seen.samples),
-        "gaussians": seen.samples[-1].gaussians,
-        "forecasts": [dataclasses.asdict(predict(seen, config, steps)) for steps in LENGTHS],
+        "iterations": len(trial.samples),
+        "gaussians": trial.samples[-1].gaussians,
+        "forecasts": [dataclasses.asdict(predict(trial, config, steps)) for steps in LENGTHS],
     }
 
 
 def bench_runs() -> list[dict[str, Any]]:
-    """Return the whole runs that the bench has stored, as `measure` has them."""
+    """Return the whole runs that the bench stored, in the form of `measure`."""
     names = {folder: name for name, (folder, _) in FOLDERS.items()}
     runs = []
     for path in sorted((RESULTS / "bench").glob("*_whole/bench.json")):
@@ -95,7 +95,7 @@ def bench_runs() -> list[dict[str, Any]]:
                         "scene": names[result["settings"]["scene"]["name"]],
                         "max_steps": training["max_steps"],
                         "how": how,
-                        "seconds": None,  # of another day, and of another state of the machine
+                        "seconds": None,  # measured on another day, in another state of the machine
                         "gaussians": mean(run["metrics"]["num_GS"] for run in of_policy),
                         "memory": None,
                         "provenance": str(path.relative_to(RESULTS.parents[1])),
@@ -105,7 +105,7 @@ def bench_runs() -> list[dict[str, Any]]:
 
 
 def compare(stored: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return one row for each quantity that was forecast and measured."""
+    """Return one row for each quantity that was both forecast and measured."""
     rows = []
     for name, scene in stored.items():
         forecasts = {forecast["max_steps"]: forecast for forecast in scene["pilot"]["forecasts"]}

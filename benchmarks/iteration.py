@@ -2,9 +2,9 @@
 
     python benchmarks/iteration.py [--quick] [--scene path/to/fern]
 
-Runs the reference trainer after densification (the number of Gaussians stays what it is) with L1 + SSIM and Adam on
-the whole 504x378 images, for several numbers of Gaussians, at SH degree 0 and 3, on all cores and on one. Times are
-medians over iterations, each on another view. Writes `benchmarks/results/iteration.json` and a plot.
+Runs the reference trainer after densification, so the number of Gaussians is constant, with L1 + SSIM and Adam on whole
+images of 504x378 pixels. Measures several numbers of Gaussians, SH degrees 0 and 3, and all cores and one. Times are
+medians over iterations with different views. Writes `benchmarks/results/iteration.json` and a plot.
 """
 
 import dataclasses
@@ -22,17 +22,17 @@ from skipgs_plug.trainer import Scene, TrainConfig, Trainer, load_scene
 
 FILE = RESULTS / "iteration.json"
 PHASES = ("forward", "loss", "backward", "optimizer")
-WARM_UP = 6  # the SH degree has reached its maximum and every buffer its size
+WARM_UP = 6  # iterations after which the SH degree has its maximum and all buffers their size
 
 # Milliseconds of OpenSplat bd0400d, the fastest CPU trainer found, for one iteration at SH degree 0 on two cores of an
 # AMD EPYC (Zen 5); medians of 24 iterations, three rounds. See docs/how_it_works/rasterizer.md.
 PEER = {1_000: 175, 3_000: 202, 10_000: 317, 30_000: 449, 100_000: 821}
 PEER_THREADS, PEER_SH_DEGREE = 2, 0
-LARGE = (1_000_000, 3_000_000)  # of which no peer was timed
+LARGE = (1_000_000, 3_000_000)  # numbers of Gaussians for which no peer was timed
 
 
 def resampled(scene: Scene, n: int) -> Scene:
-    """The scene with n of its points; when it has fewer, also copies moved by about a point's size."""
+    """Return the scene with n of its points. If it has fewer, copies are added, moved by about a point's size."""
     generator = torch.Generator().manual_seed(0)
     count = len(scene.points)
     rows = torch.randperm(count, generator=generator)[:n]
@@ -47,7 +47,7 @@ def resampled(scene: Scene, n: int) -> Scene:
 
 
 def measure(scene: Scene, sh_degree: int, iterations: int) -> dict[str, Any]:
-    """Medians over the iterations of one run."""
+    """Return medians over the iterations of one run."""
     config = TrainConfig(sh_degree=sh_degree, sh_degree_interval=1, refine_stop_iter=1, backend="warp")
     trainer = Trainer(config, scene)
     trainer.train(until=WARM_UP, progress=False)
@@ -69,7 +69,7 @@ def measure(scene: Scene, sh_degree: int, iterations: int) -> dict[str, Any]:
 
 
 def plot(rows: list[dict[str, Any]]) -> None:
-    """Phases stacked per row, the peer as a line."""
+    """Plot the phases of each row, stacked, and the peer as a line."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -99,7 +99,7 @@ def main(scene: Path = SCENES / "fern", quick: bool = False, iterations: int = 1
         scene: The folder of "fern".
         quick: Two sizes only, SH degree 3, all cores.
         iterations: Timed iterations per row.
-        only: Rows with this number of Gaussians, and the others as measured before.
+        only: Number of Gaussians. Only its rows are measured; the others stay as measured before.
     """
     about = provenance() | {"iterations": iterations, "quick": quick}
     print(f"{about['cpu']}, {about['cores']} cores, commit {about['commit']}")

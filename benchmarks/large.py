@@ -2,10 +2,11 @@
 
     python benchmarks/large.py [--gaussians 3000000] [--iterations 5]
 
-The points of "garden" and copies moved by about a point's size, seen by its three cameras, against smooth noise, since
-time depends on places and sizes. Runs the reference trainer after densification at SH degree 3, on the cores it is
-given. Prints and writes `benchmarks/results/large.json`: processor seconds of each phase, those on the wall of the
-fastest iteration, seconds of the kernels that take most, and the process's peak memory.
+The scene has the points of "garden", and copies that are moved by about a point's size. Its three cameras have smooth
+noise as photographs, since the time depends on positions and sizes only. Runs the reference trainer after densification
+at SH degree 3 on all cores that it may use. Prints and writes `benchmarks/results/large.json`: processor seconds of
+each phase, wall-clock seconds of the fastest iteration, seconds of the slowest kernels, and the peak memory of the
+process.
 """
 
 import itertools
@@ -22,15 +23,15 @@ from iteration import resampled
 from skipgs_plug.fallback_raster import get_num_threads
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.clock import PHASES, TrainClock
-from skipgs_plug.trainer.scene import View, camera_extent
+from skipgs_plug.trainer.scene import View, assemble_scene
 
 FILE = RESULTS / "large.json"
-WARM_UP = 5  # the SH degree has reached its maximum and every buffer its size
-KERNELS = 8  # that are listed
+WARM_UP = 5  # iterations after which the SH degree has its maximum and all buffers their size
+KERNELS = 8  # kernels that are listed, those with the most time
 
 
 def garden(width: int, height: int) -> Scene:
-    """The SfM points with three cameras; photographs of noise, smooth over 8 pixels."""
+    """Return the SfM points with three cameras and photographs of noise that is smooth over 8 pixels."""
     with np.load(SCENES / "garden_points.npz") as file:
         data = dict(file)
     factor = np.array([[width / float(data["width"])], [height / float(data["height"])], [1.0]])
@@ -41,12 +42,11 @@ def garden(width: int, height: int) -> Scene:
         image = torch.nn.functional.interpolate(coarse, (height, width), mode="bilinear")[0].permute(1, 2, 0)
         pose, intrinsics = torch.from_numpy(viewmat).double(), torch.from_numpy(K * factor).float()
         views.append(View(f"view_{i}.png", (image * 255).byte().contiguous(), intrinsics, pose))
-    points, colors = (torch.from_numpy(np.ascontiguousarray(data[name])) for name in ("means3d", "colors"))
-    return Scene("garden", views, [], points.float(), colors.byte(), camera_extent(views))
+    return assemble_scene(SCENES / "garden_points.npz", "garden", views, [], data["means3d"], data["colors"])
 
 
 def measure(scene: Scene, iterations: int) -> dict[str, Any]:
-    """Return seconds an iteration: means of processor seconds, and the fastest of those on the wall."""
+    """Return seconds per iteration: mean processor seconds, and the smallest wall-clock seconds."""
     config = TrainConfig(sh_degree_interval=1, refine_stop_iter=1, backend="warp")
     trainer = Trainer(config, scene)
     trainer.clock = TrainClock(trainer.backend.device, by_processor=True)

@@ -1,13 +1,13 @@
-"""What follows the rasterizer in an iteration: Adam of all parameters, and the loss, on one core and on all.
+"""Time of Adam for all parameters, and of the loss, on one core and on all.
 
     python benchmarks/optimizer_and_loss.py [--quick]
 
-Adam steps the six parameters of a model of SH degree 3 (59 numbers per Gaussian), ours beside torch's fused and default
-implementations, which run on torch's one thread as in training. The loss gives value and gradient for one image, beside
-the plain one of the trainer in torch. Calls alternate; times are medians, and minima, which other programs disturb
-least. Errors: Adam's as the share of numbers that are not bit-equal to torch's fused ones after 20 steps with random
-gradients and the largest difference in units of the rate; the loss's as relative error of the gradient against float64.
-Writes `benchmarks/results/optimizer_and_loss.json`.
+Adam steps the six parameters of a model of SH degree 3 (59 numbers per Gaussian). Our implementation is compared with
+torch's fused and default ones, which run on one thread of torch, as in training. The loss computes value and gradient
+for one image, and is compared with the trainer's plain version in torch. Calls alternate. Times are medians and minima;
+other programs disturb minima least. The errors of Adam are the share of numbers that are not bit-equal to torch's fused
+Adam after 20 steps with random gradients, and the largest difference in units of the learning rate. The error of the
+loss is the relative error of its gradient, compared with float64. Writes `benchmarks/results/optimizer_and_loss.json`.
 """
 
 from collections.abc import Callable
@@ -24,8 +24,8 @@ from skipgs_plug.fallback_raster.training.optimizer import Adam
 from skipgs_plug.trainer.loss import l1_ssim_loss as plain_loss
 
 FILE = RESULTS / "optimizer_and_loss.json"
-SHAPES = ((3,), (3,), (4,), (), (1, 3), (15, 3))  # of a Gaussian's parameters
-RATE = 1e-3
+SHAPES = ((3,), (3,), (4,), (), (1, 3), (15, 3))  # shapes of a Gaussian's parameters at SH degree 3
+RATE = 1e-3  # learning rate
 OPTIMIZERS: dict[str, Callable[[list[Tensor]], torch.optim.Optimizer]] = {
     "ours": lambda params: Adam(params, lr=RATE, eps=1e-15),
     "torch fused": lambda params: torch.optim.Adam(params, lr=RATE, eps=1e-15, fused=True),
@@ -35,7 +35,7 @@ LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"ours": l1_ssim_loss, "
 
 
 def model(n: int) -> list[Tensor]:
-    """Parameters of n Gaussians with gradients, the same each time."""
+    """Return parameters of n Gaussians with gradients, the same in each call."""
     generator = torch.Generator().manual_seed(0)
     params = [torch.nn.Parameter(torch.randn(n, *shape, generator=generator)) for shape in SHAPES]
     for param in params:
@@ -44,7 +44,7 @@ def model(n: int) -> list[Tensor]:
 
 
 def alternating(works: dict[str, Callable[[], Any]], count: int, rounds: int) -> dict[str, dict[str, float]]:
-    """Milliseconds of each, in turns."""
+    """Return milliseconds of each call. Calls alternate."""
     seconds: dict[str, list[float]] = {name: [] for name in works}
     with threads(count):
         for _ in range(rounds):
@@ -54,7 +54,7 @@ def alternating(works: dict[str, Callable[[], Any]], count: int, rounds: int) ->
 
 
 def adam_rows(n: int, counts: list[int], rounds: int) -> list[dict[str, Any]]:
-    """Times of all optimizers for n Gaussians."""
+    """Return the times of all optimizers for n Gaussians."""
     steps = {name: make(model(n)).step for name, make in OPTIMIZERS.items()}
     error = adam_error()
     rows = []
@@ -66,7 +66,7 @@ def adam_rows(n: int, counts: list[int], rounds: int) -> list[dict[str, Any]]:
 
 
 def adam_error() -> dict[str, float]:
-    """How ours differs from torch's fused one after 20 steps of 10,000 Gaussians."""
+    """Return how our Adam differs from torch's fused one after 20 steps of 10,000 Gaussians."""
     models = model(10_000), model(10_000)
     optimizers = OPTIMIZERS["ours"](models[0]), OPTIMIZERS["torch fused"](models[1])
     generator = torch.Generator().manual_seed(1)
@@ -80,7 +80,7 @@ def adam_error() -> dict[str, float]:
 
 
 def loss_rows(width: int, height: int, counts: list[int], rounds: int) -> list[dict[str, Any]]:
-    """Times of value and gradient for one image."""
+    """Return times and errors of value and gradient for one image."""
     generator = torch.Generator().manual_seed(0)
     target = torch.rand(height, width, 3, generator=generator)
     noise = 0.2 * torch.randn(target.shape, generator=generator)
@@ -106,7 +106,7 @@ def main(quick: bool = False) -> None:
     """Measure optimizer and loss.
 
     Args:
-        quick: The smaller sizes only.
+        quick: Measure only the smaller sizes.
     """
     about = provenance() | {"quick": quick}
     print(f"{about['cpu']}, {about['cores']} cores, commit {about['commit']}")
@@ -117,8 +117,8 @@ def main(quick: bool = False) -> None:
         rows += loss_rows(width, height, counts, rounds)
     for row in rows:
         errors = ", ".join(f"{name} {row[name]:.1e}" for name in row if name.startswith(("bits", "most", "gradient")))
-        place = f"{row['part']:5} {row['size']:>9} {row['threads']} threads {row['which']:12}"
-        print(f"{place} {row['ms']:8.2f} ms, at least {row['ms_min']:8.2f}  {errors}")
+        label = f"{row['part']:5} {row['size']:>9} {row['threads']} threads {row['which']:12}"
+        print(f"{label} {row['ms']:8.2f} ms, at least {row['ms_min']:8.2f}  {errors}")
     write_part(FILE, "all", rows, about)
 
 

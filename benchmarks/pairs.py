@@ -1,4 +1,4 @@
-"""Counts blended (pixel, Gaussian) pairs from their definition, without the rasterizer's lists and bounds."""
+"""Counts blended (pixel, Gaussian) pairs by definition, without the lists and bounds of the rasterizer."""
 
 from typing import Any
 
@@ -9,8 +9,7 @@ from skipgs_plug.fallback_raster.runtime.launch import worker
 from skipgs_plug.fallback_raster.runtime.parameters import FloatArray, FloatOutput
 
 
-# Every tile looks at every Gaussian, nearest first; a box around its ellipse at alpha 1/255 decides only whether
-# to look closer.
+# Each tile goes through all Gaussians, nearest first. The box around the ellipse alpha = 1/255 only excludes Gaussians.
 @worker(
     """
 for (int t = first; t < last; ++t) {
@@ -43,8 +42,8 @@ for (int t = first; t < last; ++t) {
     grain=1,
 )
 def count_tiles(
-    rows: FloatArray,  # [N, 8] centre, conic, opacity, half width and half height of the box; nearest first
-    counts: FloatOutput,  # out [tiles]
+    rows: FloatArray,  # [N, 8] 2D mean, conic, opacity, half width and half height of the box; nearest first
+    counts: FloatOutput,  # output [tiles]
     n: int,
     width: int,
     height: int,
@@ -54,7 +53,7 @@ def count_tiles(
 
 @torch.no_grad()
 def blended_pairs(scene: dict[str, Any]) -> int:
-    """Pairs with alpha of at least 1/255 in pixels that are not finished yet."""
+    """Return the number of pairs with an alpha of at least 1/255 in pixels that are not finished."""
     *_, info = rasterization(**scene, packed=True)
     order = info["depths"].argsort(stable=True)
     means, conics, opacities = (info[name][order] for name in ("means2d", "conics", "opacities"))

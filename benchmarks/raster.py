@@ -4,11 +4,10 @@
     python benchmarks/raster.py --parts scenes --quick
     python benchmarks/raster.py --parts gaussians --only 3000000    # one row; the others stay as measured before
 
-A pass is `rasterization`, a mean-L1 loss and the backward to means, scales, quats, opacities and colours; times are
-medians over repeats with fresh inputs after two warm-up passes. Every part prints a table and replaces its entry in
-`benchmarks/results/raster.json`; the plot `raster.png` shows all parts measured so far.
-The garden is read from `$SKIPGS_SHARED/data/garden_points.npz` (gsplat's test asset; default `../shared`).
-Run it on an idle machine.
+A pass is `rasterization`, a mean-L1 loss, and the backward pass to means, scales, quats, opacities and colours. Times
+are medians over repeats with new inputs, after two warm-up passes. Each part prints a table and replaces its entry in
+`benchmarks/results/raster.json`. The plot `raster.png` shows all parts measured so far. The garden is read from
+`$SKIPGS_SHARED/data/garden_points.npz` (gsplat's test asset; default `../shared`). Run it on an idle machine.
 """
 
 from __future__ import annotations
@@ -74,13 +73,13 @@ PEER = {
 }
 GARDEN_DOWNSCALE = {"162x105": 4, "324x210": 2, "648x420": 1}
 
-# Multiply-adds that a blended pair cannot do without. Forward: quadratic form 2, exp 5, transmittance 2, weight 1,
-# colour 3. Backward: the first seven again, transmittance 3, colour behind and v_alpha 6, weight, v_sigma and
-# behind 3, colour gradient 3, moments 3.
+# Multiply-adds that each blended pair needs at least. Forward: quadratic form 2, exp 5, transmittance 2, weight 1,
+# colour 3. Backward: quadratic form and exp again 7, transmittance 3, colour behind and v_alpha 6, weight, v_sigma and
+# behind 3, gradient of the colour 3, moments 3.
 MULTIPLY_ADDS_PER_PAIR = 13 + 25
 
-PROCESSES = 3  # for each point of a growth
-EXACT_IMAGES = 3  # per size, on which the loss is computed with PyTorch and in float64
+PROCESSES = 3  # processes for each point of a growth series
+EXACT_IMAGES = 3  # images of each size for which the loss is also computed in PyTorch and in float64
 
 PHASES = {
     "project": ("project_forward", "list_visible", "sh_forward"),
@@ -92,7 +91,7 @@ PHASES = {
 
 
 def one_pass(scene: dict[str, Any], seed: int, loss_columns: slice = slice(None)) -> tuple[float, float, Any]:
-    """Seconds of the forward pass with the loss, seconds of the backward pass, and the inputs with gradients."""
+    """Return seconds of the forward pass with the loss, seconds of the backward pass, and the inputs with gradients."""
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(1, scene["height"], scene["width"], 3, generator=generator)
     inputs = leaves(scene, PARAMETERS)
@@ -105,7 +104,7 @@ def one_pass(scene: dict[str, Any], seed: int, loss_columns: slice = slice(None)
 
 
 def measure(make: Callable[[int], dict[str, Any]], repeats: int) -> dict[str, Any]:
-    """Medians over passes with fresh inputs, the first two left out."""
+    """Return medians over passes with new inputs, without the first two passes."""
     forward, backward, whole = [], [], []
     phases: dict[str, list[float]] = {name: [] for name in (*PHASES, "other")}
     for seed in range(repeats + 2):
@@ -128,7 +127,7 @@ def measure(make: Callable[[int], dict[str, Any]], repeats: int) -> dict[str, An
 
 
 def scene_maker(kind: str, n: int, size: str, sh_degree: int | None = None) -> Callable[[int], dict[str, Any]]:
-    """The function that gives scene number `seed` of a kind ("random" or "garden") and image size."""
+    """Return a function from a seed to a scene of a kind ("random" or "garden") and image size."""
     if kind == "garden":
         return lambda seed: garden_scene(GARDEN_DOWNSCALE[size], seed, sh_degree)
     width, height = map(int, size.split("x"))
@@ -136,7 +135,7 @@ def scene_maker(kind: str, n: int, size: str, sh_degree: int | None = None) -> C
 
 
 def part_scenes(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
-    """The scenes that other implementations were timed on, on all cores and on one."""
+    """Measure the scenes for which a peer was timed, on all cores and on one."""
     counts = sorted({1, usable_cores()}, reverse=True)
     peaks = {}
     for count in counts:
@@ -180,7 +179,7 @@ def part_scenes(quick: bool, repeats: int, only: str | None) -> list[dict[str, A
 
 
 def part_threads(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
-    """How one scene speeds up with the number of threads."""
+    """Measure the speedup of one scene by the number of threads."""
     make = scene_maker("random", 10_000 if quick else 50_000, "504x378")
     rows: list[dict[str, Any]] = []
     for count in sorted({1, usable_cores(), *(2**k for k in range(usable_cores().bit_length()))}):
@@ -193,7 +192,7 @@ def part_threads(quick: bool, repeats: int, only: str | None) -> list[dict[str, 
 
 
 def part_gaussians(quick: bool, repeats: int, only: str | None) -> dict[str, Any]:
-    """Time and memory from 1,000 to 3,000,000 Gaussians on 504x378 pixels."""
+    """Measure time and memory of 1,000 to 3,000,000 Gaussians on 504x378 pixels."""
     counts = (1_000, 10_000, 100_000)
     if not quick:
         counts += (3_000, 30_000, 300_000, 1_000_000, 3_000_000)
@@ -201,25 +200,25 @@ def part_gaussians(quick: bool, repeats: int, only: str | None) -> dict[str, Any
 
 
 def part_pixels(quick: bool, repeats: int, only: str | None) -> dict[str, Any]:
-    """Time and memory from 128x128 to 1920x1080 pixels with 10,000 Gaussians."""
+    """Measure time and memory of 10,000 Gaussians on 128x128 to 1920x1080 pixels."""
     sizes = ((128, 128), (256, 256), (504, 378), (1008, 756), (1920, 1080))[: 3 if quick else 5]
     return growth("pixels", {w * h: (10_000, f"{w}x{h}", None) for w, h in sizes}, repeats, only)
 
 
 def part_sh_terms(quick: bool, repeats: int, only: str | None) -> dict[str, Any]:
-    """Time and memory for SH degree 0 to 3 with 100,000 Gaussians on 504x378 pixels."""
+    """Measure time and memory of SH degree 0 to 3 with 100,000 Gaussians on 504x378 pixels."""
     n = 10_000 if quick else 100_000
     points = {(degree + 1) ** 2: (n, "504x378", degree) for degree in range(4)}
     return growth("sh_terms", points, repeats, only)
 
 
 def growth(part: str, points: dict[int, tuple[int, str, int | None]], repeats: int, only: str | None) -> dict[str, Any]:
-    """Measures each point in processes of its own, because the peak memory of a process never falls.
+    """Measure each point in processes of its own, because the peak memory of a process never falls.
 
-    That peak differs by a seventh from process to process, by what the system's allocator finds where: of `PROCESSES`
-    the one with the middle peak counts, and the fastest median time.
+    The peak differs by a seventh between processes, depending on the state of the system's allocator. Of `PROCESSES`
+    processes the median peak and the fastest median time count.
 
-    `only` names one point; the others are those measured before.
+    `only` names the one point to measure. The other points stay as measured before.
     """
     rows = []
     if only is not None:
@@ -248,12 +247,12 @@ def growth(part: str, points: dict[int, tuple[int, str, int | None]], repeats: i
 
 
 def measure_point(point: str, repeats: int) -> None:
-    """One point of `growth`: prints time and memory as JSON."""
+    """Measure one point of `growth`, and print time and memory as JSON."""
     n, size, sh_degree = json.loads(point)
-    one_pass(frustum_scene(10, 32, 32, 0, sh_degree), 0)  # loads and, on first use, compiles every kernel
+    one_pass(frustum_scene(10, 32, 32, 0, sh_degree), 0)  # loads all kernels, and compiles them on first use
     if sys.platform == "linux":
-        # Loading or compiling the kernels took more memory than rendering may: give it back, let the peak start anew.
-        with contextlib.suppress(AttributeError):  # not glibc
+        # Loading or compiling kernels may take more memory than rendering: free it, and reset the peak.
+        with contextlib.suppress(AttributeError):  # no malloc_trim without glibc
             ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5")
     before = peak_memory(torch.device("cpu")) or 0
@@ -264,13 +263,13 @@ def measure_point(point: str, repeats: int) -> None:
 
 
 def standard_error(values: list[float]) -> float:
-    """Of the median, if but for outliers the values are normally distributed."""
+    """Return the standard error of the median, assuming normally distributed values with outliers."""
     first, _, third = statistics.quantiles(values, n=4)
     return 1.253 * (third - first) / 1.349 / math.sqrt(len(values))
 
 
 def part_order(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
-    """What the order of the rows costs where a camera sees part of a scene, by either entrance, SH degree 3."""
+    """Measure how the order of rows affects time at SH degree 3, where a camera sees part of a scene."""
     size = "324x210" if quick else "162x105"
     scene = garden_scene(GARDEN_DOWNSCALE[size], 0, sh_degree=3)
     n = len(scene["means"])
@@ -283,7 +282,7 @@ def part_order(quick: bool, repeats: int, only: str | None) -> list[dict[str, An
     times: dict[tuple[str, str], list[float]] = {}
     images: dict[tuple[str, str], Tensor] = {}
     with threads(usable_cores()):
-        for seed in range(repeats + 2):  # in turns
+        for seed in range(repeats + 2):  # passes alternate between orders
             for name, ordered in scenes.items():
                 there, back, fast = one_pass(ordered, seed)
                 times.setdefault((name, "activated"), []).append(there + back)
@@ -291,15 +290,15 @@ def part_order(quick: bool, repeats: int, only: str | None) -> list[dict[str, An
                 seconds, images[name, "raw"] = raw_pass(ordered, seed)
                 times.setdefault((name, "raw"), []).append(seconds)
     rows = []
-    for (name, entrance), seconds in times.items():
-        error = (images[name, entrance] - images["file", "activated"]).abs().max().item()
-        rows.append({"order": name, "parameters": entrance, "ms": median_ms(seconds[2:]), "image_difference": error})
-        print(f"{name:>9} {entrance:>9} {rows[-1]['ms']:7.1f} ms  image differs by {error:.1e}", flush=True)
+    for (name, parameters), seconds in times.items():
+        error = (images[name, parameters] - images["file", "activated"]).abs().max().item()
+        rows.append({"order": name, "parameters": parameters, "ms": median_ms(seconds[2:]), "image_difference": error})
+        print(f"{name:>9} {parameters:>9} {rows[-1]['ms']:7.1f} ms  image differs by {error:.1e}", flush=True)
     return rows
 
 
 def raw_pass(scene: dict[str, Any], seed: int) -> tuple[float, Tensor]:
-    """Seconds of forward and backward pass with raw parameters, and the image."""
+    """Return seconds of forward and backward pass with raw parameters, and the image."""
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(scene["height"], scene["width"], 3, generator=generator)
     raw = [scene["means"], scene["quats"], scene["scales"].log(), scene["opacities"].logit()]
@@ -313,14 +312,14 @@ def raw_pass(scene: dict[str, Any], seed: int) -> tuple[float, Tensor]:
 
 
 def part_optimizations(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
-    """Time with and without each optimization, in turns, and by how much it changes the result."""
+    """Measure the time with and without each optimization, alternately, and by how much it changes the result."""
     scene = garden_scene(GARDEN_DOWNSCALE["324x210" if quick else "648x420"], 0, sh_degree=3)
     left = slice(0, scene["width"] // 2)  # half of the image has no gradient
     names: list[tuple[str, ...]] = [(name,) for name in OPTIMIZATIONS] + [tuple(OPTIMIZATIONS)]
     rows = []
     print(f"{'left out':>18} {'ms':>7} {'ms with':>7} {'saves':>14} {'image':>8} {'gradient':>8}")
     for left_out in names:
-        # A pass leaves caches and free memory to the next, so either goes first in every other round.
+        # A pass affects the next one through caches and free memory, so the order changes in every round.
         seconds: dict[bool, list[float]] = {True: [], False: []}
         inputs = {}
         for seed in range(4 * repeats + 2):
@@ -335,7 +334,8 @@ def part_optimizations(quick: bool, repeats: int, only: str | None) -> list[dict
             "optimization": left_out[0] if len(left_out) == 1 else "all",
             "ms": median_ms(seconds[True]),
             "ms_without": median_ms(seconds[False]),
-            "saved": 1 - statistics.median(ratios),  # of neighbours in time, between which the machine changes little
+            "saved": 1
+            - statistics.median(ratios),  # ratios of neighbouring passes, between which the machine hardly changes
             "saved_error": standard_error(ratios),
             "image_difference": (fast["image"] - slow["image"]).abs().max().item(),
             "gradient_difference": max(relative_difference(fast[p].grad, slow[p].grad) for p in PARAMETERS),
@@ -351,9 +351,9 @@ def part_optimizations(quick: bool, repeats: int, only: str | None) -> list[dict
 
 
 def part_loss(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
-    """Value and gradient of the fused L1 + SSIM against PyTorch's convolutions: time, and error beside float64.
+    """Measure time and error of the fused L1 + SSIM loss and of PyTorch's convolutions. The truth is float64.
 
-    PyTorch takes seconds for a large image, so it and the float64 truth see only the first images, on one thread.
+    PyTorch takes seconds for a large image, so only the first images are computed by it and in float64, on one thread.
     """
     print(f"{'image':>10} {'threads':>7} {'fused ms':>8} {'torch ms':>8} {'value error':>20} {'gradient error':>20}")
     rows = []
@@ -379,14 +379,14 @@ def part_loss(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any
 
 
 def image_pair(width: int, height: int, seed: int) -> tuple[Tensor, Tensor]:
-    """An image with noise on it, and without."""
+    """Return an image with noise, and the image without."""
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(height, width, 3, generator=generator)
     return (target + 0.1 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1), target
 
 
 def loss_pass(function: Callable[..., Tensor], image: Tensor, target: Tensor) -> tuple[float, float, Tensor]:
-    """Seconds, value and gradient."""
+    """Return seconds, value and gradient of a loss."""
     leaf = image.clone().requires_grad_()
     start = time.perf_counter()
     loss = function(leaf, target)
@@ -403,9 +403,9 @@ def loss_figures(
     truths: list[tuple[float, Tensor]],
     warm_up: int,
 ) -> dict[str, float]:
-    """Time over all pairs of images, the first ones left out, and the worst errors over those with a truth."""
+    """Return times over all pairs of images without the warm-up, and the largest errors over pairs with a truth."""
     seconds, value_errors, gradient_errors = [], [], []
-    # Compared at once: gradients that are kept take new memory each time, whose first touch is no part of a loss.
+    # Gradients are compared and freed at once. New memory for each would add page faults to the time of the loss.
     for number, (image, target) in enumerate(pairs):
         elapsed, value, gradient = loss_pass(function, image, target)
         seconds.append(elapsed)
@@ -435,7 +435,7 @@ PARTS: dict[str, Callable[[bool, int, str | None], Any]] = {
 
 
 def plot(results: dict[str, Any]) -> None:
-    """Draws every part that was measured into raster.png."""
+    """Plot all measured parts to raster.png."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -474,7 +474,7 @@ def plot(results: dict[str, Any]) -> None:
         scaling.legend()
     if "optimizations" in results:
         rows = results["optimizations"]["rows"]
-        # Each row was measured in turn with its own baseline, so only the share is comparable.
+        # Each row alternated with a baseline of its own, so only shares are comparable.
         saved = [100 * row["saved"] for row in rows]
         errors = [100 * row["saved_error"] for row in rows]
         optimizations.barh([row["optimization"] for row in rows], saved, xerr=errors, ecolor="gray")
@@ -501,11 +501,11 @@ def main(
     """Measure the rasterizer.
 
     Args:
-        parts: Which tables to measure.
-        quick: Fewer and smaller scenes.
+        parts: Tables to measure.
+        quick: Measure fewer and smaller scenes.
         repeats: Timed passes per row.
-        only: One row of a part, and the others as measured before: "garden,138766,162x105" of scenes, the number of
-            Gaussians, pixels or terms of a growth series.
+        only: One row of a part to measure; the others stay as measured before. A scene ("garden,138766,162x105"), or
+            the number of Gaussians, pixels or terms of a growth series.
         point: For the benchmark's own use: one point of a growth series, as JSON.
     """
     if point is not None:

@@ -1,4 +1,4 @@
-"""Rows of the table of unmodified scripts: which script of which project, with which schedule."""
+"""Rows of the table of unmodified scripts: the script, its project and its schedule."""
 
 from typing import NamedTuple
 
@@ -7,11 +7,11 @@ class Row(NamedTuple):
     """One script with its options.
 
     Attributes:
-        label: In the table.
-        project: On GitHub.
-        folder: Of its checkout, beside the others.
-        command: Of the script, with {scene}, {factor}, {out}, and the parts of a schedule of {n} iterations.
-        pictures: Whether it is judged by the pictures that it writes, since no PLY holds its model in the scene's
+        label: Name in the table.
+        project: Owner and name of the repository on GitHub.
+        folder: Name of its checkout in the folder of all checkouts.
+        command: Command line of the script, with placeholders {scene}, {factor}, {out} and those of `schedule`.
+        pictures: Whether the script's own renders are measured, because no PLY contains its model in the scene's
             coordinates.
     """
 
@@ -22,7 +22,8 @@ class Row(NamedTuple):
     pictures: bool = False
 
 
-# Thresholds of growth suit pictures of 126x94: upstream's, for large photographs, let scenes grow ten times as far.
+# Densification thresholds for images of 126x94 pixels. With the projects' own, which are for large photographs, scenes
+# would grow to ten times as many Gaussians.
 _SAVED = "-s {scene} -r 1 --eval -m {out} --iterations {n} --save_iterations {n} "
 _SCENE = f"{_SAVED}-i images_{{factor}} --test_iterations -1 "
 _GROWS = "--densify_from_iter 150 --densify_until_iter {half} --densification_interval 100 "
@@ -140,5 +141,5 @@ ROWS = {
 
 
 def schedule(n: int) -> dict[str, int]:
-    """Return the numbers that stand in commands, for a schedule of `n` iterations."""
+    """Return the values of the placeholders in commands, for a schedule of `n` iterations."""
     return {"n": n, "half": n // 2, "late": n * 5 // 6, "two_thirds": n * 2 // 3, "fifth": n // 5, "tenth": n // 10}

@@ -1,12 +1,12 @@
-"""The graph of a skipped iteration: memory that it would hold, and the price of freeing it.
+"""The graph of a skipped iteration: the memory that it would occupy, and the time to free it.
 
     python benchmarks/skipped_graph.py [memory] [price]
 
-A backward frees what its graph saved; a skipped one does not. Most trainers overwrite `loss` and `image` only when the
-next forward pass is done, so for that long there would be two graphs; the gate frees the first at the skip
-(`skipgs_plug.core.saved_graph`). For "memory" no gate is attached. For "price" processor seconds of one iteration and
-of freeing a graph are compared, on one thread; an iteration that runs pays nothing. Rendered are random Gaussians with
-SH degree 3, L1 + SSIM, on the CPU rasterizer. Writes `benchmarks/results/skipped_graph.json`.
+A backward pass frees the tensors that its graph saved; a skipped one does not. Most trainers overwrite `loss` and
+`image` only after the next forward pass, so two graphs would exist until then. The gate frees the first graph when it
+skips (`skipgs_plug.core.saved_graph`). "memory" runs without a gate. "price" compares processor seconds of an iteration
+and of freeing a graph, on one thread. An iteration that is not skipped pays nothing. Both render random Gaussians of SH
+degree 3 with an L1 + SSIM loss on the CPU rasterizer. Writes `benchmarks/results/skipped_graph.json`.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from skipgs_plug.core.saved_graph import free_graph, nodes
 from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
 from skipgs_plug.trainer.loss import l1_ssim_loss as loss_of_torch
 
-PAIRS = 30  # of an iteration and a skip
+PAIRS = 30  # repeats, each of an iteration and a skip
 
 
 def held_bytes(output: Tensor, own: Sequence[Tensor]) -> int:
-    """Bytes that the graph keeps alive beyond the tensors in `own`."""
+    """Return the bytes that the graph keeps alive, without the tensors in `own`."""
     storages = {}
     for node in nodes(output):
         saved = [getattr(node, name) for name in dir(node) if name.startswith("_saved_")]
@@ -46,7 +46,7 @@ def held_bytes(output: Tensor, own: Sequence[Tensor]) -> int:
 
 
 def iteration(n: int, own_loss: bool, width: int, height: int) -> tuple[Callable[[], Tensor], Callable[[Tensor], None]]:
-    """Forward and backward with n Gaussians; activations and loss in plain torch, as trainers have them, or fused."""
+    """Return forward and backward functions for n Gaussians, with the loss in plain torch, as in trainers, or fused."""
     scene = frustum_scene(n, width, height, sh_degree=3)
     scene["scales"], scene["opacities"] = scene["scales"].log(), scene["opacities"].logit()
     scene["features_dc"], scene["features_rest"] = scene["colors"][:, :1].clone(), scene["colors"][:, 1:].clone()
@@ -71,7 +71,7 @@ def iteration(n: int, own_loss: bool, width: int, height: int) -> tuple[Callable
 
 
 def saved_tensors(forward: Callable[[], Tensor]) -> int:
-    """Number of tensors that autograd saves in a forward."""
+    """Return the number of tensors that autograd saves in a forward pass."""
     saved: list[Tensor] = []
     with torch.autograd.graph.saved_tensors_hooks(lambda tensor: saved.append(tensor) or tensor, lambda tensor: tensor):
         forward()
@@ -79,7 +79,7 @@ def saved_tensors(forward: Callable[[], Tensor]) -> int:
 
 
 def price(n: int, own_loss: bool, width: int, height: int) -> dict[str, Any]:
-    """Processor seconds of an iteration that runs, and of freeing the graph of one that is skipped."""
+    """Measure processor seconds of an iteration, and of freeing the graph of a skipped one."""
     forward, backward = iteration(n, own_loss, width, height)
     runs, freeing = [], []
     for _ in range(PAIRS + 3):

@@ -1,10 +1,10 @@
-"""What the package survives: kills, full disks, broken groups, mutated files, a million decisions.
+"""Runs the package through failures: kills, full disks, broken process groups, mutated files, a million decisions.
 
 Takes a quarter of an hour or more.
 
 python -m benchmarks.soak [--kills N] [--files N] [--seed N] [--out FILE]
 
-Draws a fresh seed unless one is given, and ends with an error at the first run that does not end as it should.
+Draws a new seed unless one is given. Stops with an error at the first run that does not end as it should.
 """
 
 from __future__ import annotations
@@ -27,34 +27,35 @@ from benchmarks.soak_runs import kill_at_random, make_tiny_scene, strike_every_f
 from skipgs_plug import SkipGate
 from skipgs_plug.trainer.files import write_json
 
-DECISIONS, VIEWS, BLOCKS = 1_000_000, 10_000, 10
+# Decisions in all, views that they are about, and parts whose time and memory are recorded.
+DECISIONS, VIEWS, PARTS = 1_000_000, 10_000, 10
 
 
 class Backward:
-    """A loss whose backward does nothing."""
+    """A loss whose backward pass does nothing."""
 
     def backward(self) -> None: ...
 
 
 def resident() -> float:
-    """Memory of this process in MB."""
+    """Return the resident memory of this process in MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * 4096 / 1e6
 
 
 def decide_often(seed: int) -> dict[str, Any]:
-    """Take a million decisions over 10,000 views through a whole gate: cost and memory of each tenth."""
+    """Take a million decisions about 10,000 views with a whole gate, and return time and memory of each tenth."""
     draw = random.Random(seed)
     gate, loss, step = SkipGate(start_iter=0), Backward(), 0
     base = [draw.uniform(0.02, 0.3) for _ in range(VIEWS)]
     microseconds, megabytes = [], []
-    for _ in range(BLOCKS):
+    for _ in range(PARTS):
         begun = time.perf_counter()
-        for _ in range(DECISIONS // BLOCKS):
+        for _ in range(DECISIONS // PARTS):
             view = draw.randrange(VIEWS)
             gate.backward(loss, view=view, step=step, signal=base[view] * draw.uniform(0.9, 1.1))
             step += 1
-        microseconds.append(1e6 * (time.perf_counter() - begun) / (DECISIONS // BLOCKS))
+        microseconds.append(1e6 * (time.perf_counter() - begun) / (DECISIONS // PARTS))
         megabytes.append(resident())
     return {
         "decisions": DECISIONS,

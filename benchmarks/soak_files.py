@@ -1,11 +1,11 @@
-"""Mutated scene, image, PLY, checkpoint and state files: each is refused with a sentence or loads as something sound.
+"""Mutated scene, image, PLY, checkpoint and state files. Each must be refused with one sentence, or load as valid data.
 
     from benchmarks.soak_files import run
     run(count=20_000, seed=7)
 
-A case is a function of seed and number, so `run(count=1, seed=7, first=1234)` repeats one. Cases run in child
-processes with bounded memory; a crash, a hang, a foreign exception, an unsound scene or a file that appeared is
-reported with seed, number and what had been done to which file.
+Seed and number determine a case, so `run(count=1, seed=7, first=1234)` repeats one. Cases run in child processes with
+limited memory. A crash, a hang, an unexpected exception, an invalid scene or a new file is reported with seed, number,
+file and mutation.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ from skipgs_plug import SkipGSError
 from skipgs_plug.trainer import InputError
 
 ROOT = Path(__file__).parents[1]
-MEMORY = 1 << 30  # bytes of address space beyond what the libraries take
-SECONDS = 20.0  # for one case, which takes milliseconds: then the child ends itself, wherever it is
-BATCH = 500
+MEMORY = 1 << 30  # bytes of address space that a case may add to that of the loaded libraries
+SECONDS = 20.0  # after which the child process ends itself; a case takes milliseconds
+BATCH = 500  # cases of one child process
+# Values that counts, sizes and coordinates rarely have.
 NUMBERS = (0, 1, -1, 127, 255, 2**31 - 1, -(2**31), 2**32 - 1, 2**40, 2**62, -(2**63), 2**64 - 1)
 REALS = (0.0, -1.0, 1e-300, 1e300, float("nan"), float("inf"), 1e20)
 TOKENS = (
@@ -55,7 +56,7 @@ def run(count: int, seed: int, first: int = 0, batch: int = BATCH) -> dict[str, 
     """Run cases `first` to `first + count - 1` and count their outcomes: `refused` and `loaded`.
 
     Raises:
-        AssertionError: some case was neither; every one is listed.
+        AssertionError: A case was neither. All such cases are listed.
     """
     outcomes: Counter[str] = Counter()
     failures: list[str] = []
@@ -63,7 +64,7 @@ def run(count: int, seed: int, first: int = 0, batch: int = BATCH) -> dict[str, 
     while first < last:
         end = min(first + batch, last)
         done = run_batch(seed, first, end, outcomes, failures)
-        if done < end:  # the child died in this case: go on behind it
+        if done < end:  # the child died in this case: continue with the next
             done += 1
         first = done
     if failures:
@@ -72,7 +73,7 @@ def run(count: int, seed: int, first: int = 0, batch: int = BATCH) -> dict[str, 
 
 
 def run_batch(seed: int, first: int, end: int, outcomes: Counter[str], failures: list[str]) -> int:
-    """Run cases in one child process; returns the number of the case it did not survive, or `end`."""
+    """Run cases in one child process. Returns the number of the case in which it died, or `end`."""
     done = first
     process = subprocess.run(
         [sys.executable, "-c", child_command(seed, first, end)],
@@ -105,7 +106,7 @@ def child(seed: int, first: int, end: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         sources = write_sources(Path(name))
         for source in sources.values():
-            source.load()  # loads libraries and makes threads before memory is bounded
+            source.load()  # loads libraries and starts threads before memory is limited
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         limit = pages * resource.getpagesize() + MEMORY
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
@@ -127,7 +128,7 @@ class Case:
         self.what = f"{self.source}/{self.file} by {', '.join(m.__name__ for m in self.mutations)}"
 
     def run(self, source: Source) -> dict[str, str]:
-        """Mutate, load, and put the file back."""
+        """Mutate the file, load it, and restore it."""
         content = source.files[self.file]
         for mutate in self.mutations:
             content = mutate(content, self.random)
@@ -161,7 +162,7 @@ def flip_bits(content: bytes, rng: random.Random) -> bytes:
 
 
 def overwrite(content: bytes, rng: random.Random) -> bytes:
-    """Put a number that counts, sizes or coordinates seldom have over some bytes; often near the start."""
+    """Overwrite some bytes, often near the start, with a number from NUMBERS or REALS."""
     if rng.random() < 0.5:
         kind, value = rng.choice("BHIQ"), rng.choice(NUMBERS)
         size = struct.calcsize(kind)
@@ -205,7 +206,7 @@ BYTES = (truncate, flip_bits, overwrite, overwrite, insert, cut, repeat)
 TEXT = (replace_token, replace_token, replace_token, drop_line)
 
 COLMAP = ("cameras", "images", "points3D")
-TARGETS = [  # (source, file); the binary model twice, for it is what others send
+TARGETS = [  # (source, file); the binary model twice, because users receive such files from others
     *(("binary", f"sparse/0/{name}.bin") for name in COLMAP * 2),
     *(("binary", f"sparse/0/{name}.bin") for name in ("rigs", "frames")),
     *(("text", f"sparse/0/{name}.txt") for name in COLMAP),

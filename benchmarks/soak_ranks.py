@@ -1,4 +1,4 @@
-"""Processes that train together and disagree, lag, hang or die: how each ends, and how soon."""
+"""Processes that train together while one of them disagrees, lags, hangs or dies: how the others end, and how soon."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ import torch.distributed as dist
 
 from skipgs_plug import SkipGate, SkipGSError
 
-TIME_OUT = 5.0  # of the group, in seconds
-STEPS, AT = 60, 30
-LATE = {"disagree": 0.0, "lag": 2.0, "hang": 3 * TIME_OUT}
+TIME_OUT = 5.0  # of the process group, seconds
+STEPS, AT = 60, 30  # iterations, and the one at which the second process fails
+LATE = {"disagree": 0.0, "lag": 2.0, "hang": 3 * TIME_OUT}  # seconds that it then waits
 
 
 def train_together(folder: Path, size: int, kind: str) -> dict[str, Any]:
-    """Train a parameter in `size` gloo processes, the second of which goes wrong half way.
+    """Train a parameter in `size` gloo processes, of which the second fails half way.
 
     Returns:
-        `seconds` from the trouble to the end of the last healthy process, and the `endings`.
+        `seconds` from the failure to the end of the last healthy process, and the messages at their `endings`.
 
     Raises:
-        RuntimeError: a process hung, or ended without a sentence where one was due.
+        RuntimeError: A process hung, or ended without the message that it should give.
     """
     folder.mkdir()
     context = mp.get_context("spawn")
@@ -53,7 +53,7 @@ def train_together(folder: Path, size: int, kind: str) -> dict[str, Any]:
 def _rank(rank: int, folder: str, size: int, kind: str) -> None:
     torch.set_num_threads(1)
     if sys.platform == "linux":
-        os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # containers may not know their own host name
+        os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # containers may not resolve their own host name
     rendezvous = f"file://{folder}/rendezvous"
     dist.init_process_group(
         "gloo", init_method=rendezvous, rank=rank, world_size=size, timeout=timedelta(seconds=TIME_OUT)
@@ -69,11 +69,11 @@ def _rank(rank: int, folder: str, size: int, kind: str) -> None:
                 if kind == "die":
                     os.kill(os.getpid(), signal.SIGKILL)
                 time.sleep(LATE[kind])
-            # Each process draws losses of its own: about every second decision is disagreed on.
+            # Losses differ between processes, which disagree about every second decision.
             loss = parameter.sum() * (1.0 + 0.3 * ((7 * step + 5 * rank) % 11 - 5) / 5)
             if gate.backward(loss, view=step % 3, step=step):
                 parameter.grad = None
     except (SkipGSError, RuntimeError) as error:
         ending = str(error)
     Path(folder, f"{rank}.txt").write_text(f"{time.time()}\n{ending}")
-    os._exit(0)  # the group is broken: to leave it in order would be to wait for the dead
+    os._exit(0)  # an orderly exit would wait for dead processes of the group

@@ -1,4 +1,4 @@
-"""Training runs that are killed, stopped or starved of disk space, then resumed, and compared with a run left alone."""
+"""Training runs that are killed, stopped or out of disk space, then resumed, and compared with an undisturbed run."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ from skipgs_plug.files import LEFTOVER
 from skipgs_plug.trainer import save_packed
 from skipgs_plug.trainer.synthetic import make_scene
 
-STEPS = 80
+STEPS = 80  # iterations of a run
 OPTIONS = ["--max-steps", str(STEPS), "--refine-every", "10", "--no-progress"]
 GATED = ["--warmup", "8"]
 DECIDED = ("iterations", "gated_iterations", "backwards_run", "backwards_skipped", "reasons", "events", "views")
 CURVE = "stats/train_curve.json"
-LIMIT = 120.0  # seconds that a run of seconds may take before it counts as hung
-FAULTS = ("killed before", "killed after", "disk full")  # at the renaming of a file
+LIMIT = 120.0  # seconds after which a run counts as hung; it usually takes a few
+FAULTS = ("killed before", "killed after", "disk full")  # faults when a file is renamed to its final name
 
-# The server imports once, what torch's optimizers load too; a run forked from it starts in a fraction of a second.
+# The fork server imports packages once, including those that torch's optimizers load. A run forked from it starts in a
+# fraction of a second.
 PRELOADED = (
     "skipgs_plug.commands.train skipgs_plug.fallback_raster warp gsplat torch._dynamo torchmetrics scipy.spatial"
 )
@@ -39,20 +40,20 @@ CONTEXT.set_forkserver_preload([*PRELOADED.split(), "filelock", "plyfile", "PIL.
 
 
 def make_tiny_scene(folder: Path) -> Path:
-    """Write ten views of 32x24 pixels with 160 points."""
+    """Write a scene of ten views of 32x24 pixels and 160 points."""
     path = folder / "tiny.npz"
     save_packed(make_scene(n_views=10, width=32, height=24, n_points=160), path)
     return path
 
 
 class Run:
-    """One run folder, and the command that fills it, as often as it takes.
+    """A run folder, and the command that trains in it. The command may be started several times.
 
     Args:
-        scene: as `make_tiny_scene` writes it.
-        out: the run folder.
-        gated: with the gate.
-        save_every: iterations between two checkpoints.
+        scene: File written by `make_tiny_scene`.
+        out: The run folder.
+        gated: Whether to train with the gate.
+        save_every: Iterations between two checkpoints.
     """
 
     def __init__(self, scene: Path, out: Path, gated: bool, save_every: int) -> None:
@@ -62,10 +63,10 @@ class Run:
         self.starts = 0
 
     def start(self, fault: tuple[str, int] | None = None) -> BaseProcess:
-        """Start the command, with --resume where there is something to resume.
+        """Start the command, with --resume if there is a checkpoint.
 
         Args:
-            fault: one of FAULTS, and at the how-manieth file it strikes.
+            fault: One of FAULTS, and the number of the file at which it occurs.
         """
         resume = ["--resume"] if any((self.out / "ckpts").glob("ckpt_*.pt")) else []
         log = self.out.with_suffix(".log")
@@ -76,18 +77,18 @@ class Run:
         return process
 
     def finish(self) -> None:
-        """Run to the end, undisturbed.
+        """Run to the end without a fault.
 
         Raises:
-            RuntimeError: it failed, or hung.
+            RuntimeError: The run failed or hung.
         """
         self.expect(self.start(), {0})
 
     def expect(self, process: BaseProcess, codes: set[int]) -> int:
-        """Wait for a process and return its exit code; negative is a signal.
+        """Wait for a process and return its exit code. A negative code is a signal.
 
         Raises:
-            RuntimeError: it ended with another code, with a traceback, or hung.
+            RuntimeError: The process ended with another code, printed a traceback, or hung.
         """
         process.join(LIMIT)
         code = process.exitcode
@@ -99,7 +100,7 @@ class Run:
         return code
 
     def half_written(self) -> int:
-        """Number of files that a killed process left aside."""
+        """Return the number of temporary files that killed processes left behind."""
         return sum(1 for path in self.out.rglob(".*") if LEFTOVER.fullmatch(path.name))
 
 
@@ -115,12 +116,12 @@ def _child(command: list[str], log: str, fault: tuple[str, int] | None) -> None:
 
 
 def _strike(kind: str, at: int) -> None:
-    replace, seen = os.replace, 0
+    replace, count = os.replace, 0
 
     def struck(source: Any, target: Any) -> None:
-        nonlocal seen
-        seen += 1
-        if seen != at:
+        nonlocal count
+        count += 1
+        if count != at:
             replace(source, target)
         elif kind == "disk full":
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(source))
@@ -133,13 +134,13 @@ def _strike(kind: str, at: int) -> None:
 
 
 def assert_same(out: Path, whole: Path, steps: int = STEPS) -> None:
-    """Raise AssertionError unless both runs of so many steps left the same: files, models, moments, decisions."""
+    """Raise AssertionError unless two runs of `steps` iterations have the same files, models, moments and decisions."""
     last = f"ckpts/ckpt_{steps - 1}_rank0.pt"
     left = [{p.relative_to(r).as_posix() for p in r.rglob("*") if p.is_file()} for r in (out, whole)]
     left = [{name for name in names if not name.startswith("ckpts/") or name == last} for names in left]
     assert left[0] == left[1], left[0] ^ left[1]
     for name in left[0]:
-        if name == CURVE:  # its seconds are those of each run
+        if name == CURVE:  # seconds differ between runs
             curves = [json.loads((run / name).read_text()) | {"seconds": None} for run in (out, whole)]
             assert curves[0] == curves[1], name
         elif name.startswith("stats/"):
@@ -171,16 +172,18 @@ def _assert_equal(one: Any, two: Any, name: str) -> None:
 def kill_at_random(
     scene: Path, folder: Path, gated: bool, number: signal.Signals, kills: int, seed: int, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Send a signal at random moments of runs that save every fourth iteration, resume, compare the ends.
+    """Send a signal at random times to runs that save every fourth iteration, resume them, and compare the results.
 
     Returns:
-        Counts: `kills` that met a living process, `half_written` files that they left, `runs` compared, all the same.
+        Counts: `kills` of living processes, `half_written` files left behind, and `runs` compared, all with equal
+        results.
     """
     draw = random.Random(seed)
     whole = Run(scene, folder / "whole", gated, save_every=4)
     whole.finish()
     begun = time.perf_counter()
-    Run(scene, folder / "timed", gated, save_every=4).finish()  # the first one waited for the server's imports
+    # A second run, because the first one waited for the imports of the fork server.
+    Run(scene, folder / "timed", gated, save_every=4).finish()
     seconds = time.perf_counter() - begun
     done = runs = half_written = stopped = 0
     while done < kills:
@@ -204,10 +207,10 @@ def kill_at_random(
 
 
 def strike_every_file(scene: Path, folder: Path, gated: bool, faults: tuple[str, ...] = FAULTS) -> dict[str, int]:
-    """Kill a run before and after each file that it writes gets its name, and let the disk be full there.
+    """Kill a run before and after it renames each file, and simulate a full disk there.
 
     Returns:
-        Number of faults by kind; all runs ended the same after --resume.
+        Number of faults by kind. All runs had equal results after --resume.
     """
     whole = Run(scene, folder / "whole", gated, save_every=30)
     whole.finish()
@@ -219,7 +222,7 @@ def strike_every_file(scene: Path, folder: Path, gated: bool, faults: tuple[str,
             run = Run(scene, folder / f"{fault.replace(' ', '_')}_{at}", gated, save_every=30)
             code = run.expect(run.start((fault, at)), {0, 2, -signal.SIGKILL})
             if code == 0 and "cannot be written" not in run.out.with_suffix(".log").read_text():
-                break  # it writes fewer files than that
+                break  # the run writes fewer files than `at`
             run.finish()
             assert_same(run.out, whole.out)
             shutil.rmtree(run.out)

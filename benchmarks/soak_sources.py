@@ -1,4 +1,4 @@
-"""Small valid scenes, images, PLY files, checkpoints and gate states, and what loads them: for `soak_files`."""
+"""Small valid scenes, images, PLY files, checkpoints and gate states, and functions that load them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MODEL = ("cameras", "images", "points3D")
 
 
 class Source:
-    """Files that load, and the function that loads them."""
+    """Valid files, and the function that loads them."""
 
     def __init__(self, folder: Path, files: list[str], load: Callable[[], object]) -> None:
         self.folder, self.load = folder, load
@@ -61,7 +61,7 @@ def write_sources(root: Path) -> dict[str, Source]:
 
 
 def load(path: Path) -> None:
-    """Load a scene, nothing of it from a cache, and check what the trainer relies on."""
+    """Load a scene without a cache, and check the properties that the trainer relies on."""
     try:
         scene = load_scene(path, test_every=0, init_num_pts=50)
     finally:
@@ -76,7 +76,7 @@ def load(path: Path) -> None:
 
 
 def write_colmap(scene: Scene, root: Path) -> Path:
-    """Write a text model with one pinhole and one distorted camera, points seen by two images each, and a mask."""
+    """Write a text model with a pinhole and a distorted camera, points that two images observe, and a mask."""
     from PIL import Image
     from scipy.spatial.transform import Rotation
 
@@ -91,8 +91,8 @@ def write_colmap(scene: Scene, root: Path) -> Path:
         Image.fromarray(view.image.numpy()).save(root / "images" / view.name)
         x, y, z, w = Rotation.from_matrix(view.viewmat[:3, :3].double().numpy()).as_quat()
         pose = " ".join(repr(float(v)) for v in (w, x, y, z, *view.viewmat[:3, 3].tolist()))
-        seen = " ".join(f"{k % 20}.5 {k % 16}.5 {k + 1}" for k in range(len(scene.points)) if i < 2)
-        lines += [f"{i + 1} {pose} {2 if i == 3 else 1} {view.name}", seen]
+        observed = " ".join(f"{k % 20}.5 {k % 16}.5 {k + 1}" for k in range(len(scene.points)) if i < 2)
+        lines += [f"{i + 1} {pose} {2 if i == 3 else 1} {view.name}", observed]
     (model / "images.txt").write_text("\n".join(lines) + "\n")
     rows = zip(scene.points.tolist(), scene.points_rgb.tolist(), strict=True)
     points = (f"{k + 1} {x} {y} {z} {r} {g} {b} 0.5 1 {k} 2 {k}" for k, ((x, y, z), (r, g, b)) in enumerate(rows))
@@ -121,7 +121,7 @@ def write_nerfstudio(scene: Scene, root: Path) -> Source:
 
 
 def write_frames(scene: Scene, root: Path) -> list[dict[str, object]]:
-    """Write RGBA images and return what a transforms file says of each."""
+    """Write RGBA images, and return the entry of each for a transforms file."""
     from PIL import Image
 
     root.mkdir()
@@ -148,7 +148,7 @@ def write_packed(scene: Scene, root: Path) -> Source:
 
 
 def write_images(root: Path) -> Source:
-    """Write one picture of each kind; a mutated one must decode to a picture or be refused."""
+    """Write one picture of each format. A mutated one must decode to a picture or be refused."""
     from PIL import Image
 
     root.mkdir()
@@ -171,7 +171,7 @@ def write_images(root: Path) -> Source:
 
 
 def write_plys(scene: Scene, root: Path) -> Source:
-    """Write a model in binary and in text, and a point cloud."""
+    """Write a model as binary and as text, and a point cloud."""
     from plyfile import PlyData
 
     root.mkdir()
@@ -193,7 +193,7 @@ def write_plys(scene: Scene, root: Path) -> Source:
 
 
 def write_states(scene: Scene, root: Path) -> Source:
-    """Write a trainer's checkpoint, and a gate's state as it lies beside a script's checkpoint."""
+    """Write a checkpoint of the trainer, and the state of a gate beside a script's checkpoint."""
     root.mkdir()
     trainer = Trainer(TrainConfig(max_steps=10), scene)
     trainer.save_checkpoint(root / "ckpt.pt")

@@ -1,14 +1,13 @@
-"""Seconds from the command to the picture: whole fresh processes of `skipgs-plug train`, loading and saving included.
+"""Seconds from the command to the picture: new processes of `skipgs-plug train`, with loading and saving included.
 
     python benchmarks/time_to_picture.py fern --schedules 3000:auto 3000:0.1 3000:0.12
     python benchmarks/time_to_picture.py bonsai --schedules 7000:auto 6000:0.12 --repeats 1
 
-Trains the scene with each schedule (`--max-steps` and `--share`), as a user would, and prints the seconds on the wall,
-those for which processors worked, and PSNR on held-out views; of several repeats those of the fastest. Kernels are
-compiled beforehand by a run of one iteration. The aim is the quality that OpenSplat's trainer reaches on fern, and
-29.5 dB on bonsai with `images_4`. Writes one row per schedule to `benchmarks/results/time_to_picture.json`, with the
-load of the machine and the seconds that importing torch takes beside it, which no program here can save: on a quiet
-machine about one.
+Trains the scene with each schedule (`--max-steps` and `--share`), as a user would. Prints wall-clock seconds, processor
+seconds, and PSNR on held-out views, of the fastest repeat. A run of one iteration compiles all kernels before. The
+target is the quality of OpenSplat's trainer on fern, and 29.5 dB on bonsai with `images_4`. Writes one row per schedule
+to `benchmarks/results/time_to_picture.json`, with the load of the machine and the seconds that importing torch takes.
+No program here can save that import, which takes about one second on an idle machine.
 """
 
 import json
@@ -28,7 +27,7 @@ from common import RESULTS, SCENES, provenance, write_part
 from skipgs_plug.fallback_raster.runtime.cores import usable_cores
 
 FILE = RESULTS / "time_to_picture.json"
-# Folder, further options, PSNR to reach in dB.
+# By scene: folder, further options, and PSNR to reach in dB.
 AIMS = {
     "fern": ("fern", ["--data-factor", "2"], 27.4),
     "bonsai": ("bonsai", ["--data-factor", "4"], 29.5),
@@ -40,23 +39,23 @@ class Args:
     """Measure the time from the command to the picture."""
 
     scene: Annotated[Literal["fern", "bonsai"], tyro.conf.Positional]
-    """What to train."""
+    """Scene to train."""
     schedules: tuple[str, ...] = ("3000:auto", "3000:0.1", "3000:0.12")
-    """Lengths of schedules, each with the share of iterations that runs."""
+    """Schedules: number of iterations, and the share of them that runs."""
     repeats: int = 2
-    """Processes of each schedule."""
+    """Number of processes for each schedule."""
     grow_grad2d: float = 0.001
-    """Gradient above which Gaussians are duplicated or split: the smaller, the more of them."""
+    """Gradient above which Gaussians are duplicated or split. Smaller values give more Gaussians."""
 
 
 def processor() -> float:
-    """Return the processor seconds of all children that have ended."""
+    """Return the processor seconds of all child processes that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def train(scene: Path, options: list[str], steps: int, folder: Path) -> dict[str, Any]:
-    """Run one process to its end, and return its times and what its picture is worth."""
+    """Run one process to its end, and return its times, PSNR and number of Gaussians."""
     command = [sys.executable, "-m", "skipgs_plug", "train", str(scene), "--out", str(folder), "--no-progress"]
     command += ["--max-steps", str(steps), *options]
     before, begun = processor(), time.perf_counter()

@@ -1,4 +1,4 @@
-"""Other projects' own scripts, run by `skipgs-plug run`: their scenes, what their models show, and the table of it.
+"""Runs other projects' scripts with `skipgs-plug run`: makes their scenes, measures their models, and prints the table.
 
     python benchmarks/unmodified_scripts.py scene ../shared/data/bonsai OUT --keep-every 5 --factors 4 8
     python benchmarks/unmodified_scripts.py run fastgs auto CHECKOUTS OUT --data-factor 4  # one row of script_rows.py
@@ -6,10 +6,9 @@
     python benchmarks/unmodified_scripts.py pictures OUT/test/ours_3000
     python benchmarks/unmodified_scripts.py table benchmarks/results/scripts/runs.json
 
-Every script is measured alike: its PLY is rendered by this package from the held-out cameras. A PLY of Mip-Splatting
-has its 3D filter as a property; the filter is applied, with its own 2D filter of 0.1 square pixels. Where no PLY holds
-the model in the scene's coordinates (Scaffold-GS, gsplat) it is measured by the pictures that its script has written,
-in 8 bits.
+All scripts are measured alike: this package renders their PLY from the held-out cameras. A PLY of Mip-Splatting
+contains a 3D filter, which is applied together with its 2D filter of 0.1 square pixels. For scripts without a PLY in
+the scene's coordinates (Scaffold-GS, gsplat) the pictures that the script wrote are measured, in 8 bits.
 """
 
 import json
@@ -37,7 +36,7 @@ from skipgs_plug.trainer.ply import read_ply
 
 RUNS = Path(__file__).parent / "results/scripts/runs.json"
 MODES = {"own": ["--no-gate"], "auto": ["--share", "auto"]}
-MIP_FILTER = 0.1  # square pixels, that Mip-Splatting trains with
+MIP_FILTER = 0.1  # 2D filter that Mip-Splatting trains with, square pixels
 
 
 def thin_scene(
@@ -48,15 +47,15 @@ def thin_scene(
     factors: tuple[int, ...] = (4,),
     seed: int = 0,
 ) -> None:
-    """Thin out a COLMAP scene: every nth photograph by name, some of its points, smaller images.
+    """Reduce a COLMAP scene: every nth photograph by name, some of its points, smaller images.
 
     Args:
         source: COLMAP folder.
         out: Folder to write.
-        keep_every: Every nth photograph by name is kept.
-        points: Points that are kept, drawn from those in two kept photographs or more.
-        factors: Sizes of images, as images_{factor}.
-        seed: Of the draw.
+        keep_every: n, to keep every nth photograph by name.
+        points: Number of points to keep, drawn from those that at least two kept photographs observe.
+        factors: Factors by which images are reduced, to folders images_{factor}.
+        seed: Seed of the draw.
     """
     import pycolmap
 
@@ -101,19 +100,19 @@ def run(
     runs: Path = RUNS,
     more: str = "",
 ) -> None:
-    """Run a row's script once, measure its model, and record both, in place of the same run recorded before.
+    """Run the script of a row once, measure its model, and record both. Replaces the record of an equal run.
 
-    Keep other programs from the core (taskset), since processor seconds of a busy one are too many.
+    Keep other programs off the core (taskset): on a busy core, processor seconds are too high.
 
     Args:
-        row: Name in script_rows.py.
-        mode: With the gate, or without.
+        row: Name of the row in script_rows.py.
+        mode: "auto" runs with the gate, "own" without.
         checkouts: Folder with the checkouts of all projects.
         scene: COLMAP folder with images_{data_factor}.
-        data_factor: Size of the photographs.
-        iterations: Of the schedule.
-        out: Folder for what scripts write.
-        runs: File of records.
+        data_factor: Factor by which the photographs are reduced.
+        iterations: Iterations of the schedule.
+        out: Folder for the output of scripts.
+        runs: File with the records.
         more: Further options of the script.
     """
     one = ROWS[row]
@@ -162,7 +161,7 @@ def run(
 
 
 def judge(row: Row, folder: Path, scene: Path, factor: int) -> dict[str, Any]:
-    """Return PSNR, SSIM, number of held-out views and of Gaussians (None where no PLY says it)."""
+    """Return PSNR, SSIM, and the numbers of held-out views and of Gaussians (None if there is no PLY)."""
     plys = sorted(folder.rglob("point_cloud*.ply"), key=lambda path: path.stat().st_mtime)
     if not row.pictures:
         return measure_ply(plys[-1], scene, factor)
@@ -174,7 +173,7 @@ def judge(row: Row, folder: Path, scene: Path, factor: int) -> dict[str, Any]:
 
 
 def facts(folder: Path, iterations: int) -> dict[str, Any]:
-    """Return the facts of skipgs.json that stand in the records; few without a gate."""
+    """Return the entries of skipgs.json that are recorded. Without a gate there are few."""
     found = next(iter(folder.rglob("skipgs.json")), None)
     report = {} if found is None else json.loads(found.read_text(encoding="utf-8"))
     growing = report.get("growing") or {}
@@ -192,15 +191,15 @@ def facts(folder: Path, iterations: int) -> dict[str, Any]:
 
 
 def keep(record: dict[str, Any], runs: Path) -> None:
-    """Put a record in the file, in place of the same run's; a checkout without git has the commit of earlier ones."""
+    """Write a record in place of an equal run. A checkout without git gets the commit of earlier records."""
     whole = json.loads(runs.read_text(encoding="utf-8")) if runs.exists() else {"runs": []}
     if record["project_commit"] is None:
         same = [one["project_commit"] for one in whole["runs"] if one["project"] == record["project"]]
         record["project_commit"] = next(iter(same), None)
     key = ("scene", "script", "mode", "iterations")
-    places = [i for i, one in enumerate(whole["runs"]) if all(one[name] == record[name] for name in key)]
-    if places:
-        whole["runs"][places[0]] = record
+    equal = [i for i, one in enumerate(whole["runs"]) if all(one[name] == record[name] for name in key)]
+    if equal:
+        whole["runs"][equal[0]] = record
     else:
         whole["runs"].append(record)
     with write_aside(runs) as temporary:
@@ -208,7 +207,7 @@ def keep(record: dict[str, Any], runs: Path) -> None:
 
 
 def named(scene: Path, factor: int) -> str:
-    """Return a scene with its size and the number of its views."""
+    """Return the name of a scene, its image size and its numbers of views."""
     loaded = load_scene(scene, factor)
     view = loaded.test[0]
     views = f"{len(loaded.train)} training and {len(loaded.test)} held-out views"
@@ -216,14 +215,14 @@ def named(scene: Path, factor: int) -> str:
 
 
 def commit_of(folder: Path) -> str | None:
-    """Return the commit of a checkout; None where it is none of git."""
+    """Return the commit of a checkout; None if it has no git repository."""
     asked = subprocess.run(["git", "-C", folder, "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
     return asked.stdout.strip() or None
 
 
 @torch.no_grad()
 def measure_ply(path: Path, scene: Path, factor: int) -> dict[str, Any]:
-    """Return the means of PSNR and SSIM over the held-out views, their number, and that of the Gaussians."""
+    """Return means of PSNR and SSIM over the held-out views, and the numbers of views and Gaussians."""
     loaded = load_scene(scene, factor)
     splats = loaded.frame.local_splats(read_ply(path))
     scales, opacities = torch.exp(splats["scales"]), torch.sigmoid(splats["opacities"])
@@ -255,7 +254,7 @@ def measure_ply(path: Path, scene: Path, factor: int) -> dict[str, Any]:
 
 
 def smoothing_filter(path: Path) -> Tensor | None:
-    """Return Mip-Splatting's 3D filter as standard deviations [N, 1]; None for a PLY without it."""
+    """Return Mip-Splatting's 3D filter as standard deviations [N, 1]; None if the PLY has none."""
     from plyfile import PlyData
 
     vertices = PlyData.read(str(path))["vertex"]
@@ -265,9 +264,9 @@ def smoothing_filter(path: Path) -> Tensor | None:
 
 
 def measure_pictures(folder: Path) -> dict[str, Any]:
-    """Return the means of PSNR and SSIM over pictures, and their number.
+    """Return means of PSNR and SSIM over pictures, and their number.
 
-    They lie in `renders` and `gt` (Inria's family), or photograph and render side by side in one (gsplat).
+    Renders and photographs lie in folders `renders` and `gt` (Inria's family), or side by side in one file (gsplat).
     """
     if (folder / "gt").is_dir():
         names = sorted(path.name for path in (folder / "gt").iterdir())
@@ -281,7 +280,7 @@ def measure_pictures(folder: Path) -> dict[str, Any]:
 
 
 def pixels(path: Path) -> Tensor:
-    """Return a picture as [H, W, 3] in [0, 1]."""
+    """Return a picture as a tensor [H, W, 3] in [0, 1]."""
     return torch.from_numpy(np.array(Image.open(path).convert("RGB"))).float() / 255
 
 
@@ -291,9 +290,9 @@ def means(rows: list[dict[str, float]]) -> dict[str, Any]:
 
 
 def table(runs: list[dict[str, Any]]) -> str:
-    """Return one row for each pair of runs, by scene, in the order in which they were recorded.
+    """Return a Markdown table with one row for each pair of runs, by scene, in the order of the records.
 
-    Seconds on a core that many used have a star, and are compared with others of such a core alone.
+    Seconds from a core that other programs used have a star. They are compared only with each other.
     """
     pairs: dict[tuple[str, str, int], dict[str, dict[str, Any]]] = {}
     for run in runs:
@@ -313,7 +312,7 @@ def table(runs: list[dict[str, Any]]) -> str:
 
 
 def row(key: tuple[str, str, int], pair: dict[str, dict[str, Any]]) -> str:
-    """Return a row of the table."""
+    """Return one row of the table."""
     own, auto = pair["own"], pair["auto"]
     alike = own.get("busy_core", False) == auto.get("busy_core", False)
     cells = [
@@ -331,7 +330,7 @@ def row(key: tuple[str, str, int], pair: dict[str, dict[str, Any]]) -> str:
 
 
 def seconds(run: dict[str, Any]) -> str:
-    """Return the seconds of a run, with a star where many programs used its core: they are too many."""
+    """Return the seconds of a run, with a star if other programs used its core, which makes them too high."""
     return f"{run['seconds']:.0f}{'*' if run.get('busy_core') else ''}"
 
 

@@ -1,1 +1,1 @@
-"""What a GPU says about the gate: one command, one scene, under eight minutes."""
+"""Measures the gate on a GPU: one command, one scene, under eight minutes."""

@@ -1,8 +1,8 @@
 """Measure the gate on this GPU: `python -m benchmarks.gpu SCENE`, from the root of a checkout.
 
-Installs nothing, ends within eight minutes, writes one JSON and prints one table: how often the host waits for the
-device, memory at the peak and over the first skip, seconds of refinement and in all, PSNR, for the trainer of this
-package on gsplat, and for gsplat's own simple_trainer.py where a checkout is found (`--script`, SKIPGS_SCRIPT, or
+Installs nothing, ends within eight minutes, writes one JSON file and prints one table: how often the host waits for the
+device, peak memory overall and over the first skip, seconds of refinement and in all, and PSNR. It measures the trainer
+of this package on gsplat, and gsplat's own simple_trainer.py if a checkout is found (`--script`, SKIPGS_SCRIPT, or
 `gsplat` beside this folder).
 """
 
@@ -22,8 +22,9 @@ from benchmarks.gpu.script import find_script, run_script
 from skipgs_plug.trainer import InputError, load_scene
 from skipgs_plug.trainer.backend import resolve_backend
 
-SECONDS = 450.0  # for everything: half a minute is left of eight minutes for what cannot be stopped at once
-OF_THE_SCRIPT = 0.35  # of what is left, where there is one
+# Time limit of all measurements: half a minute less than eight minutes, for work that cannot be stopped.
+SECONDS = 450.0
+SCRIPT_SHARE = 0.35  # share of the time for gsplat's script, if there is one
 
 
 def main(argv: list[str]) -> int:
@@ -42,7 +43,7 @@ def main(argv: list[str]) -> int:
         return 2
     machine = CudaMachine()
     script = find_script(asked.script) if asked.scene.is_dir() else None
-    own = Deadline(deadline.left * (1.0 - OF_THE_SCRIPT if script else 1.0))
+    own = Deadline(deadline.left * (1.0 - SCRIPT_SHARE if script else 1.0))
     result: dict[str, Any] = {"device": machine.name, "torch": torch.__version__, "scene": str(asked.scene)}
     result["trainer"] = compare(scene, backend, machine, own)
     result["script"] = None if script is None else run_script(script, asked.scene, deadline.left)
@@ -52,7 +53,7 @@ def main(argv: list[str]) -> int:
 
 
 def table(result: dict[str, Any]) -> str:
-    """The figures as a Markdown table, and what is missing."""
+    """Return the figures as a Markdown table, and the names of missing runs."""
     trainer = result["trainer"]
     lines = [
         f"{result['device']}, {trainer['schedule']} iterations, {trainer['num_GS']} Gaussians",

@@ -1,4 +1,4 @@
-"""What is asked of a device: when it is done, how much memory it took, how often the host waited."""
+"""Measurements of a device: synchronization, peak memory, and how often the host waits."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Machine(Protocol):
 
 
 class CudaMachine:
-    """The present CUDA device."""
+    """The current CUDA device."""
 
     def __init__(self) -> None:
         self.name = torch.cuda.get_device_name()
@@ -43,7 +43,7 @@ class CudaMachine:
 
     @contextmanager
     def waits(self) -> Iterator[list[int]]:
-        """Count synchronizing operations inside the block, exactly: PyTorch warns of each."""
+        """Count synchronizing operations inside the `with` statement, exactly, because PyTorch warns of each."""
         count = [0]
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")

@@ -1,4 +1,4 @@
-"""The trainer of this package with and without a gate, from one snapshot: waits, peak memory, seconds, PSNR."""
+"""Runs the trainer of this package with and without gates from one snapshot: waits, peak memory, seconds, PSNR."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from skipgs_plug.trainer.scene import Scene
 
 GATES: dict[str, dict[str, Any]] = {
     "off": {"enabled": False},
-    "gate": {"min_bwd_ratio": 0.0},  # without a floor: the most that can be skipped
+    "gate": {"min_bwd_ratio": 0.0},  # no minimum of backward passes: as many skips as possible
     "refine_share 0.4": {"refine_share": 0.4},
 }
 COUNTED = 20  # iterations whose waits are counted
-TRIAL = 30  # iterations that say how fast this machine is
-SHORTEST, LONGEST = 600, 30_000  # iterations of the schedule
+TRIAL = 30  # iterations that measure the speed of this machine
+SHORTEST, LONGEST = 600, 30_000  # bounds of the schedule, iterations
 
 
 class Deadline:
-    """What is left of the time."""
+    """A time limit."""
 
     def __init__(self, seconds: float, now: Callable[[], float] = time.monotonic) -> None:
         self._now = now
@@ -31,16 +31,16 @@ class Deadline:
 
     @property
     def left(self) -> float:
-        """Seconds."""
+        """Seconds until the time limit, at least 0."""
         return max(self._end - self._now(), 0.0)
 
 
 def schedule(seconds: float, seconds_per_iteration: float) -> int:
-    """Return the iterations of a schedule whose densification runs once and whose refinement for each gate.
+    """Return the iterations of a schedule. Its densification runs once, its refinement once for each gate.
 
     Args:
-        seconds: For all of it.
-        seconds_per_iteration: As measured at the beginning; later ones have more Gaussians and take twice as long.
+        seconds: Time limit of all runs.
+        seconds_per_iteration: Measured at the beginning. Later iterations have more Gaussians and take twice as long.
     """
     runs = 0.5 + 0.5 * len(GATES)
     wanted = int(seconds / (2.0 * seconds_per_iteration * runs))
@@ -51,11 +51,11 @@ def compare(scene: Scene, backend: Backend, machine: Machine, deadline: Deadline
     """Train to the end of densification, then refine from there once with each gate.
 
     Args:
-        scene: To train on.
+        scene: Scene to train on.
         backend: Rasterizer and device.
-        machine: What measures the device.
-        deadline: No refinement begins when less is left than the one before took.
-        steps: Iterations of the schedule; None to find them by how fast the machine is.
+        machine: Measures the device.
+        deadline: Time limit. No refinement starts if less time is left than the longest one took.
+        steps: Iterations of the schedule; if None, the speed of the machine determines them.
 
     Returns:
         `schedule` (iterations), `num_GS`, `t_densify` (seconds) and `runs`, by gate: `waits_per_iteration`,
@@ -86,7 +86,7 @@ def compare(scene: Scene, backend: Backend, machine: Machine, deadline: Deadline
 
 
 def _trial(scene: Scene, backend: Backend, machine: Machine) -> float:
-    """Seconds of one early iteration."""
+    """Measure the seconds of one early iteration."""
     trainer = Trainer(TrainConfig(max_steps=LONGEST), scene, backend)
     trainer.train(5, progress=False)
     began = time.monotonic()
@@ -112,7 +112,7 @@ def _refine(trainer: Trainer, snapshot: dict[str, Any], settings: dict[str, Any]
         def look(_: Any) -> None:
             nonlocal first_skip, overall
             if skipped and first_skip is None:
-                first_skip = machine.peak_bytes()  # over the iteration that follows the first skip
+                first_skip = machine.peak_bytes()  # peak over the iteration after the first skip
             if first_skip is None and not skipped and gate.skipped:
                 skipped.append(True)
                 overall = max(overall, machine.peak_bytes())

@@ -1,4 +1,4 @@
-"""An unmodified training script with and without a gate, in processes of their own."""
+"""Runs gsplat's unmodified training script with and without a gate, in processes of their own."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-PLACES = ("gsplat/examples/simple_trainer.py", "../gsplat/examples/simple_trainer.py")
-STEPS = 2000  # iterations, of which the second half is refined
+CANDIDATES = ("gsplat/examples/simple_trainer.py", "../gsplat/examples/simple_trainer.py")
+STEPS = 2000  # iterations, of which the second half is refinement
 
 
 def find_script(given: str | None) -> Path | None:
-    """gsplat's simple_trainer.py: as given, from SKIPGS_SCRIPT, or in a checkout beside this one."""
+    """Return the path of gsplat's simple_trainer.py: as given, from SKIPGS_SCRIPT, or in a checkout beside this one."""
     asked = given or os.environ.get("SKIPGS_SCRIPT")
-    places = [Path(asked)] if asked else [Path(place) for place in (*PLACES, str(Path.home() / PLACES[0]))]
-    return next((place for place in places if place.is_file()), None)
+    paths = [Path(asked)] if asked else [*map(Path, CANDIDATES), Path.home() / CANDIDATES[0]]
+    return next((path for path in paths if path.is_file()), None)
 
 
 def run_script(script: Path, scene: Path, seconds: float) -> dict[str, Any]:
     """Run gsplat's script twice: `off` and `gate` have `t_total`, `t_post`, `backwards_skipped`, or `error`.
 
     Args:
-        script: simple_trainer.py.
-        scene: A COLMAP folder.
-        seconds: For both.
+        script: Path of simple_trainer.py.
+        scene: COLMAP folder.
+        seconds: Time limit of both runs together.
     """
     found: dict[str, Any] = {"script": str(script)}
     for name, options in (("off", ["--threshold", "-0.999", "--warmup", "0"]), ("gate", ["--min-bwd-ratio", "0"])):
