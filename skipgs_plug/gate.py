@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Iterable
-from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
@@ -13,7 +12,6 @@ from torch import Tensor
 
 from skipgs_plug.adapters.registry import find_adapter
 from skipgs_plug.core import distributed
-from skipgs_plug.core.caution import caution
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
@@ -113,7 +111,10 @@ class SkipGate:
         else:
             self._engine = Engine(settings, policy, record_trace)
             self._engine.configure(TrainerInfo(0 if policy is None else policy.start_iter))
-        self._iteration = self._engine.iteration
+        self._iteration = iteration = self._engine.iteration
+        self._giving_up = self._engine.giving_up
+        # Around the gate's own code in a verb: an error there releases the gate, and the loop goes on.
+        self._guarded = self._giving_up.guarded(lambda: iteration.step)
 
     # Verbs for a loop of your own.
 
@@ -161,7 +162,7 @@ class SkipGate:
         if always is None:
             frame = sys._getframe(1)
             source = (frame.f_code, {**frame.f_globals, **frame.f_locals})
-        with self._guarded():
+        with self._guarded:
             keys = None if views is None else list(dict.fromkeys(view_key(view) for view in views))
             return self._engine.pace.follow(numbers, source, always or (), keys, events)
         return LoopRange(numbers, EveryNumber(lambda: None))
@@ -200,13 +201,13 @@ class SkipGate:
         self._check_losses(loss, view)
         now, step = self._iteration, int(step)
         run = Original(_backward_of_sum if isinstance(view, list) else loss.backward)
-        if self.released is None:
+        if self._giving_up.reason is None:
             try:
                 return self._gated_backward(loss, view, step, loss if signal is None else signal, run)
             except Exception as error:
                 if run.failed:
                     raise  # of the loop's own backward
-                self._engine.giving_up.on_error(error, step)
+                self._giving_up.on_error(error, step)
         now.begin(step, gated=False)
         now.ran = True
         if not run.made:
@@ -228,13 +229,14 @@ class SkipGate:
         """
         self._require_backward_before("step")
         optimizers = stepping = listed(optimizer)
-        if self.released is None:
+        if self._giving_up.reason is None:
+            stepped = self._iteration.stepped
             for one in optimizers:
-                if id(one) in self._iteration.stepped:
+                if id(one) in stepped:
                     raise GateOrderError("step() was called twice for one optimizer in this iteration.")
-            self._iteration.stepped.update(id(one) for one in optimizers)
+            stepped.update(map(id, optimizers))
             if self._engine.config.enabled:  # without a gate all of them step
-                with self._guarded():
+                with self._guarded:
                     stepping = [one for one in optimizers if has_pending_gradient(one)]
         for one in stepping:
             one.step(*args)
@@ -251,7 +253,7 @@ class SkipGate:
         """
         self._require_backward_before("update")
         self._iteration.ended = True
-        with self._guarded():
+        with self._guarded:
             self._engine.free_skipped()
 
     def notify_event(self, kind: str, step: int | None = None) -> None:
@@ -267,7 +269,7 @@ class SkipGate:
         step = self._iteration.step if step is None else int(step)
         if step is None or self._engine.policy is None:
             raise GateOrderError("notify_event() came before the first iteration; give its step.")
-        with self._guarded():
+        with self._guarded:
             self._engine.notify_event(kind, step)
 
     # Counts and settings.
@@ -275,7 +277,7 @@ class SkipGate:
     @property
     def released(self) -> str | None:
         """Why the gate let go of a run that then trained on without it; None where it did not."""
-        return self._engine.giving_up.reason
+        return self._giving_up.reason
 
     @property
     def skipped(self) -> bool:
@@ -424,19 +426,9 @@ class SkipGate:
             if not hasattr(one, "backward"):
                 raise SkipGSError(f"backward() needs the loss itself, a tensor, not {type(one).__name__}.")
 
-    def _guarded(self) -> AbstractContextManager[None]:
-        """A block of the gate's own code in a verb; an error in it releases the gate, and the loop goes on."""
-        return self._engine.giving_up.guarded(lambda: self._iteration.step)
-
     def _gated_backward(self, loss: Any, view: Any, step: int, signal: Any, run: Original) -> bool:
         """`backward`, as long as the gate holds on; `run` is the loop's own backward."""
         engine, now = self._engine, self._iteration
-        if engine.pace.lacks_loop:
-            loop = "so the gate must count them; write the loop as for step in gate.iterations(range(...))."
-            if engine.pace.needs_loop(step):
-                raise SkipGSError(f"share and refine_share leave out iterations, {loop}")
-            if now.opened == 0:
-                caution(f"refine_share leaves out iterations from {engine.start} on, {loop}", stacklevel=3)
         if step != now.step:
             engine.open_iteration(step)
         elif now.ended or now.stepped:
@@ -463,31 +455,38 @@ class SkipGate:
         return bool(kept)
 
     def _new_in_iteration(self, view: Any) -> str:
-        """Key of a view without a backward in this iteration; an index on a device is read from the start on alone."""
-        index = isinstance(view, Tensor) and view.numel() == 1 and not view.is_floating_point()
-        if index and view.device.type != "cpu" and not self._engine.active:
-            self._iteration.keys.add(NOT_READ)
+        """Return the key of a view that has no backward in this iteration yet.
+
+        Before `start_iter` an index on a device is not read: reading it would wait for the device.
+        """
+        keys = self._iteration.keys
+        if isinstance(view, Tensor) and not self._iteration.gated and _is_index_on_device(view):
+            keys.add(NOT_READ)
             return NOT_READ
         key = view_key(view)
-        if key in self._iteration.keys:
+        if key in keys:
             raise GateOrderError(
                 f"backward() was called twice for view {key!r} in iteration {self._iteration.step}; "
                 "give each iteration its own step number."
             )
-        self._iteration.keys.add(key)
+        keys.add(key)
         return key
 
     def _require_manual(self, verb: str) -> None:
-        if self.adapter is not None:
+        if self._adapter is not None:
             raise GateOrderError(
-                f"{verb}() is for loops of your own; this gate is attached by adapter {self.adapter.name!r}, "
+                f"{verb}() is for loops of your own; this gate is attached by adapter {self._adapter.name!r}, "
                 "and the trainer calls its own."
             )
 
     def _require_backward_before(self, verb: str) -> None:
         self._require_manual(verb)
-        if self.released is None and (self._iteration.ended or not self._iteration.keys):
+        if self._giving_up.reason is None and (self._iteration.ended or not self._iteration.keys):
             raise GateOrderError(f"{verb}() was called before backward() in this iteration.")
+
+
+def _is_index_on_device(view: Tensor) -> bool:
+    return view.numel() == 1 and not view.is_floating_point() and not view.is_cpu
 
 
 def _backward_of_sum(losses: Iterable[Tensor]) -> None:

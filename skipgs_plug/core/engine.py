@@ -9,7 +9,6 @@ import weakref
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from skipgs_plug.core import decision, distributed
@@ -178,11 +177,12 @@ class Engine:
                 f"Iterations went back from {before} to {step}: load the gate state that belongs to "
                 "the checkpoint, or attach a new gate."
             )
+        self.pace.begin(step, self.policy)
+        post = step >= self.start
         self.iteration.opened += 1
-        self.pace.begin(step, None if self.policy is None else self.policy.floor)
-        self.iteration.begin(step, self._gates(step))
+        self.iteration.begin(step, gated=post and self.config.enabled)
         self._skipped.clear()
-        self.clock.open(post=step >= self.start)
+        self.clock.open(post)
 
     def gate(
         self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor | None = None, alone: bool = False
@@ -201,7 +201,7 @@ class Engine:
                 freed at once.
         """
         back_from = loss if loss is not None else signal if isinstance(signal, Tensor) else None
-        foreseen = self._foreseen(view, signal, back_from)
+        foreseen = self._foreseen(view, signal, back_from) if self.iteration.gated else None
         if foreseen is False:
             skip = self._run_first(view, signal, run, back_from)
         else:
@@ -228,9 +228,9 @@ class Engine:
         self._skipped.clear()
 
     def _foreseen(self, view: str, signal: float | Tensor, loss: Tensor | None) -> bool | None:
-        """Whether the backward is skipped, if that is known without the loss, whose reading would cost a wait."""
+        """Whether the backward of a gated iteration is skipped, if that is known without waiting for the loss."""
         now = self.iteration
-        if not (now.gated and loss is not None and isinstance(signal, Tensor) and has_events(signal.device)):
+        if not (loss is not None and isinstance(signal, Tensor) and has_events(signal.device)):
             return None
         # Others are to be asked; gradients of earlier iterations would be dropped with a loss that is not finite.
         if self._accumulates or self._scene_check.running or distributed.group_size() > 1:
@@ -337,11 +337,7 @@ class Engine:
         # Where nothing pauses, means lag behind a change for long.
         if not self.pace.leaves_out or not self.stats.events:
             self._scene_check.start()
-        self.iteration.begin(step, step is not None and self._gates(step))
-
-    def _gates(self, step: int) -> bool:
-        """Whether iteration `step` is gated."""
-        return self.config.enabled and step >= self.start
+        self.iteration.begin(step, gated=step is not None and step >= self.start and self.config.enabled)
 
     def _go_on_from_saved(self, step: int) -> None:
         """Load the state of the checkpoint from which training continues with iteration `step`, if there is one."""

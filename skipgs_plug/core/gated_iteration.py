@@ -24,7 +24,10 @@ class GatedIteration:
         ended: `update` was called by hand.
     """
 
-    __slots__ = ("backwards", "decision", "ended", "gated", "keys", "opened", "ran", "signal", "step", "stepped", "view")
+    __slots__ = (
+        *("backwards", "decision", "ended", "gated", "keys", "opened"),
+        *("ran", "signal", "step", "stepped", "view"),
+    )
 
     def __init__(self) -> None:
         self.keys: set[str] = set()

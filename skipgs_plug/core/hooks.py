@@ -67,6 +67,7 @@ class Hooks:
         self._giving_up.undoes(self.restore)
         # Refusals come with the first iteration, when nothing is lost yet.
         self._giving_up.refuses = lambda: max(self._iterations, self._backwards) <= 1
+        self._guarded = self._giving_up.guarded(lambda: self._iteration.step)
         self._patches = Patches(self._expectation, self._failed)
         self._ready = False
         self.script_globals: dict[str, Any] = {}
@@ -327,7 +328,7 @@ class Hooks:
         Raises:
             SkipGSError: In the block, of a gate that is on and refuses this run in its first iteration.
         """
-        return self._giving_up.guarded(lambda: self._iteration.step)
+        return self._guarded
 
     def release(self, reason: str) -> None:
         """Take the gate off a run that goes on without it, and say why: an error would end what was trained."""

@@ -103,12 +103,12 @@ class _Guard:
 
 
 class Original:
-    """A call of the trainer's own, around which code of the gate runs.
+    """A function of the trainer that code of the gate calls. It tells the trainer's errors from the gate's.
 
     Attributes:
-        made: It was called.
-        failed: It raised, so that an error is the trainer's own.
-        result: What it returned.
+        made: Whether it was called.
+        failed: Whether its last call has not returned, so that an error comes from the trainer.
+        result: The value that its last call returned.
     """
 
     __slots__ = ("_function", "failed", "made", "result")
@@ -116,13 +116,9 @@ class Original:
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
         self.made = self.failed = False
-        self.result: Any = None
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        self.made = True
-        try:
-            self.result = self._function(*args, **kwargs)
-        except BaseException:
-            self.failed = True
-            raise
+        self.made = self.failed = True
+        self.result = self._function(*args, **kwargs)
+        self.failed = False
         return self.result

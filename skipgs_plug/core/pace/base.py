@@ -79,8 +79,12 @@ class Pace:
         """
         return LoopRange(numbers, EveryNumber(lambda: None))
 
-    def begin(self, step: int, floor: float | None) -> None:
-        """Iteration `step` begins; `floor` is the least share of real backwards in force, None without one."""
+    def begin(self, step: int, policy: Policy | None) -> None:
+        """Begin iteration `step`, in which `policy` decides on backward passes; None before `Engine.configure`.
+
+        Raises:
+            SkipGSError: Iterations are to be left out, and no loop is known that could leave them out.
+        """
 
     def describe(
         self,
@@ -105,15 +109,6 @@ class Pace:
     @property
     def leaves_out(self) -> bool:
         """Whether whole iterations may be left out, for which the pace needs the training loop."""
-        return False
-
-    @property
-    def lacks_loop(self) -> bool:
-        """Whether iterations are to be left out and no loop runs that could do so."""
-        return False
-
-    def needs_loop(self, step: int) -> bool:
-        """Whether iteration `step` belongs to a phase that leaves out iterations."""
         return False
 
     def remove(self) -> None:

@@ -10,6 +10,7 @@ from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.base import EveryNumber, Pace, Source
 from skipgs_plug.core.pace.loop_range import LoopRange, require_planned
 from skipgs_plug.core.pace.rates import ScaledRates, path_factor
+from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.trainer_info import TrainerInfo
 
 
@@ -43,7 +44,7 @@ class Compensated(Pace):
         self._plan(numbers)
         return LoopRange(numbers, EveryNumber(self._rates.pause))
 
-    def begin(self, step: int, floor: float | None) -> None:
+    def begin(self, step: int, policy: Policy | None) -> None:
         if self._last is None:
             raise SkipGSError(
                 "compensate=True must know the last iteration: write the loop as "
@@ -54,7 +55,8 @@ class Compensated(Pace):
             return
         # A trainer may go on after the end that it told: with steps of length 0.
         progress = min((step - self._start) / max(self._last + 1 - self._start, 1), 1.0)
-        self._rates.scale(path_factor(floor or 1.0, progress, self._config.rate_peak, self._rates.visibility.share))
+        floor = (policy.floor if policy is not None else None) or 1.0
+        self._rates.scale(path_factor(floor, progress, self._config.rate_peak, self._rates.visibility.share))
 
     def _plan(self, numbers: range) -> None:
         if not numbers:

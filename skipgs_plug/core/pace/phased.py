@@ -61,6 +61,7 @@ class Phased(Pace):
         self._left_out = 0
         self._bars = Bars([])
         self._attached = False  # by an adapter
+        self._asked = False  # for the loop, if it is not known in the first iteration
         self._configured = self._removed = False
         self._planned = False  # the loop's conditions were read: nothing is refused any more
 
@@ -121,20 +122,16 @@ class Phased(Pace):
         return True
 
     @property
-    def lacks_loop(self) -> bool:
-        return self.number is None and not self._removed
-
-    def needs_loop(self, step: int) -> bool:
-        return self.growing is not None or step >= self._start
-
-    @property
     def number(self) -> int | None:  # type: ignore[override]
         loop = self._finder.found
         return None if loop is None else loop.current
 
-    def begin(self, step: int, floor: float | None) -> None:
+    def begin(self, step: int, policy: Policy | None) -> None:
         # An adapter's loop is looked for from the first iteration on: a refusal comes before anything is trained.
-        needed = self._attached or self.needs_loop(step)
+        needed = self._attached or self.growing is not None or step >= self._start
+        if not self._attached and self.number is None and not self._removed:
+            self._ask_for_loop(needed)
+        self._asked = True
         if self._finder.begins(step, needed) and step >= self._start and self.refining.first is None:
             self.refining.first = step  # it began before its loop was known
             self.refining.counts()
@@ -193,6 +190,18 @@ class Phased(Pace):
         """The loop is over, or was left: whatever steps afterwards is no part of it."""
         if loop is self._finder.found:
             self._rates.pause()
+
+    def _ask_for_loop(self, needed: bool) -> None:
+        """Tell the user that the gate must count the iterations of a loop of their own.
+
+        Raises:
+            SkipGSError: The present iteration could have been left out.
+        """
+        how = "so the gate must count them; write the loop as for step in gate.iterations(range(...))."
+        if needed:
+            raise SkipGSError(f"share and refine_share leave out iterations, {how}")
+        if not self._asked:
+            caution(f"refine_share leaves out iterations from {self._start} on, {how}")
 
     def _read(self, loop: LoopRange, number: int) -> None:
         """Read the loop's conditions, with its first number that can be left out: nothing is refused later."""
