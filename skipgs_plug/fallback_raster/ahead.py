@@ -27,10 +27,11 @@ RGB_CHANNELS = 3  # of the images of training; kernels of other numbers are not 
 
 
 def load_kernels_ahead(absgrad: bool = False, lazy: bool = True, densify: bool = True) -> list[threading.Thread]:
-    """Load the kernels that training needs, in the order of their first use, on as many threads as there are cores.
+    """Load the kernels that training needs on as many threads as there are cores, those that compile longest first.
 
-    A call of a kernel that is not loaded yet waits for it, or loads it. Kernels that only some scenes need are not
-    loaded ahead. With one core nothing is done, because nothing could run at the same time.
+    The first iteration needs nearly all of them, so it begins when the last one is loaded. A call of a kernel that is
+    not loaded yet waits for it, or loads it. Kernels that only some scenes need are not loaded ahead. With one core
+    nothing is done, because nothing could run at the same time.
 
     Args:
         absgrad: Whether absolute gradients of 2D means are computed.
@@ -44,9 +45,9 @@ def load_kernels_ahead(absgrad: bool = False, lazy: bool = True, densify: bool =
     loads: list[Callable[[], object]] = [load_pool_kernels] if several else []
     absolute = [ADJOINT[RGB_CHANNELS, True]] if absgrad else []
     workers: list[Worker[Any]] = [
-        _take_rows, project_forward, list_visible, sh_forward, pack_and_count, scan_pairs, fill_pairs,
-        FORWARD[RGB_CHANNELS], _LOSS_TILES[PHOTO_DTYPE], *absolute, ADJOINT[RGB_CHANNELS, False], splat_adjoint,
-        _adam, *([_catch_up] if lazy else []), *([_sum_norms] if densify else []),
+        splat_adjoint, FORWARD[RGB_CHANNELS], pack_and_count, _LOSS_TILES[PHOTO_DTYPE], project_forward, sh_forward,
+        *absolute, ADJOINT[RGB_CHANNELS, False], *([_catch_up] if lazy else []), fill_pairs, _adam,
+        _take_rows, list_visible, scan_pairs, *([_sum_norms] if densify else []),
     ]  # fmt: skip
     loads += [worker.load for worker in workers]
     return run_aside(loads, min(usable_cores(), len(loads))) if usable_cores() > 1 else []

@@ -1,6 +1,6 @@
 """A small ray tracer in numpy: spheres, boxes and a floor, one light, hard shadows, one mirror bounce.
 
-Arrays hold one row per ray or point: [R], [R, 3].
+Arrays hold one value per ray or point, [R], or one row per coordinate, [3, R]: numpy works on long rows.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ SKY = (0.62, 0.71, 0.80)
 LIGHT = np.array([0.45, -0.35, 0.82]) / np.linalg.norm([0.45, -0.35, 0.82])
 FLOOR_HALF = 2.6
 EPS = 1e-4
+BATCH = 4096  # rays that are traced together: their arrays stay in the processor's caches
 
 
 @dataclass(frozen=True)
@@ -48,71 +49,88 @@ FLOOR, FIRST_BOX = len(SPHERES) + len(BOXES), len(SPHERES)
 def trace_view(viewmat: Array, K: Array, width: int, height: int) -> Array:
     """Return the image [H, W, 3] in [0, 1], mean of 2x2 samples per pixel."""
     x, y = np.meshgrid((np.arange(2 * width) + 0.5) / 2, (np.arange(2 * height) + 0.5) / 2)
-    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1).reshape(-1, 3)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    directions = rays @ viewmat[:3, :3]
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)]).reshape(3, -1)
+    rays /= np.sqrt(dot(rays, rays))
+    directions = viewmat[:3, :3].T @ rays
     origin = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    colour = shade(np.broadcast_to(origin, directions.shape), directions, bounces=1)
-    return colour.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
+    colour = np.empty(directions.shape)
+    for begin in range(0, directions.shape[1], BATCH):
+        part = directions[:, begin : begin + BATCH]
+        colour[:, begin : begin + BATCH] = shade(np.broadcast_to(origin[:, None], part.shape), part, bounces=1)
+    return colour.reshape(3, height, 2, width, 2).mean(axis=(2, 4)).transpose(1, 2, 0)
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Return the products [R] of vectors [3, R]; either may be one for all, [3, 1]."""
+    product: Array = a[0] * b[0]
+    product += a[1] * b[1]
+    product += a[2] * b[2]
+    return product
+
+
+def column(vector: tuple[float, ...] | Array) -> Array:
+    """Return a vector or colour [3, 1], which goes with [3, R]."""
+    return np.asarray(vector, dtype=float)[:, None]
 
 
 def shade(origins: Array, directions: Array, bounces: int) -> Array:
-    """Return the colour [R, 3] that arrives along each ray."""
+    """Return the colour [3, R] that arrives along each ray."""
     distance, item, normal = intersect(origins, directions)
-    colour = np.tile(SKY, (len(directions), 1))
+    colour = np.repeat(column(SKY), directions.shape[1], axis=1)
     hit = item >= 0
     if not hit.any():
         return colour
-    points = origins[hit] + distance[hit, None] * directions[hit]
-    normal, item, incoming = normal[hit], item[hit], directions[hit]
+    normal, item, incoming = normal[:, hit], item[hit], directions[:, hit]
+    points = origins[:, hit] + distance[hit] * incoming
     lifted = points + EPS * normal
     surface, lit = lit_albedo(points, lifted, item, normal)
-    reflected = incoming - 2 * (incoming * normal).sum(axis=1, keepdims=True) * normal
     for k, sphere in enumerate(SPHERES):
         on = item == k
         if not sphere.mirror or not on.any():
             continue
-        glint = (reflected[on] @ LIGHT).clip(0) ** 60 * (lit[on] > 0)
+        reflected = incoming[:, on] - 2 * dot(incoming[:, on], normal[:, on]) * normal[:, on]
+        glint = dot(column(LIGHT), reflected).clip(0) ** 60 * (lit[on] > 0)
         if bounces:
-            mirrored = shade(lifted[on], reflected[on], bounces - 1)
-            surface[on] = (1 - sphere.mirror) * surface[on] + sphere.mirror * mirrored
-        surface[on] += glint[:, None]
-    colour[hit] = surface.clip(0, 1)
+            mirrored = shade(lifted[:, on], reflected, bounces - 1)
+            surface[:, on] = (1 - sphere.mirror) * surface[:, on] + sphere.mirror * mirrored
+        surface[:, on] += glint
+    colour[:, hit] = surface.clip(0, 1)
     return colour
 
 
 def lit_albedo(points: Array, lifted: Array, item: Array, normal: Array) -> tuple[Array, Array]:
-    """Return the matte colour [R, 3] under light and shadow, and the light's share [R]."""
-    lit = (normal @ LIGHT).clip(0) * ~occluded(lifted)
-    return albedo(points, item) * (0.35 + 0.65 * lit)[:, None], lit
+    """Return the matte colour [3, R] under light and shadow, and the light's share [R]."""
+    lit = dot(column(LIGHT), normal).clip(0) * ~occluded(lifted)
+    return albedo(points, item) * (0.35 + 0.65 * lit), lit
 
 
 def intersect(origins: Array, directions: Array) -> tuple[Array, Array, Array]:
-    """Return distance [R], item [R] (-1 for none) and normal [R, 3] of the nearest surface."""
-    rays = len(directions)
-    nearest, item, normal = np.full(rays, np.inf), np.full(rays, -1), np.zeros((rays, 3))
+    """Return distance [R], item [R] (-1 for none) and normal [3, R] of the nearest surface."""
+    rays = directions.shape[1]
+    nearest, item, normal = np.full(rays, np.inf), np.full(rays, -1), np.zeros((3, rays))
     for k, sphere in enumerate(SPHERES):
         t = sphere_distance(origins, directions, sphere)
-        closer = t < nearest
+        closer = np.flatnonzero(t < nearest)
         nearest[closer], item[closer] = t[closer], k
-        points = origins[closer] + t[closer, None] * directions[closer]
-        normal[closer] = (points - sphere.centre) / sphere.radius
+        points = origins[:, closer] + t[closer] * directions[:, closer]
+        normal[:, closer] = (points - column(sphere.centre)) / sphere.radius
     for k, box in enumerate(BOXES):
-        t, axis = box_distance(origins, directions, box)
-        closer = t < nearest
+        t, near = box_distance(origins, directions, box)
+        closer = np.flatnonzero(t < nearest)
         nearest[closer], item[closer] = t[closer], FIRST_BOX + k
-        face = np.eye(3)[axis[closer]]
-        normal[closer] = -np.sign((directions[closer] * face).sum(axis=1, keepdims=True)) * face
+        axis = near[:, closer].argmax(axis=0)  # of the face that was hit
+        normal[:, closer] = 0.0
+        normal[axis, closer] = -np.sign(directions[axis, closer])
     t = floor_distance(origins, directions)
-    closer = t < nearest
-    nearest[closer], item[closer], normal[closer] = t[closer], FLOOR, (0.0, 0.0, 1.0)
+    closer = np.flatnonzero(t < nearest)
+    nearest[closer], item[closer], normal[:, closer] = t[closer], FLOOR, column((0.0, 0.0, 1.0))
     return nearest, item, normal
 
 
 def occluded(origins: Array) -> Array:
-    """Return whether something stands between each point [R, 3] and the light."""
-    directions = np.broadcast_to(LIGHT, origins.shape)
-    blocked = np.zeros(len(origins), dtype=bool)
+    """Return whether something stands between each point [3, R] and the light."""
+    directions = column(LIGHT)
+    blocked = np.zeros(origins.shape[1], dtype=bool)
     for sphere in SPHERES:
         blocked |= np.isfinite(sphere_distance(origins, directions, sphere))
     for box in BOXES:
@@ -121,37 +139,40 @@ def occluded(origins: Array) -> Array:
 
 
 def sphere_distance(origins: Array, directions: Array, sphere: Sphere) -> Array:
-    offset = origins - np.array(sphere.centre)
-    b = (offset * directions).sum(axis=1)
-    root = b * b - (offset * offset).sum(axis=1) + sphere.radius**2
+    """Return the distance [R] along rays [3, R], infinite where they miss; directions may be one for all, [3, 1]."""
+    offset = origins - column(sphere.centre)
+    b = dot(offset, directions)
+    root = b * b - dot(offset, offset) + sphere.radius**2
     t = -b - np.sqrt(np.maximum(root, 0))
     return np.where((root > 0) & (t > EPS), t, np.inf)
 
 
 def box_distance(origins: Array, directions: Array, box: Box) -> tuple[Array, Array]:
-    """Return distance [R] and the axis [R] of the face that was hit (slab method)."""
+    """Return the distance [R] as `sphere_distance`, and where rays enter the slab of each axis [3, R]."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        near = (np.array(box.low) - origins) / directions
-        far = (np.array(box.high) - origins) / directions
+        near = (column(box.low) - origins) / directions
+        far = (column(box.high) - origins) / directions
     near, far = np.minimum(near, far), np.maximum(near, far)
-    enter, leave = near.max(axis=1), far.min(axis=1)
-    return np.where((enter < leave) & (enter > EPS), enter, np.inf), near.argmax(axis=1)
+    enter = np.maximum(np.maximum(near[0], near[1]), near[2])
+    leave = np.minimum(np.minimum(far[0], far[1]), far[2])
+    return np.where((enter < leave) & (enter > EPS), enter, np.inf), near
 
 
 def floor_distance(origins: Array, directions: Array) -> Array:
+    """Return the distance [R] as `sphere_distance`."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = -origins[:, 2] / directions[:, 2]
-        x, y = (origins[:, i] + t * directions[:, i] for i in (0, 1))
+        t = -origins[2] / directions[2]
+        x, y = (origins[i] + t * directions[i] for i in (0, 1))
     on = (t > EPS) & (np.abs(x) < FLOOR_HALF) & (np.abs(y) < FLOOR_HALF)
     return np.where(on, t, np.inf)
 
 
 def albedo(points: Array, item: Array) -> Array:
-    """Return the unlit colour [R, 3] of surface points by their item."""
-    colour = np.empty((len(points), 3))
+    """Return the unlit colour [3, R] of surface points by their item."""
+    colour = np.empty(points.shape)
     textures = [sphere.texture for sphere in SPHERES] + [box.texture for box in BOXES] + ["tiles"]
     for k, texture in enumerate(textures):
-        on = item == k
-        if on.any():
-            colour[on] = TEXTURES[texture](points[on])
+        on = np.flatnonzero(item == k)
+        if len(on):
+            colour[:, on] = TEXTURES[texture](points[:, on])
     return colour

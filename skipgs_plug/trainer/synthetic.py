@@ -118,5 +118,5 @@ def sample_surfaces(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
     normals.append(np.tile((0.0, 0.0, 1.0), (rest, 1)))
     items.append(np.full(rest, FLOOR))
     xyz, item, normal = np.concatenate(points), np.concatenate(items), np.concatenate(normals)
-    colour, _ = lit_albedo(xyz, xyz + EPS * normal, item, normal)
-    return xyz, colour.clip(0, 1)
+    colour, _ = lit_albedo(xyz.T, (xyz + EPS * normal).T, item, normal.T)
+    return xyz, colour.T.clip(0, 1)
