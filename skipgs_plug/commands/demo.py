@@ -18,7 +18,7 @@ from skipgs_plug.trainer.pictures import Curve, plot_refinement, save_comparison
 from skipgs_plug.trainer.run_folder import RunFolder
 from skipgs_plug.trainer.synthetic import make_scene
 
-# Four times the recipe's, which makes 36,000 Gaussians for pictures of 19,200 pixels; this one makes 9,000.
+# Four times the recipe's, which makes more Gaussians than such small pictures have pixels.
 GROW_GRAD2D = 0.0008
 
 # Settings of the gate by name of the run, as in the bench; None for the trainer's own run.

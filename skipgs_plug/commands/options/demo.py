@@ -17,7 +17,7 @@ class Args:
     """Iterations of the schedule; the first half densifies."""
     views: int = 48
     """Images on the dome around the scene; every 8th is held out."""
-    width: int = 160
+    width: int = 128
     """Image width; height is three quarters of it."""
     points: int = 4000
     """Surface points to start from."""
