@@ -1,4 +1,4 @@
-"""The command `skipgs-plug`: a table of commands, each imported when it is called, after its options were read."""
+"""The command `skipgs-plug`: a table of commands. A command is imported when its options have been read."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "sfm": Command("turn photographs or a video into a scene", "train"),
-    "train": Command("train a scene by the 3DGS recipe, whole or in fewer iterations", "train"),
-    "estimate": Command("say how long training a scene will take here, from half a minute of it", "train"),
+    "train": Command("train a scene by the 3DGS recipe, in all or in fewer iterations", "train"),
+    "estimate": Command("predict how long training a scene takes here, from half a minute of training", "train"),
     "view": Command("show a trained model in the browser, with its cameras, photographs and errors", "view"),
     "render": Command("film or picture a trained model: colour and depth, along a path or held-out cameras", "view"),
     "export": Command("convert a trained model for web viewers", "train"),
     "report": Command("make one HTML page of finished runs: tables, plots, comparison", "report"),
     "run": Command("run an unmodified training script of another project, gated", "run"),
-    "demo": Command("train a scene the package makes itself, with and without the gate, and compare", "full"),
+    "demo": Command("train a small ray-traced scene with and without the gate, and compare", "full"),
     "bench": Command("compare the gate with its controls on a scene", "full"),
     "doctor": Command("say which backends and extras work here, and how to get the rest", "full"),
 }
@@ -47,13 +47,13 @@ OURS = ("SkipGSError", "InputError", "WriteError")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
-    Standard streams that are closed lead nowhere, also when it has returned.
+    Standard streams that are closed are replaced by the null device, also after it has returned.
 
     Returns:
-        0 done; 2 bad input, one sentence on stderr; 130 interrupted, 143 terminated, 141 nobody reads the output.
-        `--debug` shows the traceback.
+        0: done. 2: bad input, with one sentence on stderr, or with the traceback under `--debug`. 130: interrupted.
+        143: terminated. 141: nobody reads the output.
     """
-    if argv is None and sys.argv[1:2] != ["run"]:  # the script of another project runs as it would without us
+    if argv is None and sys.argv[1:2] != ["run"]:  # a script of another project runs as without this package
         speak_utf8()
     replace_closed_streams()
     print_any_name()
@@ -64,20 +64,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in own
     if debug:
         arguments.remove("--debug")
-    # The script of another project finds the collector as it would without us, and so does a caller in Python.
+    # A script of another project keeps the garbage collector as it is, and so does a caller in Python.
     whole_program = argv is None and arguments[:1] != ["run"]
     try:
-        # The script of another project sees signals as it would without us.
+        # A script of another project gets signals as without this package.
         with contextlib.nullcontext() if arguments[:1] == ["run"] else terminable():
             return run(arguments, whole_program)
     except KeyboardInterrupt as error:
         return interrupted([error])
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes once more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes the stream once more
         return UNREAD
     except Exception as error:
         causes = [one for one in chain(error) if isinstance(one, KeyboardInterrupt)]
-        if causes:  # met while a module was being loaded
+        if causes:  # it arrived while a module was imported
             return interrupted(causes)
         sentence = explain(error, COMMANDS[arguments[0]].extra if arguments and arguments[0] in COMMANDS else "run")
         if debug or sentence is None:
@@ -90,33 +90,33 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def speak_utf8() -> None:
-    """Begin anew in UTF-8 mode where the locale has another encoding for file names.
+    """Restart in UTF-8 mode if the locale has another encoding for file names.
 
-    Scenes and run folders name files in UTF-8, so a photograph called `Straße.jpg` could not be opened. Arguments reach
-    the new program byte by byte.
+    Scenes and run folders name files in UTF-8, so a photograph called `Straße.jpg` could not be opened. The new program
+    gets the same bytes as arguments.
     """
     if sys.getfilesystemencoding() != "utf-8":
         os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
 
 
 def expand_home(argument: str) -> str:
-    """Return an argument with `~` as the home folder: shells leave it in `--out=~/runs`, quotes and lists."""
+    """Return an argument with `~` replaced by the home folder, as shells do not in `--out=~/runs`, quotes and lists."""
     option, equals, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
     return f"{option}{equals}{os.path.expanduser(value)}" if value.startswith("~") else argument
 
 
 def replace_closed_streams() -> None:
-    """Let standard streams that were closed (`>&-`, some schedulers) lead nowhere.
+    """Replace standard streams that were closed (`>&-`, some schedulers) by the null device.
 
-    Else the next file that is opened gets the number of one of them, and what a library prints ends up in that file.
+    Otherwise the next opened file would get the number of a closed stream, and output of a library would land in it.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - as long as the process lives
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - open until the process ends
 
 
 def print_any_name() -> None:
-    """Let names that the locale has no letters for be printed with escapes, instead of ending the program."""
+    """Print characters that the locale lacks as escapes, instead of raising an error."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -134,7 +134,7 @@ def run(arguments: list[str], whole_program: bool) -> int:
             print("not installed: run from a checkout")
         return 0
     if name in COMMANDS:
-        # Options are read before heavy packages are loaded, so --help and mistakes are answered at once.
+        # Options are read before heavy packages are imported, so --help and mistakes are answered at once.
         args = importlib.import_module(f"skipgs_plug.commands.options.{name}").parse(rest)
         with uncollected() if whole_program else contextlib.nullcontext():
             command = importlib.import_module(f"skipgs_plug.commands.{name}")
@@ -168,11 +168,11 @@ def overview(arguments: list[str]) -> int:
 
 
 def explain(error: Exception, extra: str) -> str | None:
-    """Return the sentence for the user, or None for a defect of ours, which needs its traceback.
+    """Return the sentence for the user, or None for a defect of this package, which needs its traceback.
 
-    `extra` brings the packages of the command.
+    `extra` is the extra that installs the packages of the command.
 
-    Imports nothing that may be missing, or that a Ctrl-C may have left half loaded.
+    This imports no module that may be missing, or that a Ctrl-C may have left half loaded.
     """
     if any(one.__name__ in OURS and one.__module__.startswith("skipgs_plug.") for one in type(error).__mro__):
         return str(error)

@@ -1,4 +1,4 @@
-"""Files are written aside, then renamed: a reader never sees half of one. For all parts of the package."""
+"""Write files aside, then rename them, so that nobody reads half a file. For all parts of the package."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ LEFTOVER = re.compile(r"\..+\.\d+(\.tmp)?")
 
 
 class WriteError(OSError):
-    """A file that cannot be written: the disk is full, read-only, or out of reach. One sentence that says so."""
+    """A file cannot be written, because the disk is full, read-only, or out of reach. The message is one sentence."""
 
 
 def printable(name: str) -> str:
-    """Return a name as text that can be shown and written: bytes that are not UTF-8 become hexadecimal escapes."""
+    """Return a name as text that can be printed. Bytes that are not UTF-8 become hexadecimal escapes."""
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
@@ -31,10 +31,11 @@ def write_aside(path: str | Path, size: int | None = None) -> Iterator[Path]:
     """Yield a temporary path next to `path`. It is renamed to `path` on success and removed on failure.
 
     Args:
-        size: bytes that the file will about have, where that is known beforehand.
+        path: The file to write.
+        size: Approximate size in bytes, if it is known beforehand.
 
     Raises:
-        WriteError: the file cannot be written; says why, and how much room is needed.
+        WriteError: The file cannot be written. The message says why, and how much space it needs.
     """
     path = Path(path)
     temporary = path.parent / f".{path.name}.{os.getpid()}.tmp"
@@ -54,7 +55,7 @@ def write_aside(path: str | Path, size: int | None = None) -> Iterator[Path]:
 
 
 def os_error(error: BaseException) -> OSError | None:
-    """Return the OSError that an error is or came from: torch's writer raises RuntimeError on top of it."""
+    """Return the OSError in an error's chain of causes, or None. Torch's writer raises RuntimeError on top of it."""
     found: BaseException | None = error
     while found is not None and not isinstance(found, OSError):
         found = found.__cause__ or found.__context__
@@ -63,7 +64,7 @@ def os_error(error: BaseException) -> OSError | None:
 
 @contextlib.contextmanager
 def keep_going(failed: list[WriteError]) -> Iterator[None]:
-    """Let a file that cannot be written cost that file only: the error is logged and added to `failed`."""
+    """Continue after a file that cannot be written: the error is logged and added to `failed`."""
     try:
         yield
     except OSError as error:
@@ -73,7 +74,7 @@ def keep_going(failed: list[WriteError]) -> Iterator[None]:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of killed writers from a folder. No other process may be writing there."""
+    """Remove temporary files of killed processes from a folder. No other process may be writing there."""
     for path in folder.glob(".*"):
         if LEFTOVER.fullmatch(path.name) and path.is_file():
             path.unlink(missing_ok=True)
@@ -88,7 +89,7 @@ def write_error(path: Path, error: OSError, size: int | None = None) -> WriteErr
             f"{path} cannot be written ({reason}): {blocking} is a file, not a folder; give another path."
         )
     free = _free(path)
-    # numpy's writer says how many items it wrote instead of why it stopped.
+    # numpy's error tells how many items were written, but not why it stopped.
     if error.errno not in OUT_OF_SPACE and not (error.errno is None and free is not None and free < (size or 2**20)):
         if os.path.isdir(path):
             return WriteError(f"{path} cannot be written ({reason}): {path} is a folder; give the name of a file.")

@@ -1,7 +1,7 @@
-"""The collector of unreachable objects rests while a program starts and ends.
+"""Pause the garbage collector while a program starts and ends.
 
-Importing torch makes some hundred thousand objects, all of which stay. To look through them again and again took a
-sixth of the time of starting, and to look through them once more at the end as much.
+Importing torch makes some hundred thousand objects, and all of them stay. Scanning them again and again took a sixth of
+the start-up time, and one more scan at the end took as long.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def uncollected() -> Iterator[None]:
-    """Let nothing be collected inside the block, where hardly anything becomes unreachable."""
+    """Turn the collector off inside the block, in which few objects become unreachable."""
     running = gc.isenabled()
     gc.disable()
     try:
@@ -24,8 +24,8 @@ def uncollected() -> Iterator[None]:
 
 
 def keep_everything() -> None:
-    """Take all objects of now for such that stay until the process ends, so that the collector passes them over.
+    """Exempt all present objects from collection.
 
-    For whole programs only: cycles of now that become unreachable later are never freed.
+    For whole programs only: present cycles that become unreachable later are never freed.
     """
     gc.freeze()

@@ -10,10 +10,10 @@ from torch import Tensor
 
 
 class HostCopy:
-    """Begins to copy a tensor of one value to the host, behind the work that the device was given so far.
+    """Starts a copy of a tensor with one value to the host, behind the work that is queued on the device so far.
 
-    `value` waits for the copy alone, and not for what was launched after it: a backward, say. On the CPU, and on
-    devices without events, nothing is begun and `value` reads the tensor.
+    `value` waits for the copy only, and not for work that is queued later, such as a backward pass. On the CPU, and on
+    devices without events, no copy is started and `value` reads the tensor.
 
     Args:
         tensor: One value, of any shape.
@@ -26,14 +26,14 @@ class HostCopy:
         self._value: float | None = None
         self._copy = tensor.detach()
         if has_events(tensor.device):
-            # PyTorch makes a copy that does not block in pinned memory.
+            # PyTorch puts a non-blocking copy in pinned memory.
             self._copy = self._copy.to("cpu", non_blocking=True)
             self._event = getattr(torch, tensor.device.type).Event()
             self._event.record()
 
     @property
     def is_under_way(self) -> bool:
-        """Whether asking for the value would wait for a copy."""
+        """Whether `value` may have to wait for the copy."""
         return self._event is not None
 
     def value(self) -> float:
@@ -48,6 +48,6 @@ class HostCopy:
 
 @functools.cache
 def has_events(device: torch.device) -> bool:
-    """Whether copies from this device can be waited for one by one."""
-    # On MPS a copy that does not block is not in order with events.
+    """Whether this device has events, so that each copy can be waited for."""
+    # On MPS, events are not in order with non-blocking copies.
     return device.type not in ("cpu", "mps") and hasattr(getattr(torch, device.type, None), "Event")

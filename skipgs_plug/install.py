@@ -1,4 +1,4 @@
-"""Commands that are printed for the user: to install optional packages, and to continue. They fit the installation."""
+"""Commands printed for the user: to install optional packages, and to go on. They fit this installation."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ PROGRAM = "skipgs-plug"
 
 
 def program() -> str:
-    """Return how to call the command of this package: by its name, or by Python if it is not on the path."""
+    """Return the program name of this package, or the Python command for it if the name is not on the path."""
     return PROGRAM if shutil.which(PROGRAM) else f"{shlex.quote(sys.executable)} -m {NAME}"
 
 
 def next_command(*words: str | Path) -> str:
-    """Return a command line of this package that can be pasted into a shell; names of folders are quoted."""
+    """Return a command line of this package, quoted so that it can be pasted into a shell."""
     return f"{program()} {shlex.join(map(str, words))}"
 
 
 def install_command(extra: str = "full") -> str:
-    """Return the `pip install` command for an extra of this package, from where the package itself came from."""
+    """Return the `pip install` command for an extra of this package, from the source of the installed package."""
     root = Path(__file__).resolve().parents[1]
     if _is_checkout(root):
         return f"pip install -e {shlex.quote(f'{root}[{extra}]')}"
@@ -43,7 +43,7 @@ def _is_checkout(root: Path) -> bool:
 
 
 def _source() -> str | None:
-    """Return where the installed package came from when that is no index (PEP 610)."""
+    """Return the source of the installed package; None if it came from an index (PEP 610)."""
     try:
         found = json.loads(metadata.distribution(NAME).read_text("direct_url.json") or "{}")
     except (metadata.PackageNotFoundError, ValueError):

@@ -1,4 +1,4 @@
-"""Check a value that was read from a file against the type it should have, once, before anything uses it."""
+"""Check a value that was read from a file against its type, once, before it is used."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ NAMES = {int: "a whole number >= 0", float: "a finite number", str: "text", bool
 
 
 class SchemaError(ValueError):
-    """Says which entry is missing or wrong, as a clause without a full stop."""
+    """An entry is missing or wrong. The message is a clause that names it, without a full stop."""
 
 
 def check(value: Any, kind: Any, name: str) -> None:
@@ -19,9 +19,9 @@ def check(value: Any, kind: Any, name: str) -> None:
 
     Args:
         value: Plain values, containers and tensors.
-        kind: A TypedDict (entries it does not know are let pass, and those it does not require may be missing),
-            `dict[K, V]`, `list[T]`, `tuple[A, B, ...]` (a list serves as well), a union, `Any`, or a class. `int` is a
-            count (a whole number >= 0, no bool), `float` a finite number; `numbers.Real` lets NaN and infinity pass.
+        kind: A TypedDict (unknown entries pass, and entries that it does not require may be missing), `dict[K, V]`,
+            `list[T]`, `tuple[A, B, ...]` (a list passes too), a union, `Any`, or a class. `int` is a count (a whole
+            number >= 0, no bool), `float` is a finite number. `numbers.Real` allows NaN and infinity.
         name: Name of the value in messages.
     """
     origin, inner = get_origin(kind), get_args(kind)

@@ -1,4 +1,4 @@
-"""SIGTERM ends a command like Ctrl-C does, so that it can clean up."""
+"""Let SIGTERM end a command like Ctrl-C, so that the command can clean up."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import signal
 from collections.abc import Iterator
 from typing import Any
 
-UNREAD = 141  # exit code when the reader of the output has gone away: 128 + SIGPIPE, as in a shell
+UNREAD = 141  # exit code when the reader of the output is gone: 128 + SIGPIPE, like a shell
 
 
 class Terminated(KeyboardInterrupt):
@@ -15,17 +15,17 @@ class Terminated(KeyboardInterrupt):
 
 
 def raise_terminated(number: int, frame: Any) -> None:
-    """Be the handler; a second SIGTERM ends the process at once."""
+    """Handle SIGTERM. A second SIGTERM ends the process at once."""
     signal.signal(number, signal.SIG_DFL)
     raise Terminated
 
 
 @contextlib.contextmanager
 def terminable() -> Iterator[None]:
-    """Raise `Terminated` inside the block when SIGTERM arrives; the handler of before is put back afterwards."""
+    """Raise `Terminated` inside the block when SIGTERM arrives. The previous handler is restored afterwards."""
     try:
         previous = signal.signal(signal.SIGTERM, raise_terminated)
-    except ValueError:  # not in the main thread: whoever owns that handles signals
+    except ValueError:  # not in the main thread, whose owner handles signals
         yield
         return
     try:

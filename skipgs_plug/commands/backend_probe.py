@@ -1,4 +1,4 @@
-"""Renders four Gaussians with a backend, in a process of its own: a native crash ends that process alone."""
+"""Renders four Gaussians with a backend in a process of its own, so that a native crash ends only that process."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import signal
 import subprocess
 import sys
 
-LONGEST = 600  # seconds; a machine that compiles all kernels takes a minute
-# The child finds the package where this process did, installed or not.
+LONGEST = 600  # seconds until a backend counts as hanging; compiling all kernels takes about a minute
+# The child finds the package in the same place as this process, installed or not.
 CODE = "import sys; sys.path[:] = {path!r}; from skipgs_plug.commands.backend_probe import main; main({name!r})"
 
 
 def try_backend(name: str) -> tuple[bool, str]:
-    """Return whether a backend renders and differentiates here, and a sentence on what was found."""
+    """Return whether a backend renders and differentiates here, and a sentence about the result."""
     command = [sys.executable, "-c", CODE.format(path=sys.path, name=name)]
     try:
         ended = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=LONGEST, check=False)
@@ -26,20 +26,21 @@ def try_backend(name: str) -> tuple[bool, str]:
 
 
 def how_it_ended(code: int) -> str:
-    """Return what the exit code of a process says about its end."""
+    """Return a clause that tells how a process with this exit code ended."""
     if code < 0:
         try:
             return f"was ended by {signal.Signals(-code).name}"
         except ValueError:
             return f"was ended by signal {-code}"
-    return f"ended with exit code {code:#x}" if code > 255 else f"ended with exit code {code}"  # as Windows has it
+    # Windows has codes above 255.
+    return f"ended with exit code {code:#x}" if code > 255 else f"ended with exit code {code}"
 
 
 def main(name: str) -> None:
-    """Try it in this process; prints the finding, and exits with 0 if the backend works, else with 1."""
+    """Try a backend in this process. Print the result, and exit with 0 if it works, else with 1."""
     try:
         finding = render(name)
-    except Exception as error:  # whatever a backend fails with is the finding
+    except Exception as error:  # any error is a result
         print(str(error).splitlines()[0] if str(error) else type(error).__name__)
         raise SystemExit(1) from None
     print(finding)

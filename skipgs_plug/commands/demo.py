@@ -18,10 +18,10 @@ from skipgs_plug.trainer.pictures import Curve, plot_refinement, save_comparison
 from skipgs_plug.trainer.run_folder import RunFolder
 from skipgs_plug.trainer.synthetic import make_scene
 
-# Four times the recipe's, which makes more Gaussians than such small pictures have pixels.
+# Four times the recipe's threshold, which would make more Gaussians than such small pictures have pixels.
 GROW_GRAD2D = 0.0008
 
-# Settings of the gate by name of the run, as in the bench; None for the trainer's own run.
+# Settings of the gate by the name of the run; None for the trainer's own run. The bench uses the same names.
 GATES: dict[str, dict[str, Any] | None] = {"own": None, "gate": {}, "share=auto": {"share": "auto"}}
 
 

@@ -32,14 +32,14 @@ EXTRAS = (
     ("tensorboard", "tensorboard", "--tensorboard"),
 )
 
-# Not tried here: the process that does it wrong crashes, or hangs in pycolmap's handler of crashes.
+# This is not tried here, since the wrong order crashes the process or hangs it in pycolmap's crash handler.
 IMPORT_ORDER = """
       In scripts of your own, import PIL.Image before pycolmap, as this package does. In the other order
       Pillow is bound to the zlib of pycolmap (seen with 4.2.1), and the first PNG that is saved ends the process."""
 
 
 def run(args: None) -> int:
-    """Print the findings; 0 when a backend renders here, else 1."""
+    """Print the results. Return 0 if a backend renders here, else 1."""
     cuda = torch.cuda.get_device_name() if torch.cuda.is_available() else "no CUDA device"
     print(f"Python {platform.python_version()}, torch {torch.__version__}, {cuda}, {torch.get_num_threads()} threads")
     print("\nPackages")
@@ -58,7 +58,7 @@ def run(args: None) -> int:
 def check_package(module: str, distribution: str, purpose: str) -> bool:
     try:
         importlib.import_module(module)
-    except Exception as error:  # a broken installation fails in its own ways; each is a finding
+    except Exception as error:  # a broken installation may fail with any error
         reason = "missing" if isinstance(error, ModuleNotFoundError) else f"broken ({error})"
         report(False, distribution, f"{reason}, for: {purpose}; run: pip install {distribution}")
         return False
@@ -67,7 +67,7 @@ def check_package(module: str, distribution: str, purpose: str) -> bool:
 
 
 def check_backend(name: str) -> bool:
-    """Try a backend; whatever it fails with, a crash of native code too, is the finding."""
+    """Try a backend and print the result, even if native code crashes."""
     works, finding = try_backend(name)
     report(works, name, finding)
     return works

@@ -1,4 +1,4 @@
-"""`skipgs-plug estimate SCENE`: how long training will take here, from half a minute of it."""
+"""`skipgs-plug estimate SCENE`: predict the time of a training run from its first half minute."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SHOWN = ("seconds", "seconds_auto", "gaussians", "memory")  # in the order of HE
 
 
 def run(args: Args) -> int:
-    """Train a little and print the table; see `Args`."""
+    """Train for half a minute and print the table; see `Args`."""
     require_names(("SCENE", args.scene))
     config = args.train
     prepare_kernels(config)
@@ -30,7 +30,7 @@ def run(args: Args) -> int:
 
 
 def described(name: str, pilot: Pilot) -> str:
-    """Return what was looked at."""
+    """Return a line about the measured iterations."""
     seconds = sum(sample.seconds for sample in pilot.samples)
     return (
         f"{name}, {pilot.views} training views: {len(pilot.samples):,} iterations in {seconds:.0f} s, "
@@ -56,7 +56,7 @@ def table(forecasts: Sequence[Forecast]) -> str:
 
 
 def errors_seen() -> str:
-    """Return how far such forecasts were from the runs of the bench."""
+    """Return a sentence about the errors of earlier estimates, measured on runs of the bench."""
     stored = measured_errors()
     scenes = sorted({row["scene"] for row in stored["rows"]})
     parts = []
@@ -71,7 +71,7 @@ def errors_seen() -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a length of time with two digits that count.
+    """Return a length of time with two significant digits.
 
     >>> duration(8.4), duration(95), duration(8000)
     ('8 s', '1.6 min', '2.2 h')
@@ -82,7 +82,7 @@ def duration(seconds: float) -> str:
 
 
 def rounded(count: int) -> str:
-    """Return a number with two digits that count.
+    """Return a number with two significant digits.
 
     >>> rounded(118544), rounded(7)
     ('120,000', '7')

@@ -19,13 +19,13 @@ from skipgs_plug.view.spz import POSITION_BITS, to_spz
 
 log = logging.getLogger(__name__)
 
-GSPLATS = {".compressed.ply": "ply_compressed", ".splat": "splat"}  # as gsplat.export_splats calls them
+GSPLATS = {".compressed.ply": "ply_compressed", ".splat": "splat"}  # names for gsplat.export_splats
 OURS = {".spz": to_spz, ".sog": to_sog}
 ENDINGS = (*GSPLATS, *OURS, ".ply")
 
 
 def run(args: Args) -> int:
-    """Convert; see `Args`."""
+    """Convert a model; see `Args`."""
     out = args.out.expanduser()
     ending = next((ending for ending in ENDINGS if out.name.lower().endswith(ending)), None)
     if ending is None:
@@ -38,10 +38,10 @@ def run(args: Args) -> int:
     else:
         if splats["means"].dtype == torch.float64:
             log.warning(
-                "%s holds positions of single precision: they are rounded by up to %.2g units. A .ply keeps them.",
+                "%s holds positions in single precision: they are rounded by up to %.2g units. A .ply keeps them.",
                 *(out, rounding(splats["means"], ending)),
             )
-            if ending != ".sog":  # its numbers are relative to the extent
+            if ending != ".sog":  # .sog positions are relative to the extent
                 splats["means"] = splats["means"].float()
         data = OURS[ending](splats, is_antialiased(source)) if ending in OURS else exported(splats, GSPLATS[ending])
         with write_aside(out) as temporary:
@@ -51,7 +51,7 @@ def run(args: Args) -> int:
 
 
 def rounding(means: Tensor, ending: str) -> float:
-    """Return by how much a format moves positions [N, 3] at most."""
+    """Return the largest distance by which a format moves positions [N, 3]."""
     largest = float(means.abs().max())
     if ending == ".sog":
         return max(largest * 2.0**-24, position_error(means))
@@ -59,7 +59,7 @@ def rounding(means: Tensor, ending: str) -> float:
 
 
 def exported(splats: Mapping[str, Tensor], name: str) -> bytes:
-    """Return a model in a format of gsplat's."""
+    """Return a model in one of the formats of `gsplat.export_splats`."""
     from gsplat import export_splats
 
     return export_splats(**splats, format=name)

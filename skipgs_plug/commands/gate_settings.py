@@ -9,7 +9,7 @@ from skipgs_plug.trainer import InputError
 
 
 class GateSettings:
-    """Travels in the checkpoints of a trainer, and refuses one that was made with other settings.
+    """Part of a trainer's checkpoints. Refuses to resume a checkpoint that was made with other settings.
 
     Args:
         gate: The gate of the run; None if it has no gate.
@@ -22,22 +22,22 @@ class GateSettings:
         return {"settings": self._settings}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Compare.
+        """Compare the settings with those of this run.
 
         Raises:
-            InputError: the checkpoint was made with other settings; names the first.
+            InputError: The checkpoint was made with other settings. The message names the first difference.
         """
         before = state["settings"]
         if (before is None) != (self._settings is None):
             raise InputError(
                 "The run was begun without a gate; resume it without --gate and without gate settings."
                 if before is None
-                else "The run was begun with a gate; resume it with --gate, or with the gate settings that it had."
+                else "The run was begun with a gate; resume it with --gate or with the same gate settings."
             )
-        # A run that began before a setting existed began with the present default.
+        # A run that is older than a setting ran with its default.
         before = SkipConfig().as_dict() | (before or {})
         for name, value in (self._settings or {}).items():
             if before[name] != value:
                 raise InputError(
-                    f"The run was begun with gate.{name}={before[name]!r}, not {value!r}; resume it with its settings."
+                    f"The run was begun with gate.{name}={before[name]!r}, not {value!r}; resume it with that setting."
                 )

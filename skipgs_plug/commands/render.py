@@ -17,7 +17,7 @@ from skipgs_plug.view.film import write_film, write_pictures
 from skipgs_plug.view.model import open_model
 from skipgs_plug.view.path import camera_path
 
-RANGE_FRAMES = 8  # frames whose depths set the range of colours: the whole path would be rendered twice
+RANGE_FRAMES = 8  # frames that set the depth range; with all of them, the whole path would be rendered twice
 
 
 def run(args: Args) -> int:

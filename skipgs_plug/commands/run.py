@@ -46,7 +46,7 @@ def run(args: Args) -> int:
 
 
 def run_spawned(args: Args, command: list[str], rank: int, call: bytes) -> None:
-    """The work of a process that the script spawns: everything that `run` does, then the script's call."""
+    """Do the work of a process that the script spawns: attach a gate like `run`, then make the script's call."""
     code, gate = run_gated(args, command, lambda attach: spawned.run_call(command, attach, rank, call, args.cpu), rank)
     if code:
         sys.exit(code)
@@ -54,10 +54,10 @@ def run_spawned(args: Args, command: list[str], rank: int, call: bytes) -> None:
 
 
 def verify(code: int, gate: SkipGate | None) -> None:
-    """Ask a gate that saw a whole run whether it saw all that it should have.
+    """Check that the gate of a finished run has seen one training backward per iteration.
 
     Raises:
-        SkipGSError: It did not, and did not say so before.
+        SkipGSError: It has not, and the gate did not say so during the run.
     """
     if code or gate is None or not gate.trained or not gate.config.enabled:
         return
@@ -111,20 +111,20 @@ def script_name(command: Sequence[str]) -> str:
 
 
 def report(gate: SkipGate, adapter: AbstractAdapter) -> None:
-    """Write the report, also of a run that failed half-way, once the script has an output folder."""
+    """Write the report, even if the run failed half-way. Do nothing if no iteration ran."""
     if gate.stats()["iterations"] == 0:
         return
     path = Path(adapter.output_folder or ".") / "skipgs.json"
     try:
         write_report(gate, path)
         print(gate.summary(), file=sys.stderr)
-    except Exception as error:  # the model is trained, and the script's exit code says how that went
+    except Exception as error:  # the model is trained, so the script's exit code stands
         say(f"{path} could not be written ({type(error).__name__}: {error}).")
 
 
 @contextlib.contextmanager
 def cpu_instead_of_cuda(args: Args, command: Sequence[str]) -> Iterator[None]:
-    """Let the script believe in CUDA.
+    """Let the script run as if it had CUDA.
 
     Raises:
         SkipGSError: There are no stand-ins for the CUDA modules of this trainer.

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 class Session:
     """Trains a trainer to its end, and writes the run folder.
 
-    A file that cannot be written costs that file only: the others are written, and the run ends with an error that
-    says how to get it. The folder is held by this process alone (`trainer.lock`).
+    If a file cannot be written, the others are still written, and the run ends with an error that says how to get the
+    missing one. This process alone writes to the folder (`trainer.lock`).
     """
 
     def __init__(
@@ -45,11 +45,11 @@ class Session:
         """Train, and finish unless a signal stopped training.
 
         Returns:
-            0 for a finished run, 128 + number of the signal for one that was stopped, `UNREAD` when nobody reads
-            what it prints.
+            0 for a finished run, 128 + the number of the signal that stopped it, `UNREAD` when nobody reads the
+            output.
 
         Raises:
-            InputError: a file could not be written.
+            InputError: A file could not be written.
         """
         trainer, begun_at = self._trainer, self._trainer.step
         with self._open_log() as self._log, self._open_view() as self._live:
@@ -57,7 +57,7 @@ class Session:
             with stop_on_signal(trainer) as stop:
                 try:
                     trainer.train(progress=not self._options.no_progress)
-                except BrokenPipeError:  # between two iterations as well, so that the checkpoint is exact
+                except BrokenPipeError:  # raised between two iterations, so the checkpoint is exact
                     stop.exit_code = UNREAD
                 with keep_going(self._failed):
                     self._autosave.save()
@@ -81,7 +81,7 @@ class Session:
     def _open_view(self) -> contextlib.AbstractContextManager[LiveView | None]:
         if not self._options.view:
             return contextlib.nullcontext()
-        from skipgs_plug.view.live import LiveView  # with the viewer, which few runs open
+        from skipgs_plug.view.live import LiveView  # imports the viewer, which few runs open
 
         live = LiveView(self._trainer)
         print(f"Watch it at http://127.0.0.1:{live.page.port}")
@@ -115,7 +115,7 @@ class Session:
         return stats
 
     def _finish(self) -> None:
-        """Evaluate, and write all files of a finished run, also those that an earlier session did not write."""
+        """Evaluate, and write all files of a finished run, including files that an earlier session could not write."""
         folder, trainer = self._folder, self._trainer
         with keep_going(self._failed), folder.renders(trainer, self._split) as keep:
             stats = self._evaluate(self._failed, keep)

@@ -1,4 +1,4 @@
-"""`skipgs-plug sfm PHOTOS SCENE`: photographs or a video to a scene that `train` reads."""
+"""`skipgs-plug sfm PHOTOS SCENE`: turn photographs or a video into a scene for `train`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from skipgs_plug.photos.scene_folder import check_target, write_scene
 from skipgs_plug.photos.unplaced import explain_unplaced
 from skipgs_plug.trainer.errors import InputError
 
-NAMES_SHOWN = 6  # photographs named per reason, at most, so that the list stays readable
+NAMES_SHOWN = 6  # photographs listed per reason, at most, so that the list stays readable
 
 
 def run(args: Args) -> int:
@@ -34,16 +34,16 @@ def run(args: Args) -> int:
 
 
 def reconstruct(args: Args) -> Path:
-    """Write the scene, whole or not at all, print how many photographs were placed, and return its folder.
+    """Write the scene completely or not at all, print how many photographs were placed, and return its folder.
 
     Raises:
-        InputError: the photographs cannot be read or placed, or the folder holds something.
+        InputError: The photographs cannot be read or placed, or the folder is not empty.
     """
     if args.frames < 3:
         raise InputError(f"--frames {args.frames} is too few to reconstruct from; give at least 3, better 100.")
     scene = args.scene.expanduser()
     photos = args.photos.expanduser()
-    check_source(photos)  # before anything is shown or made
+    check_source(photos)  # before anything is printed or written
     check_target(scene, photos)
     scene.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=f".{scene.name}.", dir=scene.parent))
@@ -83,21 +83,19 @@ def reconstruct(args: Args) -> Path:
 def place(
     reconstruction: Reconstruction, mapping: Mapping, count: int, bar: Callable[..., tqdm]
 ) -> tuple[list[Any], Mapping]:
-    """Return the models, largest first, and the mapping they come from.
+    """Return the models, largest first, and the mapping that made them.
 
     Raises:
-        InputError: no two of the photographs could be placed.
+        InputError: No photograph could be placed.
     """
     models, taken = [], reconstruction.resolve(mapping)
     if taken == "global":
-        # Stages take seconds or minutes each, so the rest cannot be estimated; the clock shows that the work continues.
+        # A stage takes seconds or minutes, so no remaining time is shown. The clock shows that the work continues.
         honest = {"miniters": 0, "bar_format": "{desc}: {n_fmt} of {total_fmt} stages done, {elapsed}"}
         with bar("Placing photographs all at once", global_mapping.STAGES, **honest) as shown:
             models = reconstruction.map_globally(shown.update)
         if mapping == "auto" and not reconstruction.placed_enough(models):
-            print(
-                f"All at once, {size(models)} of {count} photographs could be placed; placing them one after another."
-            )
+            print(f"Global mapping placed {size(models)} of {count} photographs; placing them one after another now.")
             taken = "incremental"
     if taken == "incremental":
         with bar("Placing photographs", count) as shown:
@@ -115,12 +113,12 @@ def place(
 
 
 def size(models: Sequence[Any]) -> int:
-    """Return how many photographs the largest model holds."""
+    """Return the number of photographs in the largest model."""
     return models[0].num_reg_images() if models else 0
 
 
 def print_unplaced(reasons: dict[str, str], matching: str) -> None:
-    """Say which photographs were left out, by reason."""
+    """Print the photographs that were left out, by reason."""
     if not reasons:
         return
     by_reason = defaultdict(list)
@@ -131,4 +129,6 @@ def print_unplaced(reasons: dict[str, str], matching: str) -> None:
         more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
         print(f"  {', '.join(names[:NAMES_SHOWN])}{more}: {reason}")
     if matching == "sequential":
-        print("  Mostly neighbours in the order of names were compared; --matching exhaustive compares all, slowly.")
+        print(
+            "  Only neighbours in the order of names were compared, mostly; --matching exhaustive compares all pairs, slowly."
+        )

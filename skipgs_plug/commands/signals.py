@@ -25,7 +25,7 @@ class Stop:
 
 @contextlib.contextmanager
 def stop_on_signal(trainer: Trainer) -> Iterator[Stop]:
-    """Let a signal end training after the current iteration; the second ends at once, by KeyboardInterrupt."""
+    """Let a signal end training after the current iteration. A second signal raises KeyboardInterrupt at once."""
     stop = Stop()
 
     def handle(number: int, frame: Any) -> None:
@@ -36,7 +36,7 @@ def stop_on_signal(trainer: Trainer) -> Iterator[Stop]:
 
     previous: dict[signal.Signals, Any] = {}
     try:
-        # Not in the main thread: whoever owns that handles signals.
+        # ValueError: not in the main thread, whose owner handles signals.
         with contextlib.suppress(ValueError):
             for signum in STOPPING:
                 previous[signum] = signal.signal(signum, handle)

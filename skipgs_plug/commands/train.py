@@ -1,4 +1,4 @@
-"""`skipgs-plug train SCENE --out RUN`: the reference trainer, with a gate when asked for one."""
+"""`skipgs-plug train SCENE --out RUN`: the reference trainer, with a gate if options ask for one."""
 
 from __future__ import annotations
 
@@ -110,10 +110,10 @@ def check(args: Args, checkpoints: list[Path]) -> None:
 
 
 def scene_of_photographs(args: Args, folder: RunFolder) -> Path:
-    """Return the scene of the run's photographs, which is made in its folder unless it is there."""
+    """Return the scene of the run's photographs. It is reconstructed in the run's folder if it is not there yet."""
     scene = folder.root / SCENE
     if not is_scene(scene):
-        from skipgs_plug.commands import sfm  # with pycolmap, which training has no use for
+        from skipgs_plug.commands import sfm  # imports pycolmap, which training does not need
 
         with exclusive(folder.root):
             sfm.reconstruct(SfmArgs(Path(args.scene), scene, no_progress=args.session.no_progress))
@@ -121,9 +121,9 @@ def scene_of_photographs(args: Args, folder: RunFolder) -> Path:
 
 
 def configure(args: Args, checkpoints: list[Path]) -> tuple[list[Path], TrainConfig]:
-    """Return the checkpoints from the newest sound one on, and the settings of the run.
+    """Return the checkpoints from the newest readable one on, and the settings of the run.
 
-    A continued run keeps its schedule, and its length unless another is given.
+    A resumed run keeps its schedule. It keeps its length too, unless the options give another one.
     """
     run: dict[str, Any] = {"max_steps": REFERENCE_STEPS}
     if checkpoints:

@@ -17,7 +17,7 @@ from skipgs_plug.view.web.server import WebPage
 
 
 class Draw:
-    """Renders a model as its photographs show it."""
+    """Renders a model with the exposure of its photographs."""
 
     def __init__(self, model: Model, backend: str) -> None:
         self._model, self._painter = model, Painter.of(model, backend)
@@ -26,7 +26,7 @@ class Draw:
         image = self._painter.draw(splats, view.viewmat, view.K, view.width, view.height)[0]
         if not self._model.exposure:
             return image
-        # Models know nothing of the exposure of photographs, which they are compared with here.
+        # The model has no exposure, but the photograph beside it has.
         return fit_colours(image, view.image / 255.0, view.mask).clamp(0, 1)
 
 
@@ -46,7 +46,7 @@ def serve_model(model: Model, draw: Draw, args: Args) -> None:
     try:
         print_address(model, args.host, page.port)
         page.prepare()
-        while True:  # with a timeout, so that Ctrl-C is heard on Windows too
+        while True:  # with a timeout, since Ctrl-C does not end a wait on Windows
             threading.Event().wait(0.5)
     finally:
         page.stop()

@@ -13,17 +13,17 @@ from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.ply import sh_degree
 from skipgs_plug.view.model import Model
 
-DEPTH_QUANTILES = (0.02, 0.98)
+DEPTH_QUANTILES = (0.02, 0.98)  # ends of the colour scale: single far splats would take up all of it
 
 
 class Painter:
     """Renders models of the raw parameters that a trainer holds.
 
     Args:
-        background: colour in [0, 1] behind the model.
-        near_plane: in scene units.
-        antialiased: as the model was trained, as the next.
-        far_plane: in scene units.
+        background: Colour in [0, 1] behind the model.
+        near_plane: Near clipping plane in scene units.
+        antialiased: Whether the model was trained with antialiasing.
+        far_plane: Far clipping plane in scene units, as in training.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Painter:
 
     @classmethod
     def of(cls, model: Model, backend: str) -> Painter:
-        """Return the function that renders a model as it was trained, on the backend with this name."""
+        """Return a painter with the settings of the model's training, on the backend with this name."""
         settings = model.background, model.near_plane, model.antialiased, model.far_plane
         return cls(resolve_backend(backend), *settings)
 
@@ -55,7 +55,7 @@ class Painter:
         width: int,
         height: int,
     ) -> tuple[Tensor, Tensor]:
-        """Return colour [H, W, 3] in [0, 1] and expected depth [H, W] in scene units, 0 where nothing is."""
+        """Return colour [H, W, 3] in [0, 1] and expected depth [H, W] in scene units, 0 where the picture is empty."""
         device = self._backend.device
         raw = {name: tensor.detach().to(device) for name, tensor in splats.items()}
         background = torch.tensor([self._background], device=device) if any(self._background) else None
@@ -87,7 +87,7 @@ def to_bytes(image: Tensor) -> np.ndarray:
 
 
 def depth_range(depths: list[Tensor]) -> tuple[float, float]:
-    """Return the depths between which nearly all of these maps [H, W] lie; 0 counts as empty."""
+    """Return the range that holds 96 % of the depths in these maps [H, W]; 0 counts as empty."""
     known = torch.cat([depth[depth > 0] for depth in depths])
     if len(known) == 0:
         return 0.0, 1.0

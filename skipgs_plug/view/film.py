@@ -20,24 +20,24 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int) -> None:
     """Write frames [H, W, 3] uint8 of one size as H.264; an odd last row or column is cut off.
 
     Raises:
-        WriteError: the film cannot be written whole.
+        WriteError: The film cannot be written completely.
     """
     import imageio.v2 as iio
 
     with write_aside(path) as temporary:
         target = temporary.with_suffix(".mp4")  # ffmpeg goes by the suffix
         try:
-            target.touch()  # says why it cannot be, which the coder does not
+            target.touch()  # fails with a reason, unlike the encoder
             options: dict[str, Any] = {"fps": fps, "quality": QUALITY, "macro_block_size": 2}
             writer: Any
             given = 0
             with iio.get_writer(target, format="FFMPEG", **options) as writer:
                 for frame in frames:
                     height, width = (side // 2 * 2 for side in frame.shape[:2])
-                    with coder_ended_early(path):
+                    with encoder_ended_early(path):
                         writer.append_data(frame[:height, :width])
                     given += 1
-            with coder_ended_early(path):
+            with encoder_ended_early(path):
                 check_length(target, given)
             target.replace(temporary)
         finally:
@@ -45,18 +45,18 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int) -> None:
 
 
 @contextlib.contextmanager
-def coder_ended_early(path: Path) -> Iterator[None]:
-    """Raise WriteError instead of imageio's error, which holds the whole command line of the coder."""
+def encoder_ended_early(path: Path) -> Iterator[None]:
+    """Raise WriteError instead of imageio's error, which holds the whole command line of the encoder."""
     try:
         yield
     except (OSError, RuntimeError) as error:
         raise WriteError(
-            f"{path} cannot be written (the coder ended early; see its output); make room or give another path."
+            f"{path} cannot be written (the encoder ended early; see its output); make room or give another path."
         ) from error
 
 
 def check_length(film: Path, frames: int) -> None:
-    """Raise RuntimeError unless a film has so many frames: imageio does not look at the exit code of its coder."""
+    """Raise RuntimeError unless a film has this number of frames: imageio ignores the exit code of its encoder."""
     from imageio_ffmpeg import count_frames_and_secs
 
     found = count_frames_and_secs(str(film))[0]
@@ -68,7 +68,7 @@ def write_pictures(folder: Path, frames: Iterable[np.ndarray], names: Iterable[s
     """Write frames [H, W, 3] uint8 as PNG files of these names into a folder that must be new or empty.
 
     Raises:
-        InputError: the folder holds something.
+        InputError: The folder is not empty.
     """
     from PIL import Image
 

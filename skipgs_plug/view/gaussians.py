@@ -1,4 +1,4 @@
-"""Raw parameters of a model as viser takes Gaussians."""
+"""Raw parameters of a model in the form that viser draws."""
 
 from __future__ import annotations
 

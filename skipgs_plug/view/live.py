@@ -7,7 +7,7 @@ import time
 from skipgs_plug.trainer.loop import Iteration, Trainer
 from skipgs_plug.view.page import Page
 
-SHARE = 0.02  # share of the training time that updates of the page may take
+SHARE = 0.02  # share of the training time that page updates may take
 EVERY = 2.0  # seconds between two updates of the page, at least
 LOOK = 0.5  # seconds between two checks whether somebody has the page open
 
@@ -15,8 +15,8 @@ LOOK = 0.5  # seconds between two checks whether somebody has the page open
 class LiveView:
     """Shows a trainer's model as it grows; its `iteration` may serve as `Trainer.on_step`.
 
-    It does not touch parameters or random state, so training gives the same result with it. Each update is timed,
-    and the next one waits until updates have taken less than 2 % of training. Without visitors, there is no update.
+    It does not touch parameters or random state, so training gives the same result. Each update is timed. The next one
+    waits until updates take less than 2 % of the training time. Without visitors, there is no update.
     """
 
     def __init__(self, trainer: Trainer, host: str = "127.0.0.1", port: int = 8080) -> None:

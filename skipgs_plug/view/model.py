@@ -23,10 +23,10 @@ from skipgs_plug.trainer.scene import BLACK, Scene
 from skipgs_plug.view.splat import read_splat
 from skipgs_plug.view.spz import read_spz
 
-# Where trainers write their models: ours and gsplat's, then those of the Inria family. The last one of an
-# iteration counts: it is the format that is quickest to read.
+# Where trainers write their models: this package and gsplat, then the Inria family. If an iteration has several files,
+# the last pattern wins, since its format is read fastest.
 MODEL_FILES = ("ckpts/ckpt_*_rank0.pt", "point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
-LOADING = ("test_every", "init_num_pts", "init_ply")  # settings of a run that change how its scene is loaded
+LOADING = ("test_every", "init_num_pts", "init_ply")  # settings that change how a scene is loaded
 NEAR_PLANE = 0.01  # near clipping plane of a PLY without a scene, in its units; gsplat's default
 FILES: dict[str, Callable[[Path], dict[str, Tensor]]] = {
     ".ply": read_ply,  # plain or compressed
@@ -49,7 +49,7 @@ class Snapshot:
         Positions are float64 where float32 would lose some.
 
         Raises:
-            InputError: the file is damaged or no model.
+            InputError: The file is damaged or not a model.
         """
         read = FILES.get(self.path.suffix.lower())
         if read is not None:
@@ -69,9 +69,10 @@ class Model:
     """Snapshots by iteration, the scene if it is known, and the settings that change how a model looks.
 
     Attributes:
-        near_plane: The near plane of the training, or one that suits the scene.
-        exposure: whether photographs differ from the model by an exposure of their own.
-        far_plane: that it was trained with.
+        near_plane: Near plane of the training, or one that suits the scene.
+        antialiased: Whether the model was trained with antialiasing.
+        exposure: Whether each photograph differs from the model by an exposure of its own.
+        far_plane: Far plane of the training.
     """
 
     name: str
@@ -86,7 +87,7 @@ class Model:
     def load(self, snapshot: Snapshot) -> dict[str, Tensor]:
         """Return the raw parameters of a snapshot in the coordinates of the scene's cameras, float32.
 
-        Without a scene they are moved to the origin where float32 needs it, all snapshots alike.
+        Without a scene, all snapshots are moved to the origin alike if float32 would lose precision.
         """
         splats = snapshot.load()
         if self._frame is None:
@@ -95,7 +96,7 @@ class Model:
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """Colour in [0, 1] behind it."""
+        """Colour in [0, 1] behind the model."""
         return self.scene.background if self.scene else BLACK
 
 
@@ -103,12 +104,12 @@ def open_model(path: str | Path, scene: str | None = None, data_factor: int | No
     """Open a run folder, or a PLY, .splat or .spz of any trainer.
 
     Args:
-        scene: scene to take instead of the one that the run folder names.
-        data_factor: reduction of its images; default: as in training, 1 for a file.
+        scene: Scene to use instead of the one that the run folder names.
+        data_factor: Factor by which its images are reduced. Default: as in training, 1 for a file.
 
     Raises:
-        MissingFileError: there is no such file, no model in the folder, or no scene where the run folder says.
-        InputError: a file is damaged.
+        MissingFileError: The file does not exist, the folder holds no model, or its scene is gone.
+        InputError: A file is damaged.
     """
     path = Path(path).expanduser()
     snapshots = open_snapshots(path)
@@ -145,11 +146,11 @@ def is_antialiased(path: Path, config: Mapping[str, Any] | None = None) -> bool:
 
 
 def open_snapshots(path: str | Path) -> list[Snapshot]:
-    """Return the models of a run folder by iteration, or the one of a file, without their scene.
+    """Return the models of a run folder by iteration, or the model of a file, without their scene.
 
     Raises:
-        MissingFileError: there is no such file, or no model in the folder.
-        InputError: the file has none of the endings in `FILES`.
+        MissingFileError: The file does not exist, or the folder holds no model.
+        InputError: The file has none of the endings in `FILES`.
     """
     path = Path(path).expanduser()
     if not path.exists():
@@ -165,7 +166,7 @@ def find_snapshots(folder: Path) -> list[Snapshot]:
     """Return the models of a run folder, by iteration.
 
     Raises:
-        MissingFileError: the folder holds no model.
+        MissingFileError: The folder holds no model.
     """
     found = {}
     for pattern in MODEL_FILES:
@@ -182,7 +183,7 @@ def find_snapshots(folder: Path) -> list[Snapshot]:
 
 
 def read_config(folder: Path) -> Mapping[str, Any]:
-    """Return the content of cfg.yml; empty for folders of other trainers, which have no such file or another format."""
+    """Return the content of cfg.yml. It is empty for other trainers, which have another format or no such file."""
     import yaml
 
     file = folder / "cfg.yml"

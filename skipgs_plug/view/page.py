@@ -22,15 +22,14 @@ from skipgs_plug.view.draw import to_bytes
 from skipgs_plug.view.gaussians import to_gaussians
 from skipgs_plug.view.upright import up_direction
 
-RADIUS = (
-    5.0  # radius of the cameras on the page, in its units: viser's half precision, near plane and mouse speed suit it
-)
+# Radius of the cameras in units of the page. Viser's half precision, near plane and mouse speed suit this size.
+RADIUS = 5.0
 FRUSTUM = 0.04  # height of a camera's frustum, in radii
 STEP_BACK = 2.0  # distance of the first viewpoint behind the first camera, in units of the page
-THUMBNAIL = 96  # longer side of the photograph in a frustum, in pixels: a scene may have hundreds
+THUMBNAIL = 96  # longer side of the photograph in a frustum, in pixels; small, since a scene may have hundreds
 ERROR_GAIN = 4.0  # factor on absolute errors: at 1, an error of 0.05 would look black
 TRAIN_COLOUR, TEST_COLOUR = (90, 110, 140), (230, 120, 20)
-WORST_SHOWN = 8
+WORST_SHOWN = 8  # held-out views in the list of the worst ones, which then fits the page
 
 Splats = Mapping[str, Tensor]
 
@@ -38,12 +37,13 @@ Splats = Mapping[str, Tensor]
 class Page:
     """A viser server that shows a model.
 
-    What visitors choose is only noted; `show` and `refresh` do the work in the thread of their caller, so that a
-    rasterizer is never asked from two threads.
+    A visitor's choice is only noted. `show` and `refresh` do the work in the thread of their caller, so that no two
+    threads use the rasterizer at once.
 
     Args:
-        draw: renders a model as a view of the scene sees it, [H, W, 3] in [0, 1].
-        steps: iterations to choose from; the slider appears with two or more.
+        scene: The scene; None for a model alone.
+        draw: Renders a model as a view of the scene sees it, [H, W, 3] in [0, 1].
+        steps: Iterations to choose from. The slider appears with two or more.
 
     Raises:
         InputError: Nothing can listen on this host and port.
@@ -67,7 +67,7 @@ class Page:
         self._asked = threading.Event()
         self._handle: Any = None
         self._splats: Splats | None = None
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner of its own, verbose or not
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner, verbose or not
             self._server = viser.ViserServer(host=host, port=port, label="skipgs-plug", verbose=False)
         self._server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         self._status = self._server.gui.add_markdown("Loading ...")
@@ -81,7 +81,7 @@ class Page:
 
     @property
     def port(self) -> int:
-        """Port it listens on; another than asked for where that is taken."""
+        """The port it listens on: the given one, or the next free one."""
         return int(self._server.get_port())
 
     @property
@@ -94,11 +94,11 @@ class Page:
         return len(self._server.get_clients())
 
     def wait(self) -> None:
-        """Return when a visitor has chosen something since this returned last.
+        """Wait until a visitor has chosen something since the last call returned.
 
-        Whoever waits looks at the choices afterwards: one that is made meanwhile is not forgotten.
+        Read the choices afterwards. A choice made between two calls is not lost.
         """
-        while not self._asked.wait(0.5):  # with a timeout, so that Ctrl-C is heard on Windows too
+        while not self._asked.wait(0.5):  # with a timeout, since Ctrl-C does not end a wait on Windows
             pass
         self._asked.clear()
 
@@ -106,7 +106,7 @@ class Page:
         self._server.stop()
 
     def show(self, splats: Splats, title: str) -> None:
-        """Show another model, and the chosen view of it."""
+        """Show another model, and draw the chosen view of it."""
         gaussians = to_gaussians(splats, self._unit)
         if self._handle is None:
             self._handle = self._server.scene.add_gaussian_splats("/model", *gaussians)
@@ -117,7 +117,7 @@ class Page:
         self.refresh()
 
     def refresh(self) -> None:
-        """Draw the chosen view of the model that is shown."""
+        """Draw the chosen view of the model on the page."""
         if self._scene is None or self._splats is None:
             return
         view = self._views[self._choice.value]
@@ -132,7 +132,7 @@ class Page:
         self._quality.content = f"PSNR **{psnr(shown, truth, view.mask):.2f} dB** ({kind})"
 
     def measure(self) -> None:
-        """Measure every held-out view of the model that is shown, colour its camera, and list the worst."""
+        """Measure every held-out view of the model on the page, colour its camera, and list the worst views."""
         if self._scene is None or self._splats is None or not self._scene.test:
             return
         quality = {}

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from skipgs_plug.trainer.scene import View
 
-MOST_KEYS = 30  # cameras that the path goes through, at most: with more, it trembles like the hand that took them
-TURN_WEIGHT = 0.5  # path radii per radian: a turn by one radian takes as long as half a radius
+MOST_KEYS = 30  # cameras on the path, at most; with more, it trembles like the hand of the photographer
+TURN_WEIGHT = 0.5  # radii of the path per radian: a turn by one radian takes as long as a move by half a radius
 
 
 def camera_path(views: list[View], frames: int) -> Tensor:
@@ -18,7 +18,8 @@ def camera_path(views: list[View], frames: int) -> Tensor:
     Orientations are interpolated by Slerp, positions by monotone cubics, which do not overshoot.
 
     Args:
-        views: cameras in the order in which the path goes through them; at least one.
+        views: Cameras in the order of the path, at least one.
+        frames: Number of poses.
     """
     from scipy.interpolate import PchipInterpolator
     from scipy.spatial.transform import Rotation, Slerp

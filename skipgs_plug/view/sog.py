@@ -1,7 +1,7 @@
 """SOG, version 2: PlayCanvas's compressed format for the web, lossless WebP pictures in a ZIP file.
 
-Written from the specification at developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog. Axes are those of
-the PLY.
+Written from the specification at developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog. The axes are the
+same as in a PLY.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from skipgs_plug.trainer.ply import sh_degree
 from skipgs_plug.trainer.row_order import morton_order
 
 VERSION = 2
-STEPS = (1 << 16) - 1  # from the lowest position to the highest
-LEVELS = 256  # of a codebook
-ROUNDS = 8  # of k-means
-ROW = 64  # palette entries in a row of their picture
-LARGEST_COMPONENT = 252  # alpha of a rotation whose w is the largest; 253 to 255 stand for x, y and z
-MOST_ENTRIES = 1 << 16  # a label has two bytes
-GAUSSIANS_PER_ENTRY = 8
-PAIRS = 5e8  # of Gaussians and entries that are compared once: seconds on one core
-SAMPLES_PER_ENTRY = 16  # that entries are found from
-CHUNK = 4096  # Gaussians that are compared with all entries at once
+STEPS = (1 << 16) - 1  # steps from the lowest position to the highest: a coordinate has 16 bits
+LEVELS = 256  # levels of a codebook: a number has one byte
+ROUNDS = 8  # rounds of k-means; later ones change little
+ROW = 64  # palette entries in one row of their picture, as the format says
+LARGEST_COMPONENT = 252  # alpha of a rotation whose largest component is w; 253 to 255 stand for x, y and z
+MOST_ENTRIES = 1 << 16  # palette entries, at most: a label has two bytes
+GAUSSIANS_PER_ENTRY = 8  # Gaussians that share an entry on average, at least: more entries make the file larger
+PAIRS = 5e8  # pairs of a Gaussian and an entry per round of the search, which takes seconds on one core
+SAMPLES_PER_ENTRY = 16  # Gaussians per entry that the search looks at
+CHUNK = 4096  # Gaussians compared with all entries at once, which bounds memory
 
 
 def to_sog(splats: Mapping[str, Tensor], antialiased: bool = False, pairs: float = PAIRS) -> bytes:
-    """Return the file of a model with raw parameters, as of `read_ply`; rows are put in the order of space.
+    """Return the file of a model with raw parameters like the result of `read_ply`, with neighbours in nearby rows.
 
-    Positions are kept to 2**-17 of the extent on a scale that is finer near the origin (`position_error`); opacities
-    and rotations in a byte a number; scales and constant colours in 256 levels that suit the model; the other
-    harmonics as a palette of up to 65,536 entries.
+    Positions are rounded to 2**-17 of the extent, on a scale that is finer near the origin (`position_error`).
+    Opacities and rotations take one byte per number. Scales and constant colours have 256 levels that suit the model.
+    The other harmonics are a palette of up to 65,536 entries.
 
     Args:
         splats: `means scales quats opacities sh0 shN`.
-        antialiased: the model compensates opacities for the blur, and wants viewers to do the same.
-        pairs: of Gaussians and entries of the palette that may be compared at once in search of it; fewer are sooner.
+        antialiased: Whether the model was trained with antialiasing, which viewers must then use too.
+        pairs: Pairs of a Gaussian and a palette entry that each round of the search may compare. Fewer are faster.
     """
     means = splats["means"].detach().cpu().double()
     order = morton_order(means)
@@ -89,7 +89,7 @@ def to_sog(splats: Mapping[str, Tensor], antialiased: bool = False, pairs: float
 
 
 def position_error(means: Tensor) -> float:
-    """Return by how much positions [N, 3] are rounded at most."""
+    """Return the largest error by which positions [N, 3] are rounded."""
     _, lowest, highest = _positions(means.numpy())
     return max(
         (high - low) / STEPS / 2 * math.exp(max(abs(low), abs(high))) for low, high in zip(lowest, highest, strict=True)
@@ -97,7 +97,7 @@ def position_error(means: Tensor) -> float:
 
 
 def _positions(means: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
-    """Return 16 bits per coordinate [N, 3], and the values of 0 and 65,535 on the logarithmic scale."""
+    """Return 16 bits per coordinate [N, 3], and the logarithmic positions that 0 and 65,535 stand for."""
     scaled = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     lowest, highest = scaled.min(axis=0), scaled.max(axis=0)
     extent = np.where(highest > lowest, highest - lowest, 1.0)
@@ -106,7 +106,7 @@ def _positions(means: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]
 
 
 def _rotations(quats: np.ndarray) -> np.ndarray:
-    """Return the three smaller components, made so that the largest is positive, and which that is [N, 4]."""
+    """Return the three smaller components and the place of the largest one [N, 4]; signs make the largest positive."""
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(min=1e-12)
     largest = np.abs(quats).argmax(axis=1)[:, None]
     quats = quats * np.where(np.take_along_axis(quats, largest, axis=1) < 0, -1.0, 1.0)
@@ -116,10 +116,10 @@ def _rotations(quats: np.ndarray) -> np.ndarray:
 
 
 def _levels(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
-    """Return 256 levels by k-means, ascending, and the number of the nearest one to each value [N, M]."""
+    """Return for each value [N, M] the number of its nearest level, and the 256 levels, found by k-means, ascending."""
     ordered = np.sort(values, axis=None).astype(np.float64)
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    # Between equal ranks and equal steps: tails are rare, and large Gaussians are seen.
+    # Begin half-way between equal ranks and equal steps: tails are rare, but large Gaussians are visible.
     ranks, steps = (np.linspace(0, 1, LEVELS), np.linspace(ordered[0], ordered[-1], LEVELS))
     levels = np.sort((np.quantile(ordered, ranks) + steps) / 2)
     for _ in range(ROUNDS):
@@ -131,7 +131,7 @@ def _levels(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
 
 
 def _palette(rows: Tensor, pairs: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return entries [K, C] by k-means, and the number of the nearest one to each row [N, C]."""
+    """Return entries [K, C], found by k-means, and for each row [N, C] the number of its nearest entry."""
     n = len(rows)
     entries = int(max(1, min(MOST_ENTRIES, pairs // n, n // GAUSSIANS_PER_ENTRY)))
     generator = torch.Generator().manual_seed(0)
@@ -152,7 +152,7 @@ def _nearest(rows: Tensor, palette: Tensor) -> Tensor:
 
 
 def _grid(rows: np.ndarray) -> np.ndarray:
-    """Lay out one pixel a row [N, 3 or 4], from left to right, then down."""
+    """Return a picture with one pixel per row [N, 3 or 4], from left to right, then down."""
     width = max(4, -(-int(np.ceil(len(rows) ** 0.5)) // 4) * 4)
     height = max(1, -(-len(rows) // width))
     picture = np.zeros((height * width, rows.shape[1]), np.uint8)
@@ -164,6 +164,6 @@ def _webp(picture: np.ndarray) -> bytes:
     from PIL import Image
 
     stream = io.BytesIO()
-    # exact: colours of transparent pixels are numbers too.
+    # exact: the colours of transparent pixels carry numbers too.
     Image.fromarray(picture).save(stream, format="WEBP", lossless=True, quality=60, method=4, exact=True)
     return stream.getvalue()

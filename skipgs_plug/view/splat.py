@@ -1,6 +1,6 @@
-"""The .splat of antimatter15 and most web viewers: 32 bytes per Gaussian, colours that do not change with direction.
+"""Read .splat files (antimatter15, most web viewers): 32 bytes per Gaussian, colours do not change with direction.
 
-Written from the description at github.com/antimatter15/splat. `gsplat.export_splats` writes it; here it is read.
+Written from the description at github.com/antimatter15/splat. `gsplat.export_splats` writes such files.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("
 
 
 def read_splat(path: Path) -> dict[str, Tensor]:
-    """Return the raw parameters of a .splat, as `read_ply`, with `shN [N, 0, 3]`.
+    """Return the raw parameters of a .splat like `read_ply`, with `shN [N, 0, 3]`.
 
     Raises:
-        InputError: it cannot be read, or holds no such rows.
+        InputError: The file is damaged or not a .splat.
     """
     data = path.read_bytes()
     if not data or len(data) % ROW.itemsize:

@@ -1,8 +1,8 @@
 """SPZ: the compressed format of Niantic that phones, glTF and web viewers read; about 20 bytes per Gaussian.
 
-Version 2 is written, which every reader knows; versions 1 to 3 are read. Written from the description at
-github.com/nianticlabs/spz. Its axes are right, up, back, and those of a 3DGS model are right, down, front. So y and z
-change their signs, and rotations and spherical harmonics change with them.
+Files are written in version 2, which every reader knows. Versions 1 to 3 are read. Written from the description at
+github.com/nianticlabs/spz. The axes of SPZ are right, up, back; the axes of a 3DGS model are right, down, front. So y
+and z change their signs, and rotations and spherical harmonics change with them.
 """
 
 from __future__ import annotations
@@ -27,36 +27,38 @@ from skipgs_plug.trainer.ply import renderable, sh_degree
 log = logging.getLogger(__name__)
 
 MAGIC, VERSION = 0x5053474E, 2
-HEADER = "<IIIBBBB"  # magic, version, Gaussians, SH degree, bits behind the point, flags, nothing
+HEADER = "<IIIBBBB"  # magic, version, Gaussians, SH degree, fractional bits of positions, flags, reserved
 ANTIALIASED, EXTENDED = 1, 2  # flags
-MOST = 10_000_000  # Gaussians in a file, at most: the reader of the format's authors refuses more
-POSITION_BITS = 23  # bits of a coordinate beside its sign: the format has 24
+MOST = 10_000_000  # Gaussians in a file, at most: the authors' own reader refuses more
+POSITION_BITS = 23  # bits of a coordinate without its sign; the format has 24 bits in all
 COLOUR_SCALE = 0.15  # factor on constant SH coefficients before 0.5 is added, as the format says
 HIGHEST_DEGREE = 3
-# Signs of the coefficients of bands 1 to 3 when y and z are turned: (y z x) (xy yz zz xz xx-yy) (...)
+# Signs of the coefficients of bands 1 to 3 when y and z change sign: (y z x) (xy yz zz xz xx-yy) (...)
 SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)
-SCALES = (-10.0, 255 / 16 - 10.0)  # logarithms that a byte stands for
-FIRST_BAND_STEP, OTHER_BAND_STEP = 8, 16  # of 256: five and four bits
+SCALES = (-10.0, 255 / 16 - 10.0)  # logarithms of the scales that the bytes 0 and 255 stand for
+FIRST_BAND_STEP, OTHER_BAND_STEP = 8, 16  # quantisation steps of 256 levels: five and four bits are left
 
 
 class Spz(NamedTuple):
     """The content of a file."""
 
-    splats: dict[str, Tensor]  # raw parameters, as of `read_ply`
+    splats: dict[str, Tensor]  # raw parameters, like the result of `read_ply`
     antialiased: bool  # whether opacities are compensated for the blur, as the model was trained
 
 
 def to_spz(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
-    """Return the file of a model with raw parameters, as of `read_ply`.
+    """Return the file of a model with raw parameters like the result of `read_ply`.
 
-    Positions are kept to 2**-22 of the largest coordinate, but not finer than 2**-24; opacities, colours, scales and
-    rotations in a byte each; spherical harmonics in five bits for the first band and four for the others.
+    Positions are rounded to 2**-22 of the largest coordinate, but not finer than 2**-24. Opacities, colours, scales and
+    rotations take one byte per number, spherical harmonics five bits in the first band and four bits in the others.
     """
     means, scales, colours = (splats[name].numpy().astype(np.float64) for name in ("means", "scales", "sh0"))
     cut = int(((scales < SCALES[0]) | (scales > SCALES[1])).any(axis=1).sum())
     if cut:
         log.warning(
-            "SPZ holds scales of e^%.0f to e^%.0f: those of %d Gaussians are cut. A .ply keeps them.", *SCALES, cut
+            "SPZ holds scales from e^%.0f to e^%.0f: the scales of %d Gaussians are cut. A .ply keeps them.",
+            *SCALES,
+            cut,
         )
     n, rest = len(means), splats["shN"].numpy().astype(np.float32)
     largest = float(np.abs(means).max(initial=1e-9))
@@ -83,7 +85,7 @@ def read_spz(path: Path) -> Spz:
     """Read a file of version 1 to 3.
 
     Raises:
-        InputError: the file is damaged, of another version, or has unsupported content; the message says which.
+        InputError: The file is damaged, of another version, or has unsupported content. The message says which.
     """
     data = path.read_bytes()
     if data[:4] == struct.pack("<I", MAGIC):
@@ -124,17 +126,17 @@ def _positions(data: np.ndarray, bits: int, version: int) -> np.ndarray:
 
 
 def _first_three(data: np.ndarray) -> np.ndarray:
-    """Return quaternions [N, 4] (wxyz) of which three bytes [N, 3] hold x, y and z."""
+    """Return quaternions [N, 4] (wxyz) from three bytes [N, 3] for x, y and z."""
     xyz = data / 127.5 - 1.0
     return np.concatenate([np.sqrt((1.0 - (xyz**2).sum(axis=1, keepdims=True)).clip(0.0)), xyz], axis=1)
 
 
 def _smallest_three(data: np.ndarray) -> np.ndarray:
-    """Return quaternions [N, 4] (wxyz) of which four bytes [N, 4] hold all parts but the largest, in ten bits each."""
+    """Return quaternions [N, 4] (wxyz) from four bytes [N, 4]: ten bits for each component but the largest."""
     packed = np.ascontiguousarray(data).view("<u4")[:, 0]
     largest = packed >> np.uint32(30)
     parts = np.zeros((len(packed), 4))  # xyzw
-    for i in (3, 2, 1, 0):  # the last one lies lowest
+    for i in (3, 2, 1, 0):  # the last component has the lowest bits
         held = largest != i
         size = (packed & np.uint32(511)) * (math.sqrt(0.5) / 511)
         parts[:, i] = np.where(held, np.where(packed & np.uint32(512), -size, size), 0.0)

@@ -153,7 +153,7 @@ def test_where_all_at_once_fails_photographs_are_placed_one_after_another(fern, 
     monkeypatch.setattr(global_mapping, "LEAST_POINTS", 1_000_000)  # so that no photograph counts as placed
     assert main(["sfm", str(photos), str(scene), "--no-progress"]) == 0
     shown = capsys.readouterr().out
-    assert "All at once, 0 of 5 photographs could be placed; placing them one after another." in shown
+    assert "Global mapping placed 0 of 5 photographs; placing them one after another now." in shown
     assert "5 of 5 photographs placed (exhaustive matching, incremental mapping)" in shown
     assert main(["sfm", str(photos), str(tmp_path / "other"), "--mapping", "global", "--no-progress"]) == 2
     assert "None of the 5 photographs could be placed" in capsys.readouterr().err

@@ -174,5 +174,5 @@ def test_a_film_that_does_not_fit_is_one_sentence(run_folder, tmp_path, capfd):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     said = [line for line in capfd.readouterr().err.splitlines() if line.startswith("skipgs-plug: ")]
-    assert len(said) == 1 and said[0].startswith(f"skipgs-plug: {film} cannot be written (the coder ended early")
+    assert len(said) == 1 and said[0].startswith(f"skipgs-plug: {film} cannot be written (the encoder ended early")
     assert not list(tmp_path.iterdir())

@@ -145,7 +145,7 @@ def test_scales_that_spz_does_not_hold_are_counted(splats: Splats, caplog: pytes
     scales[:7, 1] -= 9  # a scene in kilometres
     scales[7:9] += 13
     to_spz({**splats, "scales": scales})
-    assert "those of 9 Gaussians are cut" in caplog.text
+    assert "the scales of 9 Gaussians are cut" in caplog.text
 
 
 def test_antialiasing_travels_with_an_spz(splats: Splats, tmp_path: Path) -> None:

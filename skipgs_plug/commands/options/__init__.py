@@ -1,1 +1,1 @@
-"""Options of each command, as dataclasses. Nothing here imports torch, so `--help` and typing errors answer at once."""
+"""Options of each command, as dataclasses. None of these modules imports torch, so `--help` answers at once."""

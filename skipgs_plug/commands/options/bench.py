@@ -16,7 +16,7 @@ from skipgs_plug.trainer.config import TrainConfig
 
 @dataclass
 class Options(TrainConfig):
-    """TrainConfig with a schedule that a CPU finishes, without folders and seed."""
+    """TrainConfig without folders and seed, and with a schedule that is short enough for a CPU."""
 
     data_dir: tyro.conf.Suppress[str] = ""
     result_dir: tyro.conf.Suppress[str] = ""
@@ -27,10 +27,9 @@ class Options(TrainConfig):
 
 @dataclass
 class Args:
-    """Train under each policy, compare time and quality: refinement from one snapshot per seed, or whole runs.
+    """Train under each policy and compare time and quality: refinement from one snapshot per seed, or whole runs.
 
-    Evaluation, loading and compilation are outside the clock. A killed bench continues where it stopped when
-    the same command is given again.
+    Evaluation, loading and compilation do not count as time. After a kill, the same command continues.
     """
 
     scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
@@ -42,13 +41,13 @@ class Args:
     whole: bool = False
     """Train from the first iteration under each policy, instead of refining one densified snapshot per seed."""
     policies: OptionalWords = None
-    """What to compare, all unless given; controls copy rate, time or size of others."""
+    """Policies to compare; default: all. Controls copy the rate, time or size of other policies."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
     tensorboard: bool = False
-    """Log gsplat's scalars and the gate's counters of every run to OUT/tb; the clock stands meanwhile."""
+    """Log gsplat's scalars and the gate's counters of every run to OUT/tb, outside the measured time."""
     clock: Optional[Clock] = None
-    """Seconds by the clock on the wall, or for which the processor worked for us: for a machine that others use too.
-    Processor seconds unless given for whole runs on the CPU, else the wall's."""
+    """Wall time, or processor seconds of this process, which suit a machine that others use too.
+    Default: processor seconds for whole runs on the CPU, else wall time."""
     no_progress: bool = False
     """No progress bars."""
     command: tyro.conf.Suppress[str] = "skipgs-plug bench"

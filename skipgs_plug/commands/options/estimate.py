@@ -1,4 +1,4 @@
-"""What `skipgs-plug estimate` takes."""
+"""Options of `skipgs-plug estimate`."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from skipgs_plug.commands.options.parse import Integers, parse_as
 from skipgs_plug.commands.options.train import Options
 from skipgs_plug.trainer.errors import InputError
 
-LONGEST = 10_000_000  # iterations of a run
+LONGEST = 10_000_000  # iterations of a run, at most: larger numbers are typing errors
 
 
 @dataclass
 class Args:
-    """Train for half a minute and say how long whole runs take here, with and without --share auto.
+    """Train for half a minute and predict how long whole runs take here, with and without --share auto.
 
-    Nothing is written. Settings of training are those of the command train; give those that the run will have.
+    Nothing is written. The settings of training are the same as for `train`; give the settings of the planned run.
     """
 
     scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
@@ -28,7 +28,7 @@ class Args:
     steps: Integers = (7000, 30_000)
     """Lengths of runs, in iterations."""
     seconds: float = 30.0
-    """Seconds of training to look at; more see further."""
+    """Seconds of training to measure; more give a better estimate."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
     no_progress: bool = False
     """No progress bar."""

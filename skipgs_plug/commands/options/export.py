@@ -13,7 +13,7 @@ from skipgs_plug.commands.options.parse import parse_as
 
 @dataclass
 class Args:
-    """Convert the last model of a run folder, or any 3DGS PLY, .splat or .spz. The ending of OUT chooses the format.
+    """Convert the last model of a run folder, or any 3DGS PLY, .splat or .spz. The ending of FILE sets the format.
 
     .compressed.ply: SuperSplat, PlayCanvas; 61 bytes per Gaussian, invisible ones left out.
     .splat: antimatter15 and most web viewers; 32 bytes, colours that do not change with direction.

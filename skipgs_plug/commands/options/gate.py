@@ -13,7 +13,7 @@ from skipgs_plug.core.errors import SkipGSError
 
 @dataclass
 class GateOptions:
-    """Settings of the gate, with the names of SkipConfig. The adapter chooses those that are not given."""
+    """Settings of the gate, with the names of SkipConfig. The adapter chooses all settings that are not given."""
 
     start_iter: Annotated[Optional[int], shown("INT", "end of densification")] = None
     """First iteration that may be skipped."""
@@ -24,34 +24,34 @@ class GateOptions:
     warmup: Annotated[Optional[int], shown("INT", "500; in train times max_steps / 30,000, at least 2 per view")] = None
     """Gated iterations without skipping."""
     min_bwd_ratio: Annotated[Optional[str], shown("SHARE|auto", "auto")] = None
-    """Least share of gated iterations with a backward."""
+    """Smallest share of gated iterations with a backward pass."""
     on_nonfinite: Annotated[Optional[Literal["skip", "raise", "pass"]], shown("skip|raise|pass", "skip")] = None
     """How to treat a NaN or infinite loss."""
     pause_iters: Annotated[Optional[int], shown("INT", "one round of the views, at least 500; scaled in train")] = None
-    """Real backwards after a prune or reset."""
+    """Iterations without skipping after a prune or reset."""
 
-    share: Annotated[Optional[str], shown("SHARE|auto", "the paper's gate, which leaves out none")] = None
-    """Leave out whole iterations in the whole run: the share that runs, such as 0.3, or auto."""
+    share: Annotated[Optional[str], shown("SHARE|auto", "the paper's gate, which leaves out no iterations")] = None
+    """Share of the run's iterations that run, such as 0.3, or auto. The others are left out."""
     grow_share: Annotated[Optional[str], shown("SHARE|auto", "as --share")] = None
-    """The same until densification ends only, with fewer densification events."""
+    """The same, but only until densification ends. There are fewer densification events."""
     refine_share: Annotated[Optional[str], shown("SHARE|auto", "as --share")] = None
-    """The same after densification only, such as 0.4, or auto."""
+    """The same, but only after densification, such as 0.4, or auto."""
     max_gaussians: Annotated[Optional[int], shown("INT", "no bound")] = None
-    """With --share: densification events stop before one could go beyond this number of Gaussians."""
+    """With --share: largest number of Gaussians. Densification stops before an event could exceed it."""
     always: Annotated[OptionalIntegers, shown("INT ...", "read from the loop's conditions")] = None
-    """Iterations that always run, instead of those that the loop's conditions on its number name."""
+    """Iterations that always run. Replaces the numbers that are read from the loop's conditions."""
     tolerance: Annotated[Optional[float], shown("FLOAT", "0.05")] = None
-    """Decibels that the rest of refinement may be worth when auto ends it."""
+    """With auto: refinement ends when the rest of it is worth less than this, in decibels."""
     compensate: Annotated[Optional[bool], shown("True|False", "with --refine-share only")] = None
-    """Make up for iterations that are left out with larger, shrinking steps."""
+    """Make up for left-out iterations with larger, shrinking steps."""
     rate_peak: Annotated[Optional[float], shown("FLOAT", "by the share that runs and what views show")] = None
-    """Factor on learning rates when refinement begins, falling to 0."""
+    """Factor on learning rates when refinement begins. It falls to 0."""
 
     def given(self) -> dict[str, Any]:
-        """Return the settings that the user gave, by name. SkipConfig refuses values that are not a share.
+        """Return the settings that the user gave, by name. SkipConfig checks the values.
 
         Raises:
-            SkipGSError: One of them does nothing without another, which is missing.
+            SkipGSError: A setting needs another one, which is missing.
         """
         shares = (self.share, self.grow_share, self.refine_share)
         if all(share is None for share in shares):

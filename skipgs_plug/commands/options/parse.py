@@ -1,8 +1,8 @@
 """Command lines to dataclasses.
 
 tyro compares the default of every option with its type. For `int | None` (before Python 3.14) and `tuple[int, ...]` it
-asks typeguard, which loads unittest and asyncio: 0.1 s of each command. It compares `Optional[int]` by itself, and the
-types of several values below.
+uses typeguard, which loads unittest and asyncio and takes 0.1 s of each command. It does not need typeguard for
+`Optional[int]` and for the types of several values in this module.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ T = TypeVar("T")
 
 
 def parse_as(kind: type[T], argv: list[str], command: str) -> T:
-    """Return the options of `skipgs-plug COMMAND`; print help or the mistake, and exit, as tyro does."""
+    """Return the options of `skipgs-plug COMMAND`. On `--help` or a mistake, tyro prints text and exits."""
     return tyro.cli(kind, args=argv, prog=f"skipgs-plug {command}", config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def shown(kind: str, default: str) -> Any:
-    """Return how --help shows an optional setting and its default."""
+    """Return tyro's annotation for the type and default that --help shows for an optional setting."""
     return tyro.conf.arg(metavar=kind, help_behavior_hint=f"(default: {default})")
 
 

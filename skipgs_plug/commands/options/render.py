@@ -20,7 +20,7 @@ class Args:
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PATH")]
     """Film to write (.mp4), or folder for PNG files."""
     scene: Optional[str] = None
-    """Scene that gives the cameras; default: the one the run folder names."""
+    """Scene with the cameras; default: the scene that the run folder names."""
     cameras: Literal["path", "held-out"] = "path"
     """A path through the training cameras in the order of names, or each held-out camera."""
     show: Literal["colour", "depth", "both"] = "colour"
@@ -30,7 +30,7 @@ class Args:
     fps: int = 30
     """Frames per second of a film."""
     data_factor: Optional[int] = None
-    """Size of the frames, as that of the scene's images_{factor}; default: as in training."""
+    """Factor by which frames are reduced, like the scene's images_{factor}; default: as in training."""
     backend: str = "auto"
     """auto, gsplat (CUDA) or warp (CPU)."""
     no_progress: bool = False

@@ -12,7 +12,7 @@ from skipgs_plug.commands.options.parse import Words, parse_as
 
 @dataclass
 class Args:
-    """Turn run folders into one self-contained HTML page: tables and plots inside, nothing loaded from a network."""
+    """Turn run folders into one HTML page with tables and plots. The page loads nothing from a network."""
 
     runs: Annotated[tyro.conf.Positional[Words], tyro.conf.arg(metavar="RUN ...")]
     """Folders of `skipgs-plug train`, `run` or `bench`, or their skipgs.json."""

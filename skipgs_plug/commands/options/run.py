@@ -14,7 +14,7 @@ from skipgs_plug.commands.options.parse import Words, parse_as
 
 
 def split(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Separate our options from the script's command line."""
+    """Separate the options of `run` from the script's command line."""
     if "--" not in argv:
         return list(argv), []
     at = list(argv).index("--")
@@ -25,15 +25,15 @@ def split(argv: Sequence[str]) -> tuple[list[str], list[str]]:
 class Args:
     """Run a training script of another project, unedited and gated.
 
-    Write after `--` what you would write after `python`: skipgs-plug run fastgs -- train.py -s data/garden.
-    Exit code, output and files are the script's own; skipgs.json is added to its output folder.
+    Write the words that follow `python` after `--`: skipgs-plug run fastgs -- train.py -s data/garden.
+    Exit code, output and files are the script's own. skipgs.json is added to its output folder.
     """
 
     adapter: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ADAPTER -- SCRIPT ...")]
-    """Name of the trainer: inria, fastgs, taming, ...; or auto, to recognise it by its script."""
+    """Name of the trainer, such as inria, fastgs or taming, or auto to recognise its script."""
     gate_options: Annotated[GateOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GateOptions)
     resume_gate: str = "auto"
-    """State that the gate continues from: auto (beside the checkpoint that the script loads), off, or a path."""
+    """State to resume the gate from: auto (beside the checkpoint that the script loads), off, or a path."""
     no_gate: bool = False
     """Change nothing in training; skipgs.json then holds the seconds of the trainer's own run."""
     cpu: bool = False

@@ -14,15 +14,15 @@ class SessionOptions:
     """Files and pages of a session, and when they are written. They do not change the trained model."""
 
     save_every: Optional[int] = None
-    """Iterations between two checkpoints, of which two are kept; default: five minutes of training; 0: the end only."""
+    """Iterations between checkpoints; the last two are kept. Default: five minutes of training. 0: only at the end."""
     eval_every: int = 0
-    """Iterations between two evaluations on the way; 0: the end only."""
+    """Iterations between two evaluations. 0: only at the end."""
     tensorboard: bool = False
     """Log gsplat's scalars and the gate's counters to RUN/tb, every tenth iteration."""
     view: bool = False
     """Show training in the browser; costs at most 2 % of its time."""
-    image_memory: Annotated[Optional[float], shown("GB", "a quarter of what is free")] = None
-    """Memory for decoded photographs. Photographs that do not fit are decoded again, ahead of their turn."""
+    image_memory: Annotated[Optional[float], shown("GB", "a quarter of the free memory")] = None
+    """Memory for decoded photographs. Photographs that do not fit are decoded anew before they are needed."""
     lpips_net: Optional[Literal["alex", "vgg"]] = None
     """Also report LPIPS; its weights must be on this machine."""
     no_progress: bool = False

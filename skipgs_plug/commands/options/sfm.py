@@ -16,8 +16,8 @@ from skipgs_plug.photos.choices import Mapping, Matching
 class Args:
     """Reconstruct where photographs were taken (COLMAP, on the CPU) and write a scene for `skipgs-plug train`.
 
-    Up to 100 photographs are matched each with each and placed one after another; more are matched with their
-    neighbours in the order of names and placed all at once.
+    Up to 100 photographs are matched in all pairs and placed one after another. More photographs are matched with
+    their neighbours in the order of names and placed all at once.
     """
 
     photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")]
@@ -27,9 +27,9 @@ class Args:
     frames: int = 100
     """Frames to take from a video, each the sharpest of its group."""
     matching: Matching = "auto"
-    """Which photographs are compared."""
+    """Pairs of photographs to compare: all (exhaustive), or neighbours in the order of names (sequential)."""
     mapping: Mapping = "auto"
-    """Placed one after another (incremental) or all at once (global)."""
+    """Place photographs one after another (incremental) or all at once (global)."""
     no_progress: bool = False
     """No progress bars."""
 

@@ -16,7 +16,7 @@ from skipgs_plug.trainer.config import REFERENCE_STEPS, TrainConfig
 
 @dataclass
 class Options(TrainConfig):
-    """TrainConfig without the folders, which the command takes as SCENE and --out, and the length of the run."""
+    """TrainConfig without folders and length of the run, which the command takes as SCENE, --out and --max-steps."""
 
     data_dir: tyro.conf.Suppress[str] = ""
     result_dir: tyro.conf.Suppress[str] = ""
@@ -26,7 +26,7 @@ class Options(TrainConfig):
 
 @dataclass
 class Args:
-    """Train a COLMAP, nerfstudio or Blender folder or a packed .npz: the 3DGS recipe, every iteration of it.
+    """Train a COLMAP, nerfstudio or Blender folder or a packed .npz by the 3DGS recipe.
 
     --share auto trains in fewer iterations, with larger, shrinking steps.
     """
@@ -36,9 +36,9 @@ class Args:
     out: str
     """Run folder to write."""
     sfm: bool = False
-    """Find out first where the photographs were taken, as the command sfm does, and keep the scene in OUT/scene."""
+    """First reconstruct where the photographs were taken, like the command sfm, and keep the scene in OUT/scene."""
     max_steps: Optional[int] = None
-    """Training iterations; default: 30,000, or with --resume the number of the run. A larger number extends the run."""
+    """Training iterations; default: 30,000, or with --resume as before. A larger number extends the run."""
     train: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
     gate: bool = False
     """Attach the paper's gate. Any gate setting, such as --share auto, attaches a gate too."""

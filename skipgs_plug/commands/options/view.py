@@ -12,9 +12,9 @@ from skipgs_plug.commands.options.parse import parse_as
 
 @dataclass
 class Args:
-    """Serve a page with the model, and held-out photographs beside their renders, until Ctrl-C.
+    """Serve a page with the model, and with held-out photographs beside their renders, until Ctrl-C.
 
-    It opens on phones too: one finger turns, two move; a button changes to flying.
+    It works on phones too: one finger turns, two fingers move, and a button changes to flying.
     """
 
     model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")]
@@ -22,13 +22,13 @@ class Args:
     scene: Optional[str] = None
     """Scene with the photographs; default: the scene of the run folder. A PLY needs no scene."""
     data_factor: Optional[int] = None
-    """Reduction of the photographs; default: as in training."""
+    """Factor by which photographs are reduced; default: as in training."""
     cameras: bool = False
-    """The page for finding errors: all cameras in space, all models of the run, PSNR of every held-out view."""
+    """Serve the page for finding errors: all cameras and models of the run, and the PSNR of every held-out view."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 lets other machines of the network in."""
     port: int = 8080
-    """Port to listen on; the next free one is taken."""
+    """Port to listen on. If it is taken, the next free one is used."""
     backend: str = "auto"
     """auto, gsplat (CUDA) or warp (CPU)."""
 

@@ -1,4 +1,4 @@
-"""The server of the page: the model compressed, and held-out photographs beside their renders."""
+"""The server of the page: the compressed model, and held-out photographs beside their renders."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from skipgs_plug.view.web.turn import turn, upright
 
 log = logging.getLogger(__name__)
 
-PAIRS = 5e7  # of the palette of harmonics: the page opens before the best palette would be found
-KEPT = 32  # comparisons
-PORTS = 50  # that are tried from the given one on
+PAIRS = 5e7  # see `to_sog`; a tenth of its default, so that the page opens sooner
+KEPT = 32  # comparisons that stay in memory
+PORTS = 50  # ports that are tried, from the given one on
 TO_PAGE = np.diag([-1.0, -1.0, 1.0])  # the viewer turns a model half a turn about z
-POSE = ([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 60.0)  # of a model without a scene
+POSE = ([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 60.0)  # position, target, degrees of the first view without a scene
 FILES = {
     "/": ("page/index.html", "text/html; charset=utf-8"),
     "/page.css": ("page/page.css", "text/css"),
@@ -47,13 +47,15 @@ FILES = {
 class WebPage:
     """Serves a page with one model.
 
-    The model is compressed by `prepare`; whoever asks for it before waits. Renders are made one at a time.
+    `prepare` compresses the model. Visitors who ask for it earlier wait. Renders are made one at a time.
 
     Args:
-        draw: renders the model as a view of its scene sees it, [H, W, 3] in [0, 1].
+        model: The model with its scene.
+        splats: Its raw parameters.
+        draw: Renders the model as a view of its scene sees it, [H, W, 3] in [0, 1].
 
     Raises:
-        InputError: nothing can listen on this host and port.
+        InputError: Nothing can listen on this host and port.
     """
 
     def __init__(
@@ -77,7 +79,7 @@ class WebPage:
 
     @property
     def port(self) -> int:
-        """Port it listens on; another than asked for where that is taken."""
+        """The port it listens on: the given one, or the next free one."""
         return int(self._server.server_address[1])
 
     def prepare(self) -> None:
@@ -90,7 +92,7 @@ class WebPage:
         self._server.server_close()
 
     def answer(self, path: str) -> tuple[bytes, str] | None:
-        """Return content and type of an address; None for what there is not."""
+        """Return content and type of an address; None if there is no such page."""
         if path in FILES:
             name, kind = FILES[path]
             return files("skipgs_plug.view.web").joinpath(name).read_bytes(), kind
@@ -160,7 +162,7 @@ def camera(pose: tuple[list[float], list[float], float]) -> dict[str, Any]:
     return {"position": position, "target": target, "fov": fov}
 
 
-# The viewer's format asks for all of them; they are off.
+# The viewer's format requires all of these effects. They are off.
 EFFECTS = {
     "sharpness": {"enabled": False, "amount": 0},
     "bloom": {"enabled": False, "intensity": 1, "blurLevel": 2},
@@ -180,7 +182,7 @@ def listen(host: str, port: int, page: WebPage) -> ThreadingHTTPServer:
             try:
                 found = page.answer(self.path.split("?")[0])
                 status = 200 if found else 404
-            except Exception:  # the page says so, and goes on
+            except Exception:  # the visitor gets status 500, and the server goes on
                 log.exception("%s cannot be answered.", self.path)
                 found, status = None, 500
             content, kind = found or (b"There is no such page.\n", "text/plain")

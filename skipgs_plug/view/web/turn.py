@@ -10,11 +10,11 @@ from torch import Tensor
 
 from skipgs_plug.trainer.ply import sh_degree
 
-DIRECTIONS = 64  # that coefficients are fitted to; degree 3 has 15
+DIRECTIONS = 64  # directions that coefficients are fitted to; degree 3 has only 15 unknowns
 
 
 def upright(up: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Return the rotation [3, 3] after which `up` is -y, as viewers take it of a PLY, and `ahead` is about z."""
+    """Return the rotation [3, 3] that turns `up` to -y, which viewers expect of a PLY, and `ahead` to about z."""
     down = -up / np.linalg.norm(up)
     ahead = ahead - (ahead @ down) * down
     if np.linalg.norm(ahead) < 1e-6:
@@ -25,7 +25,7 @@ def upright(up: np.ndarray, ahead: np.ndarray) -> np.ndarray:
 
 @torch.no_grad()
 def turn(splats: Mapping[str, Tensor], rotation: np.ndarray, unit: float) -> dict[str, Tensor]:
-    """Return raw parameters, as of `read_ply`, of the model turned by `rotation` [3, 3], lengths times `unit`."""
+    """Return the raw parameters of the model, turned by `rotation` [3, 3] and with lengths multiplied by `unit`."""
     from scipy.spatial.transform import Rotation
 
     matrix = torch.from_numpy(rotation).double()
@@ -48,7 +48,7 @@ def turned_harmonics(rotation: Tensor, k: int) -> Tensor:
     """Return the matrix [K, K] that turns K coefficients beyond the constant one, by a rotation [3, 3], float64."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(DIRECTIONS, 3, generator=generator, dtype=torch.float64)
-    # The turned colour along d is the colour along the direction that d came from.
+    # The colour of the turned model along d is the original colour along the direction that was turned to d.
     return torch.linalg.lstsq(basis(directions, k), basis(directions @ rotation, k)).solution
 
 
