@@ -1,4 +1,4 @@
-"""One small file per trainer, and what one needs to write another: see `AbstractAdapter`."""
+"""One small file per trainer, and the tools to write another one: see `AbstractAdapter`."""
 
 import warnings
 from typing import Any

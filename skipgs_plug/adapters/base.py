@@ -1,4 +1,4 @@
-"""The base class of adapters: one trainer's answers."""
+"""The base class of adapters: everything that the gate must know about one trainer."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class AbstractAdapter(ABC):
 
     An adapter has no loop and makes no decisions. It reports to the gate through `Hooks`:
 
-    - once: `ready(TrainerInfo(start_iter, ...))`, at attach, or at the latest before the first iteration;
+    - once: `ready(TrainerInfo(start_iter, ...))`, at attach or before the first iteration;
     - in each iteration: `iteration(step)`, `view(key)`, and the backward pass (`gate_tensor_backward`, or a wrapped
       method that calls `backward(loss, run)`);
     - for each structural change: `event(kind)`.
@@ -29,13 +29,14 @@ class AbstractAdapter(ABC):
 
     Attributes:
         name: The name by which users choose the adapter.
-        project: Name and home of the trainer, in Markdown. This and the next three are text of docs/adapters.md.
-        gated: From when on the gate decides, and which changes pause it.
-        with_share: Effect of `share` on densification, or why there is none; empty if the declared events imply it.
+        project: Name and home page of the trainer, in Markdown. `project`, `gated`, `with_share` and `left_alone` are
+            text of docs/adapters.md.
+        gated: First iteration that the gate may skip, and the changes that pause it.
+        with_share: Effect of `share` on densification, or why it has no effect. Empty if the declared events imply it.
         left_alone: Behaviour in skipped iterations, beyond the rules for every trainer.
-        stand_ins: Family of stand-ins in `skipgs_plug.compat` for the CUDA modules that its scripts import, for
-            `--cpu`; empty if there are none.
-        checked: Upstream version or commit that it was checked with and, in brackets, how. Part of error messages.
+        stand_ins: Family of stand-ins in `skipgs_plug.compat` for the CUDA modules of its scripts, for `--cpu`. Empty
+            if there is no such family.
+        checked: Upstream version or commit of the check and, in brackets, its kind. Part of error messages.
         saved_state: Returns the gate's state of the checkpoint from which the trainer continues, if any. It is called
             once, with the first iteration. Set it before the gate is created.
         output_folder: The trainer's output folder, if known.
@@ -120,7 +121,7 @@ def gate_backwards_only(hooks: Hooks, adapter: AbstractAdapter) -> None:
     if hooks.state.pace.leaves_out:
         raise SkipGSError(
             f"Adapter {adapter.name!r} cannot leave out whole iterations, since its trainer's loop does not count with "
-            "range(): leave out share and refine_share, and it gates backwards as in the paper."
+            "range(); give neither share nor refine_share, and it gates backward passes as in the paper."
         )
 
 
@@ -129,12 +130,12 @@ GATES_SPAWNED = "__skipgs_gates_spawned__"
 
 
 def refuse_other_processes(hooks: Hooks) -> None:
-    """Let a script fail that is about to spread training over several processes, where no gate is attached."""
+    """Refuse a script that is about to start several processes, since no gate is attached in them."""
 
     def spawned(fn: Any, args: Any = (), nprocs: int = 1, *more: Any, **options: Any) -> None:
         raise SkipGSError(
-            f"The script starts {nprocs} processes, which the gate cannot reach; train in one, for example with "
-            "CUDA_VISIBLE_DEVICES=0."
+            f"The script starts {nprocs} processes, which the gate cannot reach; train in one process, for example "
+            "with CUDA_VISIBLE_DEVICES=0."
         )
 
     hooks.before(torch.multiprocessing, "spawn", spawned)

@@ -12,8 +12,8 @@ class DashGaussian(InriaFamily):
     name = "dash_gaussian"
     checked = "YouyuChen0207/DashGaussian 4e3b5606 (train_dash.py, run on the CPU)"
     project = "[DashGaussian, `train_dash.py`](https://github.com/YouyuChen0207/DashGaussian)"
-    gated = "From `densify_until_iter` on, where resolution and number of Gaussians are constant."
-    left_alone = "Both optimizers, sparse Adam too. Its `train.py` is Inria's, and so is the adapter for it."
+    gated = "From `densify_until_iter` on: resolution and number of Gaussians are constant."
+    left_alone = "Both optimizers, sparse Adam too. Its `train.py` is Inria's; use adapter `inria` for it."
     stand_ins = "dash_gaussian"
     mark = "TrainingScheduler"
     calls = ("prune_and_densify",)

@@ -11,18 +11,18 @@ from skipgs_plug.core.hooks import Hooks
 
 
 class Deformable(InriaFamily):
-    """`update_learning_rate` ends an iteration here, so that the render of its view is what begins it.
+    """Here `update_learning_rate` ends an iteration, so an iteration begins with the render of its view.
 
-    The noise of the loop is an input of the network and moves nothing.
+    The noise in the loop is input of the network and moves no Gaussian.
     """
 
     name = "deformable"
     checked = "ingra14m/Deformable-3D-Gaussians ac42372 (its loop read, and a look-alike: no stand-in)"
     project = "[Deformable 3D Gaussians](https://github.com/ingra14m/Deformable-3D-Gaussians)"
-    gated = "From `densify_until_iter` on. Frames of a video are views like others, each with a mean."
+    gated = "From `densify_until_iter` on. Each frame of a video is a view with a mean of its own."
     left_alone = (
-        "The optimizers of Gaussians and network have no gradients in skipped iterations. The noise on times goes on: "
-        "it is an input of the network. Needs CUDA: `--cpu` has no stand-in for its rasterizer."
+        "The optimizers of Gaussians and network have no gradients in skipped iterations. The noise on times goes on, "
+        "since it is input of the network. Needs CUDA: `--cpu` has no stand-in for its rasterizer."
     )
     mark = "get_linear_noise_func"
     calls = ("randn",)

@@ -1,4 +1,4 @@
-"""A look at the model in skipped iterations: nothing may move it there."""
+"""Check that nothing moves the model in skipped iterations."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from skipgs_plug.core import decision
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.optimizers import has_pending_gradient
 
-CHECKED_SKIPS = 5  # skipped iterations that are looked at, from the second on
+CHECKED_SKIPS = 5  # skipped iterations that are checked, from the second on; a loop repeats what it does
 
 
 class DriftCheck:
     """Compares the parameters before and after skipped iterations without pending gradients or events.
 
-    What changes them there is something of the loop's own that belongs to the gradient step, such as noise, and
-    would go on alone. Sums and norms are compared, which costs two passes over the parameters, no memory, and one read
-    of the device in each skipped iteration that is looked at. A NaN that stays a NaN has not moved.
+    A change there comes from the loop itself. It belongs to the gradient step, such as noise, and would go on alone.
+    Sums and norms are compared. A checked iteration costs two passes over the parameters and one read of the device. A
+    NaN that stays a NaN has not moved.
     """
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._left = CHECKED_SKIPS
-        # Events so far, and what the parameters were like, when the iteration began.
+        # Number of events, names, and sums of the parameters when the iteration began.
         self._before: tuple[int, list[str], list[Tensor]] | None = None
 
     def moved(self, optimizers: Iterable[torch.optim.Optimizer]) -> list[str]:
-        """Names of the parameters that the iteration which ends here moved, in an iteration that was skipped.
+        """Return the names of the parameters that moved in the iteration before this call, if it was skipped.
 
-        To be called once at the beginning of each iteration, before `Hooks.iteration`.
+        Call it once at the beginning of each iteration, before `Hooks.iteration`.
         """
         stats = self._engine.stats
         if self._left == 0 or not stats.skips:
             return []
         before, self._before = self._before, None
-        if self._engine.iteration.decision is decision.PAUSE:  # nothing is skipped for a while
+        if self._engine.iteration.decision is decision.PAUSE:  # no iteration is skipped for a while
             return []
         optimizers = list(optimizers)
         if any(map(has_pending_gradient, optimizers)):
@@ -52,7 +52,7 @@ class DriftCheck:
 
 
 def _like(optimizers: list[torch.optim.Optimizer]) -> tuple[list[str], list[Tensor]]:
-    """Name of the group of each parameter, and sum and norm of each parameter [2], where they lie."""
+    """Return for each parameter the name of its group, and its sum and norm [2] on its device."""
     names, sums = [], []
     for optimizer in optimizers:
         for index, group in enumerate(optimizer.param_groups):
@@ -64,7 +64,7 @@ def _like(optimizers: list[torch.optim.Optimizer]) -> tuple[list[str], list[Tens
 
 
 def _changed(names: list[str], before: list[Tensor], after: list[Tensor]) -> list[str]:
-    """Names, each once, of the parameters whose sums differ. One read for each device that holds parameters."""
+    """Return the names of the parameters whose sums differ, each once. This reads each device once."""
     pairs = list(zip(names, before, after, strict=False))
     changed: list[str] = []
     for device in {old.device for old in before}:

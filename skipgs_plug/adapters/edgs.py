@@ -24,17 +24,17 @@ CHANGES = (*EVENTS, "densify_and_prune", ASSIGNED)  # opacities are assigned to 
 
 
 class EDGS(AbstractAdapter):
-    """One `train_step_gs`: learning rates, forward of `GS`, backward, step. Densifying or pruning follows it.
+    """One iteration is `train_step_gs`: learning rates, forward of `GS`, backward, step. Then it densifies or prunes.
 
-    With `no_densify` it prunes after every iteration before `densify_until_iter`, the last of which pauses the gate.
+    With `no_densify` it prunes after every iteration before `densify_until_iter`. The last prune pauses the gate.
     """
 
     name = "edgs"
     checked = "CompVis/EDGS eb21ad5 (its loop read, and a look-alike)"
     project = "[EDGS](https://github.com/CompVis/EDGS)"
-    gated = "From `gs.opt.densify_until_iter` on: until then it densifies, or prunes after every iteration."
+    gated = "From `gs.opt.densify_until_iter` on. Until then it densifies, or prunes after every iteration."
     with_share = "Refused: whole iterations cannot be left out."
-    left_alone = "Its loop counts with tqdm's `trange`. Needs CUDA: its initialization matches images with a network."
+    left_alone = "Its loop counts with tqdm's `trange`. Needs CUDA, since a network matches images at the start."
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:

@@ -41,20 +41,20 @@ class FasterGS(AbstractAdapter):
     """An iteration begins with `renderer.render_image_training(view=...)`, and counts from 0.
 
     The densification callback still runs in iteration `DENSIFICATION_END_ITERATION`, before its training step. MCMC's
-    noise is left out where the gradient step is: alone it is a random walk.
+    noise is left out together with the gradient step: alone it is a random walk.
     """
 
     name = "faster_gs"
     checked = "nerficg-project/faster-gaussian-splatting 3cb0b75 in NeRFICG c743712 (its loop read, and a look-alike)"
     project = "[Faster-GS](https://github.com/nerficg-project/faster-gaussian-splatting)"
     gated = (
-        "From `DENSIFICATION_END_ITERATION` + 1 on. With Speedy-Splat's pruning each later prune pauses the gate. As "
-        "in a shell: `skipgs-plug run faster_gs -- scripts/train.py -c config.yaml`, in the folder of NeRFICG."
+        "From `DENSIFICATION_END_ITERATION` + 1 on. With Speedy-Splat's pruning, each later prune pauses the gate. The "
+        "command, in the folder of NeRFICG: `skipgs-plug run faster_gs -- scripts/train.py -c config.yaml`."
     )
     with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
-        "MCMC's position noise is left out where the gradient step is. Its "
-        "callbacks hang on their numbers. Views are known by their frame's number. Needs CUDA: `--cpu` has no stand-in."
+        "MCMC's position noise is left out together with the gradient step. Views are known by the number of their "
+        "frame. Needs CUDA: `--cpu` has no stand-in."
     )
 
     @classmethod

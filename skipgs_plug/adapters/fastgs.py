@@ -7,15 +7,16 @@ from typing import Any
 
 from skipgs_plug.adapters.inria import InriaFamily
 
-ACCUMULATES_FROM = 15_000  # `optimizer_step` has these numbers in it
+# Constants of `optimizer_step`: iterations after which it steps every 32nd, then every 64th iteration.
+ACCUMULATES_FROM = 15_000
 SLOWER_FROM = 20_000
 
 
 class FastGS(InriaFamily):
-    """`optimizer_step(iteration)` stays untouched: it applies what the backwards since its last step left.
+    """`optimizer_step(iteration)` stays untouched: it applies the gradients gathered since its last step.
 
-    It is called in skipped iterations too, where it may have the gradients of earlier ones to apply. After
-    densification Gaussians are pruned at iterations 18,000, 21,000, 24,000 and 27,000.
+    It is called in skipped iterations too, and may apply gradients of earlier iterations there. After densification,
+    Gaussians are pruned at iterations 18,000, 21,000, 24,000 and 27,000.
     """
 
     name = "fastgs"
@@ -23,8 +24,8 @@ class FastGS(InriaFamily):
     project = "[FastGS](https://github.com/fastgs/FastGS)"
     gated = "From `densify_until_iter` on. The prunes at 18,000, 21,000, 24,000 and 27,000 pause the gate."
     left_alone = (
-        "`optimizer_step(iteration)`: it steps every 16th, 32nd or 64th iteration on what the backwards since then "
-        "have left, and does so in an iteration that is skipped itself."
+        "`optimizer_step(iteration)` steps every 16th, 32nd or 64th iteration with the gradients gathered since, even "
+        "in a skipped iteration."
     )
     stand_ins = "fastgs"
     mark = "render_fastgs"
@@ -37,12 +38,12 @@ class FastGS(InriaFamily):
         return default and self.start_iter(opt, loop) >= ACCUMULATES_FROM
 
     def always_run(self, numbers: range) -> Iterable[int]:
-        """Those in which `optimizer_step` steps an optimizer on what gathered over several."""
+        """Return the iterations in which `optimizer_step` steps with gathered gradients."""
         return (n for n in numbers if n % interval(n) == 0)
 
 
 def interval(iteration: int) -> int:
-    """Iterations between two of the rarer steps."""
+    """Return the number of iterations between two steps with gathered gradients."""
     if iteration <= ACCUMULATES_FROM:
         return 16
     return 32 if iteration <= SLOWER_FROM else 64

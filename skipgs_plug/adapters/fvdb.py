@@ -26,20 +26,20 @@ KNOWN = ("step", "zero_grad", "state_dict")  # further methods of the optimizer 
 class FVDB(AbstractAdapter):
     """An iteration begins when the loop takes a minibatch of its training set, at step `_global_step` (counted from 0).
 
-    Its optimizer steps torch's own for each parameter, which do nothing without a gradient.
+    Its optimizer steps one torch optimizer per parameter, which does nothing without a gradient.
     """
 
     name = "fvdb"
     checked = "openvdb/fvdb-reality-capture 0761837 (its loop read, and a look-alike; not the later command frgs)"
     project = "[fVDB Reality Capture](https://github.com/openvdb/fvdb-reality-capture)"
     gated = (
-        "From epoch `refine_stop_epoch` on, or from `pose_opt_stop_epoch` on where camera poses are optimized. "
-        "Opacities are reset every `reset_opacities_every_epoch` until the end, and each reset pauses the gate."
+        "From epoch `refine_stop_epoch` on, or from `pose_opt_stop_epoch` on if it is later and camera poses are "
+        "optimized. Opacities are reset every `reset_opacities_every_epoch` until the end; each reset pauses the gate."
     )
     with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
-        "Batches of several images have one joint loss and so one mean. Several crops per image are refused: each has "
-        "a backward. Epochs iterate over a DataLoader. Needs CUDA."
+        "Batches of several images have one joint loss and so one mean. Several crops per image are refused, since "
+        "each has a backward. Its loops run over epochs and a DataLoader. Needs CUDA."
     )
 
     @classmethod
@@ -65,7 +65,7 @@ class FVDB(AbstractAdapter):
         config, dataset = runner.config, runner.training_dataset
         if config.crops_per_image != 1:
             raise SkipGSError(
-                f"crops_per_image is {config.crops_per_image}, and each crop has a backward of its own: gate it with 1."
+                f"crops_per_image is {config.crops_per_image}, and each crop has a backward of its own; set it to 1."
             )
         batched = config.batch_size > 1
 

@@ -9,12 +9,12 @@ from skipgs_plug.adapters.inria import InriaFamily
 
 
 class GaussianSpa(InriaFamily):
-    """Gated after the sparsifying phase, whose alternation of steps has to stay as it is.
+    """Gated after the sparsifying phase, whose alternation of steps must stay as it is.
 
-    That phase ends with a prune, in the last iteration before the gate begins. A gate that is started
-    earlier by hand runs every iteration whose loss holds the ADMM term, and keeps it out of the means.
-    Iterations are counted, since `update_learning_rate` is called with shifted numbers. With `share` the phase runs
-    whole: its terms pull at the model, and the iterations between them pull back.
+    That phase ends with a prune in the last iteration before the gate begins. A gate that the user starts earlier runs
+    every iteration with the ADMM term in its loss, and keeps these losses out of the means. The adapter counts
+    iterations itself, since `update_learning_rate` gets shifted numbers. With `share`, all iterations of the phase run:
+    its terms pull at the model, and the iterations between them pull back.
     """
 
     name = "gaussianspa"
@@ -22,8 +22,8 @@ class GaussianSpa(InriaFamily):
     project = "[GaussianSpa](https://github.com/noodle-lab/GaussianSpa)"
     gated = "From `optimizing_spa_stop_iter` + 1 on, after a pause for the prune in the iteration before."
     with_share = (
-        "By visits. The sparsifying phase runs "
-        "whole: its terms pull at the model, and the iterations between them pull back."
+        "By visits. All iterations of the sparsifying phase run: its terms pull at the model, and the iterations "
+        "between them pull back."
     )
     left_alone = (
         "A gate that you start earlier runs all iterations with the ADMM term and keeps their losses out of the means."
@@ -42,7 +42,7 @@ class GaussianSpa(InriaFamily):
     def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
         first, last = int(opt.optimizing_spa_start_iter) + 1, int(opt.optimizing_spa_stop_iter)
         interval = int(opt.optimizing_spa_interval)
-        # The scripts disagree on whether the last of these carries the term; it is run either way.
+        # The scripts disagree whether the last of these iterations has the term. It runs in any case.
         self._admm = range(first + -first % interval, last + 1, interval)
         self._phase = range(first - 1, last + 1)
 
@@ -50,7 +50,7 @@ class GaussianSpa(InriaFamily):
         return max(int(opt.optimizing_spa_stop_iter) + 1, int(opt.densify_until_iter))
 
     def always_run(self, numbers: range) -> Iterable[int]:
-        """Those of the sparsifying phase."""
+        """Return the iterations of the sparsifying phase."""
         return (n for n in numbers if n in self._phase)
 
     def must_run(self, step: int) -> bool:

@@ -16,29 +16,28 @@ PRUNED = "prune_iter"  # the loop's variable for the iteration of the final prun
 
 
 class GNS(InriaFamily):
-    """Gated after the selection, whose loss has a term on opacities that drives Gaussians out.
+    """Gated after the selection, in which a term of the loss pushes opacities of Gaussians to zero.
 
-    The final prune may come earlier, as soon as few enough are left. Both optimizers step every 5th and later every
-    20th iteration. They are called in skipped iterations too, where they may have gradients of earlier ones to apply.
-    With `share` the selection runs whole: its term would act alone where iterations between are left out. Some time
-    after the final prune the loop lowers the opacities' rate again, in an iteration that only that prune shows.
+    The final prune comes early if few enough Gaussians are left. Both optimizers step every 5th and later every 20th
+    iteration. They are called in skipped iterations too, and may apply gradients of earlier iterations there. With
+    `share`, all iterations of the selection run: its term would act alone if iterations between were left out. The loop
+    lowers the rate of opacities again, a fixed number of iterations after the final prune.
     """
 
     name = "gns"
     checked = "XiaoBin2001/GNS 0c8e7dcd (train.py run on the CPU; train-fast.py read)"
     project = "[GNS](https://github.com/XiaoBin2001/GNS)"
     gated = (
-        "`train.py`: from `reg_end` + 1 (23,001) on, where selection by opacity has ended; without `prune_reg` from "
+        "`train.py`: from `reg_end` + 1 (23,001) on, after the selection by opacity, or without `prune_reg` from "
         "`densify_until_iter` on. `train-fast.py`: from `e2` + 1 (10,001) on."
     )
     with_share = (
-        "All events are kept. The selection runs whole: its term would "
-        "act alone where the iterations between are left out. `train-fast.py` densifies whole, in iterations "
-        "500 to 7,000."
+        "All events are kept. All iterations of the selection run: its term would act alone if iterations between "
+        "were left out. `train-fast.py` runs all iterations of densification, 500 to 7,000."
     )
     left_alone = (
-        "Both optimizers step every 5th and later every 20th iteration on what the backwards since then have left, in "
-        "skipped iterations too."
+        "Both optimizers step every 5th and later every 20th iteration with the gradients gathered since, even in a "
+        "skipped iteration."
     )
     stand_ins = "improved_gs"
     mark = "update_opacity_lr"
@@ -59,7 +58,7 @@ class GNS(InriaFamily):
             self._selection = [range(int(opt.reg_start), int(opt.reg_end) + 1)]
 
     def always_run(self, numbers: range) -> Iterable[int]:
-        """Those of the selection."""
+        """Return the iterations of the selection."""
         return (n for n in numbers if any(n in one for one in self._selection))
 
     def _attach_to_model(self, hooks: Hooks, names: dict[str, Any]) -> None:
@@ -91,7 +90,7 @@ class GNS(InriaFamily):
 
 
 def delays(loop: ast.FunctionDef) -> Iterable[int]:
-    """Iterations after the final prune in which something happens: `iteration == prune_iter + 1000`."""
+    """Yield numbers of iterations after the final prune that the loop asks for: `iteration == prune_iter + 1000`."""
     for node in ast.walk(loop):
         match node:
             case ast.BinOp(ast.Name(name), ast.Add(), ast.Constant(int(delay))) if name == PRUNED:

@@ -24,28 +24,28 @@ from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.host_copy import HostCopy
 
 EXPECTED = ("cfg", "parser", "trainset", "rasterize_splats", "world_size")
-BATCH = "batch"  # one key for the joint loss of random batches, which never recur
+BATCH = "batch"  # one key for the joint loss of random batches: a batch never comes up twice
 
 
 class GsplatRunner(AbstractAdapter):
     """One iteration: render, `strategy.step_pre_backward`, backward, optimizers, `strategy.step_post_backward`.
 
-    Optimizers are left alone: they zero gradients to None. MCMC's noise is left out where the gradient step
-    is. The strategy's methods are replaced on its class, since `train` writes the instance to a YAML file.
+    Optimizers are left alone: they set gradients to None. MCMC's noise is left out together with the gradient step. The
+    strategy's methods are replaced on its class, since `train` writes the instance to a YAML file.
     """
 
     name = "gsplat"
     checked = "nerfstudio-project/gsplat v1.5.3 and v1.6.0 90d7b4b3 (its script, run on the CPU)"
     project = "[gsplat, `examples/simple_trainer.py`](https://github.com/nerfstudio-project/gsplat)"
     gated = "From `strategy.refine_stop_iter` on (15,000, for MCMC 25,000)."
-    with_share = "By visits; those of MCMC are all kept. Opacity resets happen as often as ever."
+    with_share = "By visits; with MCMC, all events are kept. Opacity resets happen as often as ever."
     left_alone = (
-        "MCMC's position noise is left out where the gradient step is: alone it is a random walk. Batches of several "
-        "images have one joint loss and so one mean. Once `--post_processing ppisp` freezes the Gaussians, every "
-        "iteration runs as it is; `share`, `refine_share` and `compensate` are refused with it. gsplat's other example "
-        "scripts (2DGS, driving, surgery) have loops of their own, which no adapter knows. Where the script spawns a "
-        "process for each GPU, `skipgs-plug run` attaches a gate in each: a backward is left out when all of them "
-        "would (checked with gloo on the CPU, not on GPUs)."
+        "MCMC's position noise is left out together with the gradient step: alone it is a random walk. Batches of "
+        "several images have one joint loss and so one mean. Once `--post_processing ppisp` freezes the Gaussians, all "
+        "iterations run; `share`, `refine_share` and `compensate` are refused with it. No adapter knows gsplat's other "
+        "example scripts (2DGS, driving, surgery). If the script spawns a process per GPU, `skipgs-plug run` attaches "
+        "a gate in each. A backward is left out if all of them would leave it out (checked with gloo on the CPU, not "
+        "on GPUs)."
     )
     stand_ins = "gsplat"
 
@@ -60,7 +60,7 @@ class GsplatRunner(AbstractAdapter):
 
     @classmethod
     def recognises_script(cls, code: LoopCode) -> bool:
-        return {"Runner", "gsplat.distributed"} <= code.names  # without the second it is simple_trainer_2dgs.py
+        return {"Runner", "gsplat.distributed"} <= code.names  # simple_trainer_2dgs.py has no gsplat.distributed
 
     def attach_script(self, hooks: Hooks) -> None:
         def started(
@@ -69,7 +69,7 @@ class GsplatRunner(AbstractAdapter):
             self.attach_on_call(hooks, fn.__globals__["Runner"], "train")
             return original(rank, size, fn, *args, **kwargs)
 
-        # The launcher attaches in each process that is spawned; nobody else does.
+        # Only the launcher attaches in each spawned process.
         if not getattr(torch.multiprocessing.spawn, GATES_SPAWNED, False):
             refuse_other_processes(hooks)
         hooks.wrap(importlib.import_module("gsplat.distributed"), "_distributed_worker", started)
@@ -87,13 +87,13 @@ class GsplatRunner(AbstractAdapter):
         survey.read(runner.train, "step")
         batched = runner.cfg.batch_size > 1
         names = [BATCH] if batched else view_names(runner)
-        # Id of the view rendered last. It lies on the device: it is on its way before the render is launched.
+        # Id of the last rendered view. Its copy from the device starts before the render is launched.
         rendered: list[HostCopy] = []
         enabled = hooks.state.config.enabled
 
         def remember(*args: Any, image_ids: torch.Tensor | None = None, **kwargs: Any) -> None:
             if enabled and not batched and image_ids is not None and torch.is_grad_enabled():
-                rendered[:] = [HostCopy(image_ids)]  # else the viewer's render, or an evaluation's
+                rendered[:] = [HostCopy(image_ids)]  # otherwise it is a render of the viewer or of an evaluation
 
         def forwarded(own: Any, *args: Any, step: int, **kwargs: Any) -> None:
             if own is strategy:
@@ -104,7 +104,7 @@ class GsplatRunner(AbstractAdapter):
                     view = rendered.pop()
                     hooks.view(lambda: names[int(view.value())])
 
-        # HEAD's stage took hold of rasterize_splats when the runner was built.
+        # At HEAD, a stage has held the bound method since the runner was built.
         stage = getattr(runner, "stage", None)
         hooks.before(*((runner, "rasterize_splats") if stage is None else (stage, "render")), remember)
         hooks.before(type(strategy), "step_pre_backward", forwarded)
@@ -133,13 +133,13 @@ class GsplatRunner(AbstractAdapter):
 
 
 def refuse_frozen(cfg: Any, hooks: Hooks) -> None:
-    """Refuse to leave out iterations that train something else than the Gaussians.
+    """Refuse to leave out iterations if the end of the run does not train the Gaussians.
 
-    With `--post_processing ppisp` the script freezes them near the end and distils a controller: those iterations need
-    all their steps, as long as they are.
+    With `--post_processing ppisp` the script freezes the Gaussians near the end and distils a controller, which needs
+    all its steps at their own length.
 
     Raises:
-        SkipGSError: Iterations would be left out, or steps be scaled, and the run reaches that part.
+        SkipGSError: The run reaches that part, and iterations would be left out or steps scaled.
     """
     distils = getattr(cfg, "post_processing", None) == "ppisp" and cfg.ppisp_use_controller
     if not (distils and cfg.ppisp_controller_distillation):

@@ -1,4 +1,4 @@
-"""What gsplat's densification strategies ask of a gate, in gsplat's own script and in nerfstudio."""
+"""gsplat's densification strategies, which gsplat's own script and nerfstudio use."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def survey_of(adapter: Adapter, strategy: Any, *owners: Any, through: Iterable[s
 
 
 def is_mcmc(strategy: Any) -> bool:
-    """Whether the strategy moves Gaussians at random in every iteration, to the very end."""
+    """Whether the strategy moves Gaussians at random in every iteration until the end of the run."""
     return hasattr(strategy, "noise_lr")
 
 
 def gradients_read_until(strategy: Any) -> int | None:
-    """First iteration whose gradients the strategy does not read; None when it reads none at all."""
+    """Return the first iteration whose gradients the strategy does not read; None if it never reads gradients."""
     return None if strategy is None or is_mcmc(strategy) else int(strategy.refine_stop_iter)
 
 
@@ -69,7 +69,7 @@ def opacity_resets(strategy: Any, numbers: range) -> Iterable[int]:
 
 
 def leave_out_noise(hooks: Hooks, strategy: Any, owner: Any) -> range:
-    """Leave MCMC's noise out where the gradient step is left out: alone it is a random walk.
+    """Leave out MCMC's noise together with the gradient step: alone it is a random walk.
 
     Args:
         hooks: Hooks of the trainer.
@@ -77,8 +77,8 @@ def leave_out_noise(hooks: Hooks, strategy: Any, owner: Any) -> range:
         owner: Where to replace `step_post_backward`: the strategy, or its class.
 
     Returns:
-        Iterations that must not be skipped: relocation is in the same method as the noise. They matter only
-        to a gate that is started before relocation ends.
+        Iterations that must not be skipped, because relocation is in the same method as the noise. They matter only
+        to a gate that starts before relocation ends.
     """
     if not is_mcmc(strategy):
         return range(0)

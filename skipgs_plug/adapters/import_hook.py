@@ -1,4 +1,4 @@
-"""Calls that follow the import of a module, whoever imports it and whenever that is."""
+"""Run a call right after a module is imported, by whatever code."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from skipgs_plug.core.hooks import Hooks
 
 
 def when_imported(hooks: Hooks, name: str, call: Callable[[ModuleType], None]) -> None:
-    """Call `call(module)` right after the module of that name was imported, at once if it was already.
+    """Call `call(module)` right after the module of that name is imported, or at once if it is imported already.
 
-    A script may extend `sys.path` before it imports its own modules, so nothing of it can be imported in advance.
+    A script may extend `sys.path` before it imports its own modules, so they cannot be imported in advance.
 
     Args:
-        hooks: Takes the call back when the gate detaches.
+        hooks: Hooks of the trainer. The call is removed when the gate detaches.
         name: Full name of the module.
         call: Runs before the importing script binds any name of the module.
     """
@@ -30,7 +30,7 @@ def when_imported(hooks: Hooks, name: str, call: Callable[[ModuleType], None]) -
 
 
 class _Finder(MetaPathFinder):
-    """Finds one module as the other finders do, and adds a call to its execution."""
+    """Lets the other finders find one module, and adds a call to its execution."""
 
     def __init__(self, name: str, call: Callable[[ModuleType], None]) -> None:
         self._name, self._call = name, call
@@ -50,6 +50,6 @@ class _Finder(MetaPathFinder):
             execute(module)
             self._call(module)
 
-        # The loader is this module's own, and keeps all else that it can do: tracebacks ask it for sources.
+        # The loader belongs to this module alone. It stays in place, since tracebacks ask it for sources.
         setattr(spec.loader, "exec_module", execute_and_call)  # noqa: B010
         return spec

@@ -8,13 +8,13 @@ from typing import Any
 from skipgs_plug.adapters.inria import InriaFamily
 from skipgs_plug.core.trainer_info import Densification
 
-ACCUMULATES_FROM = 15_000  # the loop has this number in it
+ACCUMULATES_FROM = 15_000  # iteration; a constant of the loop
 
 
 class ImprovedGS(InriaFamily):
     """Both optimizers step every 5th iteration from 15,001 on and every 20th from 22,501 on, as upstream.
 
-    They are called in skipped iterations too, where they may have the gradients of earlier ones to apply.
+    They are called in skipped iterations too, and may apply gradients of earlier iterations there.
     """
 
     name = "improved_gs"
@@ -22,8 +22,8 @@ class ImprovedGS(InriaFamily):
     project = "[Improved-GS](https://github.com/XiaoBin2001/Improved-GS)"
     gated = "From `densify_until_iter` on."
     left_alone = (
-        "Both optimizers step every 5th and later every 20th iteration on what the backwards since then have left, in "
-        "skipped iterations too."
+        "Both optimizers step every 5th and later every 20th iteration with the gradients gathered since, even in a "
+        "skipped iteration."
     )
     stand_ins = "improved_gs"
     mark = "compute_edge_score"

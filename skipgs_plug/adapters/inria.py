@@ -1,8 +1,8 @@
-"""Inria 3DGS (classic and current), and the answers that its forks share.
+"""Inria 3DGS (classic and current), and the base class of its forks.
 
-The trainer is a function `training` in `train.py`, with the loop inline. One iteration:
-`update_learning_rate(iteration)`, `render(camera, ...)`, `loss.backward()`, densification, optimizer step.
-Everything the gate needs happens through names that can be wrapped, whoever imported them.
+The trainer is a function `training` in `train.py` that contains the loop. One iteration:
+`update_learning_rate(iteration)`, `render(camera, ...)`, `loss.backward()`, densification, optimizer step. The gate
+wraps these names, whichever module imported them.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 from skipgs_plug.core.views import view_key
 
-# Modules of a checkout, each loaded when the script asks for it.
+# Modules of a checkout. The script imports them.
 RENDERER, MODEL = "gaussian_renderer", "scene.gaussian_model"
 
 
 class InriaFamily(AbstractAdapter):
-    """Shared by Inria 3DGS and its forks: only the backward is gated, optimizers keep their schedules.
+    """Base of Inria 3DGS and its forks: only the backward is gated, and optimizers keep their schedules.
 
     Attributes:
-        mark: a name that only this fork's training scripts have, or only their loop uses.
-        renders: names of the functions that render a training view; at least one must exist.
-        structural: methods of `GaussianModel` that make losses jump.
-        scenes: names that the loop's variable for its Scene can have.
-        calls: what the loop does beyond Inria's, and the adapter knows: methods of the model, functions that draw
+        mark: A name that only this fork's training scripts have, or only their loop uses.
+        renders: Names of the functions that render a training view. At least one must exist.
+        structural: Methods of `GaussianModel` that make losses jump.
+        scenes: Possible names of the loop's variable for its Scene.
+        calls: Names that the adapter knows beyond those of Inria's loop: methods of the model, functions that draw
             noise, methods that change a tensor in place.
-        arguments: arguments of the renderer that the adapter knows, beyond Inria's.
-        densification: how its densification events are told; None if growth must run whole.
-        known_names: values of names that the loop assigns, where they are known before it; filled by `begin`.
+        arguments: Arguments of the renderer that the adapter knows, beyond those of Inria's.
+        densification: How to recognise its densification events; None if all iterations of densification must run.
+        known_names: Values of names that the loop assigns, if they are known before it. `begin` fills them.
     """
 
     mark: ClassVar[str] = ""
@@ -55,7 +55,7 @@ class InriaFamily(AbstractAdapter):
     scenes: ClassVar[tuple[str, ...]] = ("scene",)
     calls: ClassVar[tuple[str, ...]] = ()
     arguments: ClassVar[tuple[str, ...]] = ()
-    # Statistics are means over visits, so events with enough visits behind them may be fewer.
+    # Statistics are means over visits, so some events may be left out if the others have enough visits.
     densification: ClassVar[Densification | None] = Densification(marks=("densification_interval",))
 
     def __init__(self, trainer: Any = None) -> None:
@@ -83,19 +83,19 @@ class InriaFamily(AbstractAdapter):
 
     @classmethod
     def recognises(cls, names: Container[str]) -> bool:
-        """Whether a training script with these names is this trainer's, unless one asked before it knows it.
+        """Whether a training script with these names belongs to this trainer. Adapters before it in the registry win.
 
         Args:
-            names: Its global names, and whatever its function `training` uses, attributes too.
+            names: Its global names, and all names and attributes that its function `training` uses.
         """
         return cls.mark in names
 
     def examine(self, code: LoopCode, renderers: Sequence[Callable[..., Any]], model: type) -> None:
-        """Look for what this adapter does not know, before anything is trained: refuse it, or say it.
+        """Look for parts that this adapter does not know, before training begins: refuse them, or name them.
 
         Args:
             code: The training script.
-            renderers: Those of its renderers that the adapter asks for.
+            renderers: Its renderers that the adapter uses.
             model: Its GaussianModel.
 
         Raises:
@@ -111,30 +111,30 @@ class InriaFamily(AbstractAdapter):
             )
 
     def difference(self, code: LoopCode) -> str:
-        """Beginning of a sentence about a script that does more than this adapter knows."""
+        """Return the beginning of a sentence about a script that does more than this adapter knows."""
         return f"{code.source} does more than {self.checked.partition(' (')[0]}, which adapter {self.name!r} is for"
 
     def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
-        """Keep what later answers need of a run, which begins now; arguments as for `start_iter`.
+        """Keep facts about the run that begins now, for later answers. Arguments as for `start_iter`.
 
-        Called once more before the loop's conditions are read, where `loop` has no iteration yet.
+        It is also called before the loop's conditions are read. Then `loop` has no iteration yet.
         """
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        """First iteration that may be skipped: by default the first one that does not densify.
+        """Return the first iteration that may be skipped, by default the first one that does not densify.
 
         Args:
             opt: The run's optimization options.
-            loop: Everything that `training` has a name for, when its first iteration begins. Not to be kept.
+            loop: All names of `training` when its first iteration begins. Do not keep it.
         """
         return int(opt.densify_until_iter)
 
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        """First iteration whose gradients only the optimizers read; arguments as for `start_iter`."""
+        """Return the first iteration whose gradients only the optimizers read. Arguments as for `start_iter`."""
         return int(opt.densify_until_iter)
 
     def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
-        """Whether optimizers step by the iteration's number, on gradients gathered since; as for `start_iter`."""
+        """Whether optimizers step at certain iterations, with gathered gradients. Arguments as for `start_iter`."""
         return False
 
     def attach(self, hooks: Hooks) -> None:
@@ -159,7 +159,7 @@ class InriaFamily(AbstractAdapter):
                 f"it was checked with {self.checked}."
             )
         self._refuse_fork(code)
-        # The script binds names of these modules when it imports them: they are replaced right before.
+        # The script binds names of these modules when it imports them, so they are replaced right before.
         loaded: dict[str, dict[str, Any]] = {}
 
         def examined(module: types.ModuleType, attach: Callable[[Hooks, dict[str, Any]], None]) -> None:
@@ -174,10 +174,10 @@ class InriaFamily(AbstractAdapter):
         self._attach_to_loop(hooks, hooks.script_globals)
 
     def _renderers(self, names: Mapping[str, Any]) -> list[Callable[..., Any]]:
-        """Those renderers of a namespace that the adapter asks for.
+        """Return the renderers of a namespace that the adapter uses.
 
         Raises:
-            AdapterMismatchError: There are none.
+            AdapterMismatchError: The namespace has no such renderer.
         """
         present = [names[name] for name in self.renders if name in names]
         if not present:
@@ -188,10 +188,10 @@ class InriaFamily(AbstractAdapter):
         return present
 
     def _attach_to_renderer(self, hooks: Hooks, names: dict[str, Any]) -> None:
-        """Learn the training view from what is rendered."""
+        """Learn the training view from calls of the renderers."""
 
         def rendered(original: Callable[..., Any], camera: Any, *args: Any, **kwargs: Any) -> Any:
-            # Not a training camera without a name: the viewer's, which renders before the training view.
+            # A camera without a name is the viewer's, which renders before the training view.
             if self.is_training_render(args, kwargs) and (key := self.view_key(camera)) is not None:
                 hooks.view(key)
             return original(camera, *args, **kwargs)
@@ -213,9 +213,9 @@ class InriaFamily(AbstractAdapter):
         hooks.events(model, *(name for name in self.structural if hasattr(model, name)))
 
     def _begins(self, hooks: Hooks, model: Any, frame: types.FrameType) -> None:
-        """An iteration begins in the loop that this frame is of; the first one reads the run."""
+        """An iteration begins in the loop of this frame. The first one reads the run."""
         with hooks.guarded():
-            # Variables of the loop are read once, before they hold an iteration's graph.
+            # Variables of the loop are read once, before they hold the graph of an iteration.
             if self._model() is not model:
                 self._refuse_fork(LoopCode.of_module(frame.f_globals))
                 self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
@@ -230,36 +230,38 @@ class InriaFamily(AbstractAdapter):
             hooks.iteration(self._step)
 
     def _attach_to_loop(self, hooks: Hooks, script: dict[str, Any]) -> None:
-        """Hold on to the loop's backward and to its range."""
+        """Attach to the loop's backward and to its range."""
         hooks.gate_tensor_backward(LOOP)
         hooks.loop(script, LOOP, always=self.always_run, densification=self.densification, known=self._known)
 
     def _known(self, names: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Read the run before its conditions are read: the loop of a resumed one asks before its first iteration."""
+        """Read the run before its conditions: the loop of a resumed run needs them before its first iteration."""
         if "opt" in names:
             self.begin(names["opt"], names)
         return self.known_names
 
     def always_run(self, numbers: range) -> Iterable[int]:
-        """Those of these iterations on whose number something hangs that the loop itself does not say."""
+        """Return iterations that must run for reasons that the loop's own conditions do not show."""
         return ()
 
     def is_training_render(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bool:
-        """Whether a render with these arguments after the camera can be the training one."""
+        """Whether a render with these arguments after the camera can be the training render."""
         return torch.is_grad_enabled()
 
     def view_key(self, camera: Any) -> Any:
-        """What names this camera's view; None for a camera that is not of the training set."""
+        """Return the key of this camera's view; None for a camera outside the training set."""
         return getattr(camera, self._label, None)
 
     def view_keys(self, cameras: Sequence[Any]) -> list[Any]:
-        """Every key that `view_key` can give."""
+        """Return every key that `view_key` can return."""
         return [getattr(camera, self._label) for camera in cameras]
 
     def _refuse_fork(self, code: LoopCode) -> None:
         own, family = type(self), [one for one in registry.builtin_adapters() if issubclass(one, InriaFamily)]
         asked = family if own in family else [own, *family]
-        right = next(one for one in asked if one.recognises(code.names))  # the last one does in any case
+        right = next(
+            one for one in asked if one.recognises(code.names)
+        )  # `inria`, the last one, recognises every script
         if right is not own:
             raise AdapterMismatchError(
                 f"Adapter {self.name!r} is for {self.checked}, but {code.source} "
@@ -267,11 +269,11 @@ class InriaFamily(AbstractAdapter):
             )
 
     def _give_up(self, hooks: Hooks, moved: list[str]) -> None:
-        """Let training go on ungated: an error would throw away what was trained so far."""
+        """Release the gate, and let training go on: an error would lose the run."""
         hooks.release(
-            f"The loop moved {', '.join(moved)} in iteration {self._step - 1}, whose backward was skipped: it does "
-            f"something of its own that adapter {self.name!r} does not know. The gate is detached, and training goes "
-            "on without it. Gate this loop by hand with SkipGate(start_iter=...).",
+            f"The loop moved {', '.join(moved)} in iteration {self._step - 1}, whose backward was skipped, by code "
+            f"that adapter {self.name!r} does not know. The gate is detached, and training goes on without it. Gate "
+            "this loop by hand with SkipGate(start_iter=...).",
         )
 
     def _read_run(self, hooks: Hooks, loop: Mapping[str, Any]) -> None:
@@ -305,22 +307,22 @@ class InriaFamily(AbstractAdapter):
         )
 
     def _start_after_changes(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        """`start_iter`, or the end of whatever this adapter does not know, where it ends later than that."""
+        """Return `start_iter`, or the end of the calls that this adapter does not know, if that is later."""
         start = self.start_iter(opt, loop)
         if self._code is None or self._code.syntax is None:
             return start
         return begin_after(start, opt.iterations, last_calls(self._code.syntax, self.may_end_later(), loop))
 
     def may_end_later(self) -> frozenset[str]:
-        """Methods of the model that the gate does not begin before the loop has called for the last time."""
+        """Return the methods of the model whose last call the gate waits for."""
         return self._unknown.calls
 
 
 class Inria(InriaFamily):
     """graphdeco-inria/gaussian-splatting: densification ends before `densify_until_iter`.
 
-    Asked last, it is also what an unknown fork is taken for: one whose loop draws noise or writes into tensors is
-    refused, and one that calls more of its model or its renderer than Inria's is gated with a warning.
+    It is tried last, so it also takes unknown forks. A fork whose loop writes into tensors is refused. A fork that uses
+    more methods of its model, or more arguments of its renderer, is gated with a warning.
     """
 
     name = "inria"
@@ -328,17 +330,16 @@ class Inria(InriaFamily):
     project = "[Inria 3DGS](https://github.com/graphdeco-inria/gaussian-splatting)"
     gated = "From `densify_until_iter` on: that iteration does not densify any more."
     left_alone = (
-        "Both optimizers of the current version, sparse Adam too. Renders of the viewer and of evaluations are not "
-        "taken for training. When two images have the same name in different folders (older versions keep the name "
-        "only), the gate warns and tells views apart by their position. A fork that no adapter knows is refused when "
-        "its loop changes tensors in place. Otherwise the gate lists what it did not recognise, and begins after the "
-        "last iteration that the loop's conditions give for it."
+        "Both optimizers of the current version, sparse Adam too. Renders of the viewer and of evaluations do not "
+        "count as training. If two images have the same name in different folders (older versions keep the name only), the "
+        "gate warns and tells views apart by their position. A fork that no adapter knows is refused if its loop "
+        "changes tensors in place."
     )
     stand_ins = "inria"
 
     @classmethod
     def recognises(cls, names: Container[str]) -> bool:
-        return True  # asked last: what is not a fork's is the original's
+        return True  # tried last: a script of no known fork is the original's
 
     def difference(self, code: LoopCode) -> str:
         return f"{code.source} is a fork of Inria 3DGS that no adapter knows"
@@ -360,7 +361,7 @@ class Inria(InriaFamily):
 
 
 def namespace_of(trainer: Any) -> dict[str, Any] | None:
-    """Global names of a train module, or of the module that a training function is from."""
+    """Return the global names of a train module, or of the module of a training function."""
     if isinstance(trainer, types.ModuleType):
         return vars(trainer)
     if isinstance(trainer, types.FunctionType):

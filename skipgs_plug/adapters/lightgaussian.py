@@ -11,22 +11,21 @@ from skipgs_plug.adapters.inria import InriaFamily
 class LightGaussian(InriaFamily):
     """Fine-tuning and distilling are gated from the beginning, training from scratch after densification.
 
-    prune_finetune.py usually prunes in its first iteration, after the backward: the gate then begins with
-    the second, and with a pause.
-    distill_train.py jitters the camera in two of three iterations. Their losses scatter more than those of
-    the camera itself and are no measure of it, so both have means of their own.
+    prune_finetune.py usually prunes in its first iteration, after the backward. The gate then begins with the second
+    iteration, and with a pause. distill_train.py jitters the camera in two of three iterations. Losses of a jittered
+    camera scatter more than those of the camera itself, so the two have separate means.
     """
 
     name = "lightgaussian"
     checked = "VITA-Group/LightGaussian 6676b983 (its three scripts, run on the CPU)"
     project = "[LightGaussian](https://github.com/VITA-Group/LightGaussian)"
     gated = (
-        "`prune_finetune.py`: from the second iteration on (the first one prunes), after a pause; counted from the "
-        "first iteration of the run, not from zero. `train_densify_prune.py`: from `densify_until_iter` on, its later "
-        "prunes pause the gate. `distill_train.py`: from the first iteration on."
+        "`prune_finetune.py`: from the second iteration of the run on, after a pause, since the first one prunes. "
+        "`train_densify_prune.py`: from `densify_until_iter` on; later prunes pause the gate. `distill_train.py`: from "
+        "the first iteration on."
     )
     with_share = "`train_densify_prune.py`: by visits. The other two scripts do not densify."
-    left_alone = "Jittered cameras (two of three iterations with `--augmented_view`) have means of their own."
+    left_alone = "With `--augmented_view`, jittered cameras (two of three iterations) have means of their own."
     stand_ins = "lightgaussian"
     mark = "calculate_v_imp_score"
     calls = ("prune_gaussians", "onedownSHdegree", "load_ply", "randn")
@@ -60,10 +59,10 @@ class LightGaussian(InriaFamily):
 
 
 def finetunes(loop: Mapping[str, Any]) -> bool:
-    """Whether these are names of prune_finetune.py, which alone can start from a point cloud."""
+    """Whether these names are from prune_finetune.py: only this script can start from a point cloud."""
     return hasattr(loop.get("args"), "start_pointcloud")
 
 
 def distills(loop: Mapping[str, Any]) -> bool:
-    """Whether these are names of distill_train.py, which alone has two models."""
+    """Whether these names are from distill_train.py: only this script has two models."""
     return "teacher_gaussians" in loop

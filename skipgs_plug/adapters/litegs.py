@@ -22,23 +22,23 @@ EXPECTED = (LOOP, "densify", "render", "StatisticsHelperInst")
 CONTROLLER = "DensityControllerTamingGS"
 EVENTS = ("split_and_clone", "prune", "reset_opacity")
 KNOWN = ("is_densify_actived", "_get_params_from_optimizer")  # further methods that a controller runs
-INDEX = 11  # place of the tensor that holds the view's index among the arguments of `render_preprocess`
+INDEX = 11  # place of the view's index (a tensor) among the arguments of `render_preprocess`
 
 
 class LiteGS(AbstractAdapter):
     """An iteration begins with `render.render_preprocess`, which takes the view's index.
 
-    Iterations are counted from 0 through all epochs. Both of its optimizers pass over parameters without gradient.
+    Iterations are counted from 0 through all epochs. Both of its optimizers ignore parameters without a gradient.
     """
 
     name = "litegs"
     checked = "MooreThreads/LiteGS 004b952 (its loop read, and a look-alike: its rasterizer has no stand-in)"
     project = "[LiteGS](https://github.com/MooreThreads/LiteGS)"
-    gated = "From the epoch `densify_until` on, after a pause for the opacity reset that usually ends the epoch before."
+    gated = "From epoch `densify_until` on, after a pause for the opacity reset that usually ends the epoch before."
     with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
-        "Gaussians are put in a new order now and then, which changes no image. Its "
-        "loop is one over epochs and a DataLoader. Needs CUDA: `--cpu` has no stand-in for its rasterizer."
+        "It reorders Gaussians now and then, which changes no image. Its loops run over epochs and a DataLoader. Needs "
+        "CUDA: `--cpu` has no stand-in for its rasterizer."
     )
 
     def __init__(self, trainer: Any = None) -> None:
@@ -93,7 +93,7 @@ class LiteGS(AbstractAdapter):
         hooks.view(lambda: self._names[int(index)])
 
     def _read_run(self, hooks: Hooks, loop: dict[str, Any]) -> int:
-        """Read the run from the loop's variables; gives the number of its first iteration."""
+        """Read the run from the loop's variables, and return the number of its first iteration."""
         views = len(loop["train_loader"])
         self._names = [str(frame.name) for frame in loop["trainingset"].frames]
         self.output_folder = loop["lp"].model_path

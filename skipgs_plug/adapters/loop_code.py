@@ -1,4 +1,4 @@
-"""What a training loop uses, read from its code without running it."""
+"""Names in a training loop, read from its code without running it."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class LoopCode(NamedTuple):
     """The names in a training script.
 
     Attributes:
-        source: file of the script, or name of the module, for sentences.
-        names: global names of the script, and every global and attribute that its function `training` uses.
-        functions: names of its functions and classes.
-        used: every global and attribute that `training` uses, and the functions of the script that it calls;
-            none where there is no such function.
-        repeated: of these, the ones used inside the loop itself or by functions that it calls.
-        keywords: names by which arguments are passed.
-        stored: attributes that are assigned to inside the loop.
-        syntax: syntax of `training`; None where there is no source.
+        source: File of the script, or name of the module, for sentences.
+        names: Global names of the script, and every global and attribute that its function `training` uses.
+        functions: Names of its functions and classes.
+        used: Every global and attribute that `training` and the functions that it calls use. Empty if there is no
+            function `training`.
+        repeated: The subset of `used` inside the loop itself and in functions that the loop calls.
+        keywords: Names by which arguments are passed.
+        stored: Attributes that the loop assigns to.
+        syntax: Syntax of `training`; None if there is no source.
     """
 
     source: str
@@ -41,7 +41,7 @@ class LoopCode(NamedTuple):
 
     @classmethod
     def of_module(cls, namespace: Mapping[str, Any]) -> LoopCode:
-        """Of a module that was imported."""
+        """Read an imported module."""
         source = str(namespace.get("__file__") or namespace.get("__name__"))
         functions = {
             name: value.__code__
@@ -53,10 +53,10 @@ class LoopCode(NamedTuple):
 
     @classmethod
     def of_script(cls, path: Path) -> LoopCode:
-        """Of a script that is about to run.
+        """Read a script that is about to run.
 
         Raises:
-            AdapterMismatchError: It is no Python.
+            AdapterMismatchError: It is not a Python script.
         """
         try:
             script = compile(path.read_bytes(), str(path), "exec")
@@ -75,7 +75,7 @@ class LoopCode(NamedTuple):
         repeated, stored = _in_loop(training)
         called = _called(repeated, functions)
         parts = [part for code in (training, *called) for part in _with_inner(code)]
-        # The names of keywords stand together in one constant.
+        # The compiler puts the names of keywords together in one constant.
         keywords = frozenset(
             word
             for part in parts
@@ -98,7 +98,7 @@ class LoopCode(NamedTuple):
 
 
 def _called(used: set[str], functions: Mapping[str, types.CodeType]) -> list[types.CodeType]:
-    """Functions of the script that these names call, and those that they call in turn."""
+    """Functions of the script that these names call, directly or through other functions of the script."""
     found: dict[str, types.CodeType] = {}
     waiting = [name for name in used if name in functions and name != LOOP]
     while waiting:
@@ -111,7 +111,7 @@ def _called(used: set[str], functions: Mapping[str, types.CodeType]) -> list[typ
 
 
 def _in_loop(code: types.CodeType) -> tuple[set[str], set[str]]:
-    """Names used inside the loop that calls `backward`, and attributes assigned there; all of the code if none does."""
+    """Names used, and attributes assigned, in the loop that calls `backward`; without one, in the whole function."""
     steps = list(dis.get_instructions(code))
     backwards = [step.offset for step in steps if step.argval == "backward"]
     loops = [

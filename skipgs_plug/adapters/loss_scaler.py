@@ -1,4 +1,4 @@
-"""`torch.amp.GradScaler` in iterations without any gradient, where its methods fail."""
+"""`torch.amp.GradScaler` in iterations without gradients, in which its methods fail."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from skipgs_plug.core.optimizers import has_pending_gradient
 
 
 def guard_scaler(hooks: Hooks, scaler: torch.amp.GradScaler) -> None:
-    """In skipped iterations call `unscale_` and `update` only for gradients that wait from earlier ones."""
+    """In skipped iterations, call `unscale_` and `update` only for gradients that are left from earlier iterations."""
     if not scaler.is_enabled():
         return
     stepped: list[bool] = []

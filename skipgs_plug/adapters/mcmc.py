@@ -13,28 +13,25 @@ from skipgs_plug.adapters.loop_code import LOOP
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import Densification
 
-NOISE = "build_scaling_rotation"  # the loop calls it for nothing but its noise
+NOISE = "build_scaling_rotation"  # the loop calls it only for its noise
 
 
 class MCMC(InriaFamily):
-    """The noise belongs to the gradient step: left alone, it is a random walk.
+    """The noise belongs to the gradient step: alone it is a random walk.
 
-    It is computed between the lines of `training`, but its covariance comes from a function of another module:
-    in skipped iterations the loop is given zeros there. The random numbers are drawn as ever.
-    Relocation reads no gradients. A gate that is started before it ends runs the iterations that relocate.
+    It is computed inside `training`, but its covariance comes from a function of another module. In skipped iterations
+    that function returns zeros. The random numbers are drawn as usual. Relocation reads no gradients. A gate that
+    starts before relocation ends runs the iterations that relocate.
     """
 
     name = "mcmc"
     checked = "ubc-vision/3dgs-mcmc 7b4fc9f7 (its script, run on the CPU)"
     project = "[3DGS-MCMC](https://github.com/ubc-vision/3dgs-mcmc)"
     gated = (
-        "From `densify_until_iter` (25,000) on, where relocation ends. A gate that you start earlier runs the "
+        "From `densify_until_iter` (25,000) on, when relocation has ended. A gate that you start earlier runs the "
         "iterations that relocate."
     )
-    left_alone = (
-        "The position noise between the lines of the loop is zero where the gradient step is left out; its random "
-        "numbers are drawn as ever."
-    )
+    left_alone = "The position noise is zero in skipped iterations. Its random numbers are drawn as usual."
     stand_ins = "mcmc"
     mark = NOISE
     calls = ("add_new_gs", "relocate_gs", "add_", "randn_like", "randn")
@@ -60,7 +57,7 @@ class MCMC(InriaFamily):
 
         def covariance(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             factor = original(*args, **kwargs)
-            # Frame 2 called it; the model does so too, where it matters.
+            # Frame 2 is the caller. The model calls it too, and needs its values.
             in_loop = sys._getframe(2).f_code.co_name == LOOP
             return torch.zeros_like(factor) if in_loop and hooks.state.skipped else factor
 

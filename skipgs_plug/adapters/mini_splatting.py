@@ -11,10 +11,9 @@ from skipgs_plug.adapters.inria import InriaFamily
 class MiniSplatting(InriaFamily):
     """Both simplifications change the model after the backward of their iteration, and make a new optimizer.
 
-    What views show blurred is gathered beside the gradients, and waits for the next event as they do. Points are made
-    anew from depths every 5,000 iterations, in as many as ever.
-
-    Iterations are counted, since `update_learning_rate` is called with shifted numbers.
+    Gaussians that views show blurred are gathered like gradients, until the next event. Points are made anew from
+    depths every 5,000 iterations, with `share` too. The adapter counts iterations itself, since `update_learning_rate` gets
+    shifted numbers.
     """
 
     name = "mini_splatting"
@@ -25,9 +24,8 @@ class MiniSplatting(InriaFamily):
         "which does not simplify: from `densify_until_iter` on."
     )
     with_share = (
-        "By visits; views in which Gaussians are "
-        "blurred are gathered until the next event. Points are made anew from depths, and both "
-        "simplifications happen, as ever."
+        "By visits; blurred Gaussians are gathered until the next event. Points from depths and both simplifications "
+        "happen as ever."
     )
     left_alone = "Scores and depths for pruning are rendered without gradients and always run."
     stand_ins = "gaussianspa"

@@ -9,18 +9,18 @@ from skipgs_plug.adapters.inria import InriaFamily
 
 
 class MiniSplatting2(InriaFamily):
-    """Half-way between its second simplification and the end all culled Gaussians return to their views.
+    """Half-way between its second simplification and the end, all culled Gaussians return to their views.
 
-    Losses change there, so the gate begins after it. Clones by importance every 250 iterations, which read no
-    statistics of the loop, run as often as ever.
+    Losses change there, so the gate begins after it. Clones by importance happen every 250 iterations, with `share`
+    too: they read no statistics of the loop.
     """
 
     name = "mini_splatting2"
     checked = "fatPeter/mini-splatting2 5ec9202 (both loops read, and a look-alike)"
     project = "[Mini-Splatting2](https://github.com/fatPeter/mini-splatting2)"
     gated = (
-        "From the iteration after (`simp_iteration2` + `iterations`) // 2 on, where culled Gaussians return to their "
-        "views, after a pause for it."
+        "From the iteration after (`simp_iteration2` + `iterations`) // 2 on, in which culled Gaussians return to "
+        "their views, after a pause."
     )
     with_share = (
         "By visits. Clones by importance every 250 iterations, points from depths and simplifications happen as ever."

@@ -1,4 +1,4 @@
-"""Mip-Splatting: a 3D filter beside the parameters, computed anew after densification too."""
+"""Mip-Splatting: a 3D filter beside the parameters, which is recomputed after densification too."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from skipgs_plug.adapters.inria import InriaFamily
 
 
 class MipSplatting(InriaFamily):
-    """`compute_3D_filter` goes on every hundredth iteration, skipped or not.
+    """`compute_3D_filter` runs every hundredth iteration, skipped or not.
 
-    It follows from positions and cameras alone: where nothing moved, it gives what was there. So it pauses nothing.
+    It depends on positions and cameras only, so it changes nothing if nothing moved, and does not pause the gate.
     """
 
     name = "mip_splatting"
@@ -16,8 +16,8 @@ class MipSplatting(InriaFamily):
     project = "[Mip-Splatting](https://github.com/autonomousvision/mip-splatting)"
     gated = "From `densify_until_iter` on."
     left_alone = (
-        "The 3D filter is computed anew every hundredth iteration, skipped or not: where nothing moved it is what it "
-        "was, so it does not pause the gate."
+        "The 3D filter is computed anew every hundredth iteration, skipped or not. It changes only if the model moves, "
+        "so it does not pause the gate."
     )
     stand_ins = "mip_splatting"
     mark = "create_offset_gt"

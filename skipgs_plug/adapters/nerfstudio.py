@@ -28,7 +28,7 @@ CALLBACKS = ("step_cb", "step_post_backward")  # of splatfacto
 
 
 class Nerfstudio(AbstractAdapter):
-    """Attach after `trainer.setup()`. Decides on `main_loss`: other terms appear in some iterations only.
+    """Attach after `trainer.setup()`. The gate decides on `main_loss`, since other terms come in some iterations only.
 
     nerfstudio steps an optimizer only with a pending gradient, so optimizers and schedulers are left alone.
     """
@@ -36,12 +36,11 @@ class Nerfstudio(AbstractAdapter):
     name = "nerfstudio"
     checked = "nerfstudio-project/nerfstudio 1.1.5 50e0e3c7 (ns-train, run on the CPU)"
     project = "[nerfstudio, splatfacto and splatfacto-mcmc](https://github.com/nerfstudio-project/nerfstudio)"
-    gated = "As gsplat; decided on `main_loss`, since other terms appear in every tenth iteration only."
-    with_share = "As gsplat. Evaluations and the first and last of gathered gradients happen as often as ever."
+    gated = "Like gsplat; decided on `main_loss`, since other terms appear in every tenth iteration only."
+    with_share = "Like gsplat. Evaluations, and the first and last iteration of accumulated gradients, always run."
     left_alone = (
-        "An enabled loss scaler is not asked to update without a gradient. As in a shell: `skipgs-plug run nerfstudio "
-        "-- ns-train splatfacto ...` (also `-m nerfstudio.scripts.train`). `skipgs.json` lies beside its "
-        "`config.yml`."
+        "An enabled loss scaler does not update without a gradient. The command: `skipgs-plug run nerfstudio "
+        "-- ns-train splatfacto ...` (or `-m nerfstudio.scripts.train`). `skipgs.json` lies beside its `config.yml`."
     )
     stand_ins = "nerfstudio"
 
@@ -113,7 +112,7 @@ class Nerfstudio(AbstractAdapter):
         return step in self._relocations
 
     def always_run(self, numbers: range) -> Iterable[int]:
-        """Evaluations, and the first and last of several whose gradients are gathered: other functions decide there."""
+        """Return evaluations, and the first and last iterations of accumulated gradients: the loop does not show them."""
         config = self.trainer.config
         every = (config.steps_per_eval_batch, config.steps_per_eval_image, config.steps_per_eval_all_images)
         gathered = [steps for steps in config.gradient_accumulation_steps.values() if steps > 1]
@@ -132,6 +131,6 @@ def callbacks(trainer: Any) -> Iterator[tuple[Callable[..., Any], int | None]]:
 
 
 def view_names(files: list[Path]) -> list[str]:
-    """Image paths relative to the folder that holds them all."""
+    """Return image paths relative to the folder that holds all of them."""
     root = os.path.commonpath([file.parent for file in files])
     return [file.relative_to(root).as_posix() for file in files]

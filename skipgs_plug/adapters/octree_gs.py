@@ -1,4 +1,4 @@
-"""Octree-GS: Scaffold-GS with anchors on levels, which are shown from coarse to fine."""
+"""Octree-GS: Scaffold-GS with anchors on levels of detail."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from skipgs_plug.core.trainer_info import Densification
 class OctreeGS(InriaFamily):
     """Anchors are grown and pruned before `update_until`, and levels are added until `coarse_iter`.
 
-    With several resolution scales an image has a camera, and a mean, for each of them.
+    With several resolution scales, an image has one camera and one mean per scale.
     """
 
     name = "octree_gs"
     checked = "city-super/Octree-GS 9db64fe (its script, run on the CPU)"
     project = "[Octree-GS](https://github.com/city-super/Octree-GS)"
     gated = "From `update_until` on, or with `progressive` from the end of `coarse_iter` on, whichever is later."
-    left_alone = "Networks and anchors have one optimizer, which is left alone. The mask of levels is a forward's."
+    left_alone = (
+        "Networks and anchors have one optimizer, which is left alone. The mask of levels belongs to the forward."
+    )
     stand_ins = "scaffold_gs"
     mark = "set_coarse_interval"
     densification = Densification(marks=("update_interval",), needs="iterations")

@@ -1,4 +1,4 @@
-"""docs/adapters.md, made from the declarations of the adapters: `python -m skipgs_plug.adapters.page`."""
+"""Make docs/adapters.md from the adapters' declarations: `python -m skipgs_plug.adapters.page`."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from skipgs_plug.core.trainer_info import Densification
 
 HEAD = """# Supported trainers
 
-*Made by `python -m skipgs_plug.adapters.page > docs/adapters.md` from the adapters' own declarations; a test compares.*
+*Made by `python -m skipgs_plug.adapters.page > docs/adapters.md` from the adapters' declarations; a test compares.*
 
 In every trainer, only the training backward pass is gated. Learning rates, SH degree, view order, logging, evaluation,
 saving, prunes and optimizer calls continue in skipped iterations. An optimizer without gradients does nothing. Views
 are known by image name. A gate that would start while densification still reads gradients is refused.
+
+A fork may be taken for its parent. So each adapter names calls that change the model and that it does not know, and
+the gate begins after the last of them, if the loop's conditions tell their end.
 
 With `share`, densification events are left out *by visits*, when the Gaussians were seen too seldom before them, or *by
 iterations*, when fewer iterations ran before them than their thresholds count. All events are kept where each one adds

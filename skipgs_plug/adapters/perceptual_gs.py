@@ -1,4 +1,4 @@
-"""Perceptual-GS: sensitivities trained beside the scene until densification ends."""
+"""Perceptual-GS: trains sensitivities beside the scene until densification ends."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from skipgs_plug.adapters.inria import InriaFamily
 
 
 class PerceptualGS(InriaFamily):
-    """The loss has a term on sensitivities up to and with `densify_until_iter`, whose iteration may rebuild the model.
+    """The loss has a term on sensitivities up to and including `densify_until_iter`, which may rebuild the model.
 
-    Images with alpha are trained with prunes every hundredth iteration until the end, each of which pauses the gate.
+    With images that have alpha, it prunes every hundredth iteration until the end. Each prune pauses the gate.
     """
 
     name = "perceptual_gs"
     checked = "eezkni/Perceptual-GS 991f196 (its script, run on the CPU)"
     project = "[Perceptual-GS](https://github.com/eezkni/Perceptual-GS)"
     gated = (
-        "From `densify_until_iter` + 1 on, after a pause where that iteration rebuilds the model. With images that "
-        "have alpha, prunes every hundredth iteration pause the gate until the end."
+        "From `densify_until_iter` + 1 on, after a pause if iteration `densify_until_iter` rebuilds the model. With "
+        "images that have alpha, a prune every hundredth iteration pauses the gate until the end."
     )
     with_share = (
-        "By visits. Events that read weights of "
-        "all views (every 1,000 and 1,500 iterations) happen as ever; with images that have alpha all do."
+        "By visits. Events that read weights of all views (every 1,000 and 1,500 iterations) are kept. With images "
+        "that have alpha, all events are kept."
     )
-    left_alone = "Renders of sensitivity and alpha are of the same view, and belong to its loss."
+    left_alone = "Renders of sensitivity and alpha show the same view and belong to its loss."
     stand_ins = "gaussianspa"
     mark = "get_sensitivity"
     structural = (*InriaFamily.structural, "reinitial_pts")

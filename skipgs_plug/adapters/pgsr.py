@@ -8,9 +8,9 @@ from skipgs_plug.adapters.inria import InriaFamily
 
 
 class PGSR(InriaFamily):
-    """A second view is rendered with gradients in the same iteration: the first one is the view of the iteration.
+    """The loop renders a second view with gradients in the same iteration. The first view counts.
 
-    The gate decides on the whole loss. Its geometric terms begin at iteration 7,000 and stay from then on.
+    The gate decides on the whole loss. Its geometric terms begin at iteration 7,000 and go on to the end.
     """
 
     name = "pgsr"
@@ -18,8 +18,8 @@ class PGSR(InriaFamily):
     project = "[PGSR](https://github.com/zju3dv/PGSR)"
     gated = "From `densify_until_iter` on; decided on the whole loss, with the terms between neighbouring views."
     left_alone = (
-        "The appearance model's optimizer has no gradients in skipped iterations either. Needs CUDA: `--cpu` has no "
-        "stand-in for its rasterizer of planes."
+        "The optimizer of the appearance model has no gradients in skipped iterations either. Needs CUDA: `--cpu` has "
+        "no stand-in for its rasterizer of planes."
     )
     mark = "get_points_depth_in_depth_map"
     calls = ("get_points_depth_in_depth_map", "get_points_from_depth")

@@ -6,13 +6,13 @@ from skipgs_plug.adapters.inria import InriaFamily
 
 
 class PixelGS(InriaFamily):
-    """What it adds to Inria's loop is read by densification alone, so nothing of it matters to the gate."""
+    """Only densification reads what this fork adds to Inria's loop, so it does not matter to the gate."""
 
     name = "pixel_gs"
     checked = "zhengzhang01/Pixel-GS 05c9d557 (its script, run on the CPU)"
     project = "[Pixel-GS](https://github.com/zhengzhang01/Pixel-GS)"
     gated = "From `densify_until_iter` on."
-    left_alone = "Pixel counts and the gradients they weight are read by densification alone."
+    left_alone = "Only densification reads pixel counts and the gradients that they weight."
     stand_ins = "pixel_gs"
     mark = "depth_threshold"
     arguments = ("depth_threshold",)

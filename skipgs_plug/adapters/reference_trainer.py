@@ -16,18 +16,18 @@ from skipgs_plug.core.events import MIN_PAUSE_ITERS
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
-FULL_SCHEDULE = 30_000  # iterations that the default settings of gate and trainer are made for
+FULL_SCHEDULE = 30_000  # iterations of the schedule that the default settings of gate and trainer suit
 
 
 class ReferenceTrainer(AbstractAdapter):
-    """Gates the instance's `backward(loss, view, step)`; gate state travels in snapshots and checkpoints."""
+    """Gates the instance's `backward(loss, view, step)`. Snapshots and checkpoints hold the state of the gate."""
 
     name = "reference"
     checked = "the trainer of this package (itself, on the CPU, by the tests)"
     project = "this package's own trainer"
     gated = "From the end of densification on."
-    with_share = "By visits; those of MCMC are all kept."
-    left_alone = "Gate state travels in its snapshots and checkpoints."
+    with_share = "By visits; with MCMC, all events are kept."
+    left_alone = "Its snapshots and checkpoints hold the state of the gate."
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:

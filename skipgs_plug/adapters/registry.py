@@ -1,4 +1,4 @@
-"""The registry of adapters, and the choice of the one that fits a trainer."""
+"""The registry of adapters, and the choice of the adapter for a trainer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.errors import SkipGSError, UnknownTrainerError
 
-# In the order in which they are asked: forks before what they were forked from. Loaded when asked for.
+# In the order in which they are tried: a fork stands before its parent. Modules are imported when they are tried.
 BUILTIN = {
     "reference": "skipgs_plug.adapters.reference_trainer:ReferenceTrainer",
     "gsplat": "skipgs_plug.adapters.gsplat_runner:GsplatRunner",
@@ -46,7 +46,7 @@ BUILTIN = {
     "inria": "skipgs_plug.adapters.inria:Inria",
 }
 
-SHOWN = 6  # functions of an unknown script that are named, so that it is one sentence
+SHOWN = 6  # functions of an unknown script that the error names, at most: it stays one sentence
 
 _registered: dict[str, type[AbstractAdapter]] = {}
 
@@ -79,7 +79,7 @@ def register_adapter(adapter: type[AbstractAdapter]) -> type[AbstractAdapter]:
 
 
 def adapter_names() -> list[str]:
-    """Return the names of all adapters, those of users first."""
+    """Return the names of all adapters, with the users' own first."""
     return [*_registered, *BUILTIN]
 
 

@@ -1,4 +1,4 @@
-"""Scaffold-GS: anchors, from which small networks make Gaussians anew for each view."""
+"""Scaffold-GS: small networks make Gaussians from anchors, anew for each view."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class ScaffoldGS(InriaFamily):
     name = "scaffold_gs"
     checked = "city-super/Scaffold-GS 59c833b5 (its script, run on the CPU)"
     project = "[Scaffold-GS](https://github.com/city-super/Scaffold-GS)"
-    gated = "From `update_until` on, where anchors are neither grown nor pruned any more."
+    gated = "From `update_until` on: anchors are no longer grown or pruned."
     left_alone = "Networks and anchors have one optimizer, which is left alone."
     stand_ins = "scaffold_gs"
     mark = "prefilter_voxel"

@@ -1,4 +1,4 @@
-"""PyTorch's learning-rate schedulers in loops that leave out iterations: they count calls, not numbers."""
+"""PyTorch's learning-rate schedulers in loops with left-out iterations: schedulers count calls, not iterations."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from torch.optim.lr_scheduler import ChainedScheduler, CosineAnnealingWarmRestar
 
 from skipgs_plug.core.hooks import Hooks
 
-# Those with a `step` of their own that counts its calls.
+# Classes with a `step` of their own that counts its calls.
 COUNTING = (LRScheduler, ChainedScheduler, SequentialLR, CosineAnnealingWarmRestarts)
 
 
 def catch_up_schedulers(hooks: Hooks, caller: str) -> None:
-    """Let every scheduler that the function `caller` steps be where it would be if all iterations ran."""
+    """Keep every scheduler that the function `caller` steps at the value it would have if all iterations ran."""
     for kind in COUNTING:
         hooks.catch_up(kind, "step", caller)
 
 
 def function_names(function: Callable[..., Any]) -> dict[str, Any]:
-    """Global names of a function, looking through what it is wrapped in."""
+    """Return the global names of a function under its decorators."""
     return inspect.unwrap(function).__globals__  # type: ignore[attr-defined]

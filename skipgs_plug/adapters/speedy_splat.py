@@ -1,4 +1,4 @@
-"""Speedy-Splat: prunes on after densification, with backwards of its own that must all run."""
+"""Speedy-Splat: goes on pruning after densification, with backward passes of its own that must all run."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from skipgs_plug.adapters.inria import InriaFamily
 
 
 class SpeedySplat(InriaFamily):
-    """`score_func` renders every view with `scores=` and runs a backward on it, in the midst of an iteration.
+    """`score_func` renders every view with `scores=` and runs a backward on it, within one iteration.
 
-    Neither is taken for training: that backward is called by another function than `training`. Hard prunes
-    begin in the very iteration in which densification ends, after its optimizer step.
+    Neither counts as training: another function than `training` calls that backward. The first hard prune is in the
+    iteration in which densification ends, after its optimizer step.
     """
 
     name = "speedy_splat"
     checked = "j-alex-hanson/speedy-splat 6b523aa3 (its script, run on the CPU)"
     project = "[Speedy-Splat](https://github.com/j-alex-hanson/speedy-splat)"
     gated = (
-        "From `densify_until_iter` + 1 on: a hard prune falls on `densify_until_iter` itself, and every "
-        "`prune_interval` until the end, and each pauses the gate."
+        "From `densify_until_iter` + 1 on. Hard prunes happen at `densify_until_iter` and every `prune_interval` until "
+        "the end. Each pauses the gate."
     )
-    left_alone = "The backwards that compute pruning scores always run."
+    left_alone = "The backward passes for pruning scores always run."
     stand_ins = "speedy_splat"
     mark = "score_func"
     calls = ("prune_gaussians",)

@@ -16,7 +16,7 @@ from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 
-# What `step` calls on the outermost trainer, and what is looked at.
+# Attributes of the outermost trainer that `step` or this adapter uses.
 EXPECTED = ("step", "curr_step", "optimizer", "update_learning_rate", "preprocess", "before_optim_hook", "optim_step")
 BOUND = "_until_iter"  # ends the name of a part's last iteration (inclusive) with a change of its kind
 BOUNDS = ("densify_until_iter", "prune_until_iter", "opacity_reset_until_iter")  # of the package itself
@@ -26,25 +26,25 @@ RAISES = "sh_degree_up_interval"  # of the wrapper that raises the SH degree
 class StepTrainer(AbstractAdapter):
     """One `step(camera)`: learning rates, forward, loss, backward, `before_optim_hook`, `optim_step`.
 
-    All but the backward and the hook that reads gradients keep running: `loss` raises the SH degree,
-    `optim_step` resets opacities. An opacity reset shows as a parameter replaced in the optimizer; the last
-    one falls into the last iteration of densification, right before the gate begins.
+    Everything but the backward and the hook that reads gradients keeps running: `loss` raises the SH degree, and
+    `optim_step` resets opacities. A reset replaces a parameter in the optimizer. The last reset is in the last
+    iteration of densification, right before the gate begins.
     """
 
     name = "step_trainer"
     checked = "gaussian-splatting 2.11.0 of PyPI (its script, run on the CPU)"
     project = "[pip gaussian-splatting](https://pypi.org/project/gaussian-splatting/)"
     gated = (
-        "From the latest of its inclusive bounds + 1 on, after a pause for the opacity reset that falls on that "
-        "bound. Modes without densification need `--start-iter`."
+        "From the last of its `_until_iter` bounds + 1 on, after a pause for the opacity reset on that bound. "
+        "Modes without densification need `--start-iter`."
     )
     with_share = (
-        "Densification runs whole, since it is hidden in wrappers, unless a loop of yours names its events "
-        "(`gate.iterations(..., events=...)`). Refinement is shortened."
+        "All iterations of densification run, since its events are hidden in wrappers. A loop of your own can name "
+        "them (`gate.iterations(..., events=...)`). Refinement is shortened."
     )
     left_alone = (
-        "`before_optim_hook`, which reads gradients, is left out with the backward. Attach to the outermost trainer; "
-        "wrappers added later are fine."
+        "`before_optim_hook`, which reads gradients, is left out with the backward. Attach to the outermost trainer. "
+        "You may add wrappers later."
     )
     stand_ins = "pip_gaussian_splatting"
 
@@ -105,7 +105,7 @@ class StepTrainer(AbstractAdapter):
             hooks.iteration(trainer.curr_step + 1)
             original()
 
-        # Other wrappers may be put around this trainer later: they call all of these, but not its `step`.
+        # Wrappers that are added later call all of these methods, but not `step`.
         hooks.wrap(trainer, "update_learning_rate", advanced)
         hooks.always(self.always_run)
         hooks.before(trainer, "preprocess", lambda camera: hooks.view(camera.ground_truth_image_path))
@@ -115,13 +115,13 @@ class StepTrainer(AbstractAdapter):
         hooks.ready(TrainerInfo(end, gradients_read_until=end))
 
     def always_run(self, numbers: range) -> Iterable[int]:
-        """Those in which a wrapper raises the SH degree."""
+        """Return the iterations in which a wrapper raises the SH degree."""
         intervals = [part.sh_degree_up_interval for part in layers(self.trainer) if hasattr(part, RAISES)]
         return (n for n in numbers if any(n % interval == 0 for interval in intervals))
 
 
 def layers(part: Any) -> Iterator[Any]:
-    """A trainer, the trainers and densifiers that it wraps, and those that they wrap."""
+    """Yield a trainer and all trainers and densifiers inside it."""
     yield part
     for name in ("base_trainer", "densifier", "base_densifier"):
         if hasattr(part, name):

@@ -7,9 +7,9 @@ from skipgs_plug.core.trainer_info import Densification
 
 
 class Taming(InriaFamily):
-    """Both optimizers keep their schedules: with `--sh_lower` SH gradients wait for every 16th iteration.
+    """Both optimizers keep their schedules. With `--sh_lower`, SH coefficients step every 16th iteration only.
 
-    At `ho_iteration` opacity becomes a plain tensor that renders the same, so no event is reported.
+    At `ho_iteration`, opacity becomes a plain tensor that renders the same image, so it is no event.
     """
 
     name = "taming"

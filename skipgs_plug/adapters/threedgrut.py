@@ -56,20 +56,19 @@ THROUGH = (*STAGES, *(f"_{name}" for name in STAGES))
 
 
 class ThreeDGRUT(AbstractAdapter):
-    """One `run_train_iter(global_step, ...)`, counted from 0; the strategy is told of the view before the backward.
+    """One iteration is `run_train_iter(global_step, ...)`, from 0. The strategy gets the view before the backward.
 
-    MCMC's `perturb_gaussians` is left out where the gradient step is: alone it is a random walk.
+    MCMC's `perturb_gaussians` is left out together with the gradient step: alone it is a random walk.
     """
 
     name = "3dgrut"
     checked = "nv-tlabs/3dgrut a37ef72 (its loop read, and a look-alike)"
     project = "[3DGRUT](https://github.com/nv-tlabs/3dgrut)"
-    gated = "From the latest `end_iteration` of the strategy on, where nothing is densified, pruned or reset any more."
+    gated = "From the last `end_iteration` of the strategy on: it no longer densifies, prunes or resets."
     with_share = "Refused: whole iterations cannot be left out."
     left_alone = (
-        "MCMC's position noise is left out where the gradient step is. Views are known by image path, or by frame "
-        "where the dataset has no paths. Epochs iterate over a "
-        "DataLoader. Needs CUDA."
+        "MCMC's position noise is left out together with the gradient step. Views are known by image path, or by frame "
+        "if the dataset has no paths. Its loops run over epochs and a DataLoader. Needs CUDA."
     )
 
     @classmethod
@@ -119,7 +118,7 @@ class ThreeDGRUT(AbstractAdapter):
 
 
 def last_change(strategy: Any) -> int:
-    """First step at which a strategy of this configuration changes no Gaussians, except for changes without an end."""
+    """Return the first step after all changes of Gaussians that this configuration ends."""
     sections = [getattr(strategy, name) for name in CHANGES if getattr(strategy, name, None) is not None]
     ends = [int(one.end_iteration) for one in sections if one.start_iteration >= 0 and one.end_iteration >= 0]
     return max(ends, default=0)

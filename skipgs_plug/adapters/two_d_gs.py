@@ -8,8 +8,8 @@ from skipgs_plug.adapters.inria import InriaFamily
 class TwoDGS(InriaFamily):
     """The gate decides on the whole loss, with normal consistency and depth distortion.
 
-    Both weights are constant from iteration 7,000 on. A gate that starts earlier sees losses rise there, and runs
-    the backwards of views until they are below their means again.
+    Both weights are constant from iteration 7,000 on. A gate that starts earlier sees losses rise at that iteration,
+    and runs the backward passes of a view until its loss is below its mean again.
     """
 
     name = "2dgs"

@@ -1,4 +1,4 @@
-"""What a trainer does beyond what its adapter knows: found before it trains, named, and waited for."""
+"""Find what a trainer does beyond its adapter's knowledge, name it, and start the gate after it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from skipgs_plug.core.hooks import Adapter
 NOISE = frozenset({"randn", "randn_like", "normal"})
 # Methods of a tensor that change no values.
 HARMLESS = frozenset({"requires_grad_", "share_memory_", "detach_", "rename_"})
-# What Inria's loops, classic and current, call of their model, and pass to `render` by name.
+# Methods of the model that Inria's loops (classic and current) call, and arguments that they pass to `render` by name.
 CALLS = frozenset(
     {
         "add_densification_stats",
@@ -39,14 +39,14 @@ BY_HAND = "Gate it by hand with SkipGate(start_iter=...), or write an adapter (C
 
 
 class Unrecognised(NamedTuple):
-    """What a loop does that its adapter does not know.
+    """Parts of a loop of the Inria family that its adapter does not know.
 
     Attributes:
-        calls: methods of the model.
-        arguments: arguments of the renderer.
-        noise: functions that draw random numbers.
-        writes: methods that change a tensor in place, and `data`, which is assigned to.
-        known: what the adapter did recognise.
+        calls: Methods of the model.
+        arguments: Arguments of the renderer.
+        noise: Functions that draw random numbers.
+        writes: Methods that change a tensor in place, and `data` if the loop assigns to it.
+        known: Names that the adapter did recognise.
     """
 
     calls: frozenset[str]
@@ -56,13 +56,13 @@ class Unrecognised(NamedTuple):
     known: frozenset[str]
 
     def refuse(self, who: str) -> None:
-        """Refuse a loop that changes tensors itself.
+        """Refuse a loop that changes tensors itself. Noise alone is accepted, since it may be input of a network.
 
         Args:
             who: Beginning of the sentence.
 
         Raises:
-            AdapterMismatchError: The loop writes into tensors. Noise alone does not: it may be given to a network.
+            AdapterMismatchError: The loop writes into tensors.
         """
         if self.writes:
             names = ", ".join(sorted(self.writes | self.noise))
@@ -73,7 +73,7 @@ class Unrecognised(NamedTuple):
 
     @property
     def listed(self) -> list[str]:
-        """All of it as a sentence shows it; empty where everything was recognised."""
+        """The unrecognised parts, spelled for a sentence."""
         return [
             *(f"render({name}=)" for name in sorted(self.arguments)),
             *(spelled(name) for name in sorted(self.calls | self.noise)),
@@ -87,15 +87,15 @@ def unrecognised(
     calls: Iterable[str],
     arguments: Iterable[str],
 ) -> Unrecognised:
-    """Compare a loop, and the functions that it calls, with what its adapter knows.
+    """Compare a loop, and the functions that it calls, with the names that its adapter knows.
 
     Args:
         code: The training script.
         renderers: Its renderers.
         model: Its GaussianModel.
-        calls: What the adapter knows beyond Inria's: methods of the model, functions that draw noise, methods that
-            change tensors in place.
-        arguments: Arguments of the renderers that the adapter knows beyond Inria's.
+        calls: Names that the adapter knows beyond those of Inria's loop: methods of the model, functions that draw
+            noise, methods that change tensors in place.
+        arguments: Arguments of the renderers that the adapter knows beyond those of Inria's loop.
     """
     known = CALLS | set(calls)
     parameters = {name for one in renderers for name in inspect.signature(one).parameters}
@@ -225,7 +225,7 @@ def _callables(owner: Any) -> set[str]:
 
 
 def writes_in_place(name: str) -> bool:
-    """Whether this is a method that changes the values of a tensor in place."""
+    """Whether this is the name of a method that changes the values of a tensor in place."""
     private = name.startswith("_") or not name.endswith("_")
     return not private and name not in HARMLESS and callable(getattr(torch.Tensor, name, None))
 

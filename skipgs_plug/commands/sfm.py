@@ -130,5 +130,5 @@ def print_unplaced(reasons: dict[str, str], matching: str) -> None:
         print(f"  {', '.join(names[:NAMES_SHOWN])}{more}: {reason}")
     if matching == "sequential":
         print(
-            "  Only neighbours in the order of names were compared, mostly; --matching exhaustive compares all pairs, slowly."
+            "  Mostly neighbours in the order of names were compared; --matching exhaustive compares all pairs, slowly."
         )
