@@ -112,7 +112,7 @@ class Nerfstudio(AbstractAdapter):
         return step in self._relocations
 
     def always_run(self, numbers: range) -> Iterable[int]:
-        """Return evaluations, and the first and last iterations of accumulated gradients: the loop does not show them."""
+        """Return evaluations, and first and last iterations of accumulated gradients: the loop does not show them."""
         config = self.trainer.config
         every = (config.steps_per_eval_batch, config.steps_per_eval_image, config.steps_per_eval_all_images)
         gathered = [steps for steps in config.gradient_accumulation_steps.values() if steps > 1]
