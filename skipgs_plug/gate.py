@@ -16,11 +16,11 @@ from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
 from skipgs_plug.core.hooks import Adapter, Hooks
+from skipgs_plug.core.intercept import Original
 from skipgs_plug.core.optimizers import has_pending_gradient, listed
 from skipgs_plug.core.pace.base import EveryNumber
 from skipgs_plug.core.pace.loop_range import LoopRange
 from skipgs_plug.core.policy import Policy
-from skipgs_plug.core.release import Original
 from skipgs_plug.core.report import build_report, counters, summarise
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.trainer_info import TrainerInfo

@@ -12,12 +12,11 @@ import torch
 from skipgs_plug.core.clock import Times
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import AdapterMismatchError
-from skipgs_plug.core.intercept import Around, Patches, intercept_tensor_backward
+from skipgs_plug.core.intercept import Around, Original, Patches, intercept_tensor_backward
 from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_known
 from skipgs_plug.core.pace.loop_range import LoopRange, replace_range
 from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.rates import Named
-from skipgs_plug.core.release import Original
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 from skipgs_plug.core.views import NOT_READ, view_key
 

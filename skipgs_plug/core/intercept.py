@@ -12,12 +12,33 @@ from typing import Any
 import torch
 
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
-from skipgs_plug.core.release import Original
 
 Around = Callable[..., Any]  # called as around(original, *args, **kwargs) in place of original(*args, **kwargs)
 
 _MARK = "__skipgs_plug__"
 _ABSENT = object()
+
+
+class Original:
+    """A function of the trainer that code of the gate calls. It tells the trainer's errors from the gate's.
+
+    Attributes:
+        made: Whether it was called.
+        failed: Whether its last call has not returned, so that an error comes from the trainer.
+        result: The value that its last call returned.
+    """
+
+    __slots__ = ("_function", "failed", "made", "result")
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self.made = self.failed = False
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        self.made = self.failed = True
+        self.result = self._function(*args, **kwargs)
+        self.failed = False
+        return self.result
 
 
 class Patches:

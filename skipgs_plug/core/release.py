@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from types import TracebackType
-from typing import Any
 
 from skipgs_plug.core import distributed
 from skipgs_plug.core.caution import caution
@@ -100,25 +99,3 @@ class _Guard:
             return False
         self._release.on_error(error, self._step())
         return True
-
-
-class Original:
-    """A function of the trainer that code of the gate calls. It tells the trainer's errors from the gate's.
-
-    Attributes:
-        made: Whether it was called.
-        failed: Whether its last call has not returned, so that an error comes from the trainer.
-        result: The value that its last call returned.
-    """
-
-    __slots__ = ("_function", "failed", "made", "result")
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
-        self.made = self.failed = False
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        self.made = self.failed = True
-        self.result = self._function(*args, **kwargs)
-        self.failed = False
-        return self.result

@@ -133,16 +133,18 @@ class OptimizerInfo:
         name: as given.
         positions: parameters that may be positions [N, 3].
         shares: of its groups, see `divide`.
+        rows, growing: The arguments of `divide` that `shares` were found for.
     """
 
-    __slots__ = ("_divided", "_only", "groups", "name", "positions", "shares")
+    __slots__ = ("_only", "groups", "growing", "name", "positions", "rows", "shares")
 
     def __init__(self, optimizer: torch.optim.Optimizer, name: str | None) -> None:
         self.name = name
         self.groups = [GroupInfo(group, name) for group in optimizer.param_groups]
         self.positions = [param for group in self.groups for param in group.positions]
         self.shares: list[Share] = []
-        self._divided: tuple[int, bool] | None = None
+        self.rows: int | None = None
+        self.growing = False
         self._only = self.groups[0] if len(self.groups) == 1 and self.groups[0].first is not None else None
 
     def fits(self, optimizer: torch.optim.Optimizer) -> bool:
@@ -153,17 +155,15 @@ class OptimizerInfo:
             return groups[0] is only.group and len(now) == 1 and now[0] is only.first
         return len(groups) == len(self.groups) and all(map(_is_about, self.groups, groups))
 
-    def divide(self, rows: int, growing: bool) -> list[Share]:
-        """Return `shares` where there are `rows` Gaussians, 0 if their number is not known.
+    def divide(self, rows: int, growing: bool) -> None:
+        """Find `shares` where there are `rows` Gaussians, 0 if their number is not known.
 
         Args:
             rows: Only what has a row for each Gaussian takes larger steps.
             growing: The scene still grows: everything else is left alone, and opacities take longer steps, too.
         """
-        if self._divided != (rows, growing):
-            self._divided = rows, growing
-            self.shares = [share for one in self.groups if (share := _share(one, rows, growing)) is not None]
-        return self.shares
+        self.rows, self.growing = rows, growing
+        self.shares = [share for one in self.groups if (share := _share(one, rows, growing)) is not None]
 
 
 def _share(info: GroupInfo, rows: int, growing: bool) -> Share | None:

@@ -171,7 +171,8 @@ class Phased(Pace):
         runs = (self.growing is None or self.growing.runs(number)) if grows else self._refine(number)
         if runs:
             self.gap, self._left_out = self._left_out, 0
-            self._bars.catch_up()
+            if self.gap:
+                self._bars.catch_up()
         else:
             self._left_out += 1
             self._bars.left_out(number)

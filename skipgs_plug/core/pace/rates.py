@@ -128,7 +128,7 @@ class ScaledRates:
         self._rows, self._rows_now = self._rows_now or self._rows, 0
         if not self._handles:
             _hooked.append(self)
-            self._handles = [register_optimizer_step_pre_hook(self._safely(self._scale))]
+            self._handles = [register_optimizer_step_pre_hook(self._before_step)]
 
     @property
     def rows(self) -> int:
@@ -172,17 +172,29 @@ class ScaledRates:
                 raise SkipGSError(sentence)
             caution(sentence)
 
-    def _scale(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+    def _before_step(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        """Hook of PyTorch: an optimizer is about to step."""
         factor = self._factor
         if factor is None or get_ident() != self._thread:
             return
-        step = self._steps.get(id(optimizer)) or self._begin_with(optimizer)
-        if step is None:
-            return
-        step.depth += 1
-        if step.depth > 1:
-            return  # a step can call the step of its base class
-        if self._under_way:
+        try:
+            step = self._steps.get(id(optimizer)) or self._begin_with(optimizer)
+            if step is not None:
+                step.depth += 1
+                if step.depth == 1:  # a step can call the step of its base class
+                    self._scale(optimizer, step, factor)
+        except Exception as error:
+            self._failed(error)
+
+    def _failed(self, error: Exception) -> None:
+        """Raise an error of a hook, or tell the one who lets go of the training, whose step then goes on."""
+        if self.on_error is None:
+            raise error
+        self.on_error(error)
+
+    def _scale(self, optimizer: torch.optim.Optimizer, step: _Steps, factor: float) -> None:
+        under_way = self._under_way
+        if under_way:
             self._pass_on(optimizer)
         info = step.info
         if not info.fits(optimizer):
@@ -194,14 +206,14 @@ class ScaledRates:
         for param in info.positions:
             if param.shape[0] > self._rows_now:
                 self._rows_now = param.shape[0]
-        if self._only_look:
-            shares = []
-        else:
-            shares = info.divide(self._rows_now if self._rows_now > self._rows else self._rows, self._growing)
-        if self._under_way:  # an optimizer can be wrapped in another one, which has the same groups
-            scaled = {id(group) for other in self._under_way for group, _, _ in other.before}
+        rows = self._rows_now if self._rows_now > self._rows else self._rows
+        if info.rows != rows or info.growing is not self._growing:
+            info.divide(rows, self._growing)
+        shares = [] if self._only_look else info.shares
+        if under_way:  # an optimizer can be wrapped in another one, which has the same groups
+            scaled = {id(group) for other in under_way for group, _, _ in other.before}
             shares = [one for one in shares if id(one.group) not in scaled]
-        self._under_way.append(step)
+        under_way.append(step)
         before = step.before
         for group, part, most, longer in shares:
             times = part * (factor if factor < most else most)
@@ -231,25 +243,12 @@ class ScaledRates:
                 self._foreign.add(key)
                 return None
             name = names[0]
-        step = _Steps(optimizer, name, self._under_way)
+        step = _Steps(optimizer, name, self._under_way, self._failed)
         step.handles = self._watch(optimizer, step)
         self._steps[key] = step
         # Its number is given to another optimizer once it is gone.
         step.gone = weakref.ref(optimizer, lambda _, steps=self._steps: steps.pop(key, None))  # type: ignore[misc]
         return step
-
-    def _safely(self, hook: Callable[..., None]) -> Callable[..., None]:
-        """A hook whose errors do not end the trainer's step, unless whoever is told of them raises them."""
-
-        def safe(*args: Any) -> None:
-            try:
-                hook(*args)
-            except Exception as error:
-                if self.on_error is None:
-                    raise
-                self.on_error(error)
-
-        return safe
 
     def _pass_on(self, optimizer: torch.optim.Optimizer) -> None:
         """An optimizer that is wrapped in another one steps inside its step, with the same groups."""
@@ -260,7 +259,7 @@ class ScaledRates:
 
     def _watch(self, optimizer: torch.optim.Optimizer, step: _Steps) -> list[RemovableHandle]:
         """Put the trainer's settings back before anybody else looks at them."""
-        ends = optimizer.register_step_post_hook(self._safely(step.end))
+        ends = optimizer.register_step_post_hook(step.end)
         # The trainer's own hooks after a step, of a scheduler for example, find and set its rates.
         optimizer._optimizer_step_post_hooks.move_to_end(ends.id, last=False)  # type: ignore[attr-defined]
         # A checkpoint is written although a step raised: it holds the trainer's rates, too.
@@ -278,6 +277,7 @@ class _Steps:
         optimizer: It steps.
         name: Of it, where its groups have none; None if unknown.
         under_way: Steps that have begun and not ended, the outermost first.
+        failed: Told of errors at the end of a step, which it raises or has let go of the training.
 
     Attributes:
         info: about its groups.
@@ -293,15 +293,21 @@ class _Steps:
     """
 
     __slots__ = (
-        *("_under_way", "_until_end", "before", "depth", "info", "gone", "handles", "judged", "literal"),
-        *("longer", "memory_stays", "watched"),
+        *("_failed", "_under_way", "_until_end", "before", "depth", "info", "gone", "handles", "judged"),
+        *("literal", "longer", "memory_stays", "watched"),
     )
 
-    def __init__(self, optimizer: torch.optim.Optimizer, name: str | None, under_way: list[_Steps]) -> None:
+    def __init__(
+        self,
+        optimizer: torch.optim.Optimizer,
+        name: str | None,
+        under_way: list[_Steps],
+        failed: Callable[[Exception], None],
+    ) -> None:
         self.info = OptimizerInfo(optimizer, name)
         self.handles: list[RemovableHandle] = []
         self.gone: Any = None
-        self._under_way = under_way
+        self._under_way, self._failed = under_way, failed
         self.depth = 0
         self.before: list[tuple[dict[str, Any], Any, Any]] = []
         self.longer: list[dict[str, Any]] = []
@@ -312,15 +318,19 @@ class _Steps:
         self._until_end: contextlib.ExitStack | None = None
 
     def end(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        """A step has ended; the settings are the trainer's again before anybody else looks."""
-        if self.depth > 1:
-            self.depth -= 1
-        elif self.depth == 1:
-            self.depth = 0
+        """Hook of PyTorch: a step has ended; the settings are the trainer's again before anybody else looks."""
+        if self.depth == 0:
+            return
+        self.depth -= 1
+        if self.depth:
+            return
+        try:
             self._under_way.remove(self)
             self.put_back()
             if self.watched is not None:
                 self.judge(optimizer)
+        except Exception as error:
+            self._failed(error)
 
     def drop(self) -> None:
         """A step that has begun has no end: it raised."""
