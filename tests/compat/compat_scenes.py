@@ -1,4 +1,4 @@
-"""A small scene and a camera in the conventions of the Inria trainers, for the stand-ins' tests."""
+"""A small scene and a camera with the conventions of Inria's trainers, for tests of the stand-ins."""
 
 import math
 from typing import Any
@@ -11,7 +11,7 @@ TANFOVX, TANFOVY = 0.5, 0.35
 
 
 def camera(shift_x: float = 0.0) -> dict[str, Any]:
-    """Settings fields; `shift_x` moves the principal point by that share of the half width."""
+    """Return the fields of the settings. `shift_x` moves the principal point by that share of half the width."""
     angle = 0.3
     view = torch.eye(4)
     view[0, 0] = view[2, 2] = math.cos(angle)
@@ -40,13 +40,13 @@ def camera(shift_x: float = 0.0) -> dict[str, Any]:
 
 
 def intrinsics(shift_x: float = 0.0) -> Tensor:
-    """The same camera's K, written down independently of the stand-ins."""
+    """Return the K of the same camera, computed independently of the stand-ins."""
     fx, fy = WIDTH / (2 * TANFOVX), HEIGHT / (2 * TANFOVY)
     return torch.tensor([[fx, 0, (1 + shift_x) * WIDTH / 2], [0, fy, HEIGHT / 2], [0, 0, 1]])
 
 
 def gaussians(n: int = 30, seed: int = 0) -> dict[str, Tensor]:
-    """Arguments of a `GaussianRasterizer` call, all leaves that require gradients but `means2D`'s values."""
+    """Return arguments of a `GaussianRasterizer` call, all of them leaves that require gradients."""
     rng = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -67,7 +67,7 @@ def gaussians(n: int = 30, seed: int = 0) -> dict[str, Tensor]:
 def oracle(
     scene: dict[str, Tensor], settings: dict[str, Any], K: Tensor, **options: Any
 ) -> tuple[Tensor, dict[str, Any]]:
-    """The same picture from the reference rasterizer in float64. [3, H, W]"""
+    """Return the same image from the reference rasterizer in float64. [3, H, W]"""
     from skipgs_plug.fallback_raster.oracle.torch_reference import rasterization_reference
 
     image, _, info = rasterization_reference(

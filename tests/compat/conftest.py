@@ -1,4 +1,4 @@
-"""The tests of stand-ins check sizes at each kernel call, and keep torch to one thread."""
+"""Tests of the stand-ins check sizes at each kernel call, and run torch on one thread."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every stand-in module: what it returns, and that it is served and taken away again."""
+"""Every stand-in module returns the right results, is served, and is removed afterwards."""
 
 import importlib
 import importlib.util

@@ -1,4 +1,4 @@
-"""The functions that stand in for gsplat's CUDA ones in its own training script."""
+"""The functions that replace gsplat's CUDA functions in its own training script."""
 
 import importlib
 import math

@@ -1,4 +1,4 @@
-"""The stand-in for another project's SceneManager reads what COLMAP wrote."""
+"""The stand-in for another project's SceneManager reads files written by COLMAP."""
 
 import numpy as np
 import pytest

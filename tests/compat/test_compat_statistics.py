@@ -1,4 +1,4 @@
-"""Per-Gaussian statistics of the stand-ins, against dense compositing and the rasterizer's own gradients."""
+"""Per-Gaussian statistics of the stand-ins, compared with dense compositing and the rasterizer's gradients."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ def footprint():
 
 
 def dense(f):
-    """Falloff, alpha and transmittance of every pixel and Gaussian, composited in the plainest way."""
+    """Return falloff, alpha and transmittance of every pixel and Gaussian, composited one by one."""
     y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     offset = torch.stack([x, y], -1).reshape(-1, 1, 2).double() - f.means2d.double()
     a, b, c = f.conics.double().unbind(-1)

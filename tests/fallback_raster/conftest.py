@@ -12,7 +12,7 @@ from skipgs_plug.fallback_raster.runtime import guard
 
 @pytest.fixture(autouse=True)
 def one_torch_thread() -> Iterator[None]:
-    """The reference is thousands of small operations, which are ten times slower on a busy machine's threads."""
+    """Run torch on one thread: on a busy machine, several are ten times slower for the reference's small operations."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -21,7 +21,7 @@ def one_torch_thread() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def sizes_checked() -> Iterator[None]:
-    """Every kernel call compares the sizes of its tensors with what it declares; SKIPGS_PLUG_GUARD=1 does more."""
+    """Let every kernel call compare sizes of tensors with declarations. SKIPGS_PLUG_GUARD=1 adds guard zones."""
     with guard.at_least(guard.SIZES):
         yield
 
@@ -35,5 +35,5 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture
 def stress_examples(pytestconfig: pytest.Config) -> int:
-    """How many inputs the stress suite generates. The option is unknown when pytest starts higher up."""
+    """Return the number of inputs of the stress suite. The option is unknown if pytest starts in a parent folder."""
     return pytestconfig.getoption("--stress-examples", default=150)

@@ -1,4 +1,4 @@
-"""Small scenes and the comparison that the rasterizer's tests share."""
+"""Small scenes, and the comparison with the reference, for the rasterizer's tests."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DIFFERENTIABLE = ("means", "quats", "scales", "opacities", "colors", "background
 
 
 def look_at(eye: tuple[float, float, float]) -> Tensor:
-    """World-to-camera matrix [4, 4] of a camera at `eye` that looks at the origin, y down."""
+    """Return the world-to-camera matrix [4, 4] of a camera at `eye` that looks at the origin, y down."""
     position = torch.tensor(eye, dtype=torch.float64)
     forward = -position / position.norm()
     right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), forward)
@@ -34,7 +34,7 @@ def random_scene(
     backgrounds: bool = False,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Arguments of `rasterization` for a ball of Gaussians of many sizes, in float32."""
+    """Return arguments of `rasterization` for a ball of Gaussians of many sizes, in float32."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -62,12 +62,12 @@ def random_scene(
 
 
 def deep_scene(n: int, width: int = 70, height: int = 45, seed: int = 0, size: float = 1.0) -> dict[str, Any]:
-    """Many small opaque Gaussians behind one another, a few large ones among them, and a gap at one side."""
+    """Return many small opaque Gaussians behind one another, a few large ones, and a gap at one side."""
     generator = torch.Generator().manual_seed(seed)
     depth = 2 + 6 * torch.rand(n, generator=generator)
     x = (2 * torch.rand(n, generator=generator) - 1) * 0.6 * depth
     y = (2 * torch.rand(n, generator=generator) - 1) * 0.4 * depth
-    x = torch.where(depth < 5, x.clamp(min=-0.2 * depth), x)  # what is near leaves the left of the image free
+    x = torch.where(depth < 5, x.clamp(min=-0.2 * depth), x)  # near Gaussians leave the left of the image free
     scales = size * (0.06 * torch.rand(n, 3, generator=generator) + 0.03)
     scales[::211] *= 20
     return {
@@ -84,7 +84,7 @@ def deep_scene(n: int, width: int = 70, height: int = 45, seed: int = 0, size: f
 
 
 def leaves(scene: dict[str, Any], dtype: torch.dtype, extra: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The scene with fresh tensors of `dtype` that collect gradients."""
+    """Return the scene with new tensors of `dtype` that require gradients."""
     fresh = dict(scene)
     for name, value in scene.items():
         if torch.is_tensor(value):
@@ -94,7 +94,7 @@ def leaves(scene: dict[str, Any], dtype: torch.dtype, extra: tuple[str, ...] = (
 
 
 def relative_error(value: Tensor, truth: Tensor) -> float:
-    """L2 distance as a share of the truth's L2 norm; the plain norm where the truth is zero."""
+    """Return the L2 distance relative to the truth's L2 norm, or the norm itself if the truth is zero."""
     difference = (value.double() - truth.double()).norm()
     return (difference / truth.double().norm()).item() if truth.any() else difference.item()
 
@@ -102,9 +102,9 @@ def relative_error(value: Tensor, truth: Tensor) -> float:
 def errors_against_reference(
     rasterization: Any, scene: dict[str, Any], extra: tuple[str, ...] = (), **options: Any
 ) -> dict[str, float]:
-    """Errors of a float32 rendering and its gradients, measured against the float64 reference.
+    """Return errors of a float32 rendering and its gradients, compared with the float64 reference.
 
-    Pixels where a cut-off is near count in neither: their upstream gradient is zero.
+    Pixels near a cut-off are left out of both, with an upstream gradient of zero.
 
     Returns:
         `image` and `alpha`: greatest absolute error, the image's as a share of its greatest value where that

@@ -33,7 +33,7 @@ def test_spherical_harmonics(degree: int) -> None:
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_projection_and_its_gradients(antialiased: bool) -> None:
-    """gsplat's PyTorch projection knows no opacity: its boxes reach 3.33 sigma, as ours do above 1."""
+    """gsplat's PyTorch projection ignores opacity: its boxes reach 3.33 sigma, as ours do for opacities of 1."""
     scene = random_scene(cameras=3, n=500)
     scene["opacities"] = torch.full_like(scene["opacities"], 1.0 if antialiased else 1.1)
     results = []

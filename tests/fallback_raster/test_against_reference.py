@@ -57,7 +57,7 @@ def test_image_and_gradients(case: str) -> None:
 
 @pytest.mark.parametrize("case", ["SH 3", "background, depth", "absgrad, packed", "5 features", "many Gaussians"])
 def test_optimizations_change_nothing(case: str) -> None:
-    """Without any of them the rasterizer is a second oracle: nothing is left out but by the definition of alpha."""
+    """Without optimizations the rasterizer is a second oracle: it drops only alphas below the threshold."""
     scene, options = CASES[case]
     results = []
     for left_out in ((), tuple(OPTIMIZATIONS)):
@@ -79,7 +79,7 @@ def test_optimizations_change_nothing(case: str) -> None:
 
 
 def test_blocks_without_gradient_change_no_bit() -> None:
-    """What a pixel adds does not hang on which blocks are visited before it."""
+    """The sums of a pixel do not depend on the patches that are visited before."""
     scene = random_scene(n=3000, width=64, height=48)
     gradients = []
     for left_out in ((), ("zero_gradient",)):
@@ -142,7 +142,7 @@ def test_opaque_pile_stops_where_the_reference_stops() -> None:
 
 
 def test_saturated_alpha_passes_no_gradient() -> None:
-    """alpha = min(0.999, opacity * falloff): at the clamp only the color learns."""
+    """alpha = min(0.999, opacity * falloff): where alpha is clamped, only the color has a gradient."""
     gradients = []
     for function, dtype in ((rasterization, torch.float32), (rasterization_reference, torch.float64)):
         scene = random_scene(n=1, width=9, height=9)

@@ -1,4 +1,4 @@
-"""Kernels that are loaded ahead: each once, those of a run and no others, on several threads."""
+"""Kernels are loaded ahead on several threads: each once, exactly those that a run needs."""
 
 from __future__ import annotations
 

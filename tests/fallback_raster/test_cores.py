@@ -1,4 +1,4 @@
-"""Threads for the cores that a process may really use."""
+"""The number of threads follows the cores that a process may use."""
 
 from __future__ import annotations
 

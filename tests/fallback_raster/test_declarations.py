@@ -20,7 +20,7 @@ FILES = sorted(path.relative_to(KERNELS).as_posix() for path in KERNELS.rglob("*
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
-    """Arguments of the compiler by file."""
+    """Return the arguments of the compiler by file."""
     entries: list[dict[str, Any]] = json.loads(write(tmp_path_factory.mktemp("editor")).read_text())
     return {Path(entry["file"]).relative_to(KERNELS).as_posix(): entry["arguments"] for entry in entries}
 

@@ -1,4 +1,4 @@
-"""A gradient in factors is to torch the dense tensor that it stands for."""
+"""Torch treats a gradient in factors as the dense tensor that it represents."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def some(seed: int = 0, degree: int = 3) -> FactoredGradient:
 
 
 class Given(torch.autograd.Function):
-    """The sum of `x`, whose gradient is said to be `gradient`."""
+    """The sum of `x`, with `gradient` as its gradient."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, gradient: Tensor) -> Tensor:  # type: ignore[override]

@@ -41,7 +41,7 @@ def test_finite_differences(case: str) -> None:
 
 
 def test_boxes_hold_every_pixel_above_the_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The reference leaves Gaussians out where their boxes do not reach; blending all of them is the same."""
+    """The reference skips Gaussians whose boxes do not reach a square. Blending all of them gives the same image."""
     monkeypatch.setattr(torch_reference, "SQUARE", 4)  # small squares, many boxes left out
     scene = leaves(random_scene(cameras=2, sh_degree=1), torch.float64)
     image, alpha, _ = rasterization_reference(**scene)

@@ -1,4 +1,4 @@
-"""install_as_gsplat replaces gsplat's function wherever it is asked for, and gives it back."""
+"""install_as_gsplat replaces gsplat's function in all its modules, and restores it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ gsplat: Any = pytest.importorskip("gsplat")
 
 @pytest.fixture(autouse=True)
 def original() -> Iterator[Any]:
-    """gsplat's own function, which must be back after every test."""
+    """gsplat's own function, which every test must restore."""
     before = gsplat.rasterization
     assert before is not rasterization
     yield before

@@ -1,4 +1,4 @@
-"""Kernel calls cannot go wrong silently: every argument of every kernel is checked before anything is launched."""
+"""Wrong kernel calls raise errors: every argument of every kernel is checked before the launch."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def example(field: Field) -> Any:
 
 
 def examples(found: Worker[Any], /, **fields: Any) -> dict[str, Any]:
-    """Arguments of the declared kinds, of which some fields, by path, are replaced."""
+    """Return arguments of the declared kinds, with some fields replaced by path."""
     arguments = {}
     for parameter in found._parameters:
         values = [fields.get(field.path, example(field)) for field in parameter.fields]
@@ -185,7 +185,7 @@ def test_a_number_beyond_32_bits_is_refused() -> None:
 
 
 def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker[Any], dict[str, Any]]]:
-    """Workers that ran, and the fields of their arguments by path."""
+    """Return the workers that ran, and the fields of their arguments by path."""
     calls: dict[str, tuple[Worker[Any], dict[str, Any]]] = {}
     original = Worker.__call__
 
@@ -229,7 +229,7 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker[Any], d
 def test_a_tensor_of_another_size_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = recorded_calls(monkeypatch)
     assert {found.name for found, _ in calls} == set(WORKERS)
-    # Sizes that nothing else in a call tells, or only up to a whole vector.
+    # Sizes that no other argument of a call determines, or only up to a whole vector.
     free = {("reduce_pairs", "sums.pair_slot"), ("splat_adjoint", "sums.pair_slot")}
     for found, arguments in calls:
         for path, value in arguments.items():

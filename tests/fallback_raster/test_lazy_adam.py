@@ -1,4 +1,4 @@
-"""Rows that miss steps and are caught up: to the bit what Adam makes of a gradient of zeros, whenever that happens."""
+"""Rows that catch up with missed steps equal to the bit those of Adam with zero gradients, whenever they do so."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def threads() -> Iterator[Callable[[int], None]]:
 
 
 def parameter(shape: tuple[int, ...], generator: torch.Generator) -> torch.nn.Parameter:
-    """With zeros in it, of which one is negative."""
+    """A parameter with zeros, one of which is negative."""
     values = 0.03 * torch.randn(shape, generator=generator)
     values[torch.rand(shape, generator=generator) < 0.05] = 0.0
     values.view(-1)[0] = -0.0
@@ -38,7 +38,7 @@ def parameter(shape: tuple[int, ...], generator: torch.Generator) -> torch.nn.Pa
 
 
 def gradient(shape: tuple[int, ...], share: float, generator: torch.Generator) -> FactoredGradient:
-    """For a share of the rows, of all sizes from row to row, zero in some numbers and in some rows."""
+    """Gradients for a share of the rows, of very different sizes, zero in some elements and in some rows."""
     rows = torch.nonzero(torch.rand(shape[0], generator=generator) < share)[:, 0].to(torch.int32)
     directions = torch.randn(len(rows), FACTOR_FLOATS, generator=generator)
     directions[torch.rand(directions.shape, generator=generator) < 0.2] = 0.0
@@ -68,7 +68,7 @@ def train(
     seed: int = 0,
     **options: Any,
 ) -> tuple[LazyAdam, Adam]:
-    """Both after the same steps; `before` sees each step and the rows of its gradient."""
+    """Return both parameters after the same steps. `before` is called with each step and the rows of its gradient."""
     generator = torch.Generator().manual_seed(seed)
     one = parameter(shape, generator)
     other = torch.nn.Parameter(one.detach().clone())

@@ -50,12 +50,12 @@ def nearly_constant(shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
 
 
 def offset_constant(shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """The gradient of SSIM is nearly nothing here, and its parts are large: plain float32 is wrong by 3e-4."""
+    """The gradient of SSIM is nearly zero here, but its terms are large: plain float32 has an error of 3e-4."""
     return torch.full(shape, 0.9), torch.full(shape, 0.4)
 
 
 def offset_colours(shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """Likewise, each channel with an offset of its own."""
+    """Bright and flat, with a different offset for each channel."""
     ramp = torch.linspace(0.1, 0.9, shape[-1]).expand(shape)
     return ramp.contiguous(), (0.8 * ramp).contiguous()
 
@@ -67,7 +67,7 @@ def half_black(shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
 
 
 def beyond_one(shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """Renders overshoot."""
+    """Values outside [0, 1], as in renders."""
     image, target = noisy(shape)
     return 3.0 * image - 1.0, target
 

@@ -1,4 +1,4 @@
-"""Memory that is used again: only where nothing lies in it any more, and little more than was needed at one time."""
+"""Memory is reused only when no tensor uses it any more, and little more is kept than was needed at one time."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_piece_serves_tensors_that_are_somewhat_longer_or_shorter(pool: Pool) 
     for count in (85 * PAGE, 90 * PAGE, 73 * PAGE, 80 * PAGE):
         assert numbers(pool, count).data_ptr() == address
     mapped = pool.mapped
-    kept = numbers(pool, 60 * PAGE)  # which would leave a third of it unused
+    kept = numbers(pool, 60 * PAGE)  # a third of the piece would be unused
     assert kept.data_ptr() != address and pool.mapped < 2 * mapped
     other = numbers(pool, 95 * PAGE)
     assert other.data_ptr() != address
@@ -78,7 +78,7 @@ def test_little_more_is_mapped_than_was_in_use_at_one_time(pool: Pool) -> None:
 
 
 def test_an_iteration_like_the_last_maps_nothing(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most is in use at its end, and what only its beginning needs fits nothing then."""
+    """Most memory is in use at the end of an iteration. Pieces that only its beginning needs fit no tensor then."""
     mapped, map_one = [], pool._map
     monkeypatch.setattr(pool, "_map", lambda size: mapped.append(size) or map_one(size))
     for _ in range(4):

@@ -1,4 +1,4 @@
-"""Adam on all cores against its formula and against torch's own, as a class and in place of torch's function."""
+"""Adam on all cores, compared with its formula and with torch's Adam, as a class and in place of torch's function."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def threads() -> Iterator[Callable[[int], None]]:
 
 
 def gradients(shape: tuple[int, ...], seed: int, steps: int) -> list[Tensor]:
-    """Of all sizes, half of them zero."""
+    """Gradients of very different sizes, half of them zero."""
     generator = torch.Generator().manual_seed(seed)
 
     def random() -> Tensor:
@@ -52,7 +52,7 @@ def parameter(shape: tuple[int, ...]) -> torch.nn.Parameter:
 
 
 def train(optimizer: torch.optim.Optimizer, grads: list[Tensor], rates: Callable[[int], float] | None = None) -> Any:
-    """Parameter and moments after a step with each gradient."""
+    """Return parameter and moments after a step with each gradient."""
     group = optimizer.param_groups[0]
     (param,) = group["params"]
     for number, grad in enumerate(grads):
@@ -95,7 +95,7 @@ def test_torchs_own_are_a_few_roundings_away(options: dict[str, Any]) -> None:
     torchs = train(torch.optim.Adam([parameter((5000, 3))], lr=0.01, eps=1e-15, **options), grads)
     ours = train(Adam([parameter((5000, 3))], lr=0.01, eps=1e-15), grads)
     for a, b in zip(ours, torchs, strict=True):
-        # How many differ hangs on the vector instructions that torch finds: none to half of them.
+        # The number of differences, from none to half, depends on the vector instructions that torch uses.
         torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6)
 
 
@@ -325,7 +325,7 @@ def test_it_leaves_torchs_compiler_alone() -> None:
 
 @pytest.mark.parametrize("eps", [1e-15, 0.0])
 def test_numbers_that_never_had_a_gradient_are_torchs(eps: float) -> None:
-    """They stay, also zeros that are negative; without `eps` all become NaN, 0 / 0."""
+    """They do not change, not even negative zeros. Without `eps` all become NaN, 0 / 0."""
     generator = torch.Generator().manual_seed(4)
     values = torch.randn(200, 16, generator=generator)
     values[::3] = -0.0

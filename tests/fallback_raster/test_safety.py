@@ -1,4 +1,4 @@
-"""What used to crash the process, hang it or give a wrong image without a word."""
+"""Calls that used to crash or hang the process, or to give a wrong image silently."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ROOT = HERE.parents[1]
 
 
 def run(*command: str, timeout: float = 120, **environment: str) -> str:
-    """Runs Python in a process of its own, which must end well, and returns what it printed."""
+    """Run Python in a new process, which must succeed, and return its output."""
     found = subprocess.run(
         [sys.executable, *command],
         capture_output=True,
@@ -102,7 +102,7 @@ def test_signals_that_raise_at_any_time_do_not_crash() -> None:
 
 
 def everything() -> list[torch.Tensor]:
-    """Image and gradients of the loss, and a step of Adam."""
+    """Return image and gradients of the loss, and a step of Adam."""
     results = []
     for options in ({"packed": True, "absgrad": True}, {"packed": False, "render_mode": "RGB+ED"}):
         scene = {k: v.clone() if torch.is_tensor(v) else v for k, v in SCENE.items()}
@@ -312,7 +312,7 @@ def test_what_does_not_load_is_compiled_again_once(tmp_path: Path) -> None:
 
 
 def test_kernels_stay_inside_their_buffers() -> None:
-    """The core of the rasterizer's suite between guard zones; CI runs all of it so."""
+    """Run the core of the rasterizer's tests between guard zones. CI runs all of them so."""
     tests = ["test_against_reference.py", "test_adam.py", "test_threads.py"]
     chosen = "not tiles and not features and not near and not blur and not radius"
     options = ["-m", "pytest", "-q", "-x", "-k", chosen, "-p", "no:cacheprovider"]

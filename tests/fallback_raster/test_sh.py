@@ -1,4 +1,4 @@
-"""Colours from spherical harmonics: the same bits wherever the bands lie, and nothing of a row in its neighbours."""
+"""Colours from spherical harmonics: bit-equal for every layout of the bands, and independent of neighbouring rows."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def scene_with(n: int, coefficients: int) -> dict[str, Any]:
 
 
 def rendered(scene: dict[str, Any], colors: Tensor | tuple[Tensor, Tensor], degree: int) -> tuple[Tensor, Tensor]:
-    """Image and gradient of the means."""
+    """Return the image and the gradient of the means."""
     means = scene["means"].clone().requires_grad_()
     image, _, _ = rasterization(**(scene | {"means": means, "colors": colors, "sh_degree": degree}))
     image.square().sum().backward()
@@ -48,7 +48,7 @@ def test_bands_may_lie_together_or_apart(n: int, degree: int, coefficients: int)
 
 @pytest.mark.parametrize(("degree", "coefficients"), BANDS)
 def test_a_row_has_the_colour_that_it_has_alone(degree: int, coefficients: int) -> None:
-    """Gaussians without any overlap: what 16 rows share is time alone."""
+    """Gaussians without overlap: the 16 rows of a vector do not affect each other."""
     n = 37
     scene = scene_with(n, coefficients)
     columns = torch.arange(n, dtype=torch.float32)

@@ -1,4 +1,4 @@
-"""The lists of the tiles: front to back, equal depths in the order of the rows, however depths lie."""
+"""Tile lists are sorted front to back, equal depths in row order, for every distribution of depths."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows that are left out 16 at a time as spheres: the image is that of all rows, to the bit."""
+"""Rows are culled 16 at a time as spheres. The image equals that of all rows to the bit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skipgs_plug.fallback_raster.runtime.optimizations import without_optimizati
 
 
 def rendered(scene: dict[str, Any], **options: Any) -> list[Tensor]:
-    """Everything that a caller gets, and all gradients."""
+    """Return all results and all gradients."""
     inputs = leaves(scene, torch.float32, ("viewmats",))
     image, alpha, info = rasterization(**inputs, packed=False, **options)
     (image.sum() + alpha.sum()).backward()
@@ -27,7 +27,7 @@ def rendered(scene: dict[str, Any], **options: Any) -> list[Tensor]:
 
 
 def assert_equal_without(scene: dict[str, Any], **options: Any) -> Tensor:
-    """The radii, after the comparison of everything with and without."""
+    """Compare all results with and without the optimization, and return the radii."""
     with_spheres = rendered(scene, **options)
     with without_optimizations("spheres"):
         without = rendered(scene, **options)
@@ -37,7 +37,7 @@ def assert_equal_without(scene: dict[str, Any], **options: Any) -> Tensor:
 
 
 def sixteen_alike(scene: dict[str, Any], spread: float) -> dict[str, Any]:
-    """Every row becomes 16 rows at nearly the same place, as neighbours in memory."""
+    """Replace every row by 16 neighbouring rows at nearly the same position."""
     n = len(scene["means"])
     generator = torch.Generator().manual_seed(2)
     for name in ("means", "quats", "scales", "opacities", "colors"):
@@ -88,7 +88,7 @@ def test_rows_that_are_no_numbers(name: str, value: float) -> None:
 
 
 def test_rows_moved_in_place_are_seen_where_they_are() -> None:
-    """There is nothing to go stale: an optimizer moves rows into view and out of it between two images."""
+    """No state can become outdated: an optimizer moves rows into view and out of it between two images."""
     scene = sixteen_alike(random_scene(n=60), 0.02)
     for step in range(3):
         scene["means"] += torch.tensor([1.5 * (-1) ** step, 0.7, 0.0])

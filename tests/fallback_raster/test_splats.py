@@ -1,4 +1,4 @@
-"""Raw parameters: `rasterize_splats` is `rasterization` of their activations, values, gradients and lists."""
+"""`rasterize_splats` of raw parameters equals `rasterization` of their activations in values, gradients and lists."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def raw_scene(n: int = 700, **options: Any) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Raw parameters, and the camera and image size."""
+    """Return raw parameters, the camera and the image size."""
     scene = random_scene(n=n, sh_degree=3, **options)
     raw = {
         "means": scene["means"],
@@ -39,7 +39,7 @@ def raw_scene(n: int = 700, **options: Any) -> tuple[dict[str, Tensor], dict[str
 
 
 def activated(raw: dict[str, Tensor], camera: dict[str, Any], **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """The same image by the public function, with torch's activations."""
+    """Render the same image with the public function and torch's activations."""
     background = options.get("background")
     image, alpha, info = rasterization(
         raw["means"],
@@ -185,7 +185,7 @@ def test_planes_may_be_whole_numbers_and_what_lies_behind_the_camera_is_never_dr
 
 
 class AskedFor(LazyAdam):
-    """Remembers the rows that it was asked for."""
+    """Records the rows that it was called with."""
 
     def __init__(self, params: Any) -> None:
         super().__init__(params)

@@ -1,4 +1,4 @@
-"""gsplat's DefaultStrategy works on the rasterizer's info as on gsplat's own."""
+"""gsplat's DefaultStrategy works with the rasterizer's info as with gsplat's own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Finite in, finite out: extreme but finite inputs give finite images and gradients, and nothing crashes.
+"""Extreme but finite inputs give finite images and gradients, and nothing crashes.
 
 The default run is a sample. The long one:
 `pytest tests/fallback_raster/test_stress.py --stress-examples 10000`.
@@ -43,7 +43,7 @@ def magnitudes(generator: torch.Generator, low: float, high: float, *shape: int)
 
 
 def extreme_scene(draw: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of `rasterization` for one drawn combination of extremes."""
+    """Return arguments of `rasterization` for one drawn combination of extremes."""
     n, cameras, (width, height) = draw["n"], draw["cameras"], draw["size"]
     generator = torch.Generator().manual_seed(draw["seed"])
 
@@ -115,7 +115,7 @@ def extreme_scene(draw: dict[str, Any]) -> dict[str, Any]:
 
 
 def strided(value: Tensor) -> Tensor:
-    """The same values with gaps between them in memory and all dimensions in reverse order."""
+    """Return the same values with gaps in memory and all dimensions in reverse order."""
     backwards = tuple(reversed(range(value.dim())))
     gaps = value.new_full((*value.shape[::-1], 2), float("nan"))
     gaps[..., 0] = value.permute(backwards)
@@ -123,7 +123,7 @@ def strided(value: Tensor) -> Tensor:
 
 
 def check_finite(scene: dict[str, Any]) -> None:
-    """Render, go back, and look at every number that comes out."""
+    """Render, run the backward pass, and check every number of the results."""
     image, alpha, info = rasterization(**scene)
     cameras = scene["viewmats"].shape[0]
     assert image.shape[:3] == (cameras, scene["height"], scene["width"])

@@ -1,4 +1,4 @@
-"""Helpers run a kernel along with its caller, which comes back when the last of them is done."""
+"""Helpers run a kernel together with the caller, which returns when the last of them has finished."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skipgs_plug import fallback_raster
 from skipgs_plug.fallback_raster.runtime.native import Kernel
 from skipgs_plug.fallback_raster.runtime.thread_pool import ThreadPool
 
-PATIENCE = 2e-4  # seconds after which threads sleep, about
+SPIN_SECONDS = 2e-4  # time after which spinning threads sleep, about
 
 
 class Block(ctypes.Structure):
@@ -24,7 +24,7 @@ class Block(ctypes.Structure):
 
 
 def kernel(work: Callable[[int], None]) -> Kernel:
-    """One that calls Python, with the number in its block."""
+    """A kernel that calls Python with the number in its arguments."""
 
     def body(bounds: int, block: int) -> None:
         assert bounds == 7
@@ -51,7 +51,7 @@ def test_all_that_began_are_done_when_a_launch_returns(pool: ThreadPool) -> None
     def work(number: int) -> None:
         me = number, threading.get_ident()
         begun.append(me)
-        time.sleep(lengths.choice([0, 0, PATIENCE / 10, PATIENCE, 4 * PATIENCE]))
+        time.sleep(lengths.choice([0, 0, SPIN_SECONDS / 10, SPIN_SECONDS, 4 * SPIN_SECONDS]))
         ended.append(me)
 
     working = kernel(work)
@@ -62,7 +62,7 @@ def test_all_that_began_are_done_when_a_launch_returns(pool: ThreadPool) -> None
         assert threading.get_ident() in mine
         assert len(set(mine)) == len(mine) <= 1 + pool._count
         if number % 3 == 0:  # let helpers fall asleep, or not
-            time.sleep(lengths.choice([PATIENCE / 10, 3 * PATIENCE]))
+            time.sleep(lengths.choice([SPIN_SECONDS / 10, 3 * SPIN_SECONDS]))
     assert len({thread for _, thread in ended}) == 1 + pool._count
 
 
@@ -70,7 +70,7 @@ def test_helpers_that_sleep_are_woken(pool: ThreadPool) -> None:
     together = threading.Barrier(1 + pool._count)
     meeting = kernel(lambda _: together.wait(10) and None)
     for _ in range(3):
-        time.sleep(20 * PATIENCE)
+        time.sleep(20 * SPIN_SECONDS)
         pool.run(meeting, bytes(Block(0)))
     assert not together.broken
 

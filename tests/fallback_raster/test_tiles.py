@@ -1,4 +1,4 @@
-"""Which tiles Gaussians are listed in: all with a pixel at alpha >= 1/255, and none that the ellipse keeps clear of."""
+"""Gaussians are listed in all tiles with a pixel at alpha >= 1/255, and in no tile that the ellipse does not reach."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIZE = 330, 300  # 21 x 19 tiles: more rows than a vector has lanes, cut off on 
 
 
 def ellipses(n: int, seed: int) -> Splats:
-    """Centres, depths, conics, opacities and sigmas of points, discs and needles, from a pixel to the whole image."""
+    """Return 2D means, depths, conics, opacities and sigmas of points, discs and needles, from pixel to image size."""
     generator = torch.Generator().manual_seed(seed)
     draw = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
     centres = draw(n, 2) * torch.tensor([420.0, 380.0]) - 40.0
@@ -34,7 +34,7 @@ def ellipses(n: int, seed: int) -> Splats:
 
 
 def listed_tiles(bins: Bins, n: int) -> Tensor:
-    """How often each Gaussian [n] is listed in each tile, [n, tiles]."""
+    """Return how often each Gaussian [n] is listed in each tile. [n, tiles]"""
     bins.sort()
     count = len(bins.tile_start) - 1
     tile = torch.repeat_interleave(torch.arange(count), bins.tile_start.diff().long())
@@ -43,7 +43,7 @@ def listed_tiles(bins: Bins, n: int) -> Tensor:
 
 
 def tiles_with(pixels: Tensor) -> Tensor:
-    """[n, tiles]: those that hold one of the `pixels` [n, H, W]."""
+    """Mask the tiles that contain one of the `pixels` [n, H, W]. [n, tiles]"""
     width, height = SIZE
     tiles_x, tiles_y = tiles(width, height)
     padded = torch.nn.functional.pad(pixels, (0, TILE * tiles_x - width, 0, TILE * tiles_y - height))
@@ -51,7 +51,7 @@ def tiles_with(pixels: Tensor) -> Tensor:
 
 
 def least_in_tiles(centres: Tensor, conics: Tensor, margin: float) -> Tensor:
-    """The least squared distance in standard deviations, [n, tiles], in the pixels' rectangle of each and a margin."""
+    """Return the smallest squared distance in standard deviations in each tile's rectangle with a margin. [n, tiles]"""
     tiles_x, tiles_y = tiles(*SIZE)
     left = TILE * torch.arange(tiles_x, dtype=torch.float64).repeat(tiles_y) + 0.5 - margin - centres[:, :1]
     top = TILE * torch.arange(tiles_y, dtype=torch.float64).repeat_interleave(tiles_x) + 0.5 - margin - centres[:, 1:]

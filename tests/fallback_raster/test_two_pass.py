@@ -1,4 +1,4 @@
-"""Lists that end where pixels are filled: the image is that of whole lists, to the bit, wherever they end."""
+"""First lists may end at any depth: the image equals that of whole lists to the bit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from skipgs_plug.fallback_raster.stages import binning, compose, two_pass
 
 
 def rendered(scene: dict[str, Any], **options: Any) -> tuple[list[Tensor], list[Tensor]]:
-    """What must be equal, and gradients."""
+    """Return the results that must be equal, and gradients."""
     inputs = leaves(scene, torch.float32, ("viewmats",))
     image, alpha, info = rasterization(**inputs, **options)
     weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(1))
@@ -39,7 +39,7 @@ def assert_same(one: tuple[list[Tensor], list[Tensor]], other: tuple[list[Tensor
 
 
 def ending_at(monkeypatch: pytest.MonkeyPatch, depths: Any) -> list[int]:
-    """Let first lists end at `depths(tiles)`; the numbers of second lists are appended to what is returned."""
+    """Let first lists end at `depths(tiles)`. Returns a list to which the lengths of second lists are appended."""
     lists: list[int] = []
 
     def ranges(visible: Tensor, splats: Any, *size: int) -> Tensor:
@@ -89,7 +89,7 @@ def test_what_only_just_reaches_an_open_tile_is_listed_there(monkeypatch: pytest
     scene["opacities"] = 0.02 + 0.08 * torch.rand(600, generator=generator)
     with without_optimizations("two_pass"):
         whole = rendered(scene)
-    # Nothing is listed at first in the tiles of one column, and everything in all others, which so are not open.
+    # First lists are empty in the tiles of one column, and complete in all others, which are not open then.
     everything = torch.tensor(two_pass.NO_DEPTH, dtype=torch.int32).view(torch.float32)
     lists = ending_at(monkeypatch, lambda count: torch.where(torch.arange(count) % 5 == 1, 0.5, everything))
     assert_same(rendered(scene), whole)

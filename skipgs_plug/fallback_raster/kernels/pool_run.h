@@ -5,7 +5,7 @@
 #pragma once
 #include "lib/thread_pool.h"
 static constexpr auto pool_run = [](ThreadPool& pool, void (*function)(void*, void*), void* bounds, void* arguments,
-                                    int helpers, int patience) INLINE {
+                                    int helpers, int max_spins) INLINE {
     const auto wake = [&]() {
         for (int i = 0; i < helpers; ++i)
             if (__atomic_exchange_n(&pool.helpers[i].sleeps, 0, __ATOMIC_SEQ_CST))
@@ -27,7 +27,7 @@ static constexpr auto pool_run = [](ThreadPool& pool, void (*function)(void*, vo
     // Close the launch: a helper that has not joined yet would find no work left.
     const int joined = (int)(__atomic_fetch_and(&pool.state, ~ACCEPTS_HELPERS, __ATOMIC_SEQ_CST) & (ACCEPTS_HELPERS - 1));
     const auto done = [&]() { return __atomic_load_n(&pool.finished, __ATOMIC_SEQ_CST) == joined; };
-    for (int spins = 0; spins < patience && !done(); ++spins) PAUSE();
+    for (int spins = 0; spins < max_spins && !done(); ++spins) PAUSE();
     while (!done()) {
         __atomic_store_n(&pool.caller_sleeps, 1, __ATOMIC_SEQ_CST);
         // The last helper may have read the mark before it was set. Then it wakes nobody, and the caller must not

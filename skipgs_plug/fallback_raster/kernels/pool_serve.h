@@ -3,7 +3,7 @@
 // Reads the launch in `pool`. Writes its own cache line there, and adds to `finished`. All threads update `pool.state`.
 #pragma once
 #include "lib/thread_pool.h"
-static constexpr auto pool_serve = [](ThreadPool& pool, int number, int patience) INLINE {
+static constexpr auto pool_serve = [](ThreadPool& pool, int number, int max_spins) INLINE {
     ThreadPool::Helper& own = pool.helpers[number];
     unsigned last = 0;
     for (;;) {
@@ -11,7 +11,7 @@ static constexpr auto pool_serve = [](ThreadPool& pool, int number, int patience
         for (int spins = 0;; ++spins) {
             state = __atomic_load_n(&pool.state, __ATOMIC_SEQ_CST);
             if ((unsigned)(state >> 32) != last || __atomic_load_n(&pool.stop, __ATOMIC_SEQ_CST)) break;
-            if (spins < patience) {
+            if (spins < max_spins) {
                 PAUSE();
                 continue;
             }

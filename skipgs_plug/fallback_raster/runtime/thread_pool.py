@@ -17,7 +17,7 @@ from .source import PRELUDE, read_kernel
 
 # Times that a thread checks for a launch before it sleeps: 100 to 200 us on x86. More spins take processor time from
 # other programs, fewer delay launches.
-_SPINS = 5000
+_MAX_SPINS = 5000
 
 # Bytes of a cache line. Each thread has a line of its own in `kernels/lib/thread_pool.h`: threads that write to a
 # shared line would pass it to and fro.
@@ -46,7 +46,7 @@ class ThreadPool:
     def __init__(self, count: int) -> None:
         self._count = count
         # With more threads than cores, a spinning thread would keep another from its work.
-        self._patience = _SPINS if count < usable_cores() else 0
+        self._max_spins = _MAX_SPINS if count < usable_cores() else 0
         self._server, self._launcher = load_pool_kernels()
         self._memory = (ctypes.c_char * (_LINE_BYTES * (_FIRST_HELPER_LINE + count + 1)))()
         self._address = -(-ctypes.addressof(self._memory) // _LINE_BYTES) * _LINE_BYTES
@@ -78,11 +78,11 @@ class ThreadPool:
         return lock
 
     def _launch(self, *addresses: int) -> None:
-        self._launcher(self._launcher.pack(self._address, *addresses, self._count, self._patience))
+        self._launcher(self._launcher.pack(self._address, *addresses, self._count, self._max_spins))
 
     def _serve(self, number: int) -> None:
         try:
-            self._server(self._server.pack(self._address, number, self._patience))
+            self._server(self._server.pack(self._address, number, self._max_spins))
         finally:
             self._alive.remove(number)
 
@@ -95,8 +95,8 @@ def load_pool_kernels() -> tuple[Kernel, Kernel]:
             pool = {"pool": "*(ThreadPool*)"}
             launch = pool | {"function": "(void (*)(void*, void*))", "bounds": "(void*)", "arguments": "(void*)"}
             _kernels = (
-                _load("pool_serve", pool, ["number", "patience"]),
-                _load("pool_run", launch, ["helpers", "patience"]),
+                _load("pool_serve", pool, ["number", "max_spins"]),
+                _load("pool_run", launch, ["helpers", "max_spins"]),
             )
         return _kernels
 
