@@ -1,4 +1,4 @@
-"""Values that an option of the bench may have."""
+"""Possible values of the bench's options."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""Control policies: they skip as often as the gate did, without looking at any loss. Standard library only."""
+"""Control policies that skip as often as the gate did, without reading any loss. Standard library only."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ SKIP = Decision(True, "planned")
 
 
 class PlannedSkipping(Policy):
-    """Skips exactly the iterations of a plan made beforehand.
+    """Skips exactly the iterations of a plan.
 
     Args:
-        first: first iteration after warm-up; earlier ones are never skipped.
-        end: iteration after the last.
-        skips: iterations whose backward is left out.
+        first: First iteration after warm-up. Earlier iterations are never skipped.
+        end: Iteration after the last.
+        skips: Iterations whose backward pass is left out.
     """
 
     def __init__(self, first: int, end: int, skips: Iterable[int]) -> None:
@@ -29,7 +29,7 @@ class PlannedSkipping(Policy):
 
     @property
     def floor(self) -> float:
-        """Share of the iterations after warm-up that run a backward."""
+        """Share of the iterations after warm-up with a backward pass."""
         return 1.0 - len(self.skips) / max(self.end - self.first, 1)
 
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
@@ -38,7 +38,7 @@ class PlannedSkipping(Policy):
         return SKIP if step in self.skips else RUN
 
     def notify_event(self, step: int, n_views: int) -> None:
-        """A plan does not react."""
+        """Do nothing: a plan does not react to events."""
 
     def state_dict(self) -> dict[str, Any]:
         return {"first": self.first, "skips": sorted(self.skips)}
@@ -49,7 +49,7 @@ class PlannedSkipping(Policy):
 
 
 def random_skipping(first: int, end: int, n_skips: int, seed: int) -> PlannedSkipping:
-    """Skip `n_skips` of the iterations first..end-1, every choice equally likely, from an own generator."""
+    """Skip `n_skips` of the iterations first..end-1, every choice equally likely."""
     return PlannedSkipping(first, end, random.Random(seed).sample(range(first, end), n_skips))
 
 

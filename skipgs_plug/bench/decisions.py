@@ -1,12 +1,12 @@
-"""decisions.json: every decision of every run, small enough to be stored with the results.
+"""decisions.json: every decision of every run, small enough to store with the results.
 
     {"kind": "skipgs-decisions", "schema_version": 1, "start": 1500,
      "views": {"0": "12 3 15 ..."},                          by seed: index of the view of each iteration that ran
      "runs": {"0": {"own": "-1500", "gate": "w34dD3b"}}}  by seed and policy: letters, each with its repetitions
 
-The letters are those of REASON_CODES; upper case means that the backward was skipped, a point that the whole iteration
-was left out. All policies of a seed see the same views in the same order, one that runs fewer iterations only the first
-of them. Losses and means of a trace are left out.
+The letters are explained in REASON_CODES. Upper case means that the backward was skipped, a point that the whole
+iteration was left out. All policies of a seed see the same views in the same order. A policy with fewer iterations sees
+the first of them. Losses and means are not stored.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def read_decisions(path: Path) -> dict[tuple[int, str], Trace]:
     """Return traces without losses and means, by seed and policy.
 
     Raises:
-        InputError: the file is damaged or of another version; names it.
+        InputError: The file is damaged or of another version.
     """
     try:
         content: dict[str, Any] = json.loads(path.read_text())
@@ -66,7 +66,7 @@ def read_decisions(path: Path) -> dict[tuple[int, str], Trace]:
 
 
 def packed(codes: str) -> str:
-    """Return letters with the number of times that each stands in a row, left out when it is one."""
+    """Return run-length encoded letters: each letter is followed by its number of repetitions if that is above 1."""
     runs = ((letter, len(list(same))) for letter, same in groupby(codes))
     return "".join(letter if count == 1 else f"{letter}{count}" for letter, count in runs)
 
@@ -75,7 +75,7 @@ def unpacked(letters: str) -> str:
     """Undo `packed`.
 
     Raises:
-        ValueError: it is not such a string.
+        ValueError: The string is not a result of `packed`.
     """
     if not re.fullmatch(r"([a-zA-Z.-]\d*)*", letters):
         raise ValueError("letters and repetitions are mixed up")

@@ -1,4 +1,4 @@
-"""Policies by name, of both kinds of bench."""
+"""Find policies of both kinds of bench by name."""
 
 from __future__ import annotations
 
@@ -14,5 +14,5 @@ def find_policy(name: str, whole: bool) -> Policy | None:
 
 
 def known_policies(whole: bool) -> Mapping[str, Policy]:
-    """Return the policies that run unless others are named."""
+    """Return the policies that run by default."""
     return WHOLE_POLICIES if whole else POLICIES

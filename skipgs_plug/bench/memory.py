@@ -1,4 +1,4 @@
-"""Peak memory of a part of a process: of PyTorch on the GPU, of the whole process on the CPU."""
+"""Peak memory of a part of a run: PyTorch's memory on the GPU, memory of the whole process on the CPU."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ import torch
 from skipgs_plug.fallback_raster import release_memory
 
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-RESET_PEAK = "5"  # as proc(5) has it
+RESET_PEAK = "5"  # resets VmHWM, see proc(5)
 
 
 class MemoryMeter(Protocol):
     """Measures the peak of memory since the last reset."""
 
     def reset(self) -> int:
-        """Forget the peak so far; returns the bytes in use."""
+        """Forget the peak so far, and return the bytes in use."""
         ...
 
     def peak(self) -> int:
-        """Most bytes in use since then."""
+        """Return the largest number of bytes in use since the last reset."""
         ...
 
 
 class CudaMeter:
-    """Bytes that PyTorch has given out on a GPU."""
+    """Measures the bytes that PyTorch has allocated on a GPU."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
@@ -42,13 +42,13 @@ class CudaMeter:
 
 
 class ProcessMeter:
-    """Bytes of this process that lie in memory, as Linux counts them.
+    """Measures the resident bytes of this process on Linux.
 
-    Freed memory goes back to the system first. Else a run would reuse the memory of another and seem to need less.
+    A reset returns freed memory to the system. Otherwise a run would reuse the memory of another run and seem smaller.
     """
 
     def __init__(self) -> None:
-        self._trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc
+        self._trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # a function of glibc
 
     def reset(self) -> int:
         release_memory()
@@ -77,7 +77,7 @@ def memory_meter(device: torch.device) -> MemoryMeter | None:
 
 
 def _status(name: str) -> int:
-    """Return a line of /proc/self/status in bytes."""
+    """Return the value of a line of /proc/self/status in bytes."""
     found = re.search(rf"^{name}:\s*(\d+) kB$", STATUS.read_text(), re.MULTILINE)
     if found is None:
         raise OSError(f"{STATUS} has no line {name}")

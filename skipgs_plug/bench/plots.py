@@ -23,14 +23,14 @@ COLOURS = ("#000000", "#D55E00", "#E69F00", "#CC79A7", "#0072B2", "#56B4E9", "#0
 MARKERS = "so^vDPX"
 PHASES = {"forward": "#0072B2", "loss": "#56B4E9", "backward": "#D55E00", "optimizer": "#E69F00", "strategy": "#009E73"}
 NOT_VISITED, RUN, SKIPPED = 0, 1, 2
-EXAMPLES = 3  # views with a plot of their own
-SMALL = 9  # font size of legends, points
+EXAMPLES = 3  # views with a plot of their own, so that all fit on one page
+SMALL = 9  # font size of legends in points: small enough for eleven policies
 
 
 def write_plots(
     folder: Path, records: Sequence[RunRecord], rows: Sequence[Row], view_names: Sequence[str], whole: bool = False
 ) -> None:
-    """Write every picture that the finished runs, whole ones or refinements, give data for."""
+    """Write every plot for which the finished runs have data, for whole runs or for refinements."""
     done = [record for record in records if record.status == "done"]
     if not done:
         return
@@ -48,15 +48,15 @@ def write_plots(
 
 
 def style(policy: str, whole: bool = False) -> tuple[str, str]:
-    """Return colour and marker of a policy by its place in its table, the last for one that is not there."""
+    """Return colour and marker of a policy by its place in the table. An unknown policy gets the last place."""
     known = list(known_policies(whole))
     index = known.index(policy) if policy in known else zlib.crc32(policy.encode()) % len(COLOURS) - len(COLOURS)
-    # The markers lag behind the colours by one in every further round, so that the pairs differ.
+    # Markers shift against colours by one per round, so that all pairs differ.
     return COLOURS[index % len(COLOURS)], MARKERS[(index + index // len(COLOURS)) % len(MARKERS)]
 
 
 def looks_at_losses(run: RunRecord) -> bool:
-    """Whether a policy that keeps means of losses decided in this run."""
+    """Whether the policy of this run keeps means of losses."""
     return run.trace is not None and any(mean is not None for mean in run.trace.mean)
 
 
@@ -125,7 +125,7 @@ def phases(rows: Sequence[Row], whole: bool = False) -> Figure:
     names = [row.policy for row in rows]
     for phase, colour in PHASES.items():
         if any(f"share_{phase}" not in row.values for row in rows):
-            continue  # of refinements there is no densification
+            continue  # refinement has no densification
         width = np.array([r.values[f"share_{phase}"].mean * r.values[time].mean / 100 for r in rows])
         axes.barh(names, width, left=left, color=colour, label=phase, height=0.7)
         left += width

@@ -1,8 +1,8 @@
 """Policies of refinement after one densification: the trainer's own, the gate, fewer iterations, and controls.
 
-A policy has the name of the settings that a user would give to `SkipGate`: `gate`, `refine_share=auto`, and further
-settings after a comma. A new policy is one entry of POLICIES. It makes its gate and its number of iterations itself,
-from a trainer at the end of densification and from the finished runs of the same seed, whose rate or time it may copy.
+The name of a policy is the settings that a user would give to `SkipGate`: `gate`, `refine_share=auto`, and further
+settings after a comma. A new policy is one entry of POLICIES. It makes its gate and its number of iterations from a
+trainer at the end of densification and from the finished runs of the same seed, whose rate or time it may copy.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ REFERENCE = "own"  # policy that all others are compared with
 COPIED = "refine_share=0.4"  # policy whose steps and iterations the controls copy
 Earlier = Mapping[str, RunRecord]
 GateMaker = Callable[[Trainer, Earlier], SkipGate | None]
-Plan = Callable[[int, int, int, int], PlannedSkipping]  # of first, end, number of skips, seed
+Plan = Callable[[int, int, int, int], PlannedSkipping]  # arguments: first, end, number of skips, seed
 
 
 def gate_with(**settings: Any) -> GateMaker:
-    """Return a function that attaches a gate; `settings` are the arguments of SkipGate that differ from the default."""
-    # A loss that is not finite ends the run: a bench must not average over it.
+    """Return a function that attaches a gate. `settings` are arguments of SkipGate."""
+    # A loss that is not finite ends the run, since a bench must not average over it.
     return lambda trainer, earlier: SkipGate(trainer, record_trace=True, on_nonfinite="raise", **settings)
 
 
@@ -65,7 +65,7 @@ def stepping_as(name: str) -> GateMaker:
 
 
 def refine_share_as_long_as(name: str) -> GateMaker:
-    """Return a function that leaves out so many iterations that the rest takes as long as policy `name`."""
+    """Return a function that leaves out iterations until the rest takes as long as policy `name`."""
 
     def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
         return gate_with(refine_share=share_of_time(name, earlier))(trainer, earlier)  # type: ignore[return-value]
@@ -79,7 +79,7 @@ def share_of_time(name: str, earlier: Earlier) -> float:
 
 
 def no_gate(trainer: Trainer, earlier: Earlier) -> None:
-    """Attach nothing."""
+    """Attach no gate."""
 
 
 def all_iterations(trainer: Trainer, earlier: Earlier) -> int:
@@ -92,9 +92,9 @@ class Policy:
     """One row of a comparison.
 
     Attributes:
-        name: as given to --policies.
-        meaning: one line for people.
-        needs: policies of the same seed that must have run before, because it copies their rate or time.
+        name: Name for --policies.
+        meaning: One line that explains it.
+        needs: Policies of the same seed that must run before it, because it copies their rate or time.
     """
 
     name: str
@@ -108,7 +108,8 @@ class PolicySpec(Policy):
 
     Attributes:
         gate: Attaches the gate of this policy to a trainer and returns it; None for a run without a gate.
-        iterations: number of iterations; fewer than are left run through the same schedule, compressed.
+        iterations: Returns the number of iterations. If it is smaller than the rest of the run, the schedule of the
+            rest is compressed.
     """
 
     gate: GateMaker = no_gate
@@ -205,12 +206,12 @@ def number_after(setting: str, name: str) -> float | None:
 
 
 def check_policies(names: Sequence[str], find: Callable[[str], Policy | None], known: Mapping[str, Policy]) -> None:
-    """Raise InputError for no policy, one that does not exist, is given twice, or lacks one that it needs.
+    """Raise InputError if no policy is given, or if one is unknown, given twice, or lacks a policy that it needs.
 
     Args:
-        names: Policies that are to run.
+        names: Policies to run.
         find: Returns the policy with a name, or None if it does not exist.
-        known: Policies to name in a refusal.
+        known: Policies that the message lists.
     """
     if not names:
         raise InputError(f"--policies is empty; give some of {', '.join(known)}, or leave it out for all.")
@@ -222,13 +223,13 @@ def check_policies(names: Sequence[str], find: Callable[[str], Policy | None], k
             raise InputError(f"Policy {name!r} is given twice.")
         missing = [other for other in spec.needs if other not in names]
         if missing:
-            raise InputError(f"Policy {name!r} copies what {missing[0]!r} measured; add {missing[0]} to --policies.")
+            raise InputError(f"Policy {name!r} copies rate or time of {missing[0]!r}; add {missing[0]} to --policies.")
 
 
 def rounds(specs: Sequence[AnyPolicy], position: int) -> list[list[AnyPolicy]]:
     """Return groups that run in turns: policies that copy nothing, then policies that copy from them, and so on.
 
-    The order within a round is rotated by `position`, that of the seed.
+    The order within a group is rotated by `position`, the place of the seed among all seeds.
     """
     waiting = list(specs)
     done: set[str] = set()

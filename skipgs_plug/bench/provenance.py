@@ -1,4 +1,4 @@
-"""Where numbers come from: machine, versions, commit, scene, images, split."""
+"""Provenance of the numbers: machine, versions, commit, scene, images, split."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skipgs_plug.trainer import Scene, TrainConfig
 from skipgs_plug.trainer.backend import Backend
 from skipgs_plug.trainer.near_plane import near_plane
 
-MEASURING = ("skipgs_plug", "benchmarks/*.py")  # the code that figures come from
+MEASURING = ("skipgs_plug", "benchmarks/*.py")  # code that the figures depend on
 PACKAGES = ("torch", "warp-lang", "gsplat", "numpy", "torchmetrics")
 
 
@@ -46,7 +46,7 @@ def cpu_name() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python, of this package, and of the packages that compute."""
+    """Return the versions of Python, of this package, and of the packages that it computes with."""
     found = {"python": platform.python_version()}
     for name in ("skipgs_plug", *PACKAGES):
         try:
@@ -57,7 +57,7 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str | None:
-    """Return the commit of this package's own checkout, "+" added when its code differs; None outside of one."""
+    """Return the commit of this package's checkout, with "+" if its code differs; None without a checkout."""
     root = Path(skipgs_plug.__file__).parents[1]
     if not (root / ".git").exists():
         return None
@@ -75,7 +75,7 @@ def git(root: Path, *arguments: str) -> str:
 
 
 def scene_facts(scene: Scene, config: TrainConfig) -> dict[str, Any]:
-    """Return the facts that a reader needs to compare numbers: images and their source, factor, split."""
+    """Return facts about a scene with which readers can compare numbers: images, their source, factor, split."""
     sizes = sorted({(view.width, view.height) for view in scene.train + scene.test})
     return {
         "name": scene.name,

@@ -23,8 +23,8 @@ REASON_CODES = {
     "watched": "v",
     "over": "e",
 }
-OTHER_REASON = "u"  # a reason of a policy that is not in the table
-LEFT_OUT = "."  # the whole iteration was left out, forward too
+OTHER_REASON = "u"  # a reason outside the table
+LEFT_OUT = "."  # the whole iteration was left out, forward pass included
 DIGITS = 5  # significant digits of losses and means in a trace: more only make the files larger
 
 
@@ -33,11 +33,11 @@ class Trace:
     """Every decision of one refinement, or whole run, one entry per iteration number.
 
     Attributes:
-        start: iteration of the first entry.
-        view: index into the list of training views; None for an iteration that was left out.
-        loss: loss that was decided on; None for an iteration that was left out.
+        start: Iteration of the first entry.
+        view: Index into the list of training views; None for a left-out iteration.
+        loss: Loss that the decision read; None for a left-out iteration.
         mean: The view's running mean before this loss; None for a view without a mean.
-        codes: reason letters, see REASON_CODES, or LEFT_OUT.
+        codes: One letter per iteration, from REASON_CODES, or LEFT_OUT.
     """
 
     start: int
@@ -47,12 +47,12 @@ class Trace:
     codes: str = ""
 
     def add(self, view: int, loss: float, mean: float | None, reason: str, skip: bool) -> None:
-        """Append an iteration that ran its forward."""
+        """Append an iteration that ran its forward pass."""
         code = REASON_CODES.get(reason, OTHER_REASON)
         self._append(view, rounded(loss), None if mean is None else rounded(mean), code.upper() if skip else code)
 
     def fill(self, end: int) -> None:
-        """Append the iterations before `end` that are missing: they were left out."""
+        """Append the missing iterations before `end`, which were left out."""
         for _ in range(self.end, end):
             self._append(None, None, None, LEFT_OUT)
 
@@ -63,12 +63,12 @@ class Trace:
 
     @property
     def ran(self) -> list[bool]:
-        """Whether the iteration ran, if only its forward."""
+        """Whether each iteration ran, at least its forward pass."""
         return [code != LEFT_OUT for code in self.codes]
 
     @property
     def skipped(self) -> list[bool]:
-        """Whether the iteration ran its forward and skipped its backward."""
+        """Whether each iteration ran its forward pass and skipped its backward pass."""
         return [code.isupper() for code in self.codes]
 
     def _append(self, view: int | None, loss: float | None, mean: float | None, code: str) -> None:
@@ -83,7 +83,7 @@ class Point:
     """One evaluation on held-out views, outside the clock."""
 
     step: int
-    seconds: float  # of refinement, or of the whole run, so far
+    seconds: float  # time of refinement, or of the whole run, so far
     metrics: dict[str, float]  # by the names of trainer.metrics.METRICS
 
     def as_dict(self) -> dict[str, Any]:
@@ -100,28 +100,28 @@ class RunRecord:
     """One seed under one policy.
 
     Attributes:
-        status: "done"; "diverged" (its loss stopped being finite); "not run" (the policy that it copies diverged).
-        note: one sentence for a run that is not done.
+        status: "done", "diverged" (a loss was not finite), or "not run" (the policy that it copies diverged).
+        note: One sentence about a run that is not done.
         iterations: Iterations of refinement by number, including those that were left out.
         iterations_run: Iterations that ran, even if only their forward pass did.
-        backwards: of refinement.
-        warm_up: refinement iterations that the gate kept from skipping; 0 without a gate.
-        floor: least share of backwards in force at the end; None without a gate.
+        backwards: Backward passes of refinement.
+        warm_up: Warm-up iterations, in which the gate does not skip; 0 without a gate.
+        floor: Smallest share of backward passes in force at the end; None without a gate.
         gaussians_shown: Share of the Gaussians that a view shows; None if steps are not larger.
-        reasons: gated decisions by reason; empty without a gate.
-        t_post, t_total: seconds of training, of refinement and in all, by the clock of the bench.
-        seconds: both by both clocks, see `TrainClock.seconds`.
-        phases: seconds of refinement, or of the whole run, in forward, loss, backward, optimizer, strategy.
-        metrics: held-out, by the names of trainer.metrics.METRICS; num_GS.
-        train_metrics: the same on the training views, without LPIPS.
-        exact_views: held-out views that are hit exactly in the end, whose PSNR is infinite.
-        points: evaluations on held-out views: before, on the way, at the end.
-        peak_memory: most bytes in use, on the GPU or of the process, those of other runs in turns excluded; None where
-            the system does not tell.
-        chosen: shares and factor on rates in a whole run that leaves out iterations: `grow_share`, `grow_rate_factor`,
-            `refine_share`; empty otherwise.
+        reasons: Number of gated decisions by reason; empty without a gate.
+        t_post, t_total: Seconds of refinement and of the whole training, by the clock of the bench.
+        seconds: Both times by both clocks, see `TrainClock.seconds`.
+        phases: Seconds of refinement, or of the whole run, in forward, loss, backward, optimizer, strategy.
+        metrics: Metrics on held-out views, by the names of trainer.metrics.METRICS, and num_GS.
+        train_metrics: The same on the training views, without LPIPS.
+        exact_views: Number of held-out views that the final model renders exactly, with infinite PSNR.
+        points: Evaluations on held-out views: before, on the way, at the end.
+        peak_memory: Largest number of bytes in use, on the GPU or by the process, without other runs that take turns;
+            None if the system does not report it.
+        chosen: Shares and rate factor that a whole run chose: `grow_share`, `grow_rate_factor`, `refine_share`; empty
+            if it leaves out no iterations.
         tries: Settings that a search tried, with their results; empty without a search.
-        commit: of this package, when it ran.
+        commit: Commit of this package during the run.
     """
 
     seed: int
@@ -151,7 +151,7 @@ class RunRecord:
 
     @property
     def skips(self) -> int:
-        """Backwards skipped in iterations that ran."""
+        """Number of backward passes skipped in iterations that ran."""
         return self.iterations_run - self.backwards
 
     def as_dict(self, with_trace: bool = True) -> dict[str, Any]:
@@ -166,11 +166,11 @@ class RunRecord:
         """Undo `as_dict`.
 
         Raises:
-            KeyError, TypeError: a field is missing, or one is of another version.
+            KeyError, TypeError: A field is missing, or the record is of another version.
         """
         record = cls(**content)
         for name in (known.name for known in dataclasses.fields(cls)):
-            content[name]  # a run of an older version lacks the fields with a default
+            content[name]  # KeyError for a run of an older version, which lacks fields that have a default
         record.points = [Point.from_dict(point) for point in content["points"]]
         record.trace = None if content["trace"] is None else Trace(**content["trace"])
         return record

@@ -23,22 +23,22 @@ from skipgs_plug.trainer.scalars import ScalarLog
 PARTS = 10  # parts of refinement, each followed by an evaluation; policies take turns by part
 
 
-MOST_DB = 100.0  # PSNR of an image, at most: an exact image, such as bare background, would have an infinite one
+MOST_DB = 100.0  # PSNR of an image in dB, at most: an exact image, such as bare background, has an infinite PSNR
 
 
 class DivergedError(Exception):
-    """A loss or a metric is not finite any more; one sentence says where."""
+    """A loss or a metric is no longer finite. The message says where."""
 
 
 class NotRunError(Exception):
-    """A policy has no meaning for this run; one sentence says why."""
+    """A policy has no meaning for this run. The message says why."""
 
 
 def densify(trainer: Trainer, progress: bool = True, scalars: Path | None = None) -> None:
-    """Train up to the end of densification; `scalars` as in `refine`.
+    """Train up to the end of densification; `scalars` is a folder for TensorBoard scalars.
 
     Raises:
-        DivergedError: a loss is not finite.
+        DivergedError: A loss is not finite.
     """
     with finite_losses(trainer), logged(trainer, scalars) as log:
         trainer.on_step = None if log is None else log.iteration
@@ -56,16 +56,17 @@ def refine(
     """Refine to the end of the schedule under one policy, in PARTS equal parts with a pause after each but the last.
 
     Args:
-        trainer: one of its own, at the end of densification.
-        earlier: finished runs of the same seed by policy, of which a control copies rate or time.
-        lpips_net: also measure LPIPS with this backbone.
-        scalars: folder for TensorBoard scalars.
+        trainer: A trainer for this run alone, at the end of densification.
+        spec: The policy.
+        earlier: Finished runs of the same seed by policy. Controls copy their rate or time.
+        lpips_net: Backbone of LPIPS; None for no LPIPS.
+        scalars: Folder for TensorBoard scalars.
 
     Returns:
         The record, as the generator's value.
 
     Raises:
-        DivergedError: a loss or a metric is not finite.
+        DivergedError: A loss or a metric is not finite.
     """
     start, iterations = trainer.refine_stop_iter, spec.iterations(trainer, earlier)
     phases_before = dict(trainer.phase_seconds)
@@ -107,9 +108,9 @@ def refine(
 
 
 def measured(stats: dict[str, Any]) -> tuple[dict[str, float], int]:
-    """Return the metrics and the model's size in an evaluation, and how many views are hit exactly.
+    """Return the metrics and the model's size in an evaluation, and the number of views that are rendered exactly.
 
-    The PSNR of such a view is infinite; it counts with MOST_DB, so that the mean stays one of all views.
+    The PSNR of such a view is infinite. It counts as MOST_DB, so that the mean is over all views.
     """
     found = {name: stats[name] for name in (*METRICS, "num_GS") if name in stats}
     exact: set[str] = set()
@@ -124,7 +125,7 @@ def measured(stats: dict[str, Any]) -> tuple[dict[str, float], int]:
 
 @contextlib.contextmanager
 def peak_memory(trainer: Trainer, record: RunRecord) -> Iterator[None]:
-    """Raise `record.peak_memory` to the peak of this part, without the memory of other runs that take turns."""
+    """Raise `record.peak_memory` to the peak of this part, less the memory of other runs that take turns."""
     meter = memory_meter(trainer.backend.device)
     if meter is None:
         yield
@@ -139,9 +140,9 @@ def peak_memory(trainer: Trainer, record: RunRecord) -> Iterator[None]:
 
 @contextlib.contextmanager
 def compressed(trainer: Trainer, start: int, iterations: int) -> Iterator[None]:
-    """Let `iterations` iterations from `start` run through the schedule of all that are left.
+    """Compress the schedule of the rest of the run into `iterations` iterations from `start` on.
 
-    Learning rate and SH degree of an iteration are those that a full run has at the same share of its way.
+    An iteration has the learning rate and SH degree of a full run at the same share of the way.
     """
     stretch = (trainer.max_steps - start) / iterations
 
@@ -190,7 +191,7 @@ def logged(trainer: Trainer, scalars: Path | None, gate: SkipGate | None = None)
 
 @contextlib.contextmanager
 def recorded(trainer: Trainer, trace: Trace, gate: SkipGate | None, log: ScalarLog | None) -> Iterator[None]:
-    """Fill the trace, and the log, after every iteration, outside the clock."""
+    """Add every iteration to the trace and the log, outside the clock."""
     index = {name: i for i, name in enumerate(trainer.view_names)}
 
     def on_step(iteration: Iteration) -> None:
@@ -211,7 +212,7 @@ def recorded(trainer: Trainer, trace: Trace, gate: SkipGate | None, log: ScalarL
 
 
 def point(trainer: Trainer, stats: dict[str, Any], log: ScalarLog | None, seconds: float) -> Point:
-    """Return an evaluation after so many seconds, written to the log too."""
+    """Return an evaluation with its time in seconds, and write it to the log."""
     if log is not None:
         log.evaluation(stats)
     found, _ = measured(stats)

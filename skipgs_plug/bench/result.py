@@ -1,4 +1,4 @@
-"""bench.json: settings, provenance, all runs without their traces, and the table, in one dict of plain values."""
+"""The content of bench.json: settings, provenance, all runs without traces, and the table, as plain values."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ def build_result(bench: Bench, records: Sequence[RunRecord], command: str) -> di
 
     Returns:
         `kind`, `schema_version`; `command`, `commits`, `versions`; `settings` (training, scene, machine, lpips, clock,
-        whole); `seeds`, `policies`; `refinement` (first and last iteration + 1); `view_names` (traces index into
-        them); `rows` (means and spreads); `ceiling`, `timing_noise` (see summary; None for whole
-        runs, whose models differ); `runs` (records without traces,
-        which are in runs/ and, without losses, in decisions.json).
+        whole); `seeds`, `policies`; `refinement` (first iteration, last iteration + 1); `view_names` (traces hold
+        indices into it); `rows` (means and spreads); `ceiling`, `timing_noise` (see summary; None for whole runs, whose
+        models differ); `runs` (records without traces). Traces are in runs/ and, without losses, in decisions.json.
     """
     last = bench.config.max_steps
     first = bench.refine_stop_iter

@@ -1,4 +1,4 @@
-"""All runs of a bench, in turns: per seed one densification, refined under each policy, or whole runs."""
+"""All runs of a bench, in turns: one densification per seed with a refinement per policy, or whole runs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.metrics import LPIPS_WEIGHTS, require_lpips
 
 NOT_SETTINGS = ("data_dir", "result_dir", "seed", "backend")
-WARM_UP = 20  # iterations before the first run: they load and compile, which the memory of the first run must not hold
+WARM_UP = 20  # iterations before the first run: loading and compiling must not count as its memory
 Begin = Callable[[str, Earlier], Generator[None, None, RunRecord]]
 
 
@@ -32,16 +32,21 @@ class Bench:
     """Runs the missing runs of a folder and returns all runs.
 
     Args:
-        config: settings of training; its seed is replaced by each of `seeds`.
-        say: called with one line per event.
-        tensorboard: write TensorBoard scalars of every run that is missing.
-        clock: of the times that are compared, see `TrainClock`; None for the processor's in whole runs on the CPU, and
-            the wall's otherwise.
-        whole: each policy trains from the first iteration on, instead of from one densification per seed.
+        scene: The scene, with held-out views.
+        config: Settings of training. Each of `seeds` replaces its seed.
+        folder: Folder for runs and results.
+        seeds: Seeds of training.
+        policies: Names of the policies.
+        say: Called with one line per event.
+        progress: Show progress bars.
+        tensorboard: Write TensorBoard scalars of every missing run.
+        clock: Clock of the compared times, see `TrainClock`. None: processor seconds for whole runs on the CPU, else
+            wall time.
+        whole: Each policy trains from the first iteration on, instead of from one densification per seed.
 
     Raises:
-        InputError: an unknown policy, no held-out views, processor time with a GPU, or a folder made with other
-            settings.
+        InputError: A policy is unknown, the scene has no held-out views, processor time is asked for on a GPU, or the
+            folder was made with other settings.
     """
 
     def __init__(
@@ -75,7 +80,7 @@ class Bench:
         self.whole = whole
         self.clock = clock or ("processor" if whole and self.backend.device.type == "cpu" else "wall")
         if clock == "processor" and self.backend.device.type != "cpu":
-            raise InputError("A GPU works while no thread is running: --clock processor is for the CPU; leave it out.")
+            raise InputError("Processor seconds do not include the work of a GPU; leave out --clock processor.")
         self.lpips_net = available_lpips()
         self.commit = provenance.commit()
         self.settings = {
@@ -134,7 +139,7 @@ class Bench:
         for spec in specs:
             lost = [name for name in spec.needs if earlier[name].status != "done"]
             if lost:
-                note = f"{lost[0]} of this seed, which it copies, did not finish"
+                note = f"it copies {lost[0]} of this seed, which did not finish"
                 yield RunRecord(seed, spec.name, "not run", note)
                 continue
             runs[spec.name] = begin(spec.name, earlier)

@@ -1,4 +1,4 @@
-"""Controls that leave out whole iterations of a whole run, without looking at anything. Standard library only."""
+"""Controls that leave out whole iterations of a whole run without reading any loss. Standard library only."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Iterable
 
 
 def random_numbers(numbers: range, events: Iterable[int], count: int, seed: int) -> set[int]:
-    """Return `count` of the numbers, all events among them, the others drawn by chance from an own generator.
+    """Return `count` of the numbers: all events, and others drawn at random from a generator seeded with `seed`.
 
-    All events, if these are more than `count`.
+    If there are more events than `count`, return all events.
     """
     kept = set(events)
     others = [n for n in numbers if n not in kept]
@@ -17,7 +17,7 @@ def random_numbers(numbers: range, events: Iterable[int], count: int, seed: int)
 
 
 def periodic_numbers(numbers: range, events: Iterable[int], count: int, seed: int) -> set[int]:
-    """Return `count` of the numbers, all events among them, the others spread as evenly as whole numbers allow."""
+    """Return `count` of the numbers: all events, and others spread as evenly as whole numbers allow."""
     kept = set(events)
     others = [n for n in numbers if n not in kept]
     n, wanted = len(others), max(0, count - len(kept))

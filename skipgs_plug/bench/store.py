@@ -1,4 +1,4 @@
-"""The folder of a bench: every finished run is stored at once, so that a killed bench continues."""
+"""The folder of a bench. Each finished run is stored at once, so that a killed bench can continue."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class BenchFolder:
     def require_settings(self, settings: dict[str, Any]) -> None:
         """Store the settings of a new folder; an existing folder must have the same settings.
 
-        Seeds and policies are not among them: more of either may be added to a folder.
+        Seeds and policies do not count as settings: a folder may get more of them later.
 
         Raises:
-            InputError: the folder holds a bench made otherwise; names the first difference.
+            InputError: The folder holds a bench with other settings. The message names the first difference.
         """
         path = self.root / "settings.json"
         if not path.is_file():
@@ -34,15 +34,15 @@ class BenchFolder:
             if flat(stored).get(name) != value:
                 raise InputError(
                     f"{self.root} holds a bench with {name}={flat(stored).get(name)!r}, not {value!r}; "
-                    "repeat its settings or give another --out."
+                    "use its settings or give another --out."
                 )
 
     def snapshot(self, seed: int) -> Path:
-        """Return where the checkpoint of a densified seed lies."""
+        """Return the path of the checkpoint of a densified seed."""
         return self.root / "snapshots" / f"seed{seed}.pt"
 
     def scalars(self, seed: int, name: str) -> Path:
-        """Return where the TensorBoard scalars of a run, or of a seed's densification, lie."""
+        """Return the folder of the TensorBoard scalars of a run, or of a seed's densification."""
         return self.root / "tb" / f"seed{seed}_{name}"
 
     def load(self, seed: int, policy: str) -> RunRecord | None:
@@ -53,7 +53,7 @@ class BenchFolder:
         try:
             return RunRecord.from_dict(read_json(path))
         except (KeyError, TypeError) as error:
-            raise InputError(f"{path} is not a run of a bench ({error}); remove it to run that again.") from error
+            raise InputError(f"{path} is not a run of a bench ({error}); remove it to repeat the run.") from error
 
     def store(self, record: RunRecord) -> None:
         with write_aside(self._run(record.seed, record.policy)) as temporary:

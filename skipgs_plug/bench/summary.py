@@ -12,7 +12,7 @@ from skipgs_plug.bench.policies import REFERENCE
 from skipgs_plug.bench.record import Point, RunRecord
 from skipgs_plug.trainer.metrics import METRICS
 
-HEADLINE = "psnr"  # the metric that "time to reach" is about
+HEADLINE = "psnr"  # metric of "time to reach"
 
 
 @dataclass
@@ -20,7 +20,7 @@ class Quantity:
     """Mean and spread (sample standard deviation over seeds; None with one seed).
 
     Attributes:
-        seeds: how many have a value, where that is not all of them.
+        seeds: Number of seeds with a value; None if all have one.
     """
 
     mean: float
@@ -34,7 +34,7 @@ class Row:
 
     Attributes:
         seeds: Seeds that the means are taken over.
-        excluded: the others, with the reason.
+        excluded: The other seeds, with the reason.
         values: by name: `t_post t_total` (s), the same with `_wall` and `_processor`, `t_post_saved t_total_saved`
             (% less than the own run, same seed), `t_total_share` (% of its), `time_to_own` (s until the final PSNR of
             the own run, same seed, missing where it is not reached), `iterations_run`, `backwards_share` (% of the
@@ -84,7 +84,7 @@ def measured(record: RunRecord, own: RunRecord | None, full_iterations: int, who
     values["backwards_share"] = 100 * record.backwards / full_iterations
     for phase, seconds in record.phases.items():
         if phase == "strategy" and not whole:
-            continue  # nothing is left of it after densification
+            continue  # there is no densification in refinement
         values[f"share_{phase}"] = 100 * seconds / sum(record.phases.values())
     values.update(record.metrics)
     values.update({f"train_{name}": value for name, value in record.train_metrics.items() if name in METRICS})
@@ -103,9 +103,9 @@ def measured(record: RunRecord, own: RunRecord | None, full_iterations: int, who
 
 
 def time_to_reach(points: Sequence[Point], target: float) -> float | None:
-    """Return the seconds after which the held-out PSNR first was `target` dB, None if it never was.
+    """Return the seconds until the held-out PSNR first reached `target` dB; None if it never did.
 
-    Between two evaluations it is taken to change evenly with time.
+    PSNR is interpolated linearly in time between two evaluations.
     """
     before = points[0]
     for after in points:
@@ -118,16 +118,16 @@ def time_to_reach(points: Sequence[Point], target: float) -> float | None:
 
 
 def quantity(sample: Sequence[float], total: int) -> Quantity:
-    """Return mean and spread of a sample from so many of `total` seeds."""
+    """Return mean and spread of a sample, which may have fewer values than the `total` number of seeds."""
     spread = statistics.stdev(sample) if len(sample) > 1 else None
     return Quantity(statistics.fmean(sample), spread, len(sample) if len(sample) < total else None)
 
 
 def ceiling(rows: Sequence[Row]) -> dict[str, float] | None:
-    """Return how much a perfect gate could save at the gate's skip rate, in % of refinement time.
+    """Return the largest possible saving at the gate's skip rate, in % of refinement time.
 
-    A skipped iteration still pays forward, loss and decision, so no gate can save more than the share of
-    backward and optimizer in the own run's time, times the share of iterations skipped.
+    A skipped iteration still runs forward pass, loss and decision. So no gate can save more than the share of backward
+    and optimizer in the own run's time, times the share of skipped iterations.
 
     Returns:
         `share` (% of the own t_post in backward and optimizer), `skipped` (% of iterations), `most` (their
@@ -147,7 +147,7 @@ def ceiling(rows: Sequence[Row]) -> dict[str, float] | None:
 
 
 def timing_noise(records: Sequence[RunRecord]) -> float | None:
-    """Return by how much forward time per iteration differed within a seed, in %, at worst; None for single runs.
+    """Return the largest difference of forward time per iteration within a seed, in %; None for single runs.
 
     Every policy renders the same views of nearly the same model, so the difference comes from the machine.
     """

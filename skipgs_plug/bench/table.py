@@ -1,4 +1,4 @@
-"""The tables, and the sentences that belong under them."""
+"""The tables, and the sentences under them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skipgs_plug.trainer.metrics import METRICS, Metric
 
 @dataclass(frozen=True)
 class Column:
-    """A column: heading, name in `Row.values`, digits after the point, sign shown or not, text without a value."""
+    """A column: heading, name in `Row.values`, digits after the point, with a sign or not, text without a value."""
 
     heading: str
     name: str
@@ -73,7 +73,7 @@ WHOLE_READING = (
 
 
 def tables(rows: Sequence[Row], whole: bool = False) -> list[tuple[str, list[list[str]]]]:
-    """Return (caption, lines) of every table that some row has values for, of whole runs or of refinements."""
+    """Return (caption, lines) of every table with at least one value, for whole runs or for refinements."""
     contents = {
         "Time and quality, mean ± spread over seeds": WHOLE if whole else REFINEMENT,
         "Quality on the training views, to see overfitting": TRAINING,
@@ -84,7 +84,7 @@ def tables(rows: Sequence[Row], whole: bool = False) -> list[tuple[str, list[lis
 
 
 def cell(row: Row, column: Column) -> str:
-    """Return "mean ± spread", "mean" with one seed, how many seeds have a value if not all, or the text without one."""
+    """Return "mean ± spread" ("mean" with one seed), the number of seeds if some have no value, or the empty text."""
     value = row.values.get(column.name)
     if value is None:
         return column.absent if row.seeds else "-"
@@ -109,7 +109,7 @@ def cells(rows: Sequence[Row], columns: Sequence[Column]) -> list[list[str]]:
 
 
 def markdown(lines: Sequence[Sequence[str]]) -> str:
-    """Return heading and rows as a Markdown table, aligned to be read in a terminal too."""
+    """Return heading and rows as a Markdown table, aligned for terminals."""
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     rule = [("-" * width if i == 0 else "-" * (width - 1) + ":") for i, width in enumerate(widths)]
     text = []

@@ -1,4 +1,4 @@
-"""Whole runs, from the first iteration to the last, in turns, and searches for a setting that makes two runs equal."""
+"""Whole runs in turns, and searches for the setting with which one run matches another."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from skipgs_plug.trainer.scalars import ScalarLog
 PARTS = 20  # parts of a run, by iteration number; policies take turns by part, and each part ends with an evaluation
 SAME_TIME = 0.05  # relative difference of two times that counts as equal
 SAME_COUNT = 0.02  # relative difference of two numbers of Gaussians that counts as equal
-MOST_TRIES = 5  # runs of a search, at most: each costs a whole run or a densification
+MOST_TRIES = 5  # tries of a search, at most: each costs a whole run or a densification
 
 Turns = Generator[None, None, None]
-Numbers = Callable[[range, Iterable[int], int, int], set[int]]  # of numbers, events among them, how many, seed
+Numbers = Callable[[range, Iterable[int], int, int], set[int]]  # arguments: numbers, events, count, seed
 
 
 @dataclass(frozen=True)
 class Maker:
-    """Makes trainers of one seed that stand before their first iteration.
+    """Makes trainers of one seed, before their first iteration.
 
     Attributes:
-        create: makes one with changed settings of training.
+        create: Makes a trainer with changed settings of training.
         lpips_net: Backbone for LPIPS at the end; None for no LPIPS.
         scalars: Folder for TensorBoard scalars; None for no scalars.
     """
@@ -49,19 +49,19 @@ class Maker:
 def whole_run(trainer: Trainer, gate: SkipGate | None, record: RunRecord, make: Maker) -> Turns:
     """Train to the end in PARTS parts, with a pause after each but the last, and fill the record.
 
-    A search may have trained the trainer for some iterations already; the points of these stand in the record.
+    A search may have trained the trainer for some iterations already. Their points are in the record.
 
     Raises:
-        DivergedError: a loss or a metric is not finite.
+        DivergedError: A loss or a metric is not finite.
     """
     with gate or contextlib.nullcontext():
         yield from trained_until(trainer, trainer.max_steps, record, gate, make)
 
 
 def trained_until(trainer: Trainer, end: int, record: RunRecord, gate: SkipGate | None, make: Maker) -> Turns:
-    """Train up to iteration `end` (exclusive), with an evaluation and a pause after each part, no pause at the end.
+    """Train up to iteration `end` (exclusive), with an evaluation and a pause after each part, but no pause at the end.
 
-    A part is asked to stop rather than told its end: a gate that leaves out iterations plans for all that are left.
+    A part ends by a stop request, not by `until`: a gate that leaves out iterations must plan for the whole run.
     """
     if record.trace is None:
         record.trace = Trace(0)
@@ -87,7 +87,7 @@ def trained_until(trainer: Trainer, end: int, record: RunRecord, gate: SkipGate 
 
 @contextlib.contextmanager
 def stopping_at(trainer: Trainer, bound: int) -> Iterator[None]:
-    """Ask the trainer to stop once an iteration has the number before `bound` or a later one, unless it is the last."""
+    """Stop the trainer after the first iteration from `bound - 1` on, unless that is the last iteration of the run."""
     inner = trainer.on_step
 
     def on_step(iteration: Iteration) -> None:
@@ -193,8 +193,8 @@ def shortened(
 def as_many_gaussians(name: str) -> Callable[[Maker, Earlier, RunRecord], Turns]:
     """Return a function that runs every iteration, with `grow_grad2d` chosen for as many Gaussians in the end.
 
-    Each try is a densification, from which the next threshold is interpolated (logarithms of both); the one that comes
-    nearest one trains to the end of the run.
+    Each try is a densification. The next threshold is interpolated from the tries, in logarithms. The nearest try
+    trains to the end of the run.
     """
 
     def run(make: Maker, earlier: Earlier, record: RunRecord) -> Turns:
@@ -241,12 +241,12 @@ def search(
         attempt: Runs with a setting and returns the result, both above 0.
         first: Setting to begin with.
         wanted: Result to reach.
-        tolerance: Difference to it, as a share, that ends the search.
-        power: The result goes about with this power of the setting, until two are known.
-        known: Settings whose results are known already.
+        tolerance: Relative difference to `wanted` that ends the search.
+        power: Assumed exponent of the result as a power of the setting, until two results are known.
+        known: (setting, result) pairs that are known already.
 
     Returns:
-        (setting, result) of all, the known ones first.
+        (setting, result) of all tries, after `known`.
     """
     tries = list(known)
     setting, most = first, len(tries) + MOST_TRIES
@@ -261,7 +261,8 @@ def search(
 def next_setting(tries: list[tuple[float, float]], wanted: float, power: float) -> float:
     """Return the setting at which the line through two tries (in logarithms) meets `wanted`.
 
-    The two are the nearest from below and from above; without one of these the nearest two, or the nearest and `power`.
+    The two tries are the nearest below and the nearest above. If all are on one side, they are the nearest two. A
+    single try uses `power` as the slope.
     """
     ranked = sorted(tries, key=lambda one: abs(math.log(one[1] / wanted)))
     below = next((one for one in ranked if one[1] < wanted), None)
@@ -273,7 +274,7 @@ def next_setting(tries: list[tuple[float, float]], wanted: float, power: float) 
         other = ranked[1]
     if other is not None and other[0] != x and other[1] != y:
         slope = math.log(other[1] / y) / math.log(other[0] / x)
-        if slope * power > 0.0:  # noise may turn it round where both are near
+        if slope * power > 0.0:  # noise may reverse the slope of two close tries
             power = slope
     return x * (wanted / y) ** (1.0 / power)
 
@@ -284,12 +285,12 @@ def nearest(tries: list[tuple[float, float]], wanted: float) -> int:
 
 
 def same(result: float, wanted: float, tolerance: float) -> bool:
-    """Whether a result differs from `wanted` by no more than `tolerance`, as a share."""
+    """Whether the relative difference of a result to `wanted` is at most `tolerance`."""
     return abs(result / wanted - 1.0) <= tolerance
 
 
 def take(record: RunRecord, found: RunRecord) -> None:
-    """Fill a record with a run that was made for it, or that is the same."""
+    """Fill a record with a run that was made for it, or with an identical run."""
     for name in (field.name for field in dataclasses.fields(RunRecord)):
         if name not in ("seed", "policy", "tries"):
             setattr(record, name, getattr(found, name))

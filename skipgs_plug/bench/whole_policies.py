@@ -1,6 +1,6 @@
 """Policies of the whole run, from its first iteration on, and the controls.
 
-A policy has the name of the settings that a user would give to `SkipGate`, as in `policies`. A new policy is one entry
+The name of a policy is the settings that a user would give to `SkipGate`, like in `policies`. A new policy is one entry
 of WHOLE_POLICIES: a name, a line of explanation, the policies that it copies from, and the function that runs it.
 """
 
@@ -26,14 +26,14 @@ class WholePolicy(Policy):
     """One row of the comparison of whole runs.
 
     Attributes:
-        run: trains with trainers that it makes, fills the record, and pauses now and then for others.
+        run: Trains with trainers that it makes, fills the record, and yields now and then, for other policies.
     """
 
     run: Run = None  # type: ignore[assignment]
 
 
 def own(make: Maker, earlier: Earlier, record: RunRecord) -> Generator[None, None, None]:
-    """Train as the trainer does by itself."""
+    """Train without a gate."""
     yield from whole_run(make(), None, record, make)
 
 
@@ -48,7 +48,7 @@ def gated(**settings: object) -> Run:
 
 
 def larger_steps(trainer: Trainer, earlier: Earlier) -> SkipGate:
-    """Attach the factors on rates that make a refinement as short as this go as far as the own run's."""
+    """Attach rate factors with which this short refinement covers the same distance as the own run's."""
     full = earlier[REFERENCE].iterations
     peak = path_factor(min(1.0, trainer.max_steps / full), 0.0, visible=earlier[COPIED].gaussians_shown)
     gate = gate_with(refine_share=1.0, rate_peak=peak)(trainer, earlier)
