@@ -1,4 +1,4 @@
-"""Checkpoints while a run trains, so that a process that is killed loses minutes."""
+"""Checkpoints during training, so that a killed process loses only minutes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Autosave:
         """Write a checkpoint, unless this session began or saved in this iteration.
 
         Raises:
-            WriteError: it cannot be written.
+            WriteError: The checkpoint cannot be written.
         """
         if self._trainer.step != self._saved_step:
             self._folder.write_checkpoint(self._trainer)
@@ -39,7 +39,7 @@ class Autosave:
         self._saved_at = self._trainer.t_total
 
     def _due(self, iteration: Iteration) -> bool:
-        if iteration.step + 1 == self._trainer.max_steps:  # whoever trains saves the end
+        if iteration.step + 1 == self._trainer.max_steps:  # the session itself saves the end
             return False
         if self._every is None:
             return self._trainer.t_total - self._saved_at >= SECONDS

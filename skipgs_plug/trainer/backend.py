@@ -1,4 +1,4 @@
-"""Which rasterizer, loss and optimizers a trainer runs on: gsplat and torch on CUDA, this package's own on the CPU."""
+"""Rasterizer, loss and optimizers of a trainer: gsplat and torch on CUDA, this package's own on the CPU."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from torch import Tensor, nn
 from skipgs_plug.install import install_command
 from skipgs_plug.trainer.errors import InputError
 
-Optimizers = Mapping[str, torch.optim.Optimizer]  # by the names of the parameters, as `create_splats` has them
+Optimizers = Mapping[str, torch.optim.Optimizer]  # keys: names of the parameters from `create_splats`
 
 
 @dataclass(frozen=True)
 class Backend:
     """A renderer with gsplat's `rasterization` signature, and the loss and optimizers that suit its device.
 
-    This one suits gsplat; `CpuBackend` the rasterizer of this package.
+    This class suits gsplat. `CpuBackend` suits the rasterizer of this package.
     """
 
     name: str
@@ -39,17 +39,17 @@ class Backend:
         optimizers: Optimizers | None = None,
         **options: Any,
     ) -> tuple[Tensor, dict[str, Any]]:
-        """Render raw parameters, as `create_splats` names them, into one camera.
+        """Render raw parameters, with the names of `create_splats`, into one camera.
 
         Args:
-            splats: logarithms of scales, logits of opacities, SH coefficients in two parts.
-            viewmat: world to camera, of any float type.
+            splats: Logarithms of scales, logits of opacities, SH coefficients in two parts.
+            viewmat: World to camera, of any float type.
             K: Intrinsics [3, 3], pixels.
-            background: colour behind everything; None for black, which needs no compositing.
-            antialiased: compensate opacities for the blur.
-            with_rows: whether the dictionary has to hold rows of Gaussians.
-            optimizers: of these parameters, which may be behind where no view showed a Gaussian; None if all are
-                up to date.
+            background: Colour behind the scene; None for black, which needs no compositing.
+            antialiased: Compensate opacities for the blur.
+            with_rows: Whether the dictionary must hold rows of Gaussians.
+            optimizers: Optimizers of the parameters, which may lag behind for Gaussians that no view showed; None if
+                all parameters are up to date.
             options: `width height sh_degree near_plane far_plane absgrad` of `rasterization`.
 
         Returns:
@@ -76,14 +76,14 @@ class Backend:
         return torch.optim.Adam([{"params": [param], "lr": rate, "name": name}], eps=eps, fused=True)
 
     def catch_up(self, optimizers: Optimizers) -> None:
-        """Advance what the last views did not show, before somebody else looks at parameters or moments."""
+        """Bring Gaussians outside the last views up to date, before other code reads parameters or moments."""
 
     def release_memory(self) -> None:
-        """Give back memory that is kept for the next iteration, before something else needs much."""
+        """Return memory that is kept for the next iteration, before other code needs a lot."""
 
     @contextmanager
     def exclusive_cores(self) -> Iterator[None]:
-        """Keep torch to one thread inside the block where the rasterizer has threads of its own.
+        """Limit torch to one thread inside the block if the rasterizer has threads of its own.
 
         torch's idle OpenMP threads spin for a while after each operation. They take the cores from the rasterizer:
         on two cores with another process running, iterations were five times slower.
@@ -98,10 +98,10 @@ class Backend:
 
 
 class CpuBackend(Backend):
-    """The CPU rasterizer, which takes raw parameters as they are and touches only rows that are visible.
+    """The CPU rasterizer, which takes raw parameters and touches visible rows only.
 
-    Its dictionary has a row for each of these, as gsplat's packed mode. Its Adam runs on all cores, and that of `shN`,
-    three quarters of all numbers, updates what views show.
+    Its dictionary has a row per visible Gaussian, like gsplat's packed mode. Its Adam runs on all cores. The Adam of
+    `shN`, which is three quarters of all numbers, updates only Gaussians that views show.
     """
 
     def render(
@@ -171,14 +171,14 @@ def single_precision() -> Iterator[None]:
 
 
 def choose_backend(name: str = "auto") -> str:
-    """Return the name of the backend that `resolve_backend` takes."""
+    """Return the name of the backend that `resolve_backend` returns."""
     if name != "auto":
         return name
     return "gsplat" if torch.cuda.is_available() and _has_gsplat() else "warp"
 
 
 def resolve_backend(name: str = "auto") -> Backend:
-    """Return the backend called "gsplat" or "warp"; "auto" takes gsplat where CUDA works, else warp.
+    """Return the backend called "gsplat" or "warp"; "auto" is gsplat if CUDA works, else warp.
 
     Raises:
         InputError: The backend cannot run here; the message names the missing part.

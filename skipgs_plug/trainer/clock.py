@@ -28,27 +28,27 @@ class Sums:
 class TrainClock:
     """Adds up the seconds of training iterations. Work between iterations is not counted.
 
-    A GPU works on while the host is ahead. Where phases are asked for, every border of one synchronises, so that it
-    holds its own kernels. Otherwise nothing synchronises within iterations: what is still under way is booked by
-    `settle`, before anything else is done with the device.
+    A GPU goes on working while the host is ahead. To measure phases, the clock synchronises at every border of a phase,
+    so that a phase contains its own kernels. Without phases, nothing synchronises within iterations: `settle` books
+    kernels that are still running, before other work uses the device.
 
     Args:
-        device: of the trainer.
-        phases: measure phases; None for yes on the CPU, where that costs nothing, and no on a GPU, where they stay 0.
-        by_processor: `t_total`, `t_post` and `phase_seconds` are processor seconds instead of those on the wall.
+        device: Device of the trainer.
+        by_processor: `t_total`, `t_post` and `phase_seconds` are processor seconds instead of wall time.
+        phases: Measure phases. None: on the CPU, where it costs nothing, but not on a GPU, where they stay 0.
 
     Attributes:
-        wall: seconds by the clock on the wall.
-        processor: seconds for which threads of this process were running, added up over them. Other programs on the
-            machine hardly change them, and a GPU's work is not in them. NaN after a checkpoint without them.
-        phase_seconds: by phase.
+        wall: Seconds of wall time.
+        processor: Seconds for which threads of this process were running, summed over threads. Other programs on the
+            machine hardly change them. They do not include the work of a GPU. NaN after a checkpoint without them.
+        phase_seconds: Seconds by phase.
     """
 
     def __init__(self, device: torch.device, by_processor: bool = False, phases: bool | None = None) -> None:
         self._device = None if device.type == "cpu" else device
         self._phases = self._device is None if phases is None else phases
         self._after_densification = False
-        self._under_way = False  # work of the last iteration may be: nothing has synchronised since
+        self._under_way = False  # whether kernels of the last iteration may still run
         self._by_processor = by_processor
         self.wall, self.processor = Sums(), Sums()
         self.phase_seconds = dict.fromkeys(PHASES, 0.0)
@@ -76,7 +76,7 @@ class TrainClock:
         if not self._phases:
             return
         self._synchronize()
-        # Only one of both clocks: asking for processor seconds is a call of the system (0.3 to 7 us).
+        # Read only one clock: processor seconds take a system call (0.3 to 7 us).
         now = time.process_time() if self._by_processor else time.perf_counter()
         self.phase_seconds[phase] += now - self._last
         self._last = now
@@ -104,7 +104,7 @@ class TrainClock:
         self.processor.add(end[1] - self._started[1], self._after_densification)
 
     def seconds(self) -> dict[str, float]:
-        """Return `t_total`, `t_post` on the wall and, with `_processor` after the name, of the processor."""
+        """Return `t_total` and `t_post` in wall time and, with `_processor` after the name, in processor seconds."""
         return {
             "t_total": self.wall.total,
             "t_post": self.wall.post,
@@ -117,11 +117,11 @@ class TrainClock:
 
     @staticmethod
     def can_load(state: Mapping[str, float]) -> bool:
-        """Whether this is a state, be it of a version without processor seconds."""
+        """Whether this is a state of a clock, possibly of a version without processor seconds."""
         return {"t_total", "t_post", *PHASES} <= state.keys() <= {*TrainClock(torch.device("cpu")).state_dict()}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Continue from `state_dict()`; a state of a version without processor seconds leaves them unknown."""
+        """Continue from `state_dict()`. Processor seconds become NaN if the state is of a version without them."""
         self.wall = Sums(state["t_total"], state["t_post"])
         self.processor = Sums(state.get("t_total_processor", math.nan), state.get("t_post_processor", math.nan))
         self.phase_seconds.update({phase: state[phase] for phase in PHASES})
@@ -136,5 +136,5 @@ class TrainClock:
 
     @staticmethod
     def _now() -> tuple[float, float]:
-        """Return the seconds on the wall and of the processor."""
+        """Return wall time and processor seconds."""
         return time.perf_counter(), time.process_time()

@@ -20,13 +20,13 @@ def is_compressed(vertices: Mapping[str, np.ndarray]) -> bool:
 def decompress(
     vertices: Mapping[str, np.ndarray], chunks: Mapping[str, np.ndarray], sh: Mapping[str, np.ndarray]
 ) -> Columns:
-    """Return `x` to `rot_3` [N] float32 of the elements `vertex` [N], `chunk` [ceil(N / 256)] and `sh` [N] or none.
+    """Return the columns `x` to `rot_3` [N] float32 from the elements `vertex` [N], `chunk` [ceil(N / 256)] and `sh`.
 
-    Opacity is infinite where alpha is 0 or 1: a byte says no more.
+    Opacity is infinite where alpha is 0 or 1, since alpha has only one byte.
 
     Raises:
-        KeyError: a column is missing.
-        ValueError: there are fewer chunks than Gaussians need.
+        KeyError: A column is missing.
+        ValueError: There are too few chunks for the Gaussians.
     """
     packed = {
         name: np.asarray(vertices[f"packed_{name}"], dtype=np.uint32)
@@ -78,7 +78,7 @@ def unpack_rotation(packed: np.ndarray) -> list[np.ndarray]:
     largest_at = packed >> np.uint32(30)
     parts = []
     for i in range(4):
-        before = others[min(i, 2)]  # where the largest comes later
-        after = others[max(i - 1, 0)]  # where it came earlier
+        before = others[min(i, 2)]  # the largest component comes later
+        after = others[max(i - 1, 0)]  # the largest component came earlier
         parts.append(np.where(largest_at == i, largest, np.where(largest_at > i, before, after)))
     return parts

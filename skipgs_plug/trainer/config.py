@@ -11,15 +11,15 @@ from skipgs_plug.trainer.errors import InputError
 
 # Iterations of the 3DGS schedule. All milestone defaults are given for it.
 REFERENCE_STEPS = 30_000
-# Iterations between densifications, at least. With fewer, gradients are averaged over too few views and the number of
-# Gaussians explodes: 4,000 points became 140,000 within 400 iterations at an interval of 3.
+# Iterations between densifications, at least. A shorter interval averages gradients over too few views, and the number
+# of Gaussians explodes: 4,000 points became 140,000 within 400 iterations at an interval of 3.
 MIN_REFINE_EVERY = 100
-# Iterations between opacity resets, at least. Gaussians need thousands of updates to recover from a reset, also in a
+# Iterations between opacity resets, at least. Gaussians need thousands of updates to recover from a reset, even in a
 # short run: resets every 300 iterations cost 7 dB on fern.
 MIN_RESET_EVERY = 3000
 
 TINY = 1e-6  # smallest opacity, distance to 1, and scale: their logits and logarithms stay moderate
-MANY = 1 << 31  # largest count: it fits the 32-bit indices of gsplat and of the kernels
+MANY = 1 << 31  # largest count, which fits the 32-bit indices of gsplat and of the kernels
 INTEGERS = {  # least and greatest value of each setting
     "data_factor": (1, 64),
     "test_every": (0, MANY),
@@ -72,7 +72,7 @@ BELONGS_TO = {
     **dict.fromkeys(("grow_grad2d", "grow_scale3d", "prune_scale3d", "reset_every", "absgrad"), "default"),
     **dict.fromkeys(("cap_max", "noise_lr"), "mcmc"),
 }
-FROM_OTHERS = ("schedule_steps", "near_plane", *Recipe._fields)  # None: taken from other settings or the scene
+FROM_OTHERS = ("schedule_steps", "near_plane", *Recipe._fields)  # None: derived from other settings or the scene
 
 
 @dataclass
@@ -102,22 +102,22 @@ class TrainConfig:
     result_dir: str = ""
     """Run folder to write."""
     data_factor: int = 1
-    """Use images_{factor}; resized in memory when that folder is missing."""
+    """Use images_{factor}; without that folder, photographs are resized in memory."""
     test_every: int = 8
     """Hold out every n-th view by name (index % n == 0); 0 holds out none."""
     init_num_pts: int = 100_000
-    """Random initial points for scenes that bring no point cloud (Blender)."""
+    """Random initial points for scenes without a point cloud (Blender)."""
     init_ply: str = ""
     """Point cloud or 3DGS model (PLY, in the coordinates of the scene) to start from instead of the scene's points."""
     backend: Literal["auto", "gsplat", "warp"] = "auto"
-    """Rasterizer: gsplat on CUDA, warp on CPU; auto takes gsplat where CUDA works."""
+    """Rasterizer: gsplat on CUDA, warp on the CPU; auto: gsplat if CUDA works, else warp."""
     seed: int = 42
     """Seed of view order, split noise and random backgrounds."""
     max_steps: int = 30_000
     """Training iterations."""
     schedule_steps: Optional[int] = None
-    """Iterations that milestones and learning rates are scaled to; default: max_steps. A run that is extended
-    keeps the schedule that it began with, and ends with the rates of its end."""
+    """Iterations that milestones and learning rates are scaled to; default: max_steps. An extended run
+    keeps its first schedule, and goes on with the final rates of that schedule."""
     ssim_lambda: float = 0.2
     """Loss = (1 - ssim_lambda) * L1 + ssim_lambda * (1 - SSIM)."""
 
@@ -175,11 +175,11 @@ class TrainConfig:
     prune_scale3d: float = 0.1
     """Gaussians larger than this, times scene scale, are pruned after the first opacity reset."""
     absgrad: bool = False
-    """Densify by absolute gradients (AbsGS); wants grow_grad2d of about 0.0008."""
+    """Densify by absolute gradients (AbsGS); needs grow_grad2d of about 0.0008."""
     cap_max: int = 1_000_000
-    """Most Gaussians (mcmc)."""
+    """Largest number of Gaussians (mcmc)."""
     noise_lr: float = 5e5
-    """Noise on positions, times their learning rate (mcmc)."""
+    """Factor on the noise on positions, times their learning rate (mcmc)."""
     opacity_reg: Optional[float] = None
     """Weight of the mean opacity in the loss; default 0, with mcmc 0.01."""
     scale_reg: Optional[float] = None
@@ -206,7 +206,9 @@ class TrainConfig:
             raise InputError(f"strategy={self.strategy!r} is unknown; choose {' or '.join(RECIPES)}.")
         for name, strategy in BELONGS_TO.items():
             if strategy != self.strategy and getattr(self, name) != type(self).__dataclass_fields__[name].default:
-                raise InputError(f"{name} belongs to strategy {strategy}, and this is {self.strategy}; leave it out.")
+                raise InputError(
+                    f"{name} belongs to strategy {strategy}, but strategy is {self.strategy}; leave it out."
+                )
         if self.near_plane is not None and self.near_plane >= self.far_plane:
             raise InputError(f"near_plane={self.near_plane:g} is not below far_plane={self.far_plane:g}.")
 
@@ -226,5 +228,5 @@ class TrainConfig:
         return max(1, round(milestone * self.schedule / REFERENCE_STEPS))
 
     def scaled_interval(self, interval: int, least: int) -> int:
-        """Scale an interval like `scaled`, but to no less than `least`, or than itself if it is smaller."""
+        """Scale an interval like `scaled`, but not below `least`, or not at all if it is smaller than `least`."""
         return max(self.scaled(interval), min(interval, least))

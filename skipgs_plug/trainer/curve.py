@@ -1,4 +1,4 @@
-"""The loss of a run over iterations and seconds, thinned, for plots."""
+"""The loss of a run over iterations and seconds, averaged for plots."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ POINTS = 500  # points of the loss curve of a whole run: more only make the repo
 
 
 class LossCurve:
-    """Means of the loss over equal stretches of a run; its `iteration` may serve as `Trainer.on_step`.
+    """Means of the loss over equal parts of a run. Its `iteration` may serve as `Trainer.on_step`.
 
-    It travels in the trainer's checkpoints, so that a continued run has one curve.
+    The trainer's checkpoints hold it, so that a resumed run has one curve.
     """
 
     def __init__(self, trainer: Trainer) -> None:
@@ -25,7 +25,7 @@ class LossCurve:
         trainer.register_state("loss_curve", self)
 
     def iteration(self, iteration: Iteration) -> None:
-        """Take in one iteration."""
+        """Add one iteration."""
         self._pending.append(iteration.loss)
         if len(self._pending) < self._every:
             return
@@ -40,7 +40,7 @@ class LossCurve:
         self._pending.clear()
 
     def write(self, path: str | Path) -> None:
-        """Write columns `step` (last of its stretch), `seconds` of training so far, mean `loss`, `num_GS`."""
+        """Write the columns `step` (last of its part), `seconds` of training so far, mean `loss`, `num_GS`."""
         write_json(path, self._columns)
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,9 +1,9 @@
 """Densification that moves every row once.
 
-gsplat's strategy clones, splits and prunes one after the other. Each of the three copies all parameters and both of
-their moments, and sorting rows in space copies them once more. Here the strategy works only on the parameters that it
-decides by and on row numbers. All other tensors follow these numbers at the end, into memory that the gradients have
-freed. With 110,000 Gaussians that takes a third of the time.
+gsplat's strategy clones, splits and prunes. Each of the three copies all parameters and both of their moments, and
+sorting copies them once more. Here the strategy works only on row numbers and on the parameters that it reads. All
+other tensors are moved once at the end, by row number, into memory that the gradients have freed. With 110,000
+Gaussians this takes a third of the time.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ def densify(
 ) -> None:
     """Densify like `strategy.step_post_backward`, with the same result.
 
-    Parameters are new objects where their rows changed, with moments of zero for new rows, as gsplat has it.
+    Parameters whose rows changed become new objects, and new rows get moments of zero, like in gsplat.
 
     Args:
         strategy: gsplat's DefaultStrategy.
-        splats: All with an optimizer of the same name.
-        optimizers: One for each of them.
-        strategy_state: Its sums, changed in place.
+        splats: Parameters by name.
+        optimizers: One optimizer per parameter, by the same names.
+        strategy_state: Sums of the strategy, changed in place.
         step: Iteration that just ended.
-        info: Of the rasterizer.
-        in_order: Put rows in the order of space afterwards.
+        info: Dictionary of the rasterizer.
+        in_order: Sort rows in space afterwards.
     """
     n = len(splats["means"])
     decided = {name: splats[name].detach() for name in DECIDING}
     decided[ROWS] = torch.arange(n, device=splats["means"].device)
     before = {name: nn.Parameter(tensor, requires_grad=False) for name, tensor in decided.items()}
     after: dict[str, Tensor] = dict(before)
-    # Stand-ins for optimizers, with a 1 for each row whose moments stay.
+    # Stand-ins for optimizers. Their state holds a 1 for each row that keeps its moments.
     ones = {name: torch.ones(n, device=param.device) for name, param in before.items()}
     followers = {
         name: SimpleNamespace(param_groups=[{"params": [param]}], state={param: {"kept": ones[name]}})
@@ -80,7 +80,7 @@ def densify(
 
 
 def _hand_over(optimizer: torch.optim.Optimizer, old: Tensor, new: Tensor, rows: Tensor, fresh: Tensor) -> None:
-    """Give an optimizer another parameter: its moments are those of `rows` of the old one, and 0 where `fresh`."""
+    """Give an optimizer a new parameter. Its moments are the old ones of `rows`, and 0 for the rows `fresh`."""
     optimizer.param_groups[0]["params"] = [new]
     state = optimizer.state.pop(old, None)
     if state is None:

@@ -1,18 +1,18 @@
-"""The errors of the reference trainer: each carries one sentence that names the thing and the fix."""
+"""The errors of the reference trainer. Each message is one sentence that names the problem and the fix."""
 
 from __future__ import annotations
 
 
 class InputError(ValueError):
-    """A scene, point cloud, checkpoint, PLY file or option that cannot be used."""
+    """A scene, point cloud, checkpoint, PLY file or option cannot be used."""
 
 
 class MissingFileError(InputError, FileNotFoundError):
-    """A file or folder that should exist and does not."""
+    """A file or folder does not exist."""
 
 
 class DamagedCheckpointError(InputError):
-    """A checkpoint is damaged; an older one may be sound."""
+    """A checkpoint is damaged. An older one may be readable."""
 
 
 def reason(error: BaseException) -> str:

@@ -1,4 +1,4 @@
-"""Exposure: an affine colour correction per photograph, for cameras that change it from frame to frame."""
+"""Exposure: an affine colour correction per photograph, for cameras that change exposure between frames."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-LR, LR_END = 0.01, 0.001  # as in Inria's 3DGS
+LR, LR_END = 0.01, 0.001  # first and last learning rate of Inria's 3DGS
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class Exposure:
-    """Learns for every training view a map from the model's colours to those of its photograph.
+    """Learns a map from the model's colours to the colours of each training photograph.
 
-    The model itself has the common colours of all photographs, so the mean of all
-    corrections is kept at the identity. Held-out views have none of their own; see `fit_colours`.
+    The mean of all corrections is kept at the identity, so the model has the mean colours of all photographs. Held-out
+    views have no correction; see `fit_colours`.
 
     Attributes:
-        affine: matrix and offset on RGB in [0, 1], the identity at first  # [V, 3, 4]
-        optimizer: of `affine` alone.
+        affine: Matrix and offset on RGB in [0, 1], [V, 3, 4]. It starts as the identity.
+        optimizer: Optimizer of `affine`.
     """
 
     def __init__(self, names: Sequence[str], device: torch.device) -> None:
@@ -29,23 +29,23 @@ class Exposure:
         self.optimizer = torch.optim.Adam([{"params": [self.affine], "lr": LR, "name": "exposure"}], fused=True)
 
     def set_learning_rate(self, progress: float) -> None:
-        """Let the rate fall exponentially over the schedule, of which `progress` in [0, 1] is over."""
+        """Set the learning rate, which falls exponentially, for a point `progress` in [0, 1] of the schedule."""
         self.optimizer.param_groups[0]["lr"] = LR * (LR_END / LR) ** progress
 
     def apply(self, image: Tensor, name: str) -> Tensor:
-        """Return a render [H, W, 3] in the colours of photograph `name`; unchanged if the name is unknown."""
+        """Return a render [H, W, 3] in the colours of photograph `name`. An unknown name changes nothing."""
         if name not in self._index:
             return image
         affine = self.affine[self._index[name]]
         return image @ affine[:, :3].T + affine[:, 3]
 
     def step(self) -> None:
-        """Update, unless a gate left this iteration without a gradient or puts the update off."""
+        """Update, unless a gate left this iteration without a gradient or postpones the update."""
         pending = self.affine.grad is not None
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         if pending and self.affine.grad is None:
-            with torch.no_grad():  # else model and corrections drift together: on fern by 4 dB in 600 iterations
+            with torch.no_grad():  # otherwise model and corrections drift together: on fern by 4 dB in 600 iterations
                 self.affine.sub_(self.affine.mean(dim=0) - torch.eye(3, 4, device=self.affine.device))
 
     def state_dict(self) -> dict[str, Any]:
@@ -55,7 +55,7 @@ class Exposure:
         """Continue from a state.
 
         Raises:
-            ValueError: it is of other views, or holds NaN.
+            ValueError: The state is of other views, or holds NaN.
         """
         moments = [name for name in MOMENTS if name in state]
         for name in ("affine", *moments):
@@ -72,17 +72,17 @@ class Exposure:
 
 @torch.no_grad()
 def fit_colours(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the image [H, W, 3] after the affine map on its colours that brings it closest to the target.
+    """Return the image [H, W, 3] after the affine map of colours that brings it closest to the target.
 
-    Least squares over the pixels of `mask` [H, W], as evaluations of models with exposure are customary: a held-out
-    photograph has an exposure that cannot be known.
+    The map is a least-squares fit over the pixels of `mask` [H, W]. Evaluations of models with exposure usually do
+    this, since the exposure of a held-out photograph is unknown.
     """
     source = torch.cat([image, torch.ones_like(image[..., :1])], dim=-1)  # [H, W, 4]
     known = (source.reshape(-1, 4), target.reshape(-1, 3))
     if mask is not None:
         known = (source[mask], target[mask])
     rows, wanted = (part.double() for part in known)
-    # A ridge that only a picture of one colour feels, for which many maps are the best one.
+    # The ridge matters only for a picture of one colour, which many maps fit equally well.
     ridge = 1e-6 * len(rows) * torch.eye(4, dtype=torch.float64, device=rows.device)
     identity = torch.eye(4, 3, dtype=torch.float64, device=rows.device)
     solution = torch.linalg.solve(rows.T @ rows + ridge, rows.T @ wanted + ridge @ identity)

@@ -1,4 +1,4 @@
-"""Writing JSON files aside; `write_aside` itself belongs to all parts of the package."""
+"""Write JSON files aside. `write_aside` is in `skipgs_plug.files`, for all parts of the package."""
 
 from __future__ import annotations
 

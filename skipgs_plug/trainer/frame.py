@@ -1,9 +1,9 @@
 """Coordinates of training: around the origin, with cameras that spread over a length of 1.
 
-A scene trains in the same way wherever it lies and in whatever unit it is measured: both are taken out in float64 when
-the scene is loaded. In coordinates of the dataset neither would hold. Near 500,000, float32 has steps of 0.03, which
-blurs a scene in coordinates of a map. And densification turns differences of one rounded bit into another number of
-Gaussians, so that a scene in feet would end elsewhere than the same scene in metres.
+A scene trains in the same way wherever it lies and whatever its unit is: position and unit are removed in float64 when
+the scene is loaded. Training in coordinates of the dataset would have two problems. Near 500,000, float32 has steps of
+0.03, which would blur a scene in map coordinates. And densification turns rounding differences of one bit into another
+number of Gaussians, so a scene in feet would train differently than the same scene in metres.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# Distance from the origin, in extents, from which a model is far away: float32 would lose fine structure.
+# Distance from the origin, in extents, above which a model counts as far away: float32 would lose fine structure.
 FAR = 100.0
 SMALL, LARGE = 2.0**-6, 2.0**10  # extents between which a model without cameras keeps its unit
-MOST = 0.9  # share of the Gaussians that lie within a model's extent, if it has no cameras: outliers do not count
-SAME = 1e-5  # difference of two sessions' frames that counts as rounding, as a share of the scene's size
-# Extent of the cameras as a share of the distance to the points, below which they turn on the spot: then the distance
-# is the extent.
+MOST = 0.9  # share of the Gaussians within the extent of a model without cameras: the rest may be outliers
+SAME = 1e-5  # relative difference of two frames that counts as rounding, as a share of the scene's size
+# Cameras turn on the spot if their extent is a smaller share of the distance to the points. Then that distance is the
+# extent.
 ON_THE_SPOT = 0.01
 
 
@@ -32,8 +32,9 @@ class Frame:
     """Local coordinates: (position in the dataset - `centre`) / `unit`.
 
     Attributes:
-        centre: what is subtracted, in units of the dataset.
-        unit: what is divided by: the largest distance of a training camera from their centre, in units of the dataset.
+        centre: Subtracted from positions, in units of the dataset.
+        unit: Divisor of lengths: the largest distance of a training camera from the centre of all training cameras, in
+            units of the dataset.
     """
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -58,7 +59,7 @@ class Frame:
     def around(cls, positions: np.ndarray) -> Frame:
         """Return the frame of a model alone, by its positions [N, 3], of which some may be far off.
 
-        It keeps the coordinates of the file if float32 suffices for them.
+        It keeps the coordinates of the file if float32 is precise enough for them.
         """
         positions = np.asarray(positions, dtype=np.float64)
         centre = np.median(positions, axis=0)
@@ -77,12 +78,12 @@ class Frame:
         return self != Frame()
 
     def is_like(self, other: Frame, size: float) -> bool:
-        """Whether both are the same for a scene of this size in local units, but for rounding."""
+        """Whether both frames are equal up to rounding, for a scene of this size in local units."""
         apart = max(abs(own - their) for own, their in zip(self.centre, other.centre, strict=True))
         return abs(self.unit / other.unit - 1.0) <= SAME and apart <= SAME * size * self.unit
 
     def as_dict(self) -> dict[str, object]:
-        """Return the entries of skipgs.json and cfg.yml: the vector subtracted from positions, and the divisor."""
+        """Return the entries of skipgs.json and cfg.yml: the centre and the unit."""
         return {"centre": list(self.centre), "unit": self.unit}
 
     def dataset_length(self, length: float) -> float:
@@ -128,10 +129,10 @@ class Frame:
 
 
 def frame_of(content: Mapping[str, object]) -> Frame:
-    """Return the frame that `as_dict` described; that of the dataset where nothing is said of one.
+    """Return the frame that `as_dict` described; the coordinates of the dataset if there is no entry.
 
     Raises:
-        ValueError, TypeError: The value is not a frame.
+        ValueError, TypeError: The entries are not a frame.
     """
     if "centre" not in content:
         return Frame()

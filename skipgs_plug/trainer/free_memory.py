@@ -1,4 +1,4 @@
-"""Memory that this process may still take: the free memory of the machine, bounded by its control group."""
+"""Memory that is left for this process: free memory of the machine, bounded by its control group."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from pathlib import Path
 MEMINFO = "proc/meminfo"
 CGROUP_V2 = ("sys/fs/cgroup/memory.max", "sys/fs/cgroup/memory.current")  # bytes; "max" for no limit
 CGROUP_V1 = ("sys/fs/cgroup/memory/memory.limit_in_bytes", "sys/fs/cgroup/memory/memory.usage_in_bytes")
-UNKNOWN = 8 << 30  # bytes of free memory assumed on systems that do not say, such as macOS and Windows
+UNKNOWN = 8 << 30  # bytes of free memory assumed on systems that do not report it, such as macOS and Windows
 
 
 def free_memory(root: Path = Path("/")) -> int:
     """Return the bytes that can be taken without swapping.
 
     Args:
-        root: Where the file system of the kernel is mounted.
+        root: Folder with `proc` and `sys` of the kernel.
     """
     found = [size for size in (_available(root), *(_left(root, *names) for names in (CGROUP_V2, CGROUP_V1))) if size]
     return min(found, default=UNKNOWN)

@@ -1,8 +1,8 @@
-"""Photographs of a capture that does not fit into memory decoded: some stay, others are decoded ahead of their turn.
+"""Photographs of a capture that is too large for memory when decoded: some stay, others are decoded ahead of use.
 
-2,000 photographs of 12 megapixels are 72 GB decoded. Every one is decoded once while the scene loads, so that a damaged
-file is found and named before training begins. The first of them stay in memory, up to three quarters of the bound;
-the others are decoded again for each use, on threads of their own, in the order in which training asks for them.
+2,000 photographs of 12 megapixels take 72 GB decoded. Each photograph is decoded once while the scene loads, so that a
+damaged file is found before training begins. The first ones stay in memory, up to three quarters of the bound. The
+others are decoded again for each use, on separate threads, in the order in which training needs them.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from skipgs_plug.trainer.scene import View
 
 T = TypeVar("T")
 Picture = tuple[Tensor, Tensor | None]  # pixels [H, W, 3] uint8, mask [H, W] bool
-SHARE_OF_FREE = 4  # photographs take at most a quarter of the free memory by default: the model needs the rest
-SHARE_AHEAD = 4  # a quarter of the bound is for photographs that are decoded ahead of their turn
+SHARE_OF_FREE = 4  # by default, photographs take at most a quarter of the free memory, since the model needs the rest
+SHARE_AHEAD = 4  # a quarter of the bound is for photographs that are decoded ahead of use
 MOST_AHEAD = 64  # photographs decoded ahead, at most: more would only take memory
 CORES_PER_THREAD = 4  # one decoding thread per four cores: decoding takes a small part of an iteration's time
 
 
 class StreamedView(View):
-    """A view whose photograph is decoded when it is needed, or a little before; of a fixed size."""
+    """A view whose photograph is decoded when it is needed, or a little earlier."""
 
     def __init__(self, view: View, store: ImageStore, load: Callable[[], Picture]) -> None:
         self.name, self.K, self.viewmat = view.name, view.K, view.viewmat
@@ -63,9 +63,9 @@ class ImageStore:
     """Holds the decoded photographs of a scene in bounded memory.
 
     Args:
-        capacity: bytes of decoded photographs and masks; None for a quarter of the memory that is free. One photograph
-            for each decoding thread comes on top, and the one that is in use.
-        progress: show how far reading has come, once it takes longer than two seconds.
+        capacity: Bytes of decoded photographs and masks; None for a quarter of the free memory. The photograph in use
+            and one photograph per decoding thread come on top.
+        progress: Show a progress bar if reading takes longer than two seconds.
     """
 
     def __init__(self, capacity: int | None = None, progress: bool = False) -> None:
@@ -79,13 +79,13 @@ class ImageStore:
         self._pool: ThreadPoolExecutor | None = None
 
     def reading(self, items: Sequence[T]) -> Iterator[T]:
-        """Iterate over the photographs that are read, with a progress bar if it takes long."""
+        """Iterate over items, with a progress bar if it takes long."""
         from tqdm.auto import tqdm
 
         return iter(tqdm(items, desc="Reading photographs", unit="", delay=2.0, disable=not self._progress))
 
     def keep(self, view: View, load: Callable[[], Picture]) -> View:
-        """Return the view itself if there is room, else a view that `load` decodes again when it is needed."""
+        """Return the view itself if there is room, else a view that calls `load` when it is needed."""
         size = picture_bytes(view)
         if self._resident + size <= self.capacity - self._window:
             self._resident += size
@@ -93,7 +93,7 @@ class ImageStore:
         return StreamedView(view, self, load)
 
     def expect(self, views: Iterable[View]) -> None:
-        """Decode these, which are needed next and in this order, as far as there is room; forget all others."""
+        """Decode these views, which are needed next in this order, as far as there is room. Forget all others."""
         room = self._window
         wanted: dict[str, StreamedView] = {}
         for view in views:
@@ -113,7 +113,7 @@ class ImageStore:
         """Return the photograph and its mask, decoded before or now.
 
         Raises:
-            InputError: the file has become unreadable since the scene was loaded; names it.
+            InputError: The file has become unreadable since the scene was loaded.
         """
         with self._lock:
             found = self._ahead.get(view.name)
@@ -140,7 +140,7 @@ class ReadAhead:
         self._this, self._next = ViewOrder(len(views), seed), ViewOrder(len(views), seed)
 
     def expect(self, ran: int) -> None:
-        """The iteration after `ran` others begins."""
+        """Tell the store that an iteration begins, after `ran` others."""
         if self._store is None:
             return
         epoch = ran // len(self._views)  # each order keeps the permutation of one epoch
@@ -149,7 +149,7 @@ class ReadAhead:
         self._store.expect([self._views[order.at(n)] for order, n in orders])
 
     def end(self) -> None:
-        """Stop decoding ahead: no iteration follows, and it would only delay the end of the process."""
+        """Stop decoding ahead: no iteration follows, and decoding would delay the end of the process."""
         if self._store is not None:
             self._store.expect([])
 

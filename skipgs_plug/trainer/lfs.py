@@ -1,4 +1,4 @@
-"""Git LFS pointers: three lines of text that a checkout has in place of a large file that was not fetched."""
+"""Git LFS pointers: three lines of text in place of a large file that was not fetched."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One process per run folder: two that write into one would mix their files."""
+"""Allow one process per run folder, since two processes would mix their files."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from skipgs_plug.trainer.files import write_json
 
 log = logging.getLogger(__name__)
 
-LOCK = ".lock"  # the operating system holds the lock and frees it however its process ends, so it is never stale
+LOCK = ".lock"  # the operating system frees the lock however its process ends, so it is never stale
 OWNER = ".owner.json"  # host and process id of the holder
 
 
 @contextlib.contextmanager
 def exclusive(folder: Path) -> Iterator[None]:
-    """Hold a folder, which is made, for this process alone inside the block.
+    """Create a folder, and hold it for this process alone inside the block.
 
     Raises:
-        InputError: another process holds it; names its host and process id.
-        WriteError: the folder cannot be written.
+        InputError: Another process holds it. The message names its host and process id.
+        WriteError: The folder cannot be written.
     """
     from filelock import FileLock, Timeout
 
@@ -55,5 +55,5 @@ def _owner(folder: Path) -> str:
     try:
         owner = json.loads((folder / OWNER).read_text())
         return f"process {int(owner['pid'])} on {str(owner['host'])[:200]}"
-    except (OSError, ValueError, KeyError, TypeError):  # it holds the lock and has not written its name yet
+    except (OSError, ValueError, KeyError, TypeError):  # the other process has not written its name yet
         return "another process"

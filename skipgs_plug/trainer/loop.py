@@ -1,4 +1,4 @@
-"""The training loop: the 3DGS recipe, one method per thing that happens."""
+"""The training loop: the 3DGS recipe, one method per step of an iteration."""
 
 from __future__ import annotations
 
@@ -34,25 +34,25 @@ from skipgs_plug.trainer.state import Stateful
 from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
 
 MEANS_LR_END = 0.01  # learning rate of positions at the end of the schedule, as a share of the first; 3DGS's value
-DRAWING = threading.Lock()  # held while a trainer draws random numbers: gsplat draws from one generator for all threads
+DRAWING = threading.Lock()  # held while a trainer draws random numbers: gsplat uses one generator for all threads
 
 
 class Iteration(NamedTuple):
     """Facts about one iteration, for `Trainer.on_step`."""
 
     step: int
-    since: int  # number right after the previous iteration; smaller than `step` where a gate left some out
+    since: int  # number right after the previous iteration; below `step` if a gate left out iterations between
     view: str
     loss: float
     image: Tensor  # [H, W, 3], detached
     target: Tensor  # [H, W, 3] uint8
 
     def passes(self, every: int) -> bool:
-        """Whether this iteration, or one that was left out right before it, is a multiple of `every`."""
+        """Whether this iteration, or a left-out iteration right before it, is a multiple of `every`."""
         return self.step // every > (self.since - 1) // every
 
     def completes(self, every: int) -> bool:
-        """Whether a multiple of `every` iterations is done after this one, counting those that were left out."""
+        """Whether this iteration completes a multiple of `every` iterations, left-out ones included."""
         return (self.step + 1) // every > self.since // every
 
 
@@ -64,7 +64,7 @@ class Trainer:
         ran: Number of iterations that ran. It is less than `step` when a gate leaves some out. Views take turns
             among the iterations that run.
         strategy: gsplat's DefaultStrategy, or None with `mcmc`.
-        exposure: Colour correction of each photograph, with an optimizer of its own; None unless asked for.
+        exposure: Colour correction of each photograph, with an optimizer of its own; None without `config.exposure`.
         refine_stop_iter: Iteration at which densification ends.
         near_plane: Near clipping plane, in the units of `scene.frame`, like the Gaussians.
         on_step: Called after every iteration, outside the clock.
@@ -117,25 +117,25 @@ class Trainer:
         self._warm = False
         self._photographs = Photographs(scene.train, self.backend.device)
         self._value: HostCopy | None = None  # loss of the present iteration
-        self._colour: Tensor | None = None  # behind the scene; None for black  # [3]
+        self._colour: Tensor | None = None  # background [3]; None for black
         if any(scene.background):
             self._colour = torch.tensor(scene.background, dtype=torch.float32, device=self.backend.device)
 
     @property
     def splats(self) -> nn.ParameterDict:
-        """Raw parameters `means scales quats opacities sh0 shN`, in coordinates of `scene.frame`, as they are now."""
+        """Current raw parameters `means scales quats opacities sh0 shN`, in coordinates of `scene.frame`."""
         self._catch_up()
         return self._splats
 
     @property
     def optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """One per parameter, by the same names, with moments that are up to date until the next iteration."""
+        """One optimizer per parameter, by the same names. Moments are up to date until the next iteration."""
         self._catch_up()
         return self._optimizers
 
     @property
     def num_gaussians(self) -> int:
-        """How many there are, for whoever asks often: nothing is brought up to date for it."""
+        """Number of Gaussians. This is cheap: unlike `splats`, it brings no parameter up to date."""
         return len(self._splats["means"])
 
     @property
@@ -150,7 +150,7 @@ class Trainer:
 
     @property
     def t_total(self) -> float:
-        """Seconds of training; evaluation, saving and kernel compilation excluded."""
+        """Seconds of training, without evaluation, saving and kernel compilation."""
         return self.clock.t_total
 
     @property
@@ -171,12 +171,12 @@ class Trainer:
                 loss = self.train_step()
                 bar.update(
                     self.step - before
-                )  # after the iteration: it raises when the reader of the output has gone away
+                )  # outside the iteration, since it raises when the reader of the output is gone
                 if self.ran % 10 == 0:
                     bar.set_postfix_str(f"loss={loss:.3f} | GS={self.num_gaussians}", refresh=False)
                 if self.stop_requested:
                     break
-            else:  # those at the end may have been left out
+            else:  # the last iterations may have been left out
                 self.step = self.step if self.stop_requested else max(self.step, until)
         self.stop_requested = False
         self.clock.settle()
@@ -184,7 +184,7 @@ class Trainer:
         self._catch_up()
 
     def iterations(self, until: int) -> range:
-        """Numbers of the iterations up to `until` (exclusive): the seam where a gate leaves some out."""
+        """Return the numbers of the iterations up to `until` (exclusive). A gate replaces it to leave some out."""
         return range(self.step, until)
 
     @single_precision()
@@ -235,13 +235,13 @@ class Trainer:
         return value
 
     def backward(self, loss: Tensor, view: str, step: int) -> None:
-        """Compute gradients: the seam that a gate replaces on the instance, called once per iteration.
+        """Compute gradients, once per iteration. A gate replaces this method on the instance.
 
         Raises:
-            InputError: the loss is not finite; names view and step.
+            InputError: The loss is not finite. The message names view and step.
         """
         value = self._value if self._value is not None else HostCopy(loss)
-        if value.is_under_way:  # a device need not wait for the answer
+        if value.is_under_way:  # the device computes gradients while the loss is copied
             loss.backward()
             self._require_finite(value, view, step)
         else:
@@ -271,7 +271,7 @@ class Trainer:
     @torch.no_grad()
     @single_precision()
     def render(self, view: View) -> Tensor:
-        """Return the image [H, W, 3] of a view, in [0, 1] up to overshoot; of a training view with its exposure."""
+        """Return the image [H, W, 3] of a view, in [0, 1] up to overshoot. A training view gets its exposure."""
         degree = self.active_sh_degree(max(self.step - 1, 0))
         image, _ = self._rasterize(view, degree, self._background())
         return self._exposed(image, view)
@@ -288,10 +288,10 @@ class Trainer:
         Args:
             split: "test" or "train".
             lpips_net: Backbone of LPIPS, which is measured too if one is named.
-            keep: Called with the number, the view and the render [H, W, 3] of each.
+            keep: Called for each view with its number, the view and its render [H, W, 3].
 
         Returns:
-            The means by name, their flavours, `num_GS step split views`, and `per_view`: the metrics of each.
+            The means by name, their flavours, `num_GS step split views`, and `per_view`: the metrics of each view.
         """
         views = {"test": self.scene.test, "train": self.scene.train}[split]
         if not views:
@@ -322,7 +322,7 @@ class Trainer:
         write_ply(self.scene.frame.dataset_splats(dict(self.splats.items())), path)
 
     def register_state(self, name: str, owner: Stateful) -> None:
-        """Let the state of `owner` travel in snapshots and checkpoints under `name`."""
+        """Store the state of `owner` in snapshots and checkpoints under `name`."""
         self.registered[name] = owner
 
     def snapshot(self) -> dict[str, Any]:
@@ -331,7 +331,7 @@ class Trainer:
         return state.capture(self)
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot; it stays valid for another restore."""
+        """Go back to a snapshot. The snapshot can be restored again later."""
         state.apply(self, snapshot)
 
     def save_checkpoint(self, path: str | Path) -> None:
@@ -390,7 +390,7 @@ class Trainer:
         return loss
 
     def _optimizer_step(self, info: dict[str, Any]) -> bool:
-        """Step; returns whether positions were updated, which a gate may leave out or put off."""
+        """Step all optimizers. Return whether positions were updated: a gate may leave out or postpone the update."""
         pending = self._splats["means"].grad is not None
         for optimizer in self._optimizers.values():
             if self.config.visible_adam:
@@ -421,10 +421,10 @@ class Trainer:
         reset_opacity_if_missed(strategy, *args)
 
     def _move(self, mcmc: Mcmc, step: int, updated: bool) -> None:
-        # The noise belongs to the update: alone it is a random walk.
+        # The noise belongs to the update: without an update it is a random walk.
         moves = mcmc.moves(step)
         if moves:
-            self.backend.release_memory()  # gsplat's copies of all rows lie beside it
+            self.backend.release_memory()  # gsplat copies all rows
             self._catch_up()
         if updated or moves:
             rate = self._optimizers["means"].param_groups[0]["lr"] if updated else 0.0
@@ -439,9 +439,9 @@ class Trainer:
 
     @contextmanager
     def _seeded(self, step: int) -> Iterator[None]:
-        """Seed the global generator, from which gsplat draws, for this iteration.
+        """Seed the global generator, which gsplat uses, for this iteration, so that a resumed run is the same run.
 
-        So resuming is exact. The caller's random state is put back.
+        The caller's random state is restored.
         """
         with DRAWING, torch.random.fork_rng(devices=self._random_devices):
             torch.manual_seed(derive_seed(self.config.seed, step))
@@ -449,13 +449,13 @@ class Trainer:
 
     @property
     def _random_devices(self) -> list[torch.device]:
-        """Devices whose random state is kept: without a list PyTorch would initialise every GPU."""
+        """Devices whose random state is restored. Without a list, PyTorch would initialise every GPU."""
         return [] if self.backend.device.type == "cpu" else [self.backend.device]
 
     def _warm_up(self, view: View) -> None:
-        """Compile kernels before the clock runs: a forward and backward of each kind, whose gradients are dropped.
+        """Compile kernels before the clock runs, by a forward and backward of each kind. Gradients are dropped.
 
-        Densification needs all that refinement does, but for the blend's adjoint with absolute gradients.
+        Densification and refinement use the same kernels, except for the adjoint with absolute gradients.
         """
         for with_rows in {True, not self.config.absgrad}:
             image, target, _ = self._forward(view, self.config.sh_degree, 0, with_rows)

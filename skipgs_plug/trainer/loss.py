@@ -1,4 +1,4 @@
-"""Training loss in plain torch, for devices without a fused one: (1 - w) L1 + w (1 - SSIM)."""
+"""Training loss in plain torch, for devices without a fused loss: (1 - w) L1 + w (1 - SSIM)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def blur(maps: Tensor) -> Tensor:
     offsets = torch.arange(WINDOW, device=maps.device, dtype=maps.dtype) - WINDOW // 2
     window = torch.exp(-(offsets**2) / (2 * SIGMA**2))
     window = window / window.sum()
-    # As channels of one image, each with its own copy of the window: on the CPU 20 times faster than as a batch.
+    # One image with many channels, each with its own copy of the window, is 20 times faster on the CPU than a batch.
     flat = maps.reshape(1, -1, *maps.shape[-2:])
     windows = window.expand(flat.shape[1], 1, 1, WINDOW)
     flat = F.conv2d(flat, windows.transpose(2, 3), padding=(WINDOW // 2, 0), groups=flat.shape[1])

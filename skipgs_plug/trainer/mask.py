@@ -1,4 +1,4 @@
-"""Pixels that do not count: people who walked by, sky, the rig."""
+"""Pixels that do not count, such as people who walked by, sky, or the rig."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from torch import Tensor
 
 
 def leave_out(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return both images [H, W, 3] black where `mask` [H, W] is False: no loss and no gradient comes from there.
+    """Return both images [H, W, 3], black where `mask` [H, W] is False, so that these pixels give no loss or gradient.
 
-    Means still run over all pixels, so a view weighs as much as is seen of it.
+    Means still run over all pixels, so the weight of a view is its share of visible pixels.
     """
     if mask is None:
         return image, target

@@ -1,4 +1,4 @@
-"""Densification by gsplat's MCMCStrategy: a fixed number of Gaussians that move to where they are needed."""
+"""Densification by gsplat's MCMCStrategy: a bounded number of Gaussians that move where they are needed."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from torch import nn
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.strategy import gsplat_class
 
-# Iterations between moves, at least. MCMC averages no gradients over views, so it can do with less than the default
+# Iterations between moves, at least. MCMC averages no gradients over views, so it needs fewer than the default
 # strategy's 100.
 MIN_MOVE_EVERY = 25
 
 
 class Mcmc:
-    """MCMC in units of the scene: the same scene at twice the size trains in the same way.
+    """MCMC in units of the scene, so that the same scene at twice the size trains in the same way.
 
-    Checkpoints need no state of it: its random numbers are a function of seed and iteration.
+    It has no state for checkpoints, since its random numbers are a function of seed and iteration.
 
     Attributes:
-        refine_start_iter: first iteration of the moves, exclusive, as all three in iterations of this run.
-        refine_stop_iter: end of the moves, exclusive.
-        refine_every: iterations from one to the next.
+        refine_start_iter: Iteration of this run after which moves begin.
+        refine_stop_iter: Iteration of this run before which moves end.
+        refine_every: Iterations of this run between two moves.
     """
 
     def __init__(self, config: TrainConfig, scene_scale: float) -> None:
@@ -32,7 +32,7 @@ class Mcmc:
         self.refine_start_iter = config.scaled(config.refine_start_iter)
         self._strategy = gsplat_class("MCMCStrategy")(
             cap_max=config.cap_max,
-            # It multiplies noise by covariances and by the rate of positions, which follows the scale of the scene.
+            # gsplat multiplies noise by covariances and by the rate of positions. Both grow with the scene.
             noise_lr=config.noise_lr / scene_scale**2,
             refine_start_iter=self.refine_start_iter,
             refine_stop_iter=self.refine_stop_iter,
@@ -48,7 +48,7 @@ class Mcmc:
     def after_update(
         self, splats: nn.ParameterDict, optimizers: dict[str, torch.optim.Optimizer], step: int, rate: float
     ) -> None:
-        """Move and add if it is time to, and noise positions in proportion to `rate`, their learning rate."""
+        """Move and add Gaussians if it is time, and add noise to positions in proportion to their rate `rate`."""
         on_cpu = splats["means"].device.type == "cpu"
         with _strategy_on_cpu() if on_cpu else contextlib.nullcontext():
             self._strategy.step_post_backward(splats, optimizers, self._constants, step, {}, lr=rate)

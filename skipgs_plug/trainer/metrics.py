@@ -1,4 +1,4 @@
-"""PSNR, SSIM and LPIPS of rendered images; each names its flavour. A new metric is one entry of METRICS."""
+"""PSNR, SSIM and LPIPS of rendered images, each with its exact definition. A new metric is one entry of METRICS."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from skipgs_plug.trainer.mask import leave_out
 from skipgs_plug.trainer.ssim import ssim_map
 
 SSIM_FLAVOUR = "torchmetrics 1.9: 11x11 Gaussian window, borders reflected, mean over all windows"
-LEAST_ERROR = 1e-10  # mean squared error of an image, at least: PSNR is at most 100 dB instead of infinite
+LEAST_ERROR = 1e-10  # smallest mean squared error of an image, so that PSNR is at most 100 dB, not infinite
 LPIPS_WEIGHTS = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 
 
@@ -27,15 +27,15 @@ class Metric:
     """One metric, with everything that evaluations, tables and logs need.
 
     Attributes:
-        name: key in stats and results.
-        label: name for people.
-        digits: shown after the point.
+        name: Key in stats and results.
+        label: Name in tables and messages.
+        digits: Digits after the point.
         flavour: A clause that distinguishes it from other metrics of that name.
-        measure: function of render and target, images [H, W, 3], the target in [0, 1], and mask [H, W] or None.
-        unit: shown after the label.
-        tag: name in TensorBoard, where gsplat names no flavour; the key itself if empty.
-        net: LPIPS backbone; the metric is computed on request only. None for a metric of every evaluation.
-        fitted: of the render after `fit_colours`, for models that were trained with exposure.
+        measure: Function of render and target, images [H, W, 3], the target in [0, 1], and mask [H, W] or None.
+        unit: Unit after the label.
+        tag: Name in TensorBoard, like in gsplat; empty for the key.
+        net: LPIPS backbone of a metric that is computed on request only; None for a metric of every evaluation.
+        fitted: Whether it measures the render after `fit_colours`, for models that were trained with exposure.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Metric:
 def psnr(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Return PSNR in dB of images [H, W, 3] clamped to [0, 1], over the pixels of `mask`; at most 100.
 
-    Equal images have no error; 100 dB are one of 0.00001, and a number that means and files can hold.
+    Equal images would have an infinite PSNR, which means and files cannot hold.
     """
     squares = (render.clamp(0, 1) - target) ** 2
     error = float((squares if mask is None else squares[mask.to(squares.device)]).mean())
@@ -89,7 +89,7 @@ def require_lpips(net: str) -> None:
 def lpips(render: Tensor, target: Tensor, mask: Tensor | None = None, *, net: str) -> float:
     """Return LPIPS (`net` alex or vgg, inputs normalised to [-1, 1]) of images [H, W, 3] in [0, 1].
 
-    It has no mask of its own: both images should be black outside one.
+    It ignores `mask`: both images should be black outside it.
     """
     from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
 
@@ -106,7 +106,7 @@ def batch(image: Tensor) -> Tensor:
 def after_fit(
     measure: Callable[[Tensor, Tensor, Tensor | None], float],
 ) -> Callable[[Tensor, Tensor, Tensor | None], float]:
-    """Return the metric of a render whose colours were fitted to the target's."""
+    """Return the metric after the colours of the render are fitted to the target."""
 
     def fitted(render: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
         image, target = leave_out(fit_colours(render, target, mask), target, mask)
@@ -122,7 +122,7 @@ METRICS = {
     for metric in (
         Metric("psnr", "PSNR", 2, "mean of per-image PSNR, float render clamped to [0, 1]", psnr, unit="dB"),
         Metric("ssim", "SSIM", 4, SSIM_FLAVOUR, ssim),
-        # As gsplat calls them.
+        # Names of gsplat.
         Metric("cc_psnr", "PSNR, colours fitted,", 2, FITTED, after_fit(psnr), unit="dB", fitted=True),
         Metric("cc_ssim", "SSIM, colours fitted", 4, f"{SSIM_FLAVOUR}; {FITTED}", after_fit(ssim), fitted=True),
         *(
@@ -137,7 +137,7 @@ METRICS = {
 
 
 def chosen(lpips_net: str | None = None, fitted: bool = False) -> list[Metric]:
-    """Return the metrics of every evaluation, LPIPS with a backbone if one is named, and those of fitted colours."""
+    """Return the metrics of every evaluation, with LPIPS for a backbone, and with fitted colours if asked for."""
     return [metric for metric in METRICS.values() if metric.net in (None, lpips_net) and metric.fitted <= fitted]
 
 
@@ -145,6 +145,9 @@ def measure(metrics: Sequence[Metric], render: Tensor, target: Tensor, mask: Ten
     """Return the metrics of a render against its target, images [H, W, 3], by name.
 
     Args:
-        mask: Pixels that count  # [H, W]
+        metrics: The metrics.
+        render: Image [H, W, 3].
+        target: Image [H, W, 3] in [0, 1].
+        mask: Pixels that count, [H, W]; None for all.
     """
     return {metric.name: metric.measure(render, target, mask) for metric in metrics}

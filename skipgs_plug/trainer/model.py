@@ -19,14 +19,14 @@ ADAM_EPS = 1e-15
 
 
 def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near: float = 0.0) -> nn.ParameterDict:
-    """Return the Gaussians that training starts from: those of the scene, else an isotropic one per point.
+    """Return the Gaussians that training starts from: the scene's, or an isotropic Gaussian per point.
 
     They are `means [N, 3]`, `scales [N, 3]` (log), `quats [N, 4]` (wxyz), `opacities [N]` (logit), `sh0 [N, 1, 3]` and
-    `shN [N, K - 1, 3]`, in the order of space. Points in front of a lens, nearer than the near plane `near`, are
-    left out.
+    `shN [N, K - 1, 3]`, sorted so that neighbours in space are neighbours in memory. Points in front of a lens, nearer
+    than the near plane `near`, are left out.
 
     Raises:
-        InputError: all points do.
+        InputError: All points are nearer than the near plane.
     """
     if scene.gaussians is not None:
         tensors = {name: tensor.clone() for name, tensor in scene.gaussians.items()}
@@ -62,7 +62,7 @@ def one_per_point(scene: Scene, config: TrainConfig) -> dict[str, Tensor]:
 
 
 def neighbour_distance(points: Tensor, scale: float = 1.0) -> Tensor:
-    """Return the root mean square distance to the three nearest other points [M], of duplicates 0.0003 of `scale`."""
+    """Return the root mean square distance to the three nearest other points [M]; 0.0003 of `scale` for duplicates."""
     from scipy.spatial import cKDTree
 
     distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=4)  # column 0 is the point itself
@@ -74,7 +74,7 @@ def neighbour_distance(points: Tensor, scale: float = 1.0) -> Tensor:
 def create_optimizers(
     splats: nn.ParameterDict, config: TrainConfig, scene_scale: float, backend: Backend
 ) -> dict[str, torch.optim.Optimizer]:
-    """Return one Adam per parameter, learning rates as in gsplat's simple_trainer."""
+    """Return one Adam per parameter, with the learning rates of gsplat's simple_trainer."""
     rates = {
         "means": config.means_lr * scene_scale,
         "scales": config.scales_lr,

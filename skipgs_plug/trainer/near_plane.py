@@ -1,4 +1,4 @@
-"""Where rendering begins in front of a camera, for a scene of any size."""
+"""The near and far clipping planes for a scene of any size."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from skipgs_plug.trainer.config import TINY, TrainConfig
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.scene import Scene, View
 
-SHARE = 0.1  # near plane as a share of the depth of the nearest points: surfaces may be nearer than any point on them
-NEAREST = 0.01  # share of a view's points that may be nearer than its depth: these are wrong matches
-LEAST = 20  # points in a view, at least, for its depth to count
-MOST = 20_000  # points that are projected, at most, which bounds the time; of more, every n-th
-# Near plane as a share of the cameras' extent, for a scene whose points tell no depth: 3DGS uses 0.2 units in scenes
-# whose cameras spread over about 5.
+SHARE = 0.1  # near plane as a share of the nearest points' depth: a surface may come closer than its points
+NEAREST = 0.01  # share of a view's points that may be nearer than its nearest depth: they are wrong matches
+LEAST = 20  # points that a view needs for its depth to count: fewer may be wrong matches
+MOST = 20_000  # projected points, at most, which bounds the time; of more points, every n-th is used
+# Near plane as a share of the cameras' extent, if the points tell no depth. 3DGS uses 0.2 units in scenes whose cameras
+# spread over about 5 units.
 SHARE_OF_EXTENT = 0.04
 
 
 def near_plane(config: TrainConfig, scene: Scene) -> float:
     """Return the near clipping plane in local units: that of the settings, or a tenth of the nearest points' depth.
 
-    A Gaussian close to a camera covers its whole picture, and no other view tells that it is wrong. Nothing that was
-    photographed lies so near. A fixed distance cannot be right: a COLMAP scene has no unit.
+    A Gaussian close to a camera covers its whole picture, and no other view shows that it is wrong. Nothing in a
+    photograph is so near. A fixed distance cannot be right, since a COLMAP scene has no unit.
 
     Raises:
-        InputError: not below the far plane.
+        InputError: The near plane is not below the far plane.
     """
     chosen = None if config.near_plane is None else config.near_plane / scene.frame.unit
     if chosen is None:
@@ -49,7 +49,8 @@ def nearest_depth(views: list[View], points: torch.Tensor) -> float | None:
     """Return the least depth of a view's nearest points, over all views; None if no view shows enough points.
 
     Args:
-        points: [M, 3], those that lie within a view's picture count for it, whether or not something hides them.
+        views: Views of the scene.
+        points: Points [M, 3]. A point counts for a view if it projects into its picture, even if something hides it.
     """
     points = points[:: -(-len(points) // MOST)]
     depths = []
@@ -62,10 +63,10 @@ def nearest_depth(views: list[View], points: torch.Tensor) -> float | None:
 
 
 def before_a_lens(views: list[View], points: torch.Tensor, near: float) -> torch.Tensor:
-    """Return which points [M] some view would show if they were not nearer than `near`, and no view shows.
+    """Return which points [M] no view shows because they are nearer than `near` in every picture that they are in.
 
-    Wrong matches. As Gaussians they would never be drawn in training, so nothing would move or prune them, and whoever
-    looks from near that camera with a nearer plane would see fog.
+    Such points are wrong matches. As Gaussians they would never be drawn in training, so nothing would move or prune
+    them. A viewer with a nearer plane would show them as fog in front of that camera.
     """
     hidden = torch.zeros(len(points), dtype=torch.bool)
     for view in views:

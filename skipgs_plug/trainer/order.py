@@ -1,4 +1,4 @@
-"""Which view an iteration trains on: every view once per shuffled epoch."""
+"""The order of training views: every view once per shuffled epoch."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import torch
 class ViewOrder:
     """View index as a pure function of seed and iteration, so resuming needs no stored generator state.
 
-    Epoch e is a permutation drawn from an own generator seeded with (seed, e); the global generators of
-    torch and numpy are neither read nor advanced.
+    Epoch e is a permutation from a generator seeded with (seed, e). The global generators of torch and numpy are not
+    used.
     """
 
     def __init__(self, n_views: int, seed: int) -> None:
@@ -29,5 +29,5 @@ class ViewOrder:
 
 
 def derive_seed(seed: int, counter: int) -> int:
-    """Return one 63-bit seed for (seed, counter); neighbouring counters give unrelated streams."""
+    """Return a 63-bit seed for (seed, counter). Neighbouring counters give unrelated random numbers."""
     return (seed * 0x9E3779B97F4A7C15 + counter * 0xD1342543DE82EF95 + 1) % (1 << 63)

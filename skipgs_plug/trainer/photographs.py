@@ -1,4 +1,4 @@
-"""Where photographs are kept while a GPU trains on them: there, or in pinned memory and copied ahead."""
+"""Photographs during training on a GPU: in its memory, or in pinned memory and copied ahead."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from skipgs_plug.trainer.scene import View
 
 log = logging.getLogger(__name__)
 
-SHARE = 0.25  # photographs take at most this share of the device's free memory: the model grows into the rest
+SHARE = 0.25  # largest share of the device's free memory for photographs: the model grows into the rest
 
 
 class Photographs:
-    """Gives training views whose tensors lie on the device.
+    """Provides training views whose tensors are on the device.
 
-    On the CPU a view is given as it is. Photographs that fit into a quarter of the device's free memory are copied
-    there once. Otherwise they stay in pinned memory, from where the next one is copied while the present one is trained
-    on, in a stream of its own. Poses, intrinsics and masks, which are small, are kept on the device in any case.
+    On the CPU, views do not change. Photographs that fit into a quarter of the device's free memory are copied there
+    once. Otherwise they stay in pinned memory, and the next one is copied in a separate stream during the present
+    iteration. Poses, intrinsics and masks are small and always stay on the device.
 
     Args:
         views: Training views.
-        device: Of the model.
-        free_bytes: Memory of the device that is free; None to ask it.
+        device: Device of the model.
+        free_bytes: Free memory of the device in bytes; None to ask the device.
 
     Attributes:
-        resident: whether photographs stay on the device.
+        resident: Whether photographs stay on the device.
     """
 
     def __init__(self, views: Sequence[View], device: torch.device, free_bytes: int | None = None) -> None:
@@ -57,7 +57,7 @@ class Photographs:
             )
 
     def on_device(self, view: View) -> View:
-        """Return a view with all its tensors on the device; the host does not wait for it."""
+        """Return a view with all its tensors on the device. The host does not wait for the copy."""
         if self._device.type == "cpu":
             return view
         if self._streams(view):
@@ -77,7 +77,7 @@ class Photographs:
         return dataclasses.replace(kept, image=image)
 
     def begin(self, view: View) -> None:
-        """Begin to copy a view's photograph, which is the next."""
+        """Start to copy the photograph of the next view."""
         if self._device.type == "cpu" or self.resident or view.name in self._ahead or self._streams(view):
             return
         self._ahead.clear()
@@ -120,5 +120,5 @@ def _free_bytes(backend: Any) -> int:
 def _pinned(image: Tensor) -> Tensor:
     try:
         return image.pin_memory()
-    except RuntimeError:  # the system allows no more of it; copies then wait for the host
+    except RuntimeError:  # the system allows no more pinned memory; copies then block the host
         return image

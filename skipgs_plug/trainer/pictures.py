@@ -13,8 +13,8 @@ from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.scene import View
 
 ERROR_GAIN = 4.0  # factor on absolute errors: at 1, an error of 0.05 would look black
-ZOOM = 2  # size of a pixel of the render in the picture, in pixels
-SMOOTH = 0.95  # decay of the running mean of losses, per iteration: about the mean of the last 20
+ZOOM = 2  # side of one pixel of the render in the picture, in pixels
+SMOOTH = 0.95  # decay of the running mean of losses per iteration: about the mean of the last 20
 
 
 @dataclass
@@ -36,8 +36,10 @@ def save_comparison(path: Path, views: list[View], renders: Mapping[str, Sequenc
     """Write a PNG with columns truth, each run, error of each run, for up to `rows` views.
 
     Args:
-        views: held-out views, truth [H, W, 3] uint8 in them.
-        renders: of these views by name of the run, each [H, W, 3] in [0, 1].
+        path: PNG file to write.
+        views: Held-out views with their photographs.
+        renders: Renders of these views by name of the run, each [H, W, 3] in [0, 1].
+        rows: Number of views to show, at most.
     """
     from PIL import Image, ImageDraw
 

@@ -22,18 +22,18 @@ from skipgs_plug.trainer.scene import check_points
 
 log = logging.getLogger(__name__)
 
-REST = 15  # SH coefficients of degrees 1 to 3, per colour channel
-SATURATING = ("opacity", "scale_0", "scale_1", "scale_2")  # infinite where a model is saturated
+REST = 15  # SH coefficients of degrees 1 to 3 per colour channel
+SATURATING = ("opacity", "scale_0", "scale_1", "scale_2")  # may be infinite in a saturated model
 REST_COUNTS = (0, 9, 24, 45)  # f_rest properties of SH degrees 0 to 3
-MAX_LOG_SCALE = 80.0  # largest logarithm of a scale that is read: float32 overflows at e^88
+MAX_LOG_SCALE = 80.0  # largest logarithm of a scale in a file: float32 overflows at e^88
 MAX_LOGIT = 20.0  # opacity logit that stands for infinity in a file: its opacity is 1 in float32
 MIN_LOG_SCALE = -40.0  # smallest logarithm of a scale: the square of e^-40 is still a normal float32
 MAX_HEADER = (
     1 << 16
 )  # bytes of a header, at most: 3DGS headers take about 2 KB, and a damaged file may have no end_header
 COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-BRIGHTEST = 2.0  # largest number in a cloud whose colours are floats from 0 to 1; with 255 as white it would be black
-PACKED_COLOURS = ("rgb", "rgba")  # of the Point Cloud Library: one number, bytes 0xAARRGGBB
+BRIGHTEST = 2.0  # float colours up to this value have a range of 0 to 1; in a range of 0 to 255 they would be black
+PACKED_COLOURS = ("rgb", "rgba")  # format of the Point Cloud Library: one number with bytes 0xAARRGGBB
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
     *(f"f_rest_{i}" for i in range(3 * REST)),
@@ -42,7 +42,7 @@ PROPERTIES = (
 
 
 def sh_degree(coefficients: int) -> int:
-    """Return the SH degree that has so many coefficients beyond the constant one: 0, 3, 8 or 15."""
+    """Return the SH degree with this number of coefficients beyond the constant one: 0, 3, 8 or 15."""
     return round((coefficients + 1) ** 0.5) - 1
 
 
@@ -84,8 +84,8 @@ def read_ply(path: str | Path) -> dict[str, Tensor]:
         `sh0 [N, 1, 3]` and `shN [N, K - 1, 3]`, float32 on the CPU.
 
     Raises:
-        MissingFileError: no such file.
-        InputError: not a PLY, truncated, not a Gaussian PLY, empty, or with values that cannot be rendered.
+        MissingFileError: The file does not exist.
+        InputError: The file is not a Gaussian PLY, truncated, empty, or has values that cannot be rendered.
     """
     return model_of(Path(path), read_vertices(Path(path)))
 
@@ -93,11 +93,11 @@ def read_ply(path: str | Path) -> dict[str, Tensor]:
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Read a point cloud: positions [M, 3] and colours [M, 3] uint8, grey if the file has no colours.
 
-    Positions are float32, or float64 where that would lose some.
+    Positions are float32, or float64 if float32 would lose precision.
 
     Raises:
-        MissingFileError: no such file.
-        InputError: not a PLY, truncated, without x, y and z, or with values that are not finite.
+        MissingFileError: The file does not exist.
+        InputError: The file is not a PLY, truncated, lacks x, y and z, or has values that are not finite.
     """
     return points_of(Path(path), read_vertices(Path(path)))
 
@@ -106,8 +106,9 @@ def read_start(path: str | Path) -> tuple[tuple[np.ndarray, np.ndarray], dict[st
     """Read a start for training: positions and colours like `read_points`, and the Gaussians of a 3DGS model.
 
     Raises:
-        MissingFileError: no such file.
-        InputError: neither a point cloud nor a model, of fewer than four points, or compressed, which rounds.
+        MissingFileError: The file does not exist.
+        InputError: The file is neither a point cloud nor a model, has fewer than four points, or is compressed and so
+            rounded.
     """
     path = Path(path).expanduser()
     vertices = read_vertices(path, rounded=False)
@@ -147,25 +148,25 @@ def model_of(path: Path, vertices: Mapping[str, np.ndarray]) -> dict[str, Tensor
 
 
 def saturated(splats: Mapping[str, Tensor], path: str | Path) -> dict[str, Tensor]:
-    """Return raw parameters with finite numbers in place of infinite opacities and zero scales, and print their number.
+    """Replace infinite opacities and zero scales in raw parameters by finite numbers, and warn about their number.
 
-    A saturated model has them: an opacity of 1 is infinite as a logit, a flat Gaussian has a scale of e^-inf.
+    A saturated model has them: an opacity of 1 is infinite as a logit, and a flat Gaussian has a scale of e^-inf.
     """
     result = dict(splats)
     for name, low, high in (("opacities", -MAX_LOGIT, MAX_LOGIT), ("scales", MIN_LOG_SCALE, np.inf)):
         values = result[name]
         infinite = torch.isinf(values) & ((values < 0) | (high < np.inf))
         if bool(infinite.any()):
-            log.warning("%s: %d %s of infinite value are taken as finite.", path, int(infinite.sum()), name)
+            log.warning("%s: %d infinite %s are read as finite numbers.", path, int(infinite.sum()), name)
             result[name] = torch.where(infinite, values.clamp(low, high), values)
     return result
 
 
 def renderable(splats: Mapping[str, Tensor], path: str | Path) -> dict[str, Tensor]:
-    """Return raw parameters as `saturated`.
+    """Return the result of `saturated`.
 
     Raises:
-        InputError: other values are not finite, or scales too large; names `path`.
+        InputError: Other values are not finite, or scales are too large. The message names `path`.
     """
     result = saturated(splats, path)
     if not all(bool(torch.isfinite(values).all()) for values in result.values()):
@@ -185,7 +186,7 @@ def points_of(path: Path, vertices: Mapping[str, np.ndarray]) -> tuple[np.ndarra
 
 
 def positions_of(vertices: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return positions [N, 3]: float64 where the file has them so and float32 would lose some, else float32."""
+    """Return positions [N, 3]: float64 if the file has float64 and float32 would lose precision, else float32."""
     table = np.stack([vertices[name].astype(np.float64) for name in ("x", "y", "z")], axis=1)
     short = table.astype(np.float32)
     far = len(table) and np.abs(table).max() > FAR * max(float(np.ptp(table, axis=0).max()), 1e-300)
@@ -195,8 +196,8 @@ def positions_of(vertices: Mapping[str, np.ndarray]) -> np.ndarray:
 def colours_of(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return colours [M, 3] uint8 from columns of any known name and type; grey if there are no colours.
 
-    Bytes are taken as they are, also those of a type with a sign. The range of other types is told by the largest
-    value: up to 1 for floats, which may exceed it a little, else up to 255, else up to 65,535.
+    Bytes are used unchanged, even bytes of a signed type. For other types, the largest value tells the range: up to 1
+    for floats (or slightly more), else up to 255, else up to 65,535.
     """
     by_name = {name.lower(): values for name, values in vertices.items()}
     for name in PACKED_COLOURS:
@@ -223,7 +224,7 @@ def colours_of(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def read_vertices(path: Path, rounded: bool = True) -> dict[str, np.ndarray]:
-    """Return the vertices' properties [N] by name. The claims of the header are checked before memory is allocated."""
+    """Return the vertices' properties [N] by name. The header is checked before memory is allocated."""
     from plyfile import PlyData, PlyParseError
 
     check_header(path)
@@ -278,7 +279,7 @@ def plain_names(vertices: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def check_header(path: Path) -> None:
-    """Refuse counts that the file cannot hold: each value takes a byte at least, and vertices have no lists."""
+    """Refuse counts that the file cannot hold: each value takes at least one byte, and vertices have no lists."""
     if not os.path.isfile(path):
         raise MissingFileError(f"PLY {path} does not exist; give the path of a PLY file.")
     try:
@@ -311,7 +312,7 @@ def check_header(path: Path) -> None:
 def columns(
     path: Path, vertices: Mapping[str, np.ndarray], names: list[str], infinite: tuple[str, ...] = ()
 ) -> np.ndarray:
-    """Return the named properties as a table [N, len(names)] float32, finite but for those in `infinite`."""
+    """Return the named properties as a table [N, len(names)] float32. All but those in `infinite` must be finite."""
     with np.errstate(over="ignore"):
         table = np.stack([vertices[name].astype(np.float32) for name in names], axis=1)
     may_be = np.array([name in infinite for name in names])

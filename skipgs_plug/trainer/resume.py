@@ -1,4 +1,4 @@
-"""Continue a run from the newest of its checkpoints that is sound."""
+"""Continue a run from its newest readable checkpoint."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ Result = TypeVar("Result")
 
 
 def lengths(path: Path) -> dict[str, Any]:
-    """Return `max_steps` and `schedule_steps` of the run that a checkpoint belongs to.
+    """Return `max_steps` and `schedule_steps` of the run of a checkpoint.
 
     Raises:
-        DamagedCheckpointError: it is damaged.
+        DamagedCheckpointError: The checkpoint is damaged.
     """
     config = read_checkpoint(path, torch.device("cpu"))["config"]
     return {name: config[name] for name in ("max_steps", "schedule_steps")}
 
 
 def first_sound(checkpoints: list[Path], use: Callable[[Path], Result]) -> tuple[list[Path], Result]:
-    """Use the first checkpoint that is not damaged, and say which ones are.
+    """Use the first checkpoint that is not damaged, and warn about damaged ones.
 
     Returns:
-        The checkpoints from that one on, and what `use` returned.
+        The checkpoints from that one on, and the result of `use`.
 
     Raises:
-        DamagedCheckpointError: all are damaged; names the last.
+        DamagedCheckpointError: All checkpoints are damaged. The message names the last one.
     """
     for i, path in enumerate(checkpoints[:-1]):
         try:

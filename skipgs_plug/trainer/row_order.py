@@ -1,9 +1,9 @@
 """The order of the Gaussians' rows: neighbours in space are neighbours in memory.
 
-A camera sees part of a scene. When rows follow a Morton curve (Morton 1966) through space, the CPU rasterizer can leave
-out 16 rows at a time that lie outside the view, and the rows of a tile lie close together in memory. Densification
-appends rows, so all rows are sorted again from time to time, with the state of optimizers and strategy. Training
-therefore begins with another order than that of the points, and PLY files and checkpoints hold the sorted rows.
+A camera sees part of a scene. If rows follow a Morton curve (Morton 1966) through space, the CPU rasterizer can skip 16
+rows at a time outside the view, and the rows of a tile lie close together in memory. Densification appends rows, so all
+rows are sorted again from time to time, with the state of optimizers and strategy. So Gaussians are not in the order of
+the points, and PLY files and checkpoints hold sorted rows.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from torch import Tensor, nn
 
 from skipgs_plug.fallback_raster import take_rows
 
-EVERY = 4  # densifications between two sorts: each adds few rows, at the end, and sorting all rows costs more
+EVERY = 4  # densifications between two sorts: one densification adds few rows, and sorting all rows takes longer
 BITS = 10  # bits per coordinate in a Morton code: three coordinates fit a 32-bit integer
-# Share of the centres at either end of an axis that lies outside the grid. Else a few far centres would leave all
-# others in one cell.
+# Share of the centres at either end of an axis that lies outside the grid. Without it, a few far centres would put all
+# others into one cell.
 MARGIN = 0.02
 
 
 def sorts_rows(strategy: Any, step: int) -> bool:
-    """Whether rows are sorted after iteration `step`: at every fourth refinement and at the last."""
+    """Whether rows are sorted after iteration `step`: at every fourth densification and at the last one."""
     every = strategy.refine_every
     if step % every or not strategy.refine_start_iter < step < strategy.refine_stop_iter:
         return False
@@ -34,9 +34,9 @@ def sorts_rows(strategy: Any, step: int) -> bool:
 def sort_rows(
     splats: nn.ParameterDict, optimizers: dict[str, torch.optim.Optimizer], strategy_state: dict[str, Any]
 ) -> None:
-    """Put the rows of all parameters, of their gradients and moments and of the strategy's sums in the order of space.
+    """Sort the rows of all parameters, gradients, moments and sums of the strategy along the Morton curve.
 
-    Parameters stay the same objects; their values move.
+    Parameters stay the same objects.
     """
     order = morton_order(splats["means"])
     n = len(order)
@@ -45,7 +45,7 @@ def sort_rows(
         for tensor in (param, *state.values()):
             if isinstance(tensor, Tensor) and tensor.shape[:1] == (n,):
                 tensor.copy_(tensor[order])
-        if param.grad is not None:  # a gate may put the step off
+        if param.grad is not None:  # a gate may postpone the step
             param.grad = param.grad.index_select(0, order)
     for key, value in strategy_state.items():
         if isinstance(value, Tensor) and value.shape[:1] == (n,):
@@ -68,7 +68,7 @@ def morton_order(means: Tensor) -> Tensor:
 
 
 def take(tensor: Tensor, rows: Tensor) -> Tensor:
-    """Return `tensor[rows]`; on the CPU on all cores, and in large pages if it is large, which kernels read faster."""
+    """Return `tensor[rows]`. On the CPU it uses all cores, and large pages for large results, which are read faster."""
     if tensor.device.type == "cpu":
         return take_rows(tensor, rows.to(torch.int32))
     return tensor[rows]

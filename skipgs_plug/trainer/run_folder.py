@@ -21,9 +21,9 @@ from skipgs_plug.trainer.loop import Trainer
 from skipgs_plug.trainer.scene import View
 
 CHECKPOINT = re.compile(r"ckpt_(\d+)_rank0\.pt")
-SCENE = "scene"  # folder in a run folder with the scene that `train --sfm` reconstructed
-KEPT = 2  # checkpoints that stay: the older one is read when the last is damaged
-MOST_WAITING = 2  # renders that wait to be written: memory stays bounded where the disk is slow
+SCENE = "scene"  # subfolder with the scene that `train --sfm` reconstructed
+KEPT = 2  # checkpoints to keep: the older one serves if the last is damaged
+MOST_WAITING = 2  # renders that may wait for a slow disk, which bounds memory
 FOLDERS = ("", "ckpts", "ply", "stats", "renders")
 
 
@@ -56,14 +56,14 @@ class RunFolder:
         return path
 
     def checkpoints(self) -> list[Path]:
-        """Return the checkpoints, that of the highest iteration first."""
+        """Return the checkpoints, with the highest iteration first."""
         found = [
             (match, path) for path in (self.root / "ckpts").glob("*") if (match := CHECKPOINT.fullmatch(path.name))
         ]
         return [path for match, path in sorted(found, key=lambda entry: -int(entry[0][1]))]
 
     def remove_leftovers(self) -> None:
-        """Remove half-written files of a killed run. No other process may be writing here."""
+        """Remove half-written files of a killed run. No other process may be writing to the folder."""
         for name in FOLDERS:
             remove_leftovers(self.root / name)
 
@@ -86,7 +86,7 @@ class RunFolder:
         It takes the number of a held-out (or, for "train", training) view, the view, and its render [H, W, 3].
 
         Raises:
-            WriteError: One could not be written; those after it are left out. Raised at the end of the block.
+            WriteError: A render could not be written, and later ones are left out. Raised at the end of the block.
         """
         waiting: deque[Future[None]] = deque()
         failed: list[BaseException] = []

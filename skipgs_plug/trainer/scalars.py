@@ -14,17 +14,19 @@ from skipgs_plug.files import WriteError, keep_going
 from skipgs_plug.trainer.loop import Iteration, Trainer
 from skipgs_plug.trainer.metrics import METRICS
 
-EVERY = 10  # iterations between two logged points, as in gsplat's script
+EVERY = 10  # iterations between two logged points; a point costs two evaluations of the loss
 
 
 class ScalarLog:
-    """Writes scalars of a training into a folder that TensorBoard reads.
+    """Writes scalars of a training run into a folder for TensorBoard.
 
-    A folder in which an earlier run got further is continued: TensorBoard drops what that run wrote from this
-    iteration on. When the disk is full, the curves end and training continues.
+    A resumed run continues its folder: TensorBoard drops older points from the present iteration on. If the disk is
+    full, the curves end and training continues.
 
     Args:
-        more: asked for further scalars with their own tags, at each iteration that is written.
+        folder: The folder.
+        trainer: The trainer.
+        more: Returns further scalars with their own tags. It is called at each written iteration.
     """
 
     def __init__(self, folder: Path, trainer: Trainer, more: Callable[[], Mapping[str, float]] = dict) -> None:
@@ -39,7 +41,7 @@ class ScalarLog:
         if not iteration.passes(EVERY):
             return
         trainer, image, target = self._trainer, iteration.image, iteration.target
-        with torch.no_grad():  # the parts of the loss that the trainer computes in one go
+        with torch.no_grad():  # the trainer computes both parts of the loss at once
             l1, ssim = (float(trainer.backend.loss(image, target, weight)) for weight in (0.0, 1.0))
         scalars = {"loss": iteration.loss, "l1loss": l1, "ssimloss": ssim, "num_GS": trainer.num_gaussians}
         memory = peak_memory(trainer.backend.device)
@@ -69,7 +71,7 @@ class ScalarLog:
 
 
 def peak_memory(device: torch.device) -> int | None:
-    """Return the most bytes in use so far: torch's on the GPU, else the process's; None on Windows."""
+    """Return the peak memory in bytes: torch's on the GPU, else the process's; None on Windows."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     status = Path("/proc/self/status")

@@ -1,4 +1,4 @@
-"""Scene and View: images with camera poses, and a point cloud, whatever format they were read from."""
+"""Scene and View: images with camera poses, and a point cloud, independent of the file format."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
 MIN_POINTS = 4  # the scale of an initial Gaussian is the mean distance to its three nearest neighbours
 MIN_SIDE = 11  # pixels: the side of SSIM's window
-SCENE_SCALE = 1.1  # of every scene, whose cameras have an extent of 1 in local coordinates; 3DGS's factor
+SCENE_SCALE = 1.1  # scale of every scene: 3DGS's factor times the cameras' extent, which is 1 in local coordinates
 MAX_COORDINATE = 1e15  # units of the scene: squares of distances stay below the largest float32, 3e38
 
 
@@ -25,9 +25,9 @@ MAX_COORDINATE = 1e15  # units of the scene: squares of distances stay below the
 class View:
     """One posed photograph.
 
-    `name` is the image path relative to the scene, unique in it: the key under which a gate remembers the
-    view. The camera looks along +z, x right, y down; pixel centres lie at +0.5. Camera matrices are float64, so that
-    a scene has the same cameras whatever format it came in; renderers take them as float32.
+    `name` is the image path relative to the scene. It is unique, and a gate uses it as the key of the view. The camera
+    looks along +z, with x right and y down; pixel centres lie at +0.5. Camera matrices are float64, so that a scene has
+    the same cameras in every file format. Renderers take them as float32.
     """
 
     name: str
@@ -74,12 +74,12 @@ class Scene:
     points_rgb: Tensor  # [M, 3] uint8
     scene_scale: float  # 1.1 x the extent that `frame` makes 1; 3DGS's name and factor for it
     background: tuple[float, float, float] = BLACK  # colour in [0, 1] behind the scene
-    gaussians: dict[str, Tensor] | None = None  # as of `read_ply`, to start from instead of one per point; local
+    gaussians: dict[str, Tensor] | None = None  # raw parameters to start from, in local coordinates; None: from points
     frame: Frame = field(default_factory=Frame)  # from local coordinates to those of the dataset
 
 
 def split_views(views: list[View], test_every: int) -> tuple[list[View], list[View]]:
-    """Sort by name and hold out index % test_every == 0; returns (train, test)."""
+    """Sort by name, hold out index % test_every == 0, and return (train, test)."""
     views = sorted(views, key=lambda view: view.name)
     if test_every == 0:
         return views, []

@@ -1,4 +1,4 @@
-"""Adam that touches only the Gaussians a view shows (Taming 3DGS; gsplat's SelectiveAdam)."""
+"""Adam that updates only the Gaussians that a view shows (Taming 3DGS; gsplat's SelectiveAdam)."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from skipgs_plug.fallback_raster import adam_rows, moments
 
 
 class SelectiveAdam(torch.optim.Adam):
-    """Adam without bias correction whose moments and values move only for visible rows.
+    """Adam without bias correction that updates moments and values of visible rows only.
 
-    gsplat's class of that name runs in CUDA only; this one has its semantics on the CPU too.
+    gsplat's class of that name runs on CUDA only. This class does the same on the CPU too.
     """
 
     def __init__(self, params: Any, eps: float, betas: tuple[float, float] = (0.9, 0.999)) -> None:
@@ -21,7 +21,7 @@ class SelectiveAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, visibility: Tensor) -> None:  # type: ignore[override]
-        """Update rows where `visibility` [N] bool holds; no-op for parameters without gradient."""
+        """Update the rows in which `visibility` [N] is True. Parameters without a gradient do not change."""
         for group in self.param_groups:
             for param in group["params"]:
                 if param.grad is None:

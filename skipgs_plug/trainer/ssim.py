@@ -1,6 +1,6 @@
-"""SSIM with the results of torchmetrics 1.9, without importing it.
+"""SSIM with the results of torchmetrics 1.9, without importing torchmetrics.
 
-torchmetrics loads SciPy's signal processing and matplotlib, which takes longer than an evaluation.
+It imports SciPy's signal processing and matplotlib, which takes longer than an evaluation.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from torch.nn import functional
 
 SIGMA = 1.5
 RADIUS = 5  # the window has 11 pixels a side
-C1, C2 = 0.01**2, 0.03**2  # of values in [0, 1]
+C1, C2 = 0.01**2, 0.03**2  # SSIM's constants for values in [0, 1]
 
 
 def ssim_map(first: Tensor, second: Tensor) -> Tensor:
-    """Return the SSIM of every window, by its centre: two images [H, W, 3] in [0, 1] -> [H, W, 3].
+    """Return the SSIM [H, W, 3] of the window around each pixel, for two images [H, W, 3] in [0, 1].
 
-    Windows are Gaussian, of 11x11 pixels; where they reach beyond the image, its border is reflected.
+    Windows are Gaussian, of 11x11 pixels. The image is reflected at its border.
     """
     images = torch.stack([image.permute(2, 0, 1) for image in (first, second)])  # [2, 3, H, W]
     one, other = functional.pad(images, (RADIUS,) * 4, mode="reflect")

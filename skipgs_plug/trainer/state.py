@@ -30,7 +30,7 @@ VERSION = 1
 MOMENTS = {"step", "exp_avg", "exp_avg_sq"}
 # Settings that may differ between a run and its continuation; `_require_same_run` treats the two lengths.
 FREE_FIELDS = ("data_dir", "result_dir", "backend", "max_steps", "schedule_steps")
-# Errors of reading damaged bytes: they depend on the byte, which may be a length, a key, a decoder or an attribute.
+# Errors from reading damaged bytes. A damaged byte may be part of a length, a key, a decoder or an attribute.
 DAMAGE = (
     *(pickle.UnpicklingError, zipfile.BadZipFile, EOFError, OSError, MemoryError, OverflowError),
     *(RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError),
@@ -38,7 +38,7 @@ DAMAGE = (
 
 
 class Stateful(Protocol):
-    """Anything whose state should travel in snapshots and checkpoints."""
+    """An object whose state is part of snapshots and checkpoints."""
 
     def state_dict(self) -> dict[str, Any]: ...
 
@@ -46,7 +46,7 @@ class Stateful(Protocol):
 
 
 class Capturable(Protocol):
-    """The part of a `Trainer` that a snapshot holds and a checkpoint is compared with."""
+    """The part of a `Trainer` that snapshots and checkpoints use."""
 
     step: int
     ran: int
@@ -67,7 +67,7 @@ class Capturable(Protocol):
 
 
 class ConfigEntry(TypedDict):
-    """Settings of every config: length of the run, and of its schedule."""
+    """Settings that every checkpoint has: length of the run and of its schedule."""
 
     max_steps: int
     schedule_steps: int
@@ -81,7 +81,7 @@ class SceneEntry(TypedDict):
 
 
 class Checkpoint(TypedDict):
-    """Content of a checkpoint file: that of `capture`, with config and view names."""
+    """Content of a checkpoint file: the result of `capture` with config and scene."""
 
     version: int
     step: int
@@ -98,17 +98,17 @@ class Checkpoint(TypedDict):
 def capture(trainer: Capturable) -> dict[str, Any]:
     """Return an independent copy of everything that the next iteration depends on.
 
-    Keys: `version`, `step` (next iteration), `ran` (iterations that ran), `splats`, `optimizers` (moments by
-    parameter), `strategy`, `clock` (seconds), `registered` (state_dict of each registered object). View order and
-    split noise are functions of seed, step and `ran` and need no entry.
+    Keys: `version`, `step` (next iteration), `ran` (number of iterations that ran), `splats`, `optimizers` (moments by
+    parameter), `strategy`, `clock` (seconds), `registered` (state_dict of each registered object). View order and split
+    noise need no entry, since they are functions of seed, `step` and `ran`.
     """
     return copy.deepcopy(_view(trainer))
 
 
 def apply(trainer: Capturable, state: dict[str, Any]) -> None:
-    """Put a captured state back, keeping the optimizer objects so that attached tools stay attached.
+    """Restore a captured state. The optimizer objects stay the same, so that attached tools stay attached.
 
-    Registered objects without an entry (a gate attached later) are left as they are.
+    Registered objects without an entry, such as a gate that was attached later, do not change.
     """
     state = copy.deepcopy(state)
     trainer.step = state["step"]
@@ -130,10 +130,10 @@ def apply(trainer: Capturable, state: dict[str, Any]) -> None:
 
 
 def save_checkpoint(trainer: Capturable, path: str | Path) -> None:
-    """Write the captured state with config and view names; loads with `weights_only=True`.
+    """Write the captured state with config and scene. The file loads with `weights_only=True`.
 
     Raises:
-        WriteError: it cannot be written; says how much room it needs.
+        WriteError: The file cannot be written. The message says how much space it needs.
     """
     content = {
         **_view(trainer),
@@ -146,18 +146,18 @@ def save_checkpoint(trainer: Capturable, path: str | Path) -> None:
         },
     }
     size = sum(tensor.nbytes for tensor in _tensors(content))
-    # Through a file of ours: given a path, torch forgets why it could not write.
+    # Given an open file, torch keeps the reason of a failure. Given a path, it does not.
     with write_aside(path, size) as temporary, temporary.open("wb") as file:
         torch.save(content, file)
 
 
 def read_checkpoint(path: str | Path, device: torch.device) -> dict[str, Any]:
-    """Return the content of a checkpoint, every entry of it of the right type.
+    """Return the content of a checkpoint, in which every entry has the right type.
 
     Raises:
-        MissingFileError: no such file.
-        DamagedCheckpointError: something is missing or of another type, or NaN.
-        InputError: of another version.
+        MissingFileError: The file does not exist.
+        DamagedCheckpointError: An entry is missing, has another type, or holds NaN.
+        InputError: The checkpoint has another version.
     """
     path = Path(path)
     if not path.is_file():
@@ -181,12 +181,12 @@ def read_checkpoint(path: str | Path, device: torch.device) -> dict[str, Any]:
 
 
 def load_checkpoint(trainer: Capturable, path: str | Path) -> None:
-    """Continue where a checkpoint of the same scene and settings stopped.
+    """Continue from a checkpoint of the same scene and settings.
 
     Raises:
-        MissingFileError: no such file.
-        DamagedCheckpointError: damaged, or with NaN values.
-        InputError: of another scene, or made with other settings.
+        MissingFileError: The file does not exist.
+        DamagedCheckpointError: The checkpoint is damaged or holds NaN.
+        InputError: The checkpoint is of another scene, or made with other settings.
     """
     content = read_checkpoint(path, trainer.backend.device)
     _require_same_run(trainer, content, path)
@@ -229,7 +229,7 @@ def _tensors(value: Any) -> Iterator[Tensor]:
 
 
 def _check_tensors(content: dict[str, Any]) -> None:
-    """Raise SchemaError unless all tensors are finite and speak of the same Gaussians."""
+    """Raise SchemaError unless all tensors are finite and have the same number of rows."""
     splats = content["splats"]
     n = {len(tensor) if tensor.ndim else -1 for tensor in splats.values()}
     if len(n) != 1 or min(n) < 1:
@@ -256,7 +256,7 @@ def _require_same_run(trainer: Capturable, content: dict[str, Any], path: str | 
     if content["scene"]["view_names"] != list(trainer.view_names):
         raise InputError(f"Checkpoint {path} was made with other training views; resume with its own scene and split.")
     _require_same_cameras(trainer.scene, content["scene"], path)
-    # A checkpoint that is older than a setting was made with its present default.
+    # A checkpoint that is older than a setting was made with the present default.
     made_with = {field.name: field.default for field in dataclasses.fields(TrainConfig)} | content["config"]
     for name, value in dataclasses.asdict(trainer.config).items():
         if name not in FREE_FIELDS and made_with[name] != value:
@@ -277,12 +277,12 @@ def _require_same_run(trainer: Capturable, content: dict[str, Any], path: str | 
 
 
 def _in_local_coordinates(content: dict[str, Any], scene: Scene) -> dict[str, Any]:
-    """Return the content of a checkpoint for training; up to 0.1.0 it is in coordinates of the dataset."""
+    """Return the content of a checkpoint in local coordinates. Up to 0.1.0, checkpoints use those of the dataset."""
     if frame_of(content["scene"]).moves or not scene.frame.moves:
         return content
     unit = scene.frame.unit
     moments = dict(content["optimizers"]["means"])
-    for key, power in (("exp_avg", 1), ("exp_avg_sq", 2)):  # of gradients, which grow with the unit
+    for key, power in (("exp_avg", 1), ("exp_avg_sq", 2)):  # moments of gradients, which grow with the unit
         if key in moments:
             moments[key] = moments[key] * unit**power
     strategy = content["strategy"]
@@ -297,7 +297,7 @@ def _in_local_coordinates(content: dict[str, Any], scene: Scene) -> dict[str, An
 
 
 def _require_same_cameras(scene: Scene, saved: Mapping[str, Any], path: str | Path) -> None:
-    """Raise InputError if Gaussians of a checkpoint would not lie where the cameras of the scene look."""
+    """Raise InputError if the checkpoint was trained with other cameras or in another frame than the scene's."""
     try:
         frame = frame_of(saved)
     except (TypeError, ValueError, KeyError) as error:
@@ -313,7 +313,9 @@ def _require_same_cameras(scene: Scene, saved: Mapping[str, Any], path: str | Pa
         return
     own = _viewmats(scene)
     if not isinstance(poses, Tensor) or poses.shape != own.shape:
-        raise DamagedCheckpointError(f"Checkpoint {path} is damaged (its cameras are none); use an older one.")
+        raise DamagedCheckpointError(
+            f"Checkpoint {path} is damaged (its cameras have another shape); use an older one."
+        )
     poses = poses.cpu().double()
     if not frame.moves:
         poses = torch.stack([scene.frame.local_pose(pose) for pose in poses])
@@ -333,7 +335,7 @@ def _viewmats(scene: Scene) -> Tensor:
 
 
 def _require_same_shape(trainer: Capturable, content: dict[str, Any], path: str | Path) -> None:
-    """Raise DamagedCheckpointError unless the trainer can hold these tensors, and knows all other entries."""
+    """Raise DamagedCheckpointError unless the trainer has the same parameters and entries."""
     wrong = _difference(trainer, content)
     if wrong is not None:
         raise DamagedCheckpointError(

@@ -1,4 +1,4 @@
-"""Densification by gsplat's DefaultStrategy, milestones scaled, opacity reset as documented."""
+"""Densification by gsplat's DefaultStrategy, with scaled milestones and with its documented opacity reset."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def create_strategy(config: TrainConfig) -> Any:
 
 
 def _with_kernel(strategy: type[Any]) -> type[Any]:
-    """Return the class with sums over views that a kernel adds to on the CPU: torch takes five times as long."""
+    """Return the class with a kernel that adds up gradients on the CPU: torch takes five times as long."""
 
     class Strategy(strategy):  # type: ignore[misc]
         def _update_state(
@@ -66,10 +66,10 @@ def gsplat_class(name: str) -> Any:
 def reset_interval(config: TrainConfig) -> int:
     """Return the iterations between opacity resets, so that the last one leaves time to recover.
 
-    In a short run the scaled interval can put a reset right before the end of densification, and refinement would
-    start from a model that is still opaque nowhere. The resets are spread so that none falls into the last
-    MIN_RESET_EVERY iterations; the schedule of 30,000 iterations stays as it is, and so does an interval that was
-    asked to be shorter.
+    In a short run, the scaled interval can put a reset right before the end of densification. Refinement would then
+    start from a transparent model. So resets are spread such that no reset falls into the last MIN_RESET_EVERY
+    iterations of densification. The schedule of 30,000 iterations does not change, and neither does a shorter interval
+    that the user chose.
     """
     stop = config.scaled(config.recipe.refine_stop_iter)
     every = config.scaled_interval(config.reset_every, MIN_RESET_EVERY)
@@ -86,11 +86,11 @@ def reset_opacity_if_missed(
     state: dict[str, Any],
     step: int,
 ) -> bool:
-    """Reset opacities when this step is due and the strategy did not; returns whether it acted.
+    """Reset opacities if a reset is due in this step and the strategy did not do it. Return whether it acted.
 
     gsplat 1.5.3 writes `step % reset_every == 0 & step > 0`, which Python reads as
-    `step % reset_every == 0 and 0 > 0`: its reset never fires. A strategy that did reset leaves no opacity
-    above the reset value, so a repaired gsplat makes this a no-op.
+    `step % reset_every == 0 and 0 > 0`, so its reset never happens. A strategy that did reset leaves no opacity above
+    the reset value, so this does nothing with a repaired gsplat.
     """
     if step == 0 or step % strategy.reset_every or step >= strategy.refine_stop_iter:
         return False

@@ -1,7 +1,7 @@
-"""The demo scene: ray traced in numpy, so its ground truth owes nothing to a splat rasterizer.
+"""The demo scene, ray traced in numpy, so that its ground truth does not depend on a splat rasterizer.
 
-A textured floor, two textured boxes, a matte and a mirroring sphere, seen from cameras on a dome. Points on
-the surfaces stand in for those of structure from motion.
+A textured floor, two textured boxes, a matte and a mirroring sphere, seen from cameras on a dome. Points on the
+surfaces replace points from structure from motion.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from skipgs_plug.trainer.raytrace import (
 )
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene
 
-RADIUS = 3.6  # units of the scene, from its middle to each camera: the floor, 5.2 wide, fills most of the picture
+RADIUS = 3.6  # distance of each camera from the middle; the floor is 5.2 wide and fills most of the picture
 FOV_X = np.deg2rad(52.0)
 
 
@@ -93,7 +93,7 @@ def look_at(position: Array, target: Array) -> Array:
 
 
 def sample_surfaces(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return points [n, 3] and colours [n, 3]: half on the floor, the rest shared by the objects."""
+    """Return points [n, 3] and colours [n, 3]: half of them on the floor, the others on the objects."""
     shares = [n // 8] * (len(SPHERES) + len(BOXES))
     points, items, normals = [], [], []
     for k, (sphere, count) in enumerate(zip(SPHERES, shares, strict=False)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 Array = np.ndarray
-PRIMES = 374761393, 668265263, 2147483647  # of the lattice's hash, one per axis
+PRIMES = 374761393, 668265263, 2147483647  # factors of the lattice's hash, one per axis
 
 
 def mix(a: tuple[float, ...], b: tuple[float, ...], weight: Array) -> Array:
@@ -18,7 +18,7 @@ def value_noise(points: Array, frequency: float) -> Array:
     floor = np.floor(scaled)
     fraction = scaled - floor
     fraction = fraction * fraction * (3 - 2 * fraction)
-    weights = 1 - fraction, fraction  # of the lower and of the upper corner along each axis
+    weights = 1 - fraction, fraction  # weights of the lower and the upper corner along each axis
     hashes = floor.astype(np.int64) * np.array(PRIMES)[:, None]
     total = np.zeros(points.shape[1])
     for i, j, k in np.ndindex(2, 2, 2):

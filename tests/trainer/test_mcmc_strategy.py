@@ -103,7 +103,7 @@ def test_a_scene_of_another_size_trains_alike(scene: Scene) -> None:
 
 
 def test_settings_that_belong_to_the_other_strategy_are_refused() -> None:
-    with pytest.raises(InputError, match="cap_max belongs to strategy mcmc, and this is default; leave it out"):
+    with pytest.raises(InputError, match="cap_max belongs to strategy mcmc, but strategy is default; leave it out"):
         TrainConfig(cap_max=10)
     with pytest.raises(InputError, match="grow_grad2d belongs to strategy default"):
         TrainConfig(strategy="mcmc", grow_grad2d=0.1)

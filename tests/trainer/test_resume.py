@@ -202,6 +202,6 @@ def test_a_saturated_checkpoint_is_continued(trainer: Trainer, tmp_path: Path, c
         trainer.splats["scales"][4, 2] = -torch.inf
     trainer.save_checkpoint(tmp_path / "c.pt")
     trainer.load_checkpoint(tmp_path / "c.pt")
-    assert "1 opacities of infinite value are taken as finite" in caplog.text
+    assert "1 infinite opacities are read as finite numbers" in caplog.text
     assert all(bool(torch.isfinite(values).all()) for values in trainer.splats.values())
     trainer.train(until=5, progress=False)
