@@ -205,7 +205,7 @@ def test_masks_of_other_suffixes_are_found_and_others_counted(colmap: Path, capl
     masked = [view.name for view in scene.train + scene.test if view.mask is not None]
     assert sorted(masked) == [f"cam/view_{number:03d}.png" for number in range(4)]
     assert "6 of 10 views have no mask" in caplog.text
-    assert "1 masks are called like no view, such as cam/mask_4.png" in caplog.text
+    assert "1 masks have no view of that name, such as cam/mask_4.png" in caplog.text
 
 
 @pytest.mark.parametrize(

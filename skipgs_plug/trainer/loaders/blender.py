@@ -21,8 +21,8 @@ from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
 from skipgs_plug.trainer.ply import read_points
 from skipgs_plug.trainer.scene import BLACK, WHITE, Scene, View, assemble_scene, split_views
 
-HELD_OUT = ("transforms_test.json", "transforms_val.json")  # the first of these
-BOX = 1.3  # half edge of the cube of initial points, as in 3DGS
+HELD_OUT = ("transforms_test.json", "transforms_val.json")  # the first one that exists is used
+BOX = 1.3  # half the edge of the cube of initial points; the value of 3DGS
 
 
 def load_blender(

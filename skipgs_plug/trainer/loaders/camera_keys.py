@@ -1,4 +1,4 @@
-"""Cameras as transforms.json writes them: the keys of instant-ngp, nerfstudio and exporters for Blender."""
+"""Cameras in transforms.json, with the keys of instant-ngp, nerfstudio and exporters for Blender."""
 
 from __future__ import annotations
 
@@ -15,11 +15,18 @@ from skipgs_plug.trainer.loaders.photograph import MAX_SIDE
 PERSPECTIVE = ("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")  # each says the same in its own way
+FOCAL = (
+    "fl_x",
+    "fl_y",
+    "camera_angle_x",
+    "camera_angle_y",
+    "x_fov",
+    "y_fov",
+)  # alternative ways to give a focal length
 NUMBERS = ("w", "h", "cx", "cy", *FOCAL, *DISTORTION)
 UNDISTORT = "undistort the images"
 ALPHA = "write what is transparent as the alpha channel of the images"
-# Keys that change a picture and are not modelled: refused unless zero, false or empty. Meaning and cure of each.
+# Keys that change a picture and are not modelled, with meaning and cure. They are refused unless zero, false or empty.
 UNSUPPORTED = {
     **dict.fromkeys(
         ("k5", "k6", "p3", "p4", "b1", "b2", "s1", "s2", "s3", "s4", "skew", "shear", "distortion_params"),
@@ -35,7 +42,7 @@ UNSUPPORTED = {
 
 
 def values_of(content: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
-    """Return the keys that hold for a frame: its own, and those of the file for which it has no word."""
+    """Return the keys of a frame: its own, and keys of the file that the frame does not override."""
     shared = content
     if any(frame.get(key) is not None for key in FOCAL):
         shared = {key: value for key, value in content.items() if key not in FOCAL}
@@ -46,11 +53,11 @@ def read_camera(values: dict[str, Any], image_path: Path, source: Path) -> Any:
     """Return the pycolmap.Camera that a frame (its own values over those of the file) describes.
 
     Focal lengths come from `x_fov` and `y_fov` (degrees), `fl_x` and `fl_y` (pixels) or `camera_angle_x` and
-    `camera_angle_y` (radians), in this order as instant-ngp takes them; one axis alone stands for both.
+    `camera_angle_y` (radians), in this order, like in instant-ngp. A value for one axis counts for both.
 
     Raises:
-        InputError: a model that is neither a pinhole nor OpenCV's (fisheye) lens, without a focal length, or with a
-            key that changes the picture in a way that is not modelled.
+        InputError: The model is neither a pinhole nor OpenCV's (fisheye) lens, there is no focal length, or a key
+            changes the picture in a way that is not modelled.
     """
     refuse_unsupported(values, source)
     numbers = {name: read_number(values[name], name, source) for name in NUMBERS if values.get(name) is not None}

@@ -27,14 +27,14 @@ log = logging.getLogger(__name__)
 
 
 STEMS = ("cameras", "images")
-MODEL_FOLDERS = ("sparse", "colmap/sparse")  # the second: nerfstudio's
+MODEL_FOLDERS = ("sparse", "colmap/sparse")  # the second one is written by nerfstudio
 Cloud = tuple[np.ndarray, np.ndarray]
 
 
 def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStore, cloud: Cloud | None = None) -> Scene:
-    """Load a COLMAP reconstruction, of which `path` is the scene or the very model; see `load_scene`.
+    """Load a COLMAP reconstruction; see `load_scene`. `path` is the scene or one of its models.
 
-    `cloud` (points, colours) takes the place of its points.
+    `cloud` (points, colours) replaces its points.
     """
     if is_model(path):
         model, path = path, scene_of(path)
@@ -60,7 +60,9 @@ def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStor
     if not views:
         raise InputError(f"{model} registers no image; run COLMAP again with more overlap between photographs.")
     if distorted:
-        log.warning("%s: lens distortion (%s) is removed, and the result kept.", path, ", ".join(sorted(distorted)))
+        log.warning(
+            "%s: lens distortion (%s) is removed, and the result is cached.", path, ", ".join(sorted(distorted))
+        )
     if unplaced:
         log.warning("%s: %d of %d images have no pose and are left out.", model, unplaced, unplaced + len(views))
     say_what_is_unlisted(folder, [*paths, *(folder / name for name in called)], "image of the model")
@@ -84,7 +86,7 @@ def assemble(
 
 
 def cloud_beside(model: Path) -> Cloud | None:
-    """Return points and colours of the points3D.ply that Inria's trainer leaves, in a model without other points."""
+    """Return points and colours of the points3D.ply that Inria's trainer writes, if the model has no other points."""
     path = model / "points3D.ply"
     others = (model / f"points3D{suffix}" for suffix in (".bin", ".txt"))
     if any(other.is_file() for other in others) or not path.is_file():
@@ -93,7 +95,7 @@ def cloud_beside(model: Path) -> Cloud | None:
 
 
 def is_model(folder: Path) -> bool:
-    """Whether a folder holds cameras and images (.bin or .txt); its points may come from elsewhere."""
+    """Whether a folder holds cameras and images (.bin or .txt). Points are optional."""
     return any(is_complete(folder, suffix) for suffix in (".bin", ".txt"))
 
 
@@ -102,13 +104,13 @@ def is_complete(folder: Path, suffix: str) -> bool:
 
 
 def scene_of(model: Path) -> Path:
-    """Return the scene that a model belongs to: the next folder above it with images, else its own."""
+    """Return the scene of a model: the nearest folder above it with images, or the model's own folder."""
     parents = [model, *model.resolve().parents[:3]]
     return next((folder for folder in parents if subfolder(folder, "images").is_dir()), model)
 
 
 def find_model(path: Path) -> Path:
-    """Return the model of a scene: the first of sparse/0, sparse, sparse/1 and so on; names a larger one.
+    """Return the model of a scene: the first of sparse/0, sparse, sparse/1 and so on. Warn if another one is larger.
 
     Raises:
         MissingFileError: There is no model.
@@ -157,7 +159,7 @@ def listed_in_text(model: Path) -> int:
 
 
 def say_if_both(model: Path) -> None:
-    """Say that a binary model is read where a text model beside it lists another number of images."""
+    """Warn if a text model beside the binary one, which is read, lists another number of images."""
     if not (is_complete(model, ".bin") and is_complete(model, ".txt")):
         return
     binary, text = listed_in_binary(model), listed_in_text(model)
@@ -166,10 +168,10 @@ def say_if_both(model: Path) -> None:
 
 
 def read_model(model: Path) -> tuple[Any, dict[int, str]]:
-    """Read the reconstruction, turning pycolmap's failures into one sentence.
+    """Read the reconstruction, and turn errors of pycolmap into one sentence.
 
     Returns:
-        The reconstruction, and the names of a text model's images by id, in place of those in it.
+        The reconstruction, and for a text model the correct names of its images by id.
     """
     pycolmap = import_pycolmap()
     models = camera_models(pycolmap)
@@ -193,7 +195,7 @@ def read_model(model: Path) -> tuple[Any, dict[int, str]]:
         return reconstruction, names
     except InputError:
         raise
-    except Exception as error:  # pycolmap raises bare RuntimeError, ValueError or IndexError by kind of damage
+    except Exception as error:  # pycolmap raises RuntimeError, ValueError or IndexError
         raise InputError(f"COLMAP model {model} cannot be read ({reason(error)}); export it again.") from error
 
 
@@ -225,7 +227,7 @@ def pose_of(image: Any, name: str, model: Path) -> np.ndarray:
 
 
 def image_folder(path: Path, data_factor: int) -> tuple[Path, int]:
-    """Return the folder to read and the factor that is left to apply in memory."""
+    """Return the folder to read, and the factor by which photographs must be reduced in memory."""
     full = subfolder(path, "images")
     if data_factor > 1:
         reduced = subfolder(path, f"images_{data_factor}")

@@ -1,4 +1,4 @@
-"""Lengths in COLMAP's binary files: its reader takes counts at their word, whatever the size of the file."""
+"""Check lengths in COLMAP's binary files: its reader trusts counts, whatever the size of the file."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from typing import Any
 from skipgs_plug.trainer.errors import InputError, reason
 from skipgs_plug.trainer.lfs import HINT, is_pointer
 
+# Sizes in bytes.
 POINT_2D = 24  # x, y, id of the 3D point
 TRACK_ELEMENT = 8  # image id, index of the 2D point
 POSE = 56  # quaternion, translation
 
 
 def check_lengths(model: Path, camera_models: dict[int, int]) -> None:
-    """Walk through every binary file of a model and see that its counts fill it exactly.
+    """Check for every binary file of a model that its counts fill it exactly.
 
     Args:
-        model: folder with cameras.bin, images.bin, points3D.bin and, of newer versions, rigs.bin and frames.bin.
-        camera_models: number of parameters by id of the camera model.
+        model: Folder with cameras.bin, images.bin, points3D.bin and, in newer versions, rigs.bin and frames.bin.
+        camera_models: Number of parameters by id of the camera model.
 
     Raises:
-        InputError: a file is shorter or longer than its counts say, or has an unknown camera model.
+        InputError: A file is shorter or longer than its counts tell, or has an unknown camera model.
     """
     for name, walk in WALKS.items():
         path = model / name
@@ -56,7 +57,7 @@ def check_lengths(model: Path, camera_models: dict[int, int]) -> None:
 
 
 def leave_out_points(model: Path, target: Path) -> None:
-    """Write a binary model without points into `target`: cameras, and images without the observations of points."""
+    """Write a binary model into `target` without points: cameras, and images without observations of points."""
     shutil.copyfile(model / "cameras.bin", target / "cameras.bin")
     (target / "points3D.bin").write_bytes(struct.pack("<Q", 0))
     data = (model / "images.bin").read_bytes()

@@ -1,8 +1,8 @@
-"""COLMAP's text models, as other programs write them.
+"""COLMAP's text models, including variants that other programs write.
 
-pycolmap ends a name at its first space, and reads every second line of images.txt as observations, even if a program
-left these lines out. Here both are read correctly, and the model is passed to pycolmap without observations, which the
-package does not use.
+pycolmap ends a name at its first space. It also reads every second line of images.txt as observations, even if a
+program left these lines out. This module reads both correctly, and passes the model to pycolmap without observations,
+which the package does not use.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ IMAGE_FIELDS = 9  # id, quaternion, translation, camera; then the name
 
 
 def simplify(model: Path, target: Path, camera_models: Mapping[str, int]) -> tuple[dict[int, str], int]:
-    """Write a text model into `target` without observations, its images named by their numbers.
+    """Write a text model into `target` without observations, and with numbers as names of images.
 
     Args:
-        camera_models: number of parameters by name of the camera model.
+        model: Folder of the model.
+        target: Folder to write.
+        camera_models: Number of parameters by name of the camera model.
 
     Returns:
         The names of the images, by their ids, and the number of points.
@@ -47,7 +49,7 @@ def simplify(model: Path, target: Path, camera_models: Mapping[str, int]) -> tup
 
 
 def point_of(fields: list[str]) -> list[str]:
-    """Return id, position, colour and error of a point; colours that were written as 254.0 as whole numbers."""
+    """Return id, position, colour and error of a point, with colours such as 254.0 as whole numbers."""
     try:
         colour = [str(round(float(value))) for value in fields[4:7]]
     except (ValueError, OverflowError):
@@ -56,7 +58,7 @@ def point_of(fields: list[str]) -> list[str]:
 
 
 def check_parameters(fields: list[str], camera_models: Mapping[str, int], path: Path) -> None:
-    """Raise InputError for a camera with more or fewer numbers than its model has; pycolmap does not say which."""
+    """Raise InputError for a camera with a wrong number of parameters: pycolmap's error does not name it."""
     if len(fields) < 4 or fields[1] not in camera_models:
         return
     expected, given = camera_models[fields[1]], len(fields) - 4
@@ -68,13 +70,14 @@ def check_parameters(fields: list[str], camera_models: Mapping[str, int], path: 
 
 
 def image_records(path: Path, cameras: set[str]) -> list[tuple[int, list[str]]]:
-    """Return id and fields of each image; the name is the last field, with its spaces.
+    """Return id and fields of each image. The name is the last field and may hold spaces.
 
     Args:
-        cameras: ids of the model's cameras, by which an image is told from observations.
+        path: The file images.txt.
+        cameras: Ids of the model's cameras, which distinguish an image from observations.
     """
     records: list[tuple[int, list[str]]] = []
-    observations = False  # whether the line may hold those of the image before it
+    observations = False  # whether the line may hold observations of the image before it
     for line in content_lines(path):
         fields = line.strip().split(maxsplit=IMAGE_FIELDS)
         if observations and not is_image(fields, line.split(), cameras):
@@ -101,7 +104,7 @@ def is_image(fields: list[str], words: list[str], cameras: set[str]) -> bool:
 
 
 def content_lines(path: Path) -> list[str]:
-    """Return the lines of a text file without comments, whatever ends them."""
+    """Return the lines of a text file without comments, for any kind of line break."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -29,18 +29,20 @@ def read_image(
     """Decode an image and shrink it by `factor` (bicubic).
 
     Args:
-        source: file or stream.
+        source: File or stream.
         label: Name of the image in errors.
-        background: composes transparency onto this colour; None leaves colours as they are, for alpha as a mask.
-        size: width and height that the camera was calibrated for. Pixels stay as they are stored, as COLMAP reads
-            them; where only the orientation in EXIF makes them fit, it is applied.
+        background: Colour that transparency is composed onto; None keeps colours, for alpha as a mask.
+        factor: Factor by which the image is reduced.
+        size: Width and height that the camera was calibrated for. Pixels stay as they are stored, like in COLMAP. The
+            orientation in EXIF is applied only if the image fits the camera with it and not without it.
 
     Returns:
-        image [H, W, 3] uint8, and its alpha [H, W] uint8 or None.
+        Image [H, W, 3] uint8, and its alpha [H, W] uint8 or None.
 
     Raises:
-        MissingFileError: no such file.
-        InputError: damaged, too large, of a kind whose range of values is unknown, or of another shape than `size`.
+        MissingFileError: The file does not exist.
+        InputError: The image is damaged, too large, of a type whose range of values is unknown, or its shape does not
+            fit `size`.
     """
     picture = upright(decode(source, label), label, size)
     has_alpha = has_transparency(picture)
@@ -68,7 +70,7 @@ def has_transparency(picture: Image.Image) -> bool:
 def read_mask(path: Path, image: Tensor, size: tuple[int, int]) -> Tensor:
     """Return a mask [H, W] bool of the size of `image` [H, W, 3]: True where it is neither black nor transparent.
 
-    Formats that lose some of a picture leave grey around its edges: there white begins in the middle.
+    Lossy formats leave grey at edges, so their threshold is half of white.
     """
     picture = upright(decode(path, path), path, size)
     if has_transparency(picture):
@@ -85,7 +87,7 @@ def decode(source: Path | IO[bytes], label: Path | str) -> Image.Image:
         raise MissingFileError(f"Image {source} does not exist; restore it or remove it from the reconstruction.")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about metadata that is not used
+            warnings.simplefilter("ignore")  # warnings about metadata that is not used
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(source) as opened:
                 opened.load()
@@ -130,6 +132,6 @@ def upright(picture: Image.Image, label: Path | str, size: tuple[int, int] | Non
 
 
 def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether one is a scaled copy of the other, up to a rounded or cut pixel on each side."""
+    """Whether one size is a scaled copy of the other, up to a rounded or cut pixel per side."""
     (width, height), (full_width, full_height) = size, other
     return abs(height * full_width - width * full_height) <= full_width + full_height

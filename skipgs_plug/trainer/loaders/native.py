@@ -1,10 +1,11 @@
 """The one place that loads pycolmap: after Pillow, and without its handler of SIGTERM.
 
-On Linux pycolmap brings its own zlib, and Pillow is then bound to some of its functions: after `import pycolmap`, the
-first PNG that Pillow writes ends the process (deflateEnd frees memory of another deflateInit). When Pillow is loaded
+On Linux, pycolmap brings its own zlib, and a Pillow that is imported later is bound to some of its functions. Then the
+first PNG that Pillow writes ends the process (deflateEnd frees memory of another deflateInit). If Pillow is imported
 first, both work.
 
-pycolmap's logging library answers SIGTERM with a stack trace of the process; Python's handler is put back.
+pycolmap's logging library replaces the handler of SIGTERM and prints a stack trace. This module restores Python's
+handler.
 """
 
 from __future__ import annotations
@@ -25,18 +26,18 @@ if sys.platform == "linux" and next(m for m in sys.modules if m in ("pycolmap", 
 
 
 def import_pycolmap() -> Any:
-    """Return the module, which is loaded on first use.
+    """Import pycolmap and return it.
 
     Raises:
         InputError: pycolmap is not installed.
     """
     loaded = "pycolmap" in sys.modules
-    before = signal.getsignal(signal.SIGTERM)  # None: not from Python, and not ours to put back
+    before = signal.getsignal(signal.SIGTERM)  # None: the handler is not from Python and cannot be restored
     try:
         import pycolmap
     except ImportError as error:
         raise InputError(f"Cameras of photographs need pycolmap ({error}); run: {install_command()}.") from error
     if not loaded and before is not None:
-        with contextlib.suppress(ValueError):  # another thread than the main one may not
+        with contextlib.suppress(ValueError):  # only the main thread may set a handler
             signal.signal(signal.SIGTERM, before)
     return pycolmap

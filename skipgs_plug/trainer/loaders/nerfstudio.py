@@ -1,4 +1,4 @@
-"""nerfstudio folders: transforms.json with calibrated photographs, perhaps distorted, and a point cloud as PLY."""
+"""nerfstudio folders: transforms.json with calibrated, maybe distorted photographs, and a point cloud as PLY."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def load_nerfstudio(
     images: ImageStore,
     cloud: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Scene:
-    """Load transforms.json; `cloud` (points, colours) takes the place of its point cloud. See `load_scene`."""
+    """Load transforms.json; `cloud` (points, colours) replaces its point cloud. See `load_scene`."""
     source = path / FILE
     content = read_object(source)
     frames = content.get("frames")

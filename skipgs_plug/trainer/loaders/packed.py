@@ -18,10 +18,10 @@ from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene
 
 VERSION = 1
-# Bytes (256 MiB). A larger array that was compressed to less than a twentieth is refused: photographs and points do not
-# compress that far, and a damaged or hostile file could ask for any amount of memory.
+# 256 MiB, in bytes. A larger array that is compressed to less than a twentieth is refused: photographs and points do
+# not compress that far, and a damaged or hostile file could request any amount of memory.
 BOMB = 1 << 28
-SHAPES: dict[str, tuple[int | None, ...]] = {  # None: any; the number of views is checked apart
+SHAPES: dict[str, tuple[int | None, ...]] = {  # None: any length; the number of views is checked separately
     "version": (),
     "name": (),
     "n_train": (),
@@ -34,7 +34,14 @@ SHAPES: dict[str, tuple[int | None, ...]] = {  # None: any; the number of views 
     "points_rgb": (None, 3),
     "background": (3,),
 }
-KINDS = {"name": "U", "view_names": "U", "Ks": "f", "viewmats": "f", "points": "f", "background": "f"}  # else integers
+KINDS = {
+    "name": "U",
+    "view_names": "U",
+    "Ks": "f",
+    "viewmats": "f",
+    "points": "f",
+    "background": "f",
+}  # all others are integers
 
 
 def save_packed(scene: Scene, path: str | Path) -> None:
@@ -111,7 +118,7 @@ def load_packed(path: Path, cloud: tuple[np.ndarray, np.ndarray] | None = None) 
 
 
 def read_archive(path: Path) -> dict[str, Any]:
-    """Return the arrays of the archive; sizes, types and shapes are checked before memory is taken."""
+    """Return the arrays of the archive. Sizes, types and shapes are checked before memory is allocated."""
     try:
         with zipfile.ZipFile(path) as archive:
             for name, shape in SHAPES.items():
@@ -123,7 +130,7 @@ def read_archive(path: Path) -> dict[str, Any]:
 
 
 def check_header(archive: zipfile.ZipFile, name: str, expected: tuple[int | None, ...]) -> None:
-    """Raise ValueError unless an array is of the expected shape and kind and as large as the archive can hold."""
+    """Raise ValueError unless an array has the expected shape and type, and a size that the archive can hold."""
     member = archive.getinfo(f"{name}.npy")
     if member.file_size > max(BOMB, 20 * member.compress_size):
         raise ValueError(f"{name} claims {member.file_size:,} bytes in {member.compress_size:,}")

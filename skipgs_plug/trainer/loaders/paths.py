@@ -1,4 +1,4 @@
-"""Names that a scene gives: files inside its folder, and nothing else."""
+"""File names in a scene, which may only lead to files inside its folder."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.scene import is_text
 
-SETTLED = 2_000_000_000  # ns
+SETTLED = (
+    2_000_000_000  # nanoseconds after a change until a folder's listing is cached: file systems have coarse clocks
+)
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
 
 
 def relative_name(folder: Path, name: str) -> str:
-    """Return a name that a scene gives as a path relative to its folder, with slashes.
+    """Return a file name in a scene as a path relative to its folder, with slashes.
 
-    Backslashes separate folders, as programs on Windows write them, unless a file has them in its name. Of a path
-    that leaves the folder (written on another machine, or relative to elsewhere), the longest end counts that is an
-    image in it.
+    Backslashes separate folders, like on Windows, unless a file has them in its name. If a path leaves the folder (it
+    was written on another machine, or relative to another folder), its longest end that is an image in the folder
+    counts.
 
     Raises:
-        InputError: the name is empty, leaves the folder or cannot be a file name.
+        InputError: The name is empty, leaves the folder or cannot be a file name.
     """
     if not is_text(name):
         raise InputError(
@@ -100,9 +102,9 @@ def find_images(folder: Path, names: Sequence[str]) -> list[Path]:
 
 def look_up(folder: Path, name: PurePosixPath) -> Path | None:
     """Return the image in a folder with this name, or with nearly this name; None if it does not exist."""
-    # Down to one folder and the name: a name alone would be taken for one of another camera.
+    # Down to one folder and the name: a name alone could belong to another camera.
     ends = [PurePosixPath(*name.parts[start:]) for start in range(max(len(name.parts) - 1, 1))]
-    if len(name.parts) == 2 and name.parts[0] == folder.name:  # as seen from the folder above
+    if len(name.parts) == 2 and name.parts[0] == folder.name:  # relative to the folder above
         ends.append(PurePosixPath(name.name))
     for end in ends:
         for candidate in spellings(end):
@@ -115,7 +117,7 @@ def look_up(folder: Path, name: PurePosixPath) -> Path | None:
 
 
 def spellings(name: PurePosixPath) -> Iterator[PurePosixPath]:
-    """Yield a name, the name with other image suffixes, and the name with one added."""
+    """Yield a name, the name with other image suffixes, and the name with a suffix added."""
     yield name
     if name.suffix.lower() in IMAGE_SUFFIXES:  # what follows a dot may be part of the name
         yield from (name.with_suffix(suffix) for suffix in IMAGE_SUFFIXES)
@@ -152,7 +154,7 @@ def entries(folder: Path, names: Sequence[str]) -> list[Path]:
     """Return the entries of a folder with one of these names, in any case."""
     try:
         changed = os.stat(folder).st_mtime_ns
-        # Names may be added within the tick of the file system's clock in which the folder was listed.
+        # Files may be added within the same tick of the file system's clock, after the listing.
         list_of = listing if time.time_ns() - changed > SETTLED else listing.__wrapped__
         known = list_of(str(folder), changed)
     except OSError:
@@ -162,7 +164,7 @@ def entries(folder: Path, names: Sequence[str]) -> list[Path]:
 
 @functools.lru_cache(maxsize=64)
 def listing(folder: str, changed: int) -> dict[str, list[str]]:
-    """Return the names in a folder, which was last changed then (ns), by themselves without capital letters."""
+    """Return the names in a folder by their lower-case form. `changed` (ns) is its time of change, for the cache."""
     result: dict[str, list[str]] = {}
     for name in os.listdir(folder):
         result.setdefault(name.casefold(), []).append(name)

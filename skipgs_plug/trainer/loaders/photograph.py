@@ -33,17 +33,17 @@ def load_photograph(
     mask_path: Path | None = None,
     images: ImageStore | None = None,
 ) -> View:
-    """Read a photograph; alpha below one half and black pixels of the mask do not count in the loss.
+    """Read a photograph. Alpha below one half and black pixels of the mask do not count in the loss.
 
     Args:
-        name: of the view.
-        image_path: at any scale of the size that the camera was calibrated for.
+        name: Name of the view.
+        image_path: The photograph, at any scale of the size that the camera was calibrated for.
         camera: pycolmap.Camera of any model that pycolmap can undistort.
-        viewmat: world to camera [4, 4].
+        viewmat: World to camera [4, 4].
         cache: Keeps undistorted photographs.
-        factor: shrink by this in memory.
-        mask_path: picture of the same shape, black where pixels are left out.
-        images: Keeps the photograph; None: it stays in memory.
+        factor: Factor by which the photograph is reduced in memory.
+        mask_path: Picture of the same shape, black where pixels are left out.
+        images: Store for the photograph; None: it stays in memory.
     """
     check_camera(camera, image_path)
 
@@ -58,7 +58,7 @@ def load_photograph(
 def read_straight(
     image_path: Path, camera: Any, cache: UndistortedCache, factor: int, mask_path: Path | None
 ) -> Straight:
-    """Return a photograph as a pinhole camera sees it; see `load_photograph`."""
+    """Return a photograph without lens distortion; see `load_photograph`."""
     if model_name(camera) in PINHOLE_MODELS:
         pixels, mask = read_photograph(image_path, camera, factor, mask_path)
         K = scaled_matrix(camera, pixels)
@@ -75,14 +75,14 @@ def read_straight(
 def scaled_matrix(camera: Any, pixels: Tensor) -> np.ndarray:
     """Return the calibration matrix [3, 3] float64 of a pinhole camera for the size of `pixels` [H, W, 3]."""
     K = np.array(camera.calibration_matrix(), dtype=np.float64)
-    # The downscaled image has a rounded size: scale by the size that was loaded, not by the factor.
+    # The reduced image has a rounded size: scale by the loaded size, not by the factor.
     K[0] *= pixels.shape[1] / camera.width
     K[1] *= pixels.shape[0] / camera.height
     return K
 
 
 def read_photograph(image_path: Path, camera: Any, factor: int, mask_path: Path | None) -> tuple[Tensor, Tensor | None]:
-    """Return pixels [H, W, 3] and mask [H, W], as they were taken."""
+    """Return pixels [H, W, 3] and mask [H, W], with lens distortion."""
     size = (camera.width, camera.height)
     pixels, alpha = read_image(image_path, image_path, None, factor, size)
     mask = None if alpha is None else alpha >= 128
@@ -93,26 +93,26 @@ def read_photograph(image_path: Path, camera: Any, factor: int, mask_path: Path 
 
 
 def lost_angle(camera: Any, view: View) -> str:
-    """Return a clause on how much of a wide lens is cut away in `view`, empty for less than a tenth.
+    """Return a clause about the lost part of a wide lens in `view`; empty if it is less than a tenth.
 
-    The angle of the lens is that of an equidistant fisheye, which its distortion changes little.
+    The lens counts as an equidistant fisheye, which its distortion changes little.
     """
     if "FISHEYE" not in model_name(camera):
         return ""
     whole = math.degrees(camera.width / float(np.array(camera.params)[list(camera.focal_length_idxs())][0]))
     kept = math.degrees(2 * math.atan(view.width / 2 / float(view.K[0, 0])))
-    return f", of about {whole:.0f} degrees {kept:.0f} are kept" if kept < 0.9 * whole else ""
+    return f", {kept:.0f} of about {whole:.0f} degrees are kept" if kept < 0.9 * whole else ""
 
 
 def undistort(pixels: Tensor, mask: Tensor | None, camera: Any, image_path: Path) -> Straight:
-    """Resample image and mask as a pinhole camera sees them, cut so that no pixel is without a source."""
+    """Resample image and mask for a pinhole camera, cropped so that every pixel has a source."""
     pycolmap = import_pycolmap()
     try:
         fitted = pycolmap.Camera(camera.todict())
         fitted.rescale(pixels.shape[1], pixels.shape[0])
         options = pycolmap.UndistortCameraOptions()
         bitmap, pinhole = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(pixels.numpy()), fitted)
-        K = np.array(pinhole.calibration_matrix(), dtype=np.float64)  # not of a camera that sees a sphere
+        K = np.array(pinhole.calibration_matrix(), dtype=np.float64)  # fails for a camera that sees a sphere
         straight = torch.from_numpy(np.array(bitmap.to_array()))
         if mask is not None:
             drawn = pycolmap.Bitmap.from_array(mask.byte().numpy() * 255)
@@ -127,7 +127,7 @@ def undistort(pixels: Tensor, mask: Tensor | None, camera: Any, image_path: Path
 
 
 def check_camera(camera: Any, source: Path) -> None:
-    """Refuse sizes, focal lengths and distortions that no camera has."""
+    """Refuse impossible sizes, focal lengths and distortions."""
     parameters = np.array(camera.params, dtype=np.float64)
     focal = parameters[list(camera.focal_length_idxs())]
     if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE):
@@ -146,7 +146,7 @@ def model_name(camera: Any) -> str:
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
-    """Return the mask of an image: its name with .png added (COLMAP's way), or its name with any image suffix."""
+    """Return the mask of an image: its name with .png added (like COLMAP), or its name with any image suffix."""
     path = inside(folder, name)
     added = path.with_name(path.name + ".png")
     return added if os.path.isfile(added) else look_up(folder, PurePosixPath(path.relative_to(folder).as_posix()))

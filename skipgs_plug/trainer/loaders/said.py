@@ -1,4 +1,4 @@
-"""Notes about files of a scene that are not used."""
+"""Warnings about files of a scene that are not used."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 
 
 def say_what_is_unlisted(folder: Path, listed: Sequence[Path], what: str) -> None:
-    """Print how many images of a folder `what` does not list: they could not be placed, or were added later."""
+    """Warn about images of a folder that `what` does not list: they were not placed, or were added later."""
     others = unlisted_images(folder, listed)
     if others:
         log.warning(
@@ -21,12 +21,12 @@ def say_what_is_unlisted(folder: Path, listed: Sequence[Path], what: str) -> Non
 
 
 def say_bare(masks: Path, found: Sequence[Path | None]) -> None:
-    """Say how many views have no mask where others have, and how many masks belong to no view."""
+    """Warn about views without a mask if others have one, and about masks without a view."""
     if not masks.is_dir():
         return
     bare = sum(path is None for path in found)
     if bare:
-        log.warning("%s: %d of %d views have no mask there and count whole.", masks, bare, len(found))
+        log.warning("%s: %d of %d views have no mask there, so all their pixels count.", masks, bare, len(found))
         others = unlisted_images(masks, [path for path in found if path is not None])
         if others:
-            log.warning("%s: %d masks are called like no view, such as %s.", masks, len(others), others[0])
+            log.warning("%s: %d masks have no view of that name, such as %s.", masks, len(others), others[0])

@@ -1,4 +1,4 @@
-"""Photographs without lens distortion, stored in their scene: undistorting takes several times as long as reading."""
+"""Cache of undistorted photographs in their scene: undistorting takes several times as long as reading."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CAMERA = "pinhole"  # entry of the PNG: calibration matrix
 
 
 class Straight(NamedTuple):
-    """A photograph as a pinhole camera sees it."""
+    """A photograph without lens distortion."""
 
     pixels: Tensor  # [H, W, 3] uint8
     mask: Tensor | None  # [H, W] bool
@@ -35,7 +35,7 @@ class Straight(NamedTuple):
 class UndistortedCache:
     """One PNG per photograph in a folder of the scene, named by a hash of everything that it depends on.
 
-    So it is never out of date, and may be deleted at any time. Where it cannot be written, which is said once,
+    So the cache is never out of date and may be deleted at any time. If it cannot be written, there is one warning, and
     distortion is removed at each load.
     """
 
@@ -44,7 +44,7 @@ class UndistortedCache:
         self._writable = True
 
     def key(self, image_path: Path, mask_path: Path | None, camera: Any, factor: int) -> str:
-        """Return the name under which a photograph is kept."""
+        """Return the key of a photograph."""
         digest = hashlib.sha256()
         description = camera.todict() | {"camera_id": 0, "has_prior_focal_length": False}
         for part in (VERSION, import_pycolmap().__version__, str(factor), str(sorted(description.items(), key=str))):
@@ -64,7 +64,7 @@ class UndistortedCache:
                 pixels = torch.from_numpy(np.array(opened))  # [H, W, 3 or 4]
                 K = np.array(json.loads(opened.info[CAMERA]), dtype=np.float64).reshape(3, 3)
         except Exception as error:  # Pillow raises many kinds of errors on damaged files
-            log.debug("%s cannot be read (%s) and is written again.", path, error)
+            log.debug("%s cannot be read (%s) and is written anew.", path, error)
             return None
         if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or not np.isfinite(K).all():
             return None
@@ -72,7 +72,7 @@ class UndistortedCache:
         return Straight(pixels[..., :3].contiguous(), mask, K)
 
     def write(self, key: str, straight: Straight) -> None:
-        """Keep a photograph."""
+        """Write a photograph, unless the folder cannot be written."""
         if not self._writable:
             return
         pixels = straight.pixels.numpy()
