@@ -98,6 +98,8 @@ class CallReader:
     def _body(
         self, body: list[ast.stmt], scope: Scope, end: int | None, stores: Counter[str], known: dict[str, Any]
     ) -> None:
+        if end == 0:  # never reached
+            return
         for statement in body:
             if isinstance(statement, ast.If):
                 self._calls(statement.test, scope, end)
@@ -171,6 +173,9 @@ class CallReader:
                 if isinstance(operator, ast.And) is holds:
                     return min(known, default=None)
                 return max(known) if len(known) == len(ends) else None
+            case ast.Compare(option, [ast.Is() | ast.IsNot()], [ast.Constant(None)]):
+                # An option that is not given: the whole run goes past the call.
+                return 0 if _is_plain_place(option) and _held(test, scope) is (not holds) else None
             case ast.Compare(left, [operator], [right]) if not holds:
                 negated = _NEGATED.get(type(operator))
                 return None if negated is None else _end_of_one(left, negated(), right, scope)
@@ -292,6 +297,18 @@ def _value(node: ast.expr, scope: Scope) -> Any:
         return eval(compile(ast.Expression(node), "<condition>", "eval"), {"__builtins__": PURE}, scope.values)
     except Exception:
         return None
+
+
+def _held(test: ast.expr, scope: Scope) -> bool | None:
+    """Whether a condition holds when the loop begins; None if that is not known."""
+    try:
+        return bool(eval(compile(ast.Expression(test), "<condition>", "eval"), {"__builtins__": {}}, scope.values))
+    except Exception:
+        return None
+
+
+def _is_plain_place(node: ast.expr) -> bool:
+    return all(isinstance(part, (ast.Name, ast.Attribute, ast.expr_context)) for part in ast.walk(node))
 
 
 def _is_plain(part: ast.AST) -> bool:

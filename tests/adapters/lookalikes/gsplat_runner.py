@@ -65,7 +65,7 @@ class Dataset:
 class Runner:
     def __init__(self, strategy, batch_size=1, world_size=1, result_dir="output", **options):
         self.cfg = SimpleNamespace(
-            strategy=strategy, batch_size=batch_size, max_steps=LAST + 1, result_dir=result_dir, **options
+            strategy=strategy, batch_size=batch_size, max_steps=LAST + 1, result_dir=result_dir, compression=None, **options
         )
         self.world_size = world_size
         self.parser = SimpleNamespace(image_names=sorted([*NAMES, "test/0.png"]))
@@ -114,10 +114,16 @@ class Runner:
             )
             if step % 10 == 9:
                 self.eval(step)
+            if cfg.compression is not None and step in [i - 1 for i in (LAST + 1,)]:
+                self.run_compression()
 
     @torch.no_grad()
     def eval(self, step):
         self.rasterize_splats(camtoworlds=[next(iter(self.images.values()))])
+
+    def run_compression(self):
+        for name in self.splats:
+            self.splats[name].data = self.splats[name].data.half().float()
 
     def number_of(self, camera):
         return next(number for number, one in self.images.items() if one is camera)
