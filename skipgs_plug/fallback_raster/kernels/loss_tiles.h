@@ -1,16 +1,16 @@
 // Sums |image - target| and 1 - SSIM over each tile, and computes the gradient of the loss.
 //
 // A tile is processed once, from its first row to its last. Two ring buffers of rows hold the inputs of the vertical
-// blurs: the first holds x, d, x^2 + y^2 and d^2 of shifted images, the second three coefficients of the gradient of 1
-// - SSIM, all blurred along the row. Blurring the first ring vertically gives SSIM, WINDOW_RADIUS rows late; blurring
-// the second gives the gradient, another WINDOW_RADIUS rows late.
+// blurs, already blurred along the row. The first holds x, d, x^2 + y^2 and d^2 of shifted images, where d = x - y. The
+// second holds three coefficients of the gradient. Blurring the first ring vertically gives SSIM, WINDOW_RADIUS rows
+// late. Blurring the second gives the gradient, another WINDOW_RADIUS rows late.
 //
 // Reads both images. Writes the sums and the gradient of its own tiles. No other thread writes to these tiles.
 #pragma once
 #include "lib/simd.h"
 // Weights of SSIM's Gaussian window of sigma 1.5 pixels. They add up to 1.
 static constexpr float w[SSIM_WINDOW] = {0.00102838f, 0.00759876f, 0.03600077f, 0.10936069f, 0.21300554f, 0.26601172f,
-                                    0.21300554f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
+                                         0.21300554f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
 static constexpr int WINDOW_RADIUS = SSIM_WINDOW / 2;  // pixels
 // Vectors of 16 floats that the window reaches to one side of a tile, for the largest number of channels.
 static constexpr int MAX_REACH_VECTORS = (WINDOW_RADIUS * MAX_LOSS_CHANNELS + 15) / 16;
@@ -164,8 +164,8 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
             const int centre = first_row - WINDOW_RADIUS;  // first of ROWS_AT_ONCE rows whose SSIM is computed
             if (centre + ROWS_AT_ONCE <= top - more_rows) continue;
             const v16* line[RING_ROWS];
-            const int oldest = first_row + ROWS_AT_ONCE + RING_OFFSET;
-            for (int k = 0; k < RING_ROWS; ++k) line[k] = blurred + (oldest + k) % RING_ROWS * wide * 4;
+            for (int k = 0; k < RING_ROWS; ++k)
+                line[k] = blurred + (first_row + ROWS_AT_ONCE + k + RING_OFFSET) % RING_ROWS * wide * 4;
             bool own_row[ROWS_AT_ONCE], row_counts[ROWS_AT_ONCE];
             for (int r = 0; r < ROWS_AT_ONCE; ++r) {
                 own_row[r] = centre + r >= top && centre + r < bottom;
@@ -211,8 +211,8 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
 
             const int done = centre - WINDOW_RADIUS;  // first of ROWS_AT_ONCE rows whose gradient is computed
             if (done < top) continue;
-            const int oldest_slope = centre + ROWS_AT_ONCE + RING_OFFSET;
-            for (int k = 0; k < RING_ROWS; ++k) line[k] = sloping + (oldest_slope + k) % RING_ROWS * LOSS_TILE_VECTORS * 3;
+            for (int k = 0; k < RING_ROWS; ++k)
+                line[k] = sloping + (centre + ROWS_AT_ONCE + k + RING_OFFSET) % RING_ROWS * LOSS_TILE_VECTORS * 3;
             for (int vector = 0; vector < own; ++vector) {
                 const int i = 16 * (begin + vector), at = 16 * (vector + more + side);
                 v16 blurs[3][ROWS_AT_ONCE];

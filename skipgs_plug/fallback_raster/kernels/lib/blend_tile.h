@@ -20,9 +20,9 @@ static constexpr vpatch lane_y = {0.f, 0.f, 0.f, 0.f, 1.f, 1.f, 1.f, 1.f};
 static constexpr int PATCH_LINES = TILE / PATCH_ROWS, PATCHES = 4 * PATCH_LINES;
 
 struct Tile {
-    int x0, y0, rows, columns;  // first pixel; rows and columns that lie in the image
-    int begin, end;             // range of the tile in the lists
-    vpatch px[4], py[PATCH_LINES];    // pixel centres of each column and each line of patches
+    int x0, y0, rows, columns;      // first pixel; rows and columns that lie in the image
+    int begin, end;                 // range of the tile in the lists
+    vpatch px[4], py[PATCH_LINES];  // pixel centres of each column and each line of patches
 
     Tile(int t, const int* tile_start, const Grid& grid)
         : x0(t % grid.tiles_x * TILE), y0(t / grid.tiles_x * TILE), rows(smaller(TILE, grid.height - y0)),

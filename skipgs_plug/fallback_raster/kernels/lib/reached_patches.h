@@ -14,7 +14,7 @@ static constexpr v16 line = {0.f, 1.f, 2.f, 3.f, 4.f, 5.f, 6.f, 7.f, 0.f, 1.f, 2
 #endif
 static constexpr auto reached_patches = [](const Record* const* r, int x0, int y0, unsigned* reached) INLINE {
 #pragma clang fp contract(fast)
-    // One field of each record, repeated for each line.
+    // One field of each record, number `c` of its floats, repeated for each line.
     auto column = [r](int c) INLINE -> v16 {
 #ifdef __AVX512F__
         v4 of[4];

@@ -13,11 +13,11 @@ static constexpr int MAX_BUCKET_PAIRS = 16;
 static constexpr int MAX_BUCKET_PAIRS = 8;  // a register holds only two pairs, so a round takes longer
 #endif
 struct SortedTile {
-    long long *dealt, *other;  // the tile's pairs in buckets, and scratch of the same size
+    long long *dealt, *other;  // pairs of the tile in buckets, and scratch of the same size
     int *record, *pair;        // outputs: record and number of each pair
     const int* pair_record;
     int count, done, next, shift;  // pairs; sorted pairs; next bucket; log2 of the range of a bucket
-    int bound[MAX_BUCKETS + 2];        // start of each bucket, and end of the last one
+    int bound[MAX_BUCKETS + 2];    // start of each bucket, and end of the last one
 
     SortedTile(int begin, int end, const TileLists& lists)
         : dealt(lists.buffer + begin), other(lists.unsorted + begin), record(lists.tile_record + begin),
