@@ -65,7 +65,12 @@ class Dataset:
 class Runner:
     def __init__(self, strategy, batch_size=1, world_size=1, result_dir="output", **options):
         self.cfg = SimpleNamespace(
-            strategy=strategy, batch_size=batch_size, max_steps=LAST + 1, result_dir=result_dir, compression=None, **options
+            strategy=strategy,
+            batch_size=batch_size,
+            max_steps=LAST + 1,
+            result_dir=result_dir,
+            compression=None,
+            **options,
         )
         self.world_size = world_size
         self.parser = SimpleNamespace(image_names=sorted([*NAMES, "test/0.png"]))
