@@ -1,4 +1,4 @@
-"""What the train_*.py examples share: they are `skipgs-plug run ADAPTER ... -- SCRIPT ...`, spelt as Python."""
+"""Shared code of the train_*.py examples, which call `skipgs-plug run ADAPTER ... -- SCRIPT ...` from Python."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skipgs_plug.cli import main
 
 
 def run_in_checkout(adapter: str, *scripts: str) -> int:
-    """Run a script of the checkout that `--repo` names, gated by this adapter; return its exit code."""
+    """Run a script of the checkout `--repo`, gated by this adapter, and return its exit code."""
     parser = _parser()
     parser.add_argument("--repo", type=Path, required=True, help="folder of the unmodified checkout")
     if len(scripts) > 1:
@@ -23,21 +23,21 @@ def run_in_checkout(adapter: str, *scripts: str) -> int:
 
 
 def run_module(adapter: str, module: str) -> int:
-    """Run an installed module as `python -m` does, gated by this adapter; return its exit code."""
+    """Run an installed module like `python -m`, gated by this adapter, and return its exit code."""
     before, after = _split()
     _, gate_options = _parser().parse_known_args(before)
     return main(["run", adapter, *gate_options, "--", "-m", module, *after])
 
 
 def _split() -> tuple[list[str], list[str]]:
-    """Ours and the script's part of the command line."""
+    """Return the example's and the script's part of the command line."""
     words = sys.argv[1:]
     at = words.index("--") if "--" in words else len(words)
     return words[:at], words[at + 1 :]
 
 
 def _parser() -> argparse.ArgumentParser:
-    """A parser that shows the docstring of the example as its help."""
+    """Return a parser that shows the docstring of the example as its help."""
     example = inspect.stack()[2].frame.f_globals["__doc__"]
     return argparse.ArgumentParser(
         description=example, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False

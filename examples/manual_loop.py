@@ -1,4 +1,4 @@
-"""A training loop of one's own, in plain PyTorch. manual_loop_skipgs.py is the same loop, gated."""
+"""A training loop of your own, in plain PyTorch. manual_loop_skipgs.py is the same loop with a gate."""
 
 import argparse
 import math

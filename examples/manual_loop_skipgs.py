@@ -1,4 +1,4 @@
-"""A training loop of one's own, in plain PyTorch, gated. manual_loop.py is the same loop without the gate."""
+"""A training loop of your own, in plain PyTorch, with a gate. manual_loop.py is the same loop without it."""
 
 import argparse
 import math

@@ -1,4 +1,4 @@
-"""Gate the reference trainer on a scene made on the spot: no GPU, no download, about a minute.
+"""Gate the reference trainer on a small ray-traced scene: no GPU, no download, about a minute.
 
     python examples/quickstart_cpu.py
 
