@@ -1,21 +1,23 @@
-"""The floor: the least share of recorded iterations that run a real backward."""
+"""The floor: the least share of the recorded iterations that must run a real backward pass."""
 
 from __future__ import annotations
 
 from typing import Any
 
-MIN_SAMPLES = 100  # iterations recorded before the floor is in force; of fewer, the share says little (authors' value)
-UNCALIBRATED_FLOOR = 0.5  # floor until warm-up has set one (authors' value)
+# Number of recorded iterations from which the floor applies; a share of fewer says little. The authors' value.
+MIN_SAMPLES = 100
+UNCALIBRATED_FLOOR = 0.5  # floor until warm-up has set it; the authors' value
 
 
 class BackwardBudget:
-    """Counts recorded backwards and skips, and says whether one more skip is affordable.
+    """Counts recorded backward passes and skips, and decides whether the floor allows another skip.
 
     Attributes:
-        floor: share in force; 0.5 until an "auto" floor is calibrated.
-        backwards: recorded iterations with a backward, warm-up included.
-        skips: recorded iterations without.
-        calibrating: an "auto" floor waits for the first recorded iteration after warm-up.
+        floor: Floor in force; 0.5 until an "auto" floor is calibrated.
+        backwards: Number of recorded iterations with a backward pass, warm-up included.
+        skips: Number of recorded iterations without a backward pass.
+        calibrating: Whether an "auto" floor still waits for the first recorded iteration after warm-up.
+        would_skip, would_total: Number of warm-up visits that the rule would have skipped, and of all that it judged.
     """
 
     __slots__ = ("backwards", "calibrating", "floor", "skips", "would_skip", "would_total")
@@ -29,18 +31,18 @@ class BackwardBudget:
         self.would_total = 0
 
     def allows_skip(self) -> bool:
-        """False while too few backwards were run."""
+        """Whether another skip keeps the share of backward passes at or above the floor."""
         total = self.backwards + self.skips
         return total <= MIN_SAMPLES or self.backwards / total >= self.floor
 
     def observe_warmup(self, would_skip: bool) -> None:
-        """Record the rule's decision on a warm-up visit of a view that has a mean."""
+        """Record whether the rule would have skipped a warm-up visit of a view that has a mean."""
         self.would_total += 1
         if would_skip:
             self.would_skip += 1
 
     def calibrate(self) -> None:
-        """Set an "auto" floor from the decisions of warm-up; without any, it stays 0.5."""
+        """Set an "auto" floor from the visits of warm-up; it stays at 0.5 if there was none."""
         if self.would_total > 0:
             self.floor = max(0.5, 1.0 - 0.5 * (self.would_skip / self.would_total))
             self.calibrating = False

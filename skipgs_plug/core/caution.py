@@ -1,4 +1,4 @@
-"""Warnings of the gate, which end neither a training nor the gate."""
+"""Warnings of the gate that end neither the training nor the gate."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import warnings
 
 
 def caution(sentence: str, stacklevel: int = 2) -> None:
-    """Warn, also where warnings are errors (`python -W error`): there the sentence is printed.
+    """Issue a RuntimeWarning. If warnings are errors (`python -W error`), print the sentence instead.
 
-    A warning that is raised inside a training would end it, or let the gate go.
+    A warning that is raised as an error would end the training, or release the gate.
 
     Args:
-        sentence: To be said.
-        stacklevel: As in `warnings.warn`, counted from the caller.
+        sentence: Text of the warning.
+        stacklevel: Stack level of `warnings.warn`, counted from the caller of this function.
     """
     try:
         warnings.warn(sentence, RuntimeWarning, stacklevel=stacklevel + 1)

@@ -23,14 +23,14 @@ _AVAILABLE = dist.is_available()  # whether this build of PyTorch has torch.dist
 
 
 def group_size() -> int:
-    """Number of processes that train together; 1 without torch.distributed."""
+    """Return the number of processes that train together; 1 without torch.distributed."""
     if _AVAILABLE and dist.is_initialized():
         return dist.get_world_size()
     return 1
 
 
 def refuse_unreachable_ranks(world_size: int | None = None) -> None:
-    """Raise SkipGSError when there are other processes but no group to agree with them through."""
+    """Raise SkipGSError if there are other processes but no process group through which gates can agree."""
     world = int(os.environ.get("WORLD_SIZE") or 1) if world_size is None else world_size
     if world > 1 and group_size() == 1:
         raise SkipGSError(
@@ -40,7 +40,7 @@ def refuse_unreachable_ranks(world_size: int | None = None) -> None:
 
 
 def refuse_several(because: str, instead: str) -> None:
-    """Raise SkipGSError when several processes train together, for a reason given as half a sentence."""
+    """Raise SkipGSError if several processes train together; its sentence is made of `because` and `instead`."""
     if group_size() > 1:
         raise SkipGSError(f"{because}, but {group_size()} train together; {instead}.")
 
@@ -49,8 +49,8 @@ def agree(own: Decision, device: torch.device | None = None) -> Decision:
     """Combine this rank's decision with those of all others: skip only if every rank would.
 
     Args:
-        own: Of this rank.
-        device: Of the loss, where votes go if the group has nothing on the CPU; None if it is a plain number.
+        own: Decision of this rank.
+        device: Device of the loss, to which votes go if the group has no CPU backend; None for a plain number.
 
     Raises:
         SkipGSError: Another rank stopped with an error, or does not answer.
@@ -67,13 +67,13 @@ def agree(own: Decision, device: torch.device | None = None) -> Decision:
 
 
 def abort(device: torch.device | None = None) -> None:
-    """Tell the other ranks that this one raises, so that they do not wait for it. They may have ended themselves."""
+    """Tell the other ranks that this rank raises an error, so that they do not wait. They may have ended already."""
     with contextlib.suppress(SkipGSError):
         _lowest(_ABORT, device)
 
 
 def mean(values: Tensor) -> list[float]:
-    """Return the mean of each value [K] over all ranks, which call this together; one read of a device.
+    """Return the mean of each value [K] over all ranks, with one read of the device. All ranks must call it together.
 
     Raises:
         SkipGSError: Another rank does not answer.
@@ -86,7 +86,7 @@ def mean(values: Tensor) -> list[float]:
 
 
 def largest(value: int) -> int:
-    """Return the largest of a number over all ranks, which call this together."""
+    """Return the largest value over all ranks. All ranks must call it together."""
     return value if group_size() == 1 else int(_reduced(torch.tensor([value]), dist.ReduceOp.MAX)[0])
 
 
@@ -96,7 +96,7 @@ def _lowest(vote: int, device: torch.device | None) -> int:
 
 
 def _reduced(values: Tensor, operation: Any) -> list[float]:
-    """Reduce values over all ranks where the group can, and return them."""
+    """Reduce values over all ranks, on a device that the group supports, and return them."""
     group = None
     if values.device.type not in _devices():
         values = values.cpu()
@@ -105,7 +105,7 @@ def _reduced(values: Tensor, operation: Any) -> list[float]:
     try:
         dist.all_reduce(values, op=operation, group=group)
         return values.cpu().tolist()  # type: ignore[no-any-return]
-    except RuntimeError as error:  # also of NCCL, which reports a peer that is gone when the result is read
+    except RuntimeError as error:  # NCCL reports a missing peer only when the result is read
         raise SkipGSError(
             "Another process of the group did not answer: it ended, or waited longer than the time-out of "
             "init_process_group(); see its output, and resume all from their last checkpoint. PyTorch says: "
@@ -114,7 +114,7 @@ def _reduced(values: Tensor, operation: Any) -> list[float]:
 
 
 def _devices() -> set[str]:
-    """Types of the devices whose tensors the process group takes: "cpu", "cuda"."""
+    """Return the types of devices whose tensors the process group accepts, such as "cpu" and "cuda"."""
     return {str(torch.device(one).type) for one in _world()._device_types}
 
 
@@ -122,11 +122,11 @@ def _world() -> Any:
     return dist.group.WORLD
 
 
-_own_groups: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()  # of gloo, by the group beside which
+_own_groups: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()  # gloo group by the trainer's group
 
 
 def _gloo_group() -> Any:
-    """A group on the CPU beside one that has none, such as `cuda:nccl`; all ranks make it with their first vote."""
+    """Return a CPU group for a process group without one, such as `cuda:nccl`; all ranks create it together."""
     world = _world()
     if world not in _own_groups:
         _own_groups[world] = dist.new_group(backend="gloo")

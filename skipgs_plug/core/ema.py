@@ -12,8 +12,8 @@ class ViewMeans:
     """Exponential running means, seeded with each view's first loss (paper, per-view loss EMA).
 
     Attributes:
-        values: mean by view key. A restored state has string keys; `update` gives each back to the key
-            that the loop uses when that view comes along. Bounded by MAX_VIEWS.
+        values: Mean by view key, for at most MAX_VIEWS views. A restored state has string keys; `update` replaces each
+            by the key that the loop uses.
     """
 
     __slots__ = ("_decay", "_gain", "values")
@@ -43,10 +43,10 @@ class ViewMeans:
         return len(self.values)
 
     def state_dict(self) -> dict[str, float]:
-        """Means by view key as text.
+        """Return the means by the text of the view key.
 
         Raises:
-            SkipGSError: Two keys have the same text (6 and "6").
+            SkipGSError: Two keys have the same text, such as 6 and "6".
         """
         state = {str(view): mean for view, mean in self.values.items()}
         if len(state) != len(self.values):

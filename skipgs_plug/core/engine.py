@@ -48,13 +48,13 @@ class Engine:
             once, with the first iteration.
 
     Attributes:
-        config: settings in force.
+        config: Settings in force.
         policy: The policy; None until `configure` is called.
-        start: first iteration that may be skipped.
+        start: First iteration that may be skipped.
         iteration: Facts about the present iteration.
-        stats, clock: counts, seconds.
-        rates: scales learning rates, for the pace.
-        pace: says which iterations run, and scales learning rates.
+        stats, clock: Counts, seconds.
+        rates: Scales learning rates, for the pace.
+        pace: Decides which iterations run, and scales learning rates.
         trace: Rows of gated decisions; None if they are not recorded.
     """
 
@@ -75,7 +75,7 @@ class Engine:
         iteration = self.iteration
         # A refusal in the first iteration loses nothing.
         self.giving_up = Release(config.enabled, lambda: iteration.opened <= 1)
-        own = weakref.ref(self)  # PyTorch holds hooks of the rates, which must not hold a gate that was dropped
+        own = weakref.ref(self)  # PyTorch holds the hooks of the rates, which must not keep a dropped gate alive
 
         def taken_back() -> None:
             if (engine := own()) is not None:
@@ -105,12 +105,11 @@ class Engine:
         """Complete the settings with the facts about the trainer, and create the policy.
 
         Args:
-            info: About the trainer.
+            info: Facts about the trainer.
             given: Names of settings that the user gave, which no default replaces.
 
         Raises:
-            SkipGSError: Nothing says when to begin, the settings begin too early, view names repeat, or other
-                processes are out of reach.
+            SkipGSError: `start_iter` is unknown or too early, view names repeat, or other processes cannot be reached.
         """
         if info.world_size is not None:
             distributed.refuse_unreachable_ranks(info.world_size)
@@ -163,10 +162,10 @@ class Engine:
         return None if self.policy is None else self.policy.mean(view)
 
     def open_iteration(self, step: int) -> None:
-        """Iteration `step` begins.
+        """Begin iteration `step`.
 
         Raises:
-            GateOrderError: It lies before the previous one.
+            GateOrderError: The number is smaller than that of the previous iteration.
         """
         if self.iteration.step is None:
             self._go_on_from_saved(step)
@@ -187,25 +186,24 @@ class Engine:
     def gate(
         self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor | None = None, alone: bool = False
     ) -> bool:
-        """Call `run`, a real backward, unless the view can do without; True when its gradients stay.
+        """Call `run`, a real backward pass, unless it is skipped; return True if gradients were computed and kept.
 
-        Many answers do not depend on the loss: then, on a device, the backward is launched while the loss is on its way
-        to the host. A loss that turns out not to be finite has its gradients dropped before any optimizer steps.
+        Many decisions do not depend on the loss. On a device, the backward pass is then launched while the loss is
+        copied to the host. If the loss turns out not to be finite, its gradients are dropped before an optimizer steps.
 
         Args:
             view: Key of the view.
-            signal: Value to decide on.
-            run: The backward.
+            signal: Value to decide by.
+            run: The backward pass.
             loss: The tensor whose backward pass runs, if it is not the signal.
-            alone: Whether no other backward of this iteration needs what this one shares with it: a skipped graph is
-                freed at once.
+            alone: Whether the iteration has no other backward pass, so that a skipped graph can be freed at once.
         """
         back_from = loss if loss is not None else signal if isinstance(signal, Tensor) else None
         foreseen = self._foreseen(view, signal, back_from) if self.iteration.gated else None
         if foreseen is False:
             skip = self._run_first(view, signal, run, back_from)
         else:
-            # In iterations that train nothing the loss is not read.
+            # The loss is not read in iterations that train nothing.
             skip = self.decide(view, None if foreseen else signal).skip
             if not skip:
                 run()
@@ -220,7 +218,7 @@ class Engine:
         return not skip
 
     def free_skipped(self) -> None:
-        """Free the tensors saved for the skipped backward passes of this iteration; it has no other one."""
+        """Free the tensors saved for the skipped backward passes of this iteration, which has no further ones."""
         for reference in self._skipped:
             loss = reference()
             if loss is not None:
@@ -232,7 +230,7 @@ class Engine:
         now = self.iteration
         if not (loss is not None and isinstance(signal, Tensor) and has_events(signal.device)):
             return None
-        # Others are to be asked; gradients of earlier iterations would be dropped with a loss that is not finite.
+        # Other processes must be asked. With accumulation, a non-finite loss would drop earlier gradients too.
         if self._accumulates or self._scene_check.running or distributed.group_size() > 1:
             return None
         assert self.policy is not None and now.step is not None
@@ -241,7 +239,7 @@ class Engine:
         return self.policy.foreseen(view, now.step)
 
     def _run_first(self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor | None) -> bool:
-        """Launch the backward, then decide; True when its gradients were dropped after all."""
+        """Launch the backward pass, then decide; return True if its gradients were dropped."""
         assert isinstance(signal, Tensor) and loss is not None
         copy = HostCopy(signal)
         run()
@@ -294,7 +292,7 @@ class Engine:
         self.policy.notify_event(step, self.n_views)
 
     def state_dict(self) -> dict[str, Any]:
-        """As `SkipGate.state_dict`."""
+        """Return the state; see `SkipGate.state_dict`."""
         if self.policy is None or self._pending_state is not None:
             return dict(self._pending_state or {})
         self.clock.mark(exactly=True)
@@ -310,11 +308,11 @@ class Engine:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """As `SkipGate.load_state_dict`; before `configure` the state is kept until then."""
+        """Load a state; see `SkipGate.load_state_dict`. Before `configure`, the state is kept until that call."""
         require_state(state)
         if self.policy is None:
             self._pending_state = dict(state)
-            # The loop asks about its first number before the trainer says anything else.
+            # The loop asks about its first number before the trainer reports anything else.
             self._load_pace(gate_state(state))
             return
         pending, self._pending_state = self._pending_state is not None, None
@@ -334,7 +332,7 @@ class Engine:
             self._guard.in_a_row = state["non_finite_in_a_row"]
             self.clock.load_state_dict(state["clock"])
             step = state["step"]
-        # Where nothing pauses, means lag behind a change for long.
+        # A pace that leaves out iterations does not pause, so means are far off for a long time after a change.
         if not self.pace.leaves_out or not self.stats.events:
             self._scene_check.start()
         self.iteration.begin(step, gated=step is not None and step >= self.start and self.config.enabled)
@@ -347,7 +345,7 @@ class Engine:
             self.load_state_dict(state)
 
     def _load_pace(self, whole: dict[str, Any]) -> None:
-        """Load which iterations run, and how long steps are; the authors' controller has neither."""
+        """Load the state of the pace and of visibility; the authors' controller has neither."""
         state = whole.get("pace")
         if (state is None) == self.pace.leaves_out:
             saved = None if state is None else state["refining"]["asked"]
@@ -406,7 +404,7 @@ class Engine:
 
 
 def _on_host(signal: float | Tensor | HostCopy) -> float:
-    """Return the value to decide by; a read of the device if it lies there."""
+    """Return the value to decide by; this waits for the device that holds it."""
     if isinstance(signal, Tensor):
         return float(signal.item())
     return signal.value() if isinstance(signal, HostCopy) else float(signal)

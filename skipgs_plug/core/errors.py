@@ -16,7 +16,7 @@ class AdapterMismatchError(SkipGSError):
 
 
 class BrokenTrainingError(SkipGSError):
-    """The training itself is broken, such as by losses that stay non-finite: it is raised at any time."""
+    """The training itself is broken, for example because losses stay non-finite. It is raised at any time."""
 
 
 class GateOrderError(SkipGSError):

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-MIN_PAUSE_ITERS = 500  # iterations of a pause, at least, so that a scene of few views has time to settle
+# Least number of iterations of a pause, so that losses settle in scenes of few views too. In other scenes a pause has
+# one iteration per view.
+MIN_PAUSE_ITERS = 500
 
 
 class Pause:
-    """The iterations after a structural change that all run a real backward and are not recorded.
+    """The iterations after a structural change. All of them run a real backward pass, and none is recorded.
 
-    A change makes every loss jump. Means keep their values from before the jump, so that a view counts as
-    recovered only when it really is. New views get no mean during a pause, so that no mean is seeded at the peak.
+    A change makes every loss jump. Means keep their values from before the jump, so that a view counts as recovered
+    only when its loss is back. New views get no mean during a pause, so that no mean is seeded at the peak.
 
     Attributes:
-        until: first iteration that is not paused any more.
-        events: number of changes that caused or extended a pause.
+        until: First iteration after the pause.
+        events: Number of changes that caused or extended a pause.
     """
 
     __slots__ = ("_iters", "events", "until")
@@ -24,7 +26,7 @@ class Pause:
         self.events = 0
 
     def extend(self, step: int, n_views: int) -> int:
-        """Pause the iterations after `step`; return by how many iterations the pause grows."""
+        """Pause the iterations after `step`; return the number of iterations that this adds to the pause."""
         iters = max(n_views, MIN_PAUSE_ITERS) if self._iters is None else self._iters
         begin = max(self.until, step + 1)
         end = step + 1 + iters

@@ -1,4 +1,4 @@
-"""The present iteration: one record that gate, engine, hooks and optimizer steps share."""
+"""The present iteration: one record that the gate, the engine and the hooks share."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from skipgs_plug.core.decision import Decision
 
 
 class GatedIteration:
-    """What is known of the present iteration. `begin` is the one place where it is forgotten.
+    """Facts about the present iteration. Only `begin` resets them.
 
     Attributes:
-        step: its number, None before the first.
-        gated: whether its backward may be skipped, as far as its number decides.
-        opened: number of iterations that have begun with this gate.
-        decision: the last answer in it.
-        ran: a real backward ran in it.
-        view, signal: what a trainer's hooks named for the backward to come.
-        backwards: training backwards that hooks saw in it.
-        keys: views that `backward` was called on by hand.
-        stepped: ids of the optimizers that `step` was called on by hand.
-        ended: `update` was called by hand.
+        step: Number of the iteration; None before the first.
+        gated: Whether the iteration is at or after `start_iter` and the gate is on.
+        opened: Number of iterations that have begun with this gate.
+        decision: The last decision in the iteration.
+        ran: Whether a real backward pass ran in the iteration.
+        view, signal: View and value that the trainer's hooks reported for the coming backward pass.
+        backwards: Number of training backward passes that the hooks saw.
+        keys: Keys of the views that the user called `backward` with.
+        stepped: Ids of the optimizers that the user called `step` with.
+        ended: Whether the user called `update`.
     """
 
     __slots__ = (
@@ -36,7 +36,7 @@ class GatedIteration:
         self.begin(None, gated=False)
 
     def begin(self, step: int | None, gated: bool) -> None:
-        """Forget the previous iteration; `step` is the number of the new one."""
+        """Reset all facts for iteration `step`."""
         self.step = step
         self.gated = gated
         self.decision: Decision = decision.INACTIVE
@@ -50,5 +50,5 @@ class GatedIteration:
 
     @property
     def skipped(self) -> bool:
-        """Whether it has a backward that was skipped, and none that ran."""
+        """Whether a backward pass was skipped in the iteration and no other one ran."""
         return self.decision.skip and not self.ran

@@ -137,7 +137,7 @@ class Hooks:
             if call.failed:
                 raise  # the trainer's own
             self._failed(error)
-        # A gate that gave up owes the trainer its backward: nothing handles an iteration without one any more.
+        # After a release the trainer needs its backward pass, because the gate no longer handles skipped iterations.
         return call() if self.released and not call.made else None
 
     def _is_training_backward(self) -> bool:
@@ -229,9 +229,9 @@ class Hooks:
         self._engine.pace.describe(always)
 
     def require(self, number: int) -> None:
-        """Iteration `number` must run, which is only known now: a condition of the loop waits for what just happened.
+        """Make iteration `number` run, because a condition of the loop depends on an event that just happened.
 
-        A condition that waits like this is to be given a value by which it never holds; see `known` of `loop`.
+        Give the name in such a condition a value for which it never holds; see `known` of `loop`.
         """
         self._engine.pace.require(number)
 
@@ -259,13 +259,13 @@ class Hooks:
         self.wrap(owner, name, counted)
 
     def number(self, counted: int) -> int:
-        """Number of the present iteration, for trainers whose iterations are only counted: `counted` if all ran."""
+        """Return the number of the present iteration in the training loop; `counted` while that loop is not known."""
         number = self._engine.pace.number
         return counted if number is None else number
 
     @property
     def gap(self) -> int:
-        """Iterations that were left out right before the present one."""
+        """Number of iterations that were left out right before the present one."""
         return self._engine.pace.gap
 
     def catch_up(self, owner: Any, name: str, caller: str) -> None:
@@ -294,15 +294,15 @@ class Hooks:
         intercept_tensor_backward(self._patches, callers, self.backward)
 
     def on_detach(self, label: str, undo: Callable[[], None]) -> None:
-        """Have something else taken back by `detach`."""
+        """Add a function that undoes another change at `detach`."""
         self._patches.add_undo(label, undo)
 
     @property
     def state(self) -> Engine:
-        """What has `state_dict` and `load_state_dict`, for trainers that carry others' state along."""
+        """Object with `state_dict` and `load_state_dict`, for trainers that save the state of other objects too."""
         return self._engine
 
-    # What the gate asks.
+    # Questions of the gate.
 
     @property
     def patched(self) -> list[str]:
@@ -311,33 +311,34 @@ class Hooks:
 
     @property
     def trained(self) -> bool:
-        """Whether an iteration was seen, or a training backward that was in none."""
+        """Whether an iteration was seen, or a training backward pass outside of any iteration."""
         return self._iterations + self._backwards > 0
 
     @property
     def released(self) -> bool:
-        """Whether the gate gave up, and training goes on without it."""
+        """Whether the gate was released, so that training continues without it."""
         return self._giving_up.reason is not None
 
     def guarded(self) -> AbstractContextManager[None]:
-        """A block of an adapter's own code: an error in it releases the gate, and the code behind it runs on.
+        """Return a block for an adapter's own code. An error in it releases the gate, and the code after it runs.
 
-        Functions that are put around names need none: there the trainer gets what it would have without a gate.
+        Functions that are put around names do not need a block: after an error there, the trainer gets the result that
+        it would have without a gate.
 
         Raises:
-            SkipGSError: In the block, of a gate that is on and refuses this run in its first iteration.
+            SkipGSError: The gate is on and refuses this run in its first iteration.
         """
         return self._guarded
 
     def release(self, reason: str) -> None:
-        """Take the gate off a run that goes on without it, and say why: an error would end what was trained."""
+        """Release the gate with a reason, so that training continues without it; an error would end the training."""
         self._giving_up.let_go(reason)
 
     def _failed(self, error: Exception) -> None:
         self._giving_up.on_error(error, self._iteration.step)
 
     def restore(self) -> None:
-        """Put back every replaced name."""
+        """Restore every replaced name."""
         self._patches.restore()
 
     def verify(self) -> None:

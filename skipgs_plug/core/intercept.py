@@ -1,4 +1,4 @@
-"""Replace names in somebody else's code, know every one of them, and put them all back."""
+"""Replace names in the code of a trainer, list every replacement, and restore all of them."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ class Original:
 class Patches:
     """All names that one gate has replaced, in order.
 
-    Where code that was put around a name fails, and not the name itself, `on_error` is told, and the trainer gets what
-    it would have without a gate.
+    If the code around a name fails, and not the original function, `on_error` receives the error, and the trainer gets
+    the result that it would have without a gate.
 
     Args:
-        on_error: Told of an error of code around a name; raises it, or has let go of the trainer. None raises it.
-        expectation: Sentence for errors: which upstream version the names were checked at.
+        expectation: Sentence for errors that says with which upstream version the names were checked.
+        on_error: Receives errors of the code around a name, and raises them or releases the gate. None raises them.
     """
 
     def __init__(self, expectation: str = "", on_error: Callable[[Exception], None] | None = None) -> None:
@@ -59,11 +59,11 @@ class Patches:
 
     @property
     def names(self) -> list[str]:
-        """What is replaced at present, as "owner.name"."""
+        """Names that are replaced at present, as "owner.name"."""
         return [label for label, _ in self._undo]
 
     def wrap(self, owner: Any, name: str, around: Around) -> None:
-        """Call `around(original, *args, **kwargs)` wherever `owner.name(*args, **kwargs)` is called.
+        """Call `around(original, *args, **kwargs)` in place of each `owner.name(*args, **kwargs)`.
 
         Args:
             owner: A class (`original` then takes the instance first), an instance, a module, or the
@@ -72,8 +72,8 @@ class Patches:
             around: The replacement.
 
         Raises:
-            AdapterMismatchError: There is no such callable.
-            SkipGSError: It is gated already.
+            AdapterMismatchError: The owner has no callable of this name.
+            SkipGSError: A gate has replaced the name already.
         """
         label = f"{_describe(owner)}.{name}"
         original = owner.get(name) if isinstance(owner, dict) else getattr(owner, name, None)
@@ -83,7 +83,7 @@ class Patches:
             raise SkipGSError(f"{label} is gated already: detach() the other gate first.")
 
         if _is_bound(original, owner):
-            # Schedulers of PyTorch reach for optimizer.step.__func__, so a method stays a method.
+            # Schedulers of PyTorch use optimizer.step.__func__, so a method must stay a method.
             @functools.wraps(original)
             def method(_: Any, *args: Any, **kwargs: Any) -> Any:
                 call = Original(original)
@@ -98,7 +98,7 @@ class Patches:
 
         @functools.wraps(original)
         def function(*args: Any, **kwargs: Any) -> Any:
-            call = Original(original)  # frame 2 of `around` is the caller's: nothing stands between
+            call = Original(original)  # `around` reads the caller's frame, which must be two frames above its own
             try:
                 return around(call, *args, **kwargs)
             except Exception as error:
@@ -108,18 +108,18 @@ class Patches:
         self._set(owner, name, function, label)
 
     def _instead(self, error: Exception, call: Original, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """What the trainer gets where the code around a call failed; an error of its own call is raised."""
+        """Return the original's result after the code around a call failed; raise an error of the original itself."""
         if call.failed or self._on_error is None:
             raise error
         self._on_error(error)
         return call.result if call.made else call(*args, **kwargs)
 
     def add_undo(self, label: str, undo: Callable[[], None]) -> None:
-        """List something else that `restore` has to take back."""
+        """Add a function that `restore` calls to undo another change."""
         self._undo.append((label, undo))
 
     def restore(self) -> None:
-        """Put everything back, latest first. Harmless when called again."""
+        """Undo all changes, the latest first. Further calls do nothing."""
         while self._undo:
             _, undo = self._undo.pop()
             undo()
@@ -139,7 +139,7 @@ class Patches:
 
 
 def _remove(owner: Any, name: str) -> None:
-    with contextlib.suppress(AttributeError):  # somebody was faster, and the rest has to be put back all the same
+    with contextlib.suppress(AttributeError):  # other code removed it already, and further names must be restored
         delattr(owner, name)
 
 
@@ -151,19 +151,19 @@ def _is_bound(function: Any, owner: Any) -> bool:
 def intercept_tensor_backward(
     patches: Patches, callers: tuple[str, ...], gated: Callable[[torch.Tensor, Callable[[], Any]], Any]
 ) -> None:
-    """Hand the scalar backwards that a function of one of these names calls itself to `gated`.
+    """Pass scalar backward calls of functions with these names to `gated`.
 
-    `torch.Tensor.backward` is replaced for the process, so everything else passes through: backwards of
-    other functions (a pruning score, say), backwards of tensors that are not scalars.
+    `torch.Tensor.backward` is replaced in the whole process. Calls from other functions, such as for a pruning score,
+    and calls on tensors that are not scalars go to the original.
 
     Args:
-        patches: Where the replacement is listed.
-        callers: Names of functions that hold the training backward.
-        gated: Called with the loss and a function that runs the real backward.
+        patches: List of replacements, to which this one is added.
+        callers: Names of the functions that call the training backward.
+        gated: Receives the loss and a function that runs the real backward.
     """
 
     def around(original: Callable[..., Any], loss: torch.Tensor, *args: Any, **kwargs: Any) -> Any:
-        # Frame 0 is this function, 1 the wrapper, 2 whoever called backward.
+        # Frame 0 is this function, frame 1 the wrapper, frame 2 the caller of backward.
         if sys._getframe(2).f_code.co_name not in callers or loss.numel() != 1:
             return original(loss, *args, **kwargs)
         return gated(loss, lambda: original(loss, *args, **kwargs))

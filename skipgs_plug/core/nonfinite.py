@@ -1,4 +1,4 @@
-"""What a NaN or infinite loss does to the gate: never silently anything."""
+"""Treatment of NaN and infinite losses, of which the user always hears."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ from skipgs_plug.core.caution import caution
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.errors import BrokenTrainingError
 
-MIN_IN_A_ROW = 10  # non-finite losses in a row, at least, that make an error: fewer can come from single views
+# Least number of non-finite losses in a row that are an error. Fewer can come from single damaged views.
+MIN_IN_A_ROW = 10
 
 
 class NonFiniteGuard:
-    """Answers for losses that are not finite, and gives up when they go on.
+    """Decides on losses that are not finite, and raises an error if they continue.
 
     Args:
-        mode: "skip", "raise" or "pass", as `SkipConfig.on_nonfinite`.
+        mode: "skip", "raise" or "pass"; see `SkipConfig.on_nonfinite`.
+
+    Attributes:
+        in_a_row: Number of non-finite losses since the last finite one.
     """
 
     def __init__(self, mode: str) -> None:
@@ -26,18 +30,18 @@ class NonFiniteGuard:
         """Decide on a loss that is not finite.
 
         Raises:
-            BrokenTrainingError: mode is "raise", or every view of an epoch (at least 10 losses) in a row was
-                non-finite.
+            BrokenTrainingError: The mode is "raise", or as many losses in a row as there are views, at least 10, were
+                not finite.
         """
         known = "no finite loss before" if mean is None else f"mean of its finite losses {mean:.4g}"
         what = f"Loss is {loss} in iteration {step} on view {view!r} ({known})"
         self.in_a_row += 1
         if self._mode == "raise":
-            raise BrokenTrainingError(f"{what}: it came out of the trainer so; check that image and camera.")
+            raise BrokenTrainingError(f"{what}: the trainer computed this value; check that image and camera.")
         if self.in_a_row >= max(MIN_IN_A_ROW, n_views):
             raise BrokenTrainingError(
                 f"{what}, like {self.in_a_row - 1} losses before it: the model is lost; "
-                "go back to a checkpoint and lower the learning rates."
+                "resume from a checkpoint with lower learning rates."
             )
         if view not in self._warned:
             self._warned.add(view)

@@ -155,13 +155,13 @@ class SkipPolicy(Policy):
         return self.budget.floor
 
     def mean(self, view: Hashable) -> float | None:
-        """Running mean of a view's loss, None for a view without one."""
+        """Return the running mean of a view's loss; None for a new view."""
         return self.means.get(view)
 
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
-        """Decide whether to skip the backward of `view`, whose loss is `loss`, in iteration `step`.
+        """Decide whether to skip the backward pass of `view`, whose loss is `loss`, in iteration `step`.
 
-        Call it once per view and iteration, after the forward; the answer is recorded as followed.
+        Call it once per view and iteration, after the forward pass. The answer is recorded as if it is followed.
         """
         if step < self._start_iter or not self.enabled:
             return decision.INACTIVE
@@ -195,7 +195,7 @@ class SkipPolicy(Policy):
         return answer
 
     def foreseen(self, view: Hashable, step: int) -> bool | None:
-        """False in a pause, in warm-up, for a view without a mean, and while the floor forbids skipping."""
+        """Return False in a pause, in warm-up, for a new view, and while the floor forbids skipping."""
         if step < self._start_iter or not self.enabled or step < self.pause.until:
             return False
         warmup_end = step + self._warmup if self._warmup_end is None else self._warmup_end
@@ -204,10 +204,10 @@ class SkipPolicy(Policy):
         return False if self.means.get(view) is None else None
 
     def overrule(self, own: Decision, answer: Decision) -> None:
-        """Count the decision that takes effect instead of the one that was recorded last.
+        """Count the decision that takes effect in place of the one that was recorded last.
 
-        Another process needed the backward, or its loss was not finite: then the iteration counts for nothing, as one
-        with such a loss of its own.
+        Another process needed the backward pass, or its loss was not finite. In the latter case the iteration does not
+        count, like an iteration whose own loss is not finite.
         """
         if own not in _COUNTED:
             return
@@ -231,7 +231,7 @@ class SkipPolicy(Policy):
             self._warmup_end += added
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that changes, as plain values with string keys.
+        """Return everything that changes, as plain values with string keys.
 
         Returns:
             `version` (2); `means` (mean by view key); `budget` (`floor`, `backwards`, `skips`,

@@ -1,4 +1,4 @@
-"""The one place where a gate gives up: no run is lost to it."""
+"""Release of a gate that fails, so that no training is lost to an error of the gate."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ log = logging.getLogger(__name__)
 
 
 class Release:
-    """Lets go of a training that continues without a gate.
+    """Releases the gate after an error, so that training continues without it.
 
-    A refusal is raised as long as it costs nothing. An error of the training itself is raised at any time, and so is
-    every error where other processes would wait for this one. Any other error releases the gate, with one warning.
+    A refusal is raised while it costs no trained iterations. An error of the training itself is raised at any time, and
+    so is every error for which other processes would wait. Any other error releases the gate, with one warning.
 
     Args:
-        enabled: Whether the gate is on. One that is off has refused nothing and ends nothing.
-        refuses: Says whether a refusal still costs nothing.
+        enabled: Whether the gate is on. A gate that is off refuses nothing.
+        refuses: Returns whether a refusal still costs nothing.
 
     Attributes:
-        reason: Sentence that was said; None while the gate holds on.
-        refuses: As given.
+        reason: The sentence of the warning; None while the gate is attached.
+        refuses: The argument.
     """
 
     def __init__(self, enabled: bool, refuses: Callable[[], bool]) -> None:
@@ -36,20 +36,20 @@ class Release:
         self.refuses = refuses
 
     def undoes(self, undo: Callable[[], None]) -> None:
-        """Have something taken back whenever the gate gives up."""
+        """Add a function that undoes a part of the attachment when the gate is released."""
         self._undo.append(undo)
 
     def on_error(self, error: Exception, step: int | None, refuses: bool | None = None) -> None:
-        """Raise an error of the gate's own code, or let go.
+        """Raise an error of the gate's own code, or release the gate.
 
         Args:
-            error: That was raised.
-            step: Present iteration, if it is known.
-            refuses: Whether a refusal costs nothing, where the caller knows better than `refuses`.
+            error: The error.
+            step: Present iteration; None if it is not known.
+            refuses: Whether a refusal costs nothing, if the caller knows better than the attribute `refuses`.
 
         Raises:
-            Exception: The error, if it is a refusal that costs nothing, is of the training itself, or if other
-                processes would wait for this one.
+            Exception: The error, if it is a refusal that costs nothing, if it is an error of the training itself, or if
+                other processes would wait for this one.
         """
         if self.reason is not None:
             return
@@ -64,7 +64,7 @@ class Release:
         self.let_go(f"The gate is released{where}, and training goes on without it, in all its iterations ({why})")
 
     def let_go(self, reason: str) -> None:
-        """Take everything back, and say why, once."""
+        """Undo the attachment, and warn with the reason, once."""
         if self.reason is None:
             self.reason = reason
             self._take_back()
@@ -84,7 +84,7 @@ class Release:
 
 
 class _Guard:
-    """A block of code whose errors are told to a `Release`."""
+    """A block of code whose errors go to a `Release`."""
 
     __slots__ = ("_release", "_step")
 

@@ -1,9 +1,9 @@
-"""Tensors that autograd saved for a backward pass, freed when the pass is skipped instead of at the next forward pass.
+"""Free the tensors that autograd saved for a backward pass when the pass is skipped.
 
-A backward pass frees the tensors that the forward pass saved; a skipped one does not. Most trainers hold `loss` and
-`image` until the next forward pass is done, so two graphs exist at once: 41 % more memory at the peak in a model of
-Inria's sizes. PyTorch lets hooks be registered on a tensor that a graph has saved already, and drops the tensor for the
-value that the hook returns. Hooks that are registered at a skip cost nothing in the iterations that run.
+A backward pass frees the tensors that the forward pass saved; a skipped backward pass does not. Most trainers keep
+`loss` and `image` until the following forward pass is done, so that two graphs exist at once: 41 % more memory at the
+peak in a model of Inria's sizes. PyTorch accepts hooks on a tensor that a graph has saved already, and replaces the
+tensor by the value that the hook returns. Hooks that are registered at a skip cost nothing in iterations that run.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from skipgs_plug.core.errors import SkipGSError
 
 
 def free_graph(loss: Tensor) -> None:
-    """Free the tensors saved for the backward pass of a loss; no backward pass can reach them any more."""
+    """Free the tensors saved for the backward pass of a loss. No backward pass may need them later."""
     for node in nodes(loss):
         for name in _saved_names(node.__class__):
             try:
@@ -28,12 +28,12 @@ def free_graph(loss: Tensor) -> None:
             for each in saved if isinstance(saved, (tuple, list)) else (saved,):
                 try:
                     each.register_hooks(_forget, _refuse)
-                except RuntimeError:  # None, freed already, or under hooks of the trainer's own
+                except RuntimeError:  # the tensor is None, was freed already, or has hooks of the trainer
                     continue
 
 
 def nodes(loss: Tensor) -> Iterator[Any]:
-    """Yield every function of the graph behind a loss once."""
+    """Yield every function of the graph of a loss once."""
     waiting, seen = [loss.grad_fn], set()
     while waiting:
         node = waiting.pop()
@@ -44,7 +44,7 @@ def nodes(loss: Tensor) -> Iterator[Any]:
 
 
 def drop_gradients(loss: Tensor) -> None:
-    """Take the gradients of all leaves behind a loss away, so that no optimizer steps with them."""
+    """Remove the gradients of all leaves of a loss's graph, so that no optimizer steps with them."""
     for node in nodes(loss):
         leaf = getattr(node, "variable", None)
         if isinstance(leaf, Tensor):
@@ -52,17 +52,17 @@ def drop_gradients(loss: Tensor) -> None:
 
 
 def _forget(tensor: Tensor) -> None:
-    """Return what is kept in place of a saved tensor: nothing."""
+    """Keep nothing in place of a saved tensor."""
 
 
 def _refuse(kept: None) -> NoReturn:
     raise SkipGSError(
-        "A backward needs the graph of a loss whose backward was skipped, and which is freed; call backward on both "
-        "losses at once, or compute what they share anew."
+        "A backward pass needs the graph of a loss whose backward pass was skipped and whose graph is freed; call "
+        "backward on both losses at once, or compute their common part again."
     )
 
 
 @functools.cache
 def _saved_names(kind: Any) -> tuple[str, ...]:
-    """Attributes of a function of autograd that give its saved tensors as PyTorch keeps them."""
+    """Return the names of an autograd function's attributes that hold its saved tensors."""
     return tuple(name for name in dir(kind) if name.startswith("_raw_saved_"))

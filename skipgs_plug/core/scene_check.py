@@ -1,20 +1,22 @@
-"""Whether a loaded state can be of the scene that is trained, judged by the first losses after it."""
+"""Check by the first losses after a resume whether the loaded state belongs to the scene that is trained."""
 
 from __future__ import annotations
 
 from skipgs_plug.core.errors import SkipGSError
 
-CHECKED_LOSSES = 10  # first losses after a resume that are compared with the means of their views
-# Factor between a loss and the mean of its view above which the scenes differ. A mean lags behind its loss,
-# but by less than that when training continues.
+# Number of losses after a resume that are compared with the means of their views. A few may be far off by chance, but
+# not ten in a row.
+CHECKED_LOSSES = 10
+# Factor between a loss and the mean of its view from which the loss counts as far off. A mean lags behind the losses,
+# but by less than this factor while training continues.
 FAR = 2.0
 
 
 class SceneCheck:
     """Refuses a state when each of the first ten losses after it is far from the mean of its view.
 
-    Names of views do not tell scenes apart that count their images alike. One loss near its mean, or a
-    structural change, ends the check.
+    Names of views do not distinguish scenes whose images are numbered alike. One loss near its mean, or a structural
+    change, ends the check.
     """
 
     def __init__(self) -> None:
@@ -26,18 +28,18 @@ class SceneCheck:
         return self._left > 0
 
     def start(self) -> None:
-        """A state was loaded."""
+        """Begin the check, because a state was loaded."""
         self._left = CHECKED_LOSSES
 
     def stop(self) -> None:
-        """Losses jump for a reason."""
+        """End the check, because a structural change makes losses jump."""
         self._left = 0
 
     def see(self, loss: float, mean: float | None, step: int) -> None:
-        """Judge one loss, while the check runs; a view without a mean says nothing.
+        """Judge one loss while the check runs. A loss of a view without a mean does not count.
 
         Raises:
-            SkipGSError: It was the tenth, and all were far off.
+            SkipGSError: This is the tenth loss, and all ten were far off.
         """
         if mean is None or not self.running:
             return

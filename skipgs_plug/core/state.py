@@ -15,7 +15,7 @@ GATE_VERSION = 2
 
 
 class BudgetState(TypedDict):
-    """As `BackwardBudget.state_dict`."""
+    """Content of `BackwardBudget.state_dict()`."""
 
     floor: float
     backwards: int
@@ -26,7 +26,7 @@ class BudgetState(TypedDict):
 
 
 class PolicyState(TypedDict):
-    """As `SkipPolicy.state_dict`."""
+    """Content of `SkipPolicy.state_dict()`."""
 
     version: int
     means: dict[Any, float]
@@ -37,13 +37,13 @@ class PolicyState(TypedDict):
 
 
 class RefinementPolicyState(TypedDict):
-    """As `RefinementPolicy.state_dict`."""
+    """Content of `RefinementPolicy.state_dict()`."""
 
     means: dict[Any, float]
 
 
 class StatsState(TypedDict):
-    """As `GateStats.state_dict`; a view's row is visits, backwards, skips, last loss."""
+    """Content of `GateStats.state_dict()`; the row of a view is visits, backwards, skips, last loss."""
 
     iterations: int
     backwards: int
@@ -54,7 +54,7 @@ class StatsState(TypedDict):
 
 
 class ClockState(TypedDict):
-    """As `GateClock.state_dict`."""
+    """Content of `GateClock.state_dict()`."""
 
     t_total: float
     t_post: float
@@ -63,7 +63,7 @@ class ClockState(TypedDict):
 
 
 class SamplingState(TypedDict):
-    """As `Sampling.state_dict`."""
+    """Content of `Sampling.state_dict()`."""
 
     share: float
     run: int
@@ -72,7 +72,7 @@ class SamplingState(TypedDict):
 
 
 class EarlyStoppingState(TypedDict):
-    """As `EarlyStopping.state_dict`."""
+    """Content of `EarlyStopping.state_dict()`."""
 
     ends: list[float]
     cycle: int
@@ -84,7 +84,7 @@ class EarlyStoppingState(TypedDict):
 
 
 class NewerRefiningState(TypedDict, total=False):
-    """What states of earlier versions lack."""
+    """Entries that states of earlier versions do not have."""
 
     changed: int | None
     expected: int | None
@@ -92,7 +92,7 @@ class NewerRefiningState(TypedDict, total=False):
 
 
 class RefiningState(NewerRefiningState):
-    """As `Refining.state_dict`."""
+    """Content of `Refining.state_dict()`."""
 
     asked: float | str
     share: float | None
@@ -104,7 +104,7 @@ class RefiningState(NewerRefiningState):
 
 
 class EventsState(TypedDict):
-    """As `Events.state_dict`."""
+    """Content of `Events.state_dict()`."""
 
     kept: int
     left_out: int
@@ -112,20 +112,20 @@ class EventsState(TypedDict):
 
 
 class GrowingState(TypedDict):
-    """As `Growing.state_dict`."""
+    """Content of `Growing.state_dict()`."""
 
     asked: float | str
     share: float | None
     first: int | None
     views: int
-    gaussians_shown: tuple[float | None, float | None]  # by the first measurement, by the latest one
+    gaussians_shown: tuple[float | None, float | None]  # in the first measurement, in the latest one
     measuring: bool
     sampling: SamplingState
     events: EventsState | None
 
 
 class PaceState(TypedDict):
-    """As `Phased.state_dict`."""
+    """Content of `Phased.state_dict()`."""
 
     start: int
     last: int | None
@@ -137,7 +137,7 @@ class PaceState(TypedDict):
 
 
 class GateState(TypedDict):
-    """As `SkipGate.state_dict`; the policy checks its own part, which another policy fills with other things."""
+    """Content of `SkipGate.state_dict()`; each policy has its own part, and checks it."""
 
     version: int
     policy: dict[str, Any]
@@ -146,7 +146,7 @@ class GateState(TypedDict):
     clock: ClockState
     step: int | None
     pace: PaceState | None
-    visibility: tuple[float, float, int, float, float]  # as `Visibility.state_dict`
+    visibility: tuple[float, float, int, float, float]  # content of `Visibility.state_dict()`
 
 
 class ReleaseStats(TypedDict):
@@ -173,14 +173,14 @@ def is_release_state(state: Mapping[str, Any]) -> bool:
 
 
 def policy_state(state: Mapping[str, Any], release_warmup_end: int) -> dict[str, Any]:
-    """Check a policy state and bring it to the present version.
+    """Check a policy state and convert it to the present version.
 
     Args:
-        state: As saved by `SkipPolicy.state_dict`, or by the authors' controller (`state_version` 1).
-        release_warmup_end: Iteration at which the authors' warm-up ends; their state does not hold it.
+        state: State of `SkipPolicy.state_dict`, or of the authors' controller (`state_version` 1).
+        release_warmup_end: Iteration at which the authors' warm-up ends; their state does not contain it.
 
     Raises:
-        SkipGSError: Another version, or an entry is missing or of another type.
+        SkipGSError: The version differs, or an entry is missing or has another type.
     """
     require_state(state)
     if is_release_state(state):
@@ -194,17 +194,17 @@ def refinement_policy_state(state: Mapping[str, Any]) -> Mapping[str, Any]:
     """Check the state of a `RefinementPolicy`.
 
     Raises:
-        SkipGSError: An entry is missing or of another type.
+        SkipGSError: An entry is missing or has another type.
     """
     _require(state, RefinementPolicyState, "policy")
     return state
 
 
 def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Check the state of a whole gate, as saved by `SkipGate.state_dict`, or by the authors' controller.
+    """Check the state of a whole gate, saved by `SkipGate.state_dict` or by the authors' controller.
 
     Raises:
-        SkipGSError: Another version, or an entry is missing or of another type.
+        SkipGSError: The version differs, or an entry is missing or has another type.
     """
     require_state(state)
     accumulator = state.get("accumulator") or {}
@@ -222,19 +222,19 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
                 "The gate state was saved by a version before 0.2.0, which left out iterations in another way; "
                 "continue with that version, or start the gate afresh."
             )
-        # States from before iterations could be left out, and before steps depended on what a view shows.
+        # Complete states of earlier versions: at first no iterations were left out, and visibility was not measured.
         state = {"pace": None, **state}
-        visibility = state.setdefault("visibility", state.pop("shown", [0.0, 0]))  # it was called "shown"
-        if isinstance(visibility, (list, tuple)) and len(visibility) == 2:  # from before sums could wait on a device
+        visibility = state.setdefault("visibility", state.pop("shown", [0.0, 0]))  # the entry was called "shown"
+        if isinstance(visibility, (list, tuple)) and len(visibility) == 2:  # sums were never unread
             state["visibility"] = [*visibility, visibility[1], 0.0, 0.0]
-        if isinstance(state.get("clock"), Mapping):  # and from before processor seconds were counted
+        if isinstance(state.get("clock"), Mapping):  # processor seconds were not counted
             state["clock"] = {"t_total_processor": math.nan, "t_post_processor": math.nan, **state["clock"]}
         _require(state, GateState, "state")
     return dict(state)
 
 
 def require_state(state: Any) -> None:
-    """Raise SkipGSError unless this can be a state at all."""
+    """Raise SkipGSError unless this is a dictionary with entries."""
     if not isinstance(state, Mapping):
         raise SkipGSError(f"A gate state is a dict, not {type(state).__name__}; start the gate afresh.")
     if not state:

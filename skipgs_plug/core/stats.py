@@ -13,10 +13,10 @@ class GateStats:
     """Counts of decisions. Every gated iteration is either a backward or a skip.
 
     Attributes:
-        iterations: training backwards seen, before `start_iter` too.
-        backwards: real backwards from `start_iter` on (warm-up and paused ones included).
-        skips: skipped backwards.
-        reasons: gated decisions by reason.
+        iterations: Number of training backward passes, run or skipped, before `start_iter` too.
+        backwards: Number of real backward passes from `start_iter` on, including those in warm-up and in pauses.
+        skips: Number of skipped backward passes.
+        reasons: Number of gated decisions, by reason.
         events: Number of structural changes that the policy was notified of, by kind.
     """
 
@@ -49,12 +49,12 @@ class GateStats:
 
     @property
     def gated(self) -> int:
-        """Training backwards seen from `start_iter` on, run or skipped."""
+        """Number of training backward passes from `start_iter` on, run or skipped."""
         return self.backwards + self.skips
 
     @property
     def skip_ratio(self) -> float:
-        """Share of the gated iterations that were skipped, 0 without any."""
+        """Share of the gated backward passes that were skipped; 0 if there was none."""
         return self.skips / self.gated if self.gated else 0.0
 
     @property
@@ -63,7 +63,7 @@ class GateStats:
         return len(self._views)
 
     def view_table(self, mean_of: Callable[[str], float | None]) -> list[dict[str, Any]]:
-        """One row per view, by name: `view visits backwards skips mean_loss last_loss`."""
+        """Return one row per view, by name: `view visits backwards skips mean_loss last_loss`."""
         return [
             {
                 "view": view,
@@ -77,7 +77,7 @@ class GateStats:
         ]
 
     def scalars(self) -> dict[str, float]:
-        """Counts as a flat dict for loggers."""
+        """Return the counts as a flat dict for loggers."""
         return {
             "skipgs/skip_ratio": self.skip_ratio,
             "skipgs/backwards": float(self.backwards),
@@ -87,7 +87,7 @@ class GateStats:
         }
 
     def load_release_state(self, state: dict[str, Any]) -> None:
-        """Take the counts from a state of the authors' controller, which has no counts per view."""
+        """Load the counts of the authors' controller, which has no counts per view."""
         self.backwards, self.skips = state["stats"]["bwd"], state["stats"]["skip"]
         self.iterations = self.gated
 

@@ -9,12 +9,12 @@ class TraceRow(NamedTuple):
     """One gated decision.
 
     Attributes:
-        step: iteration.
-        view: view key.
-        loss: loss that was decided on.
-        mean: The view's mean before this loss; None for a new view.
-        reason: as in `Decision`.
-        skip: True when the backward was skipped.
+        step: Number of the iteration.
+        view: Key of the view.
+        loss: Value that was decided by.
+        mean: Running mean of the view before this loss; None for a new view.
+        reason: Reason; see `Decision`.
+        skip: Whether the backward pass was skipped.
     """
 
     step: int

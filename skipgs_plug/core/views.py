@@ -13,23 +13,23 @@ from typing import Any
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
 
-CHECKED_KEYS = 5_000  # different views after which some must have come twice; if not, keys do not name views
-RECURRING = 0.01  # share of decisions on views that were seen before, at least, for keys to name views
-NOT_READ = "not read"  # key in iterations whose view matters to nothing, and would be read from a device
-MAX_VIEWS = 200_000  # views per table, at most: more than any scene has, and about 60 MB in all
+CHECKED_KEYS = 5_000  # number of different keys at which recurrence is checked; few scenes have as many training views
+RECURRING = 0.01  # least share of decisions on views seen before; below it, keys are counters and do not name views
+NOT_READ = "not read"  # key in iterations whose decision does not depend on the view, so that no device must be read
+MAX_VIEWS = 200_000  # largest number of views per table: more than any scene has, and about 60 MB in all
 
 
 def view_key(view: Any) -> str:
-    """Return the text by which a view is known.
+    """Return the text that identifies a view.
 
     Args:
         view: Image name or path, index (int, or a tensor or array of one whole number), or a tuple of these.
 
     Raises:
-        SkipGSError: Something else, which might not be the same for the same view in the next run.
+        SkipGSError: The key has another type, and might differ for the same view in another run.
     """
     if isinstance(view, str):
-        return str.__str__(view)  # a NumPy text would get into saved states
+        return str.__str__(view)  # a NumPy string must not get into saved states
     if isinstance(view, numbers.Integral):
         return str(int(view))
     if isinstance(view, os.PathLike):
@@ -51,7 +51,7 @@ def view_key(view: Any) -> str:
 
 
 def require_unique(names: Iterable[str]) -> list[str]:
-    """Return the names as a list, or raise SkipGSError that shows one that several views share."""
+    """Return the names as a list; raise SkipGSError if several views share a name."""
     names = list(names)
     name, count = Counter(names).most_common(1)[0] if names else ("", 0)
     if count > 1:
@@ -62,17 +62,17 @@ def require_unique(names: Iterable[str]) -> list[str]:
 
 
 def warn_unless_recurring(keys: int, decisions: int) -> None:
-    """Warn if keys hardly ever came twice in many decisions; call it at each new key."""
+    """Warn if hardly any key came twice in many decisions. Call it at each new key."""
     if keys == CHECKED_KEYS and decisions - keys < RECURRING * decisions:
         caution(
             f"{keys:,} different view keys came in {decisions:,} gated decisions, and a view that does not come again "
-            "is never skipped: unless there are that many training views, name the image in view=, not a counter or "
-            "the id of an object."
+            "is never skipped: unless there are so many training views, name the image in view=, not a counter or the "
+            "id of an object."
         )
 
 
 def forget_oldest(table: dict[Any, Any]) -> None:
-    """Take the half of a table of views that came first out of it, once it holds more than MAX_VIEWS."""
+    """Remove the older half of a table of views if it holds more than MAX_VIEWS."""
     if len(table) > MAX_VIEWS:
         for view in list(itertools.islice(table, len(table) // 2)):
             del table[view]

@@ -129,7 +129,7 @@ def test_a_backward_through_a_freed_graph_is_an_error_with_a_sentence():
             loss = (value.exp() * value).mean()
             gate.backward(loss, view="a", step=step)
             gate.update()
-        with pytest.raises(SkipGSError, match="needs the graph of a loss whose backward was skipped"):
+        with pytest.raises(SkipGSError, match="needs the graph of a loss whose backward pass was skipped"):
             loss.backward()
 
 

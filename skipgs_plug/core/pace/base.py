@@ -1,4 +1,4 @@
-"""The interface of a pace, and the pace of a run in which every iteration runs unchanged."""
+"""The interface of a pace, and the pace of a run in which every iteration runs with the trainer's own rates."""
 
 from __future__ import annotations
 
@@ -11,50 +11,50 @@ from skipgs_plug.core.pace.loop_range import LoopRange
 from skipgs_plug.core.policy import Policy, SkipPolicy
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
-Source = tuple[CodeType, Mapping[str, Any]]  # code of the function that holds a loop, and the names that it knew
+Source = tuple[CodeType, Mapping[str, Any]]  # code of the function that holds a loop, and the names that it had
 Always = Callable[[range], Iterable[int]]
 Known = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 NAMED = "named for this trainer"  # reason of iterations that must run and that no condition of the loop names
 
 
 def nothing_always(numbers: range) -> Iterable[int]:
-    """Return that only iterations named by the loop's own conditions must run."""
+    """Return no iterations: only those that the loop's own conditions name must run."""
     return ()
 
 
 def nothing_known(names: Mapping[str, Any]) -> Mapping[str, Any]:
-    """No name that the loop assigns has a value that is known before."""
+    """Return no values: none is known of the names that the loop assigns."""
     return {}
 
 
 class Pace:
     """Every iteration runs, and learning rates do not change.
 
-    Other paces derive from this one. The engine asks one question per iteration, `LoopRange` asks it through `runs`,
-    and tells one thing, that the iteration begins (`begin`).
+    Other paces derive from this one. A pace gets one question per iteration, whether it runs (`LoopRange` asks the
+    owner's `runs`), and one report, that it begins (`begin`, from the engine).
 
     Attributes:
-        number: number of the iteration that the training loop is in; None while the loop is not known, and after it.
-        gap: iterations that were left out right before the present one.
+        number: Number of the iteration that the training loop is in; None while the loop is unknown, and after it.
+        gap: Number of iterations that were left out right before the present one.
     """
 
     number: int | None = None
     gap: int = 0
 
     def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
-        """Take the facts about the trainer.
+        """Receive the facts about the trainer.
 
         Args:
             start: First iteration of refinement.
-            info: About the trainer.
-            views: Keys of all training views, None if unknown.
+            info: Facts about the trainer.
+            views: Keys of all training views; None if they are unknown.
 
         Raises:
-            SkipGSError: This pace cannot be kept in this trainer.
+            SkipGSError: This pace does not work with this trainer.
         """
 
     def policy(self, config: SkipConfig) -> Policy:
-        """Return the policy that decides about the backwards of iterations that run."""
+        """Return the policy that decides on the backward passes of iterations that run."""
         return SkipPolicy.from_config(config)
 
     def follow(
@@ -65,14 +65,14 @@ class Pace:
         views: list[str] | None = None,
         events: Iterable[int] | None = None,
     ) -> LoopRange:
-        """Return the loop that stands for `numbers` in a training loop of the user's own.
+        """Return the loop that replaces `numbers` in a training loop of the user's own.
 
         Args:
             numbers: All iterations of the run, or all that are left.
-            source: Where the loop's conditions are read; None to read none.
+            source: Code in which the loop's conditions are read; None to read no conditions.
             always: Iterations that must run.
-            views: Keys of all training views, None if the trainer tells them.
-            events: Iterations that densify, None if they are unknown or the trainer's adapter knows them.
+            views: Keys of all training views; None if the trainer's adapter passes them.
+            events: Iterations that densify; None if they are unknown, or if the trainer's adapter knows them.
 
         Raises:
             SkipGSError: The numbers go on after those of an earlier plan.
@@ -93,29 +93,29 @@ class Pace:
         densification: Densification | None = None,
         known: Known = nothing_known,
     ) -> None:
-        """Take facts that the loop's source does not show.
+        """Receive facts that the loop's source does not show.
 
         Args:
-            always: Gives further iterations that must run.
-            pure: Functions that only look at numbers, and may stand in the loop's conditions.
-            densification: How its densification events are told; None if `configure` says it, or nobody knows.
-            known: Is given all that the loop's function has names for, right before the loop's conditions are read;
-                gives the values of names that the loop assigns, where they are known before.
+            always: Returns further iterations that must run.
+            pure: Names of functions that only read numbers, and may occur in the loop's conditions.
+            densification: How to recognise densification events; None if `configure` tells it, or if it is unknown.
+            known: Receives all names of the loop's function right before the loop's conditions are read, and returns
+                values of names that the loop assigns, if they are known before.
         """
 
     def require(self, number: int) -> None:
-        """Iteration `number` must run, which is only known now."""
+        """Make iteration `number` run. Call it for a need that shows only during the run."""
 
     @property
     def leaves_out(self) -> bool:
-        """Whether whole iterations may be left out, for which the pace needs the training loop."""
+        """Whether whole iterations may be left out; the pace then needs the training loop."""
         return False
 
     def remove(self) -> None:
-        """Let go of the loop, which runs all its numbers from now on."""
+        """Release the loop, which runs all its numbers from now on."""
 
     def report(self) -> dict[str, Any] | None:
-        """Return the entries of skipgs.json about iterations that were left out; None if none can be left out."""
+        """Return the entries of skipgs.json about left-out iterations; None if this pace leaves out no iteration."""
         return None
 
     def state_dict(self) -> dict[str, Any] | None:
@@ -127,7 +127,7 @@ class Pace:
 
 
 class EveryNumber:
-    """Owner of a loop that runs all its numbers; `at_end` is called when the loop is over, or was left."""
+    """Owner of a loop that runs all its numbers; `at_end` is called when the loop is over, or was left early."""
 
     wants_loop = False
 

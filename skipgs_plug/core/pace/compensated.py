@@ -1,4 +1,4 @@
-"""The pace of the paper's gate with larger, shrinking steps, which make up for the backwards that it skips."""
+"""The pace of the paper's gate with larger, shrinking steps, which make up for skipped backward passes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from skipgs_plug.core.trainer_info import TrainerInfo
 
 
 class Compensated(Pace):
-    """Runs every iteration, and scales the learning rates of gated ones by the floor's share of backwards.
+    """Runs every iteration, and scales the learning rates of gated iterations by the policy's floor.
 
     Args:
-        config: With `compensate`.
+        config: Settings with `compensate`.
         rates: Scales learning rates.
     """
 
@@ -26,7 +26,7 @@ class Compensated(Pace):
         self._config = config
         self._rates = rates
         self._start = 0
-        self._last: int | None = None  # iteration after which steps have no length
+        self._last: int | None = None  # last iteration, after which steps have length 0
 
     def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
         self._start = start
@@ -53,7 +53,7 @@ class Compensated(Pace):
         if step < self._start:
             self._rates.pause()
             return
-        # A trainer may go on after the end that it told: with steps of length 0.
+        # A trainer may go on after the last iteration that it announced. Its steps then have length 0.
         progress = min((step - self._start) / max(self._last + 1 - self._start, 1), 1.0)
         floor = (policy.floor if policy is not None else None) or 1.0
         self._rates.scale(path_factor(floor, progress, self._config.rate_peak, self._rates.visibility.share))

@@ -1,4 +1,4 @@
-"""Parts of a loop that only move a progress bar: no iteration must run for them, and the bar is moved on without."""
+"""Parts of a loop that only advance a progress bar: no iteration must run for them, and the gate advances the bar."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import ast
 from collections.abc import Container, Iterator, Mapping
 from typing import Any, NamedTuple
 
-# Methods of a progress bar that show something; what `update` adds is made up for.
+# Methods of a progress bar that show text, and the method that advances it.
 SHOWS = frozenset({"refresh", "set_description", "set_description_str", "set_postfix", "set_postfix_str"})
 MOVES = "update"
-# Functions and methods that only look at their arguments, as they stand beside a bar.
+# Functions and methods that only read their arguments, and that loops call for the text beside a bar.
 LOOKS = frozenset({"abs", "bool", "float", "format", "int", "len", "max", "min", "repr", "round", "str", "sum"})
 LOOKING = frozenset({"cpu", "detach", "format", "item", "join", "numel", "size", "tolist"})
 _VALUES = (
@@ -20,12 +20,12 @@ _VALUES = (
 
 
 class Moves(NamedTuple):
-    """A progress bar that the loop moves on by hand.
+    """A progress bar that the loop advances by hand.
 
     Attributes:
-        bar: The bar, of tqdm.
-        by: What each of the iterations adds.
-        numbers: These iterations.
+        bar: The bar of tqdm.
+        by: Number that each of the iterations adds.
+        numbers: The iterations that advance the bar.
     """
 
     bar: Any
@@ -34,7 +34,7 @@ class Moves(NamedTuple):
 
 
 class Bars:
-    """Moves bars on for iterations that are left out, so that they end where they should."""
+    """Advances bars for iterations that are left out, so that they end at their total."""
 
     def __init__(self, moves: list[Moves]) -> None:
         self._moves = moves
@@ -46,7 +46,7 @@ class Bars:
                 self._behind[index] += one.by
 
     def catch_up(self) -> None:
-        """Show what was left out; before the next iteration runs, which may close the bar."""
+        """Advance the bars. Call it before an iteration runs, because the iteration may close a bar."""
         for index, one in enumerate(self._moves):
             if self._behind[index]:
                 one.bar.update(self._behind[index])
@@ -54,21 +54,21 @@ class Bars:
 
 
 def is_bar(node: ast.AST, names: Mapping[str, Any]) -> bool:
-    """Whether this is a name of a bar of tqdm."""
+    """Whether this is the name of a progress bar of tqdm."""
     return isinstance(node, ast.Name) and any(
         kind.__module__.partition(".")[0] == "tqdm" for kind in type(names.get(node.id)).__mro__
     )
 
 
 def only_shows(statement: ast.If, names: Mapping[str, Any], around: ast.AST) -> bool:
-    """Whether the branches of an `if` do nothing but move a progress bar, and write beside it.
+    """Whether the branches of an `if` only advance a progress bar and set the text beside it.
 
-    What is printed is a record that somebody may read: an `if` that prints is none of these.
+    Printed text is a record that somebody may read, so an `if` that prints does more than that.
 
     Args:
         statement: The `if`.
-        names: What the loop had names for before it began.
-        around: What the loop stands in. What a branch keeps must not be read elsewhere in it.
+        names: Names and values that the function had before the loop.
+        around: Syntax tree of the function. Variables that a branch assigns must not be read elsewhere in it.
     """
     inside = {id(part) for part in ast.walk(statement)}
     read = {
@@ -83,7 +83,7 @@ def only_shows(statement: ast.If, names: Mapping[str, Any], around: ast.AST) -> 
 
 
 def moves(body: list[ast.stmt], names: Mapping[str, Any]) -> Iterator[tuple[Any, float]]:
-    """Yield the bars that these statements move on, not those inside them, and by how much."""
+    """Yield each bar that these statements advance themselves, not in blocks inside them, and the number they add."""
     for one in body:
         if isinstance(one, ast.Expr) and _is_move(one.value, names):
             call = one.value
@@ -129,7 +129,7 @@ def _shows(statement: ast.stmt, names: Mapping[str, Any], read: Container[str]) 
 
 
 def _looks(node: ast.expr) -> bool:
-    """Whether an expression only looks at values."""
+    """Whether an expression only reads values."""
     for part in ast.walk(node):
         if isinstance(part, ast.Call):
             name = part.func.id if isinstance(part.func, ast.Name) else ""

@@ -1,13 +1,15 @@
-"""How much of refinement a scene needs, foreseen from views that are watched but not trained on for a while.
+"""Estimates how much of refinement a scene needs, with views that are watched but not trained on for a while.
 
-Refinement runs in cycles of steps that shrink to nothing, so that a cycle leaves a finished model behind; they end at
-1/8, 1/4 and all of what may run. In the first two, the losses of a few watched views at the end of a cycle say what it
-brought to views that are not trained on. What a doubling of the iterations brings hardly ever grows with the next
-doubling, so the second cycle's gain times the doublings that are left bounds what the rest would still bring; when
-that is less than the tolerance, refinement ends. Watched views that get worse still lose what only training gave them,
-which says nothing of the others. In the last cycle all views are trained. Watched views never get back wholly what
-they missed, so there are few, not for long, and none where a twelfth of the views is less than three or where a cycle
-is too short to show each of them.
+Refinement runs in cycles. In each cycle steps shrink to zero, so that it ends with a finished model. The cycles end
+after 1/8, 1/4 and all of the iterations that may run. In the first two, a few views are watched: they are rendered but
+not trained on, and their losses at the end of a cycle say how much it improved views outside training. A doubling of
+the iterations hardly ever gains more than the doubling before it. So the second cycle's gain, times the number of
+doublings that are left, bounds the gain of the rest. If the bound is below the tolerance, refinement ends.
+
+A watched view that gets worse still loses detail that only its own training gave it, which says nothing about other
+views. In the last cycle all views are trained. Watched views never recover completely, so they are few and are watched
+for a short time only. No view is watched if a twelfth of the views is less than three, or if the first cycle is too
+short to show each view.
 """
 
 from __future__ import annotations
@@ -19,20 +21,21 @@ from typing import Any
 
 from skipgs_plug.core.errors import SkipGSError
 
-CYCLE_ENDS = (0.125, 0.25, 1.0)
-ONE_CYCLE = (1.0,)  # where nothing is to be foreseen: the share is given, or no view is watched
-LEAST_LOSS = 1e-5  # below, no picture differs
-WATCHED_SHARE = 1 / 12  # of the views
-LEAST_WATCHED, MOST_WATCHED = 3, 12  # fewer than three cannot tell a twentieth of a decibel: none then
+CYCLE_ENDS = (0.125, 0.25, 1.0)  # ends of the cycles, as shares of the iterations that may run
+ONE_CYCLE = (1.0,)  # the same if nothing is estimated: the share is given, or no view is watched
+LEAST_LOSS = 1e-5  # mean absolute difference below which losses count as equal; 8-bit images have steps of 4e-3
+WATCHED_SHARE = 1 / 12  # share of the views that is watched
+# Bounds on the number of watched views. Fewer than three cannot resolve 0.05 dB; more than twelve cost quality.
+LEAST_WATCHED, MOST_WATCHED = 3, 12
 
 
 def watched_views(names: Iterable[str], iterations: float, seed: int = 0) -> frozenset[str]:
-    """Draw the views to watch; the same for the same names, none where there are few views.
+    """Draw the views to watch: the same for the same names, and none if there are few views.
 
     Args:
-        names: Of all training views.
-        iterations: That may run. None is watched where the first cycle does not show every view.
-        seed: Of the draw.
+        names: Names of all training views.
+        iterations: Number of iterations that may run. No view is watched if the first cycle does not show every view.
+        seed: Seed of the draw.
     """
     names = sorted(names)
     count = min(MOST_WATCHED, round(len(names) * WATCHED_SHARE))
@@ -42,17 +45,17 @@ def watched_views(names: Iterable[str], iterations: float, seed: int = 0) -> fro
 
 
 class EarlyStopping:
-    """Follows the cycles, and says when the rest is not worth its time.
+    """Follows the cycles, and ends refinement when the rest would gain too little.
 
     Args:
-        tolerance: Decibels that the rest may be worth when refinement ends.
-        ends: Where cycles end, as shares of the iterations that may run.
+        tolerance: Gain of the rest, in decibels, below which refinement ends.
+        ends: Ends of the cycles, as shares of the iterations that may run.
 
     Attributes:
-        cycle: index of the present cycle.
-        ended: refinement is over.
-        gains: decibels that each finished cycle brought to the watched views: (mean, standard error).
-        foreseen: decibels that the rest was worth when it was last judged, with two standard errors added.
+        cycle: Index of the present cycle.
+        ended: Whether refinement is over.
+        gains: Gain of the watched views in each judged cycle, in decibels: (mean, standard error).
+        foreseen: Bound on the gain of the rest at the last check, in decibels, two standard errors included.
     """
 
     def __init__(self, tolerance: float, ends: tuple[float, ...] = CYCLE_ENDS) -> None:
@@ -71,19 +74,19 @@ class EarlyStopping:
 
     @property
     def early(self) -> bool:
-        """Whether refinement ended before all that may run has run."""
+        """Whether refinement ended before all iterations that may run had run."""
         return self.ended and self.cycle < len(self._ends) - 1
 
     def see(self, view: str, loss: float) -> None:
-        """A watched view was rendered; its last loss in a cycle counts."""
+        """Record the loss of a watched view; its last loss in a cycle counts."""
         if loss > 0.0:
             self._now[view] = loss
 
     def progress(self, share_done: float) -> float:
-        """Return the progress through the present cycle, having gone some share of the way; judges where one ends.
+        """Return the progress through the present cycle, in [0, 1]; judge each cycle that has ended.
 
         Args:
-            share_done: Iterations run, of those that may run, in [0, 1].
+            share_done: Share of the iterations that may run that have run, in [0, 1].
         """
         while not self.ended and share_done >= self._ends[self.cycle]:
             self._end_cycle()
@@ -97,7 +100,7 @@ class EarlyStopping:
         if end == 1.0:
             self.ended = True
             return
-        # The first cycle is not judged: views that are no longer trained on lose what only training gave them.
+        # The first cycle is not judged: watched views first lose detail that only their own training gave them.
         if self.cycle > 0:
             gain = mean_gain(self._before, self._now)
             if gain is not None:
@@ -126,11 +129,11 @@ class EarlyStopping:
         """Continue from `state_dict()`.
 
         Raises:
-            SkipGSError: Its cycles are none.
+            SkipGSError: No run has such cycles.
         """
         if tuple(state["ends"]) not in (CYCLE_ENDS, ONE_CYCLE) or not 0 <= state["cycle"] < len(state["ends"]):
             raise SkipGSError(
-                f"The gate state is in cycle {state['cycle']} of those that end at {state['ends']}, which no run has; "
+                f"The gate state is in cycle {state['cycle']} of cycles that end at {state['ends']}, which no run has; "
                 "start the gate afresh."
             )
         self._ends = tuple(state["ends"])
@@ -140,11 +143,15 @@ class EarlyStopping:
 
 
 def mean_gain(before: dict[str, float], after: dict[str, float]) -> tuple[float, float] | None:
-    """Return mean and standard error of the gain over the views seen both times, in decibels; None with less than two.
+    """Return the mean and the standard error of the gain, in decibels; None with fewer than two views.
 
-    Losses of 3DGS are mean absolute differences for the most part, so 20 log10 of their ratio is about what PSNR gains.
+    Losses of 3DGS are mostly mean absolute differences, so 20 log10 of their ratio is about the gain in PSNR.
+
+    Args:
+        before: Losses of views at the end of an earlier cycle.
+        after: Losses of views at the end of a later cycle. Views in only one of the two do not count.
     """
-    # A view of background alone has a loss of 0.
+    # A view that shows background only has a loss of 0.
     pairs = [(max(before[view], LEAST_LOSS), max(after[view], LEAST_LOSS)) for view in sorted(after) if view in before]
     gains = [20.0 * math.log10(earlier / later) for earlier, later in pairs]
     if len(gains) < 2:

@@ -9,28 +9,29 @@ from typing import Any
 from skipgs_plug.core.pace.needs import NEARLY_ALL
 from skipgs_plug.core.trainer_info import Densification
 
-# Visits of each Gaussian behind an event. Densification grows what has a large mean gradient over its visits: over
-# fewer, the means are noisier, and more of them lie above the threshold (bonsai with 10 visits: 17 to 90 % more
-# Gaussians). Over more, events are fewer, and a scene that must grow far does not get there (Lego). What a view shows
-# is measured after each event. 20 visits keep bonsai at 86 to 103 % of its Gaussians.
+# Visits of each Gaussian before an event that is kept. Densification splits Gaussians whose mean gradient over their
+# visits is large. With fewer visits the means are noisier, and more of them exceed the threshold: bonsai with 10 visits
+# gets 17 to 90 % more Gaussians. With more visits there are fewer events, and a scene that must grow a lot, such as
+# Lego, does not get there. With 20 visits bonsai has 86 to 103 % of its Gaussians.
 VISITS_BEHIND = 20.0
-# Where a view shows nearly all, growth is limited by the number of events instead: every second one ends with half of
-# Lego's Gaussians.
+# The same if a view shows nearly all Gaussians. The number of events limits growth then: with every second event, Lego
+# ends with half of its Gaussians.
 VISITS_BEHIND_FULL_VIEWS = 8.0
-VISIBLE = 1 / 3  # share of the Gaussians that a view shows, before it is measured
+# Share of the Gaussians that a view shows, until it is measured. It is measured again after each event.
+VISIBLE = 1 / 3
 
 
 class Events:
-    """Decides event by event whether enough stands behind it.
+    """Decides for each event whether enough iterations ran before it.
 
-    An event that is not kept leaves its statistics to the next one.
+    If an event is left out, its statistics go on to the following event.
 
     Args:
         numbers: Iterations with an event.
-        densification: What this trainer's events need.
+        densification: The needs of this trainer's events.
 
     Attributes:
-        kept, left_out: events counted so far.
+        kept, left_out: Numbers of events so far.
     """
 
     def __init__(self, numbers: Iterable[int], densification: Densification) -> None:
@@ -38,7 +39,7 @@ class Events:
         self._known = frozenset(self._numbers)
         self._needs = densification.needs
         self.kept = self.left_out = 0
-        self._behind = 0  # iterations that ran since the last event
+        self._behind = 0  # number of iterations that ran since the last event
 
     def __contains__(self, number: int) -> bool:
         return number in self._known
@@ -48,16 +49,16 @@ class Events:
 
     @property
     def end(self) -> int | None:
-        """Iteration at which one more event would follow the last one upstream; None without events."""
+        """Iteration of the event that would follow the last one in the trainer's schedule; None without events."""
         return self._numbers[-1] + self._distance(self._numbers[-1]) if self._numbers else None
 
     @property
     def all_run(self) -> bool:
-        """Whether each event runs, however few iterations stand behind it."""
+        """Whether each event runs, however few iterations ran before it."""
         return self._needs == "nothing"
 
     def ran(self, number: int) -> None:
-        """An iteration runs, with its event if it has one."""
+        """Count an iteration that runs, with its event if it has one."""
         if number in self._known:
             self.kept += 1
             self._behind = 0
@@ -65,11 +66,11 @@ class Events:
             self._behind += 1
 
     def skipped(self, number: int) -> None:
-        """An iteration is left out, with its event if it has one."""
+        """Count an iteration that is left out, with its event if it has one."""
         self.left_out += number in self._known
 
     def enough(self, number: int, visible: float | None) -> bool:
-        """Whether enough stands behind the event in iteration `number`.
+        """Whether enough iterations ran before the event in iteration `number`.
 
         Args:
             number: Iteration with an event.
@@ -78,7 +79,7 @@ class Events:
         if self.all_run:
             return True
         distance = self._distance(number)
-        # The event's own iteration adds to its statistics too.
+        # The iteration of the event adds to the statistics too.
         behind = self._behind + 1
         if self._needs == "iterations":
             return behind >= distance
@@ -87,7 +88,7 @@ class Events:
         return behind * visible >= min(visits, distance * visible)
 
     def _distance(self, number: int) -> int:
-        """Iterations from the event before to this one in the trainer's own schedule."""
+        """Return the number of iterations from the previous event to this one in the trainer's own schedule."""
         place = bisect.bisect_left(self._numbers, number)
         before = self._numbers[place - 1] if place else 0
         return number - before

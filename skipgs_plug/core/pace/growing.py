@@ -15,28 +15,29 @@ from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.sampling import Sampling
 from skipgs_plug.core.trainer_info import Densification
 
-MEASURED = 20  # steps over which the share of Gaussians that a view shows is averaged before it decides on shares
-# Steps over which it is averaged anew after each event that was kept, because it falls as the scene grows: on bonsai
-# from 46 % of the first points to 30 %. Few steps are enough to count visits by, and each look costs a read on a GPU.
+# Number of steps over which the share of the Gaussians that a view shows is averaged before it decides on shares.
+MEASURED = 20
+# The same after each event that was kept. The share falls as the scene grows, on bonsai from 46 % to 30 %. A few steps
+# are precise enough to count visits, and each measured step can cost a read of the GPU.
 MEASURED_AGAIN = 8
 
 
 class Growing:
-    """Says which iterations run while the scene grows, and scales learning rates where that replaces iterations.
+    """Decides which iterations run while the scene grows, and scales learning rates if that replaces iterations.
 
-    Iterations that run are spread evenly. Densification events run when enough stands behind them, and the iterations
-    of the others are left out, so that their statistics go on to the next. Everything else that depends on a number
-    happens as ever.
+    The iterations that run are spread evenly. A densification event runs if enough iterations ran before it. The
+    iteration of any other event is left out, so that its statistics go on to the following event. Everything else that
+    depends on the iteration's number happens as in the trainer's own run.
 
     Args:
-        config: With `growing`.
-        rates: Scales learning rates, and measures what a view shows.
+        config: Settings with `growing`.
+        rates: Scales learning rates, and measures the share of the Gaussians that a view shows.
 
     Attributes:
-        share: share of the iterations that runs; None before the phase begins.
-        sampling: counts the iterations that ran and that were left out.
-        events: densification events; None before the phase begins.
-        always: iterations that must run, by the reason.
+        share: Share of the iterations that runs; None before the phase begins.
+        sampling: Counts the iterations that ran and that were left out.
+        events: Densification events; None before the phase begins.
+        always: Iterations that must run, by reason.
     """
 
     def __init__(self, config: SkipConfig, rates: ScaledRates) -> None:
@@ -50,11 +51,12 @@ class Growing:
         self._first_number: int | None = None
         self._length = 0
         self._epoch = 0
-        self._visible: float | None = None  # by the first measurement, which settles the share
-        self._visible_now: float | None = None  # by the latest one
+        self._visible: float | None = None  # share that a view shows, in the first measurement; it settles `share`
+        self._visible_now: float | None = None  # the same in the latest measurement
         self._measuring = True
         self._saved_events: dict[str, Any] | None = None
-        self._rows = self._grown = 0  # Gaussians when the last event was asked about, and those added since before it
+        # Number of Gaussians at the last event, and number that the event before it added.
+        self._rows = self._grown = 0
 
     @property
     def first(self) -> int | None:
@@ -69,17 +71,17 @@ class Growing:
         densification: Densification,
         epoch: int | None,
     ) -> bool:
-        """Take the facts that are known when the loop begins; False if the loop shows no densification event.
+        """Receive the facts that are known when the loop begins; return False if no densification event is found.
 
         Args:
             numbers: Iterations from the first that can be left out to the end of densification.
-            found: Iterations on which something depends, by the condition of the loop.
-            hidden: Further iterations of these that must run.
-            densification: The trainer's events.
+            found: Iterations that conditions of the loop name, by condition.
+            hidden: Further iterations of `numbers` that must run.
+            densification: How to recognise the trainer's events.
             epoch: Number of iterations in which every view comes up once; None if unknown.
 
         Raises:
-            SkipGSError: "auto" must know the number of views, and it is unknown.
+            SkipGSError: "auto" needs the number of views, and it is unknown.
         """
         if self.share is None and epoch is None:
             raise SkipGSError(
@@ -100,24 +102,25 @@ class Growing:
         self.events = Events(events, densification)
         if self._saved_events is not None:
             self.events.load_state_dict(self._saved_events)
-        # Of what shares its number with an event, only what happens less often than events keeps that number: what
-        # happens as often, such as a line in a log, comes round again.
+        # A condition can name the iteration of an event that is left out. The iteration runs all the same if the
+        # condition holds less often than events happen. If it holds as often, such as for a line in a log, it holds
+        # again soon.
         rare = [hits for hits in others.values() if len(hits) < len(events)]
         common = [hits for hits in others.values() if len(hits) >= len(events)]
         self._must = frozenset(hidden).union(*rare, *(hits - events for hits in common))
         if self._first_number is None:
             self._first_number = numbers.start
-        # Prunes and selections after the last event need no more iterations than these.
+        # Prunes and selections after the last event need no further iterations.
         self._length = min(numbers.stop, self.events.end or numbers.stop) - self._first_number
         self._epoch = epoch or self._epoch
         return True
 
     def require(self, number: int) -> None:
-        """Iteration `number` must run, which is only known now."""
+        """Make iteration `number` run. Call it for a need that shows only during the run."""
         self._must |= {number}
 
     def runs(self, number: int) -> bool:
-        """Whether iteration `number` runs; asked once for each, in order."""
+        """Whether iteration `number` runs; called once for each number, in order."""
         assert self.events is not None
         self._settle()
         assert self.share is not None
@@ -144,7 +147,7 @@ class Growing:
         return runs
 
     def _settle(self) -> None:
-        """Take what is measured so far; the share of the phase stays once enough steps were seen."""
+        """Use the present measurement; the share of the phase is fixed once enough steps are measured."""
         assert self.events is not None
         visibility = self._rates.visibility
         settled = self._visible is not None
@@ -162,13 +165,13 @@ class Growing:
 
     @property
     def _factor(self) -> float:
-        """Factor on learning rates in force."""
+        """Present factor on learning rates."""
         if self.share is None or not self._config.compensates:
             return 1.0
         return growing_factor(self._length, self.share, self._visible)
 
     def _full(self) -> bool:
-        """Whether one more event could grow the scene beyond the number of Gaussians that the user set."""
+        """Whether one more event could exceed the number of Gaussians that the user allows."""
         bound = self._config.max_gaussians
         if bound is None:
             return False

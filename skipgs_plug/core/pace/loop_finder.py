@@ -1,15 +1,17 @@
-"""Finds the loop that trains among all loops that count with `range`."""
+"""Finds the training loop among all loops that count with `range`."""
 
 from __future__ import annotations
 
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.pace.loop_range import LoopRange
 
-SEARCHED = 10  # iterations that could be left out, after which the training loop must have been recognised
+# Number of iterations that could be left out, within which the training loop must be found. It is as small as
+# `CHECKED_ITERATIONS`, so that the user hears of a missing loop within seconds.
+SEARCHED = 10
 
 
 class LoopFinder:
-    """The training loop is the one whose numbers the trainer's iterations follow.
+    """Finds the loop whose numbers are those of the trainer's iterations.
 
     Attributes:
         found: The training loop; None until it is known.
@@ -23,7 +25,7 @@ class LoopFinder:
         self._without = 0
 
     def asks(self, loop: LoopRange, number: int) -> bool:
-        """A loop asks about a number; True if it is the training loop."""
+        """Take note that a loop asks about a number; return whether it is the training loop."""
         if self.found is None and number == self.expected:
             self.found = loop
         if loop is not self.found:
@@ -34,14 +36,14 @@ class LoopFinder:
         return True
 
     def begins(self, step: int, needed: bool) -> bool:
-        """The trainer begins iteration `step`; True if this shows which loop trains.
+        """Take note that the trainer begins iteration `step`; return whether this shows the training loop.
 
         Args:
             step: Number of the iteration.
             needed: Whether the iteration belongs to a phase that leaves out iterations.
 
         Raises:
-            AdapterMismatchError: No loop over a range counts the iterations.
+            AdapterMismatchError: No loop over a range counts the trainer's iterations.
         """
         if self.found is not None:
             return False

@@ -16,35 +16,36 @@ from skipgs_plug.core.intercept import Patches
 
 
 class Owner(Protocol):
-    """Who says which numbers a loop runs."""
+    """Decides which numbers a loop runs."""
 
     @property
     def wants_loop(self) -> bool:
-        """Whether it is not known yet which loop trains."""
+        """Whether the training loop is not known yet."""
         ...
 
     def runs(self, loop: LoopRange, number: int) -> bool:
-        """Whether the loop runs with this number; asked once for each, in order."""
+        """Whether the loop runs with this number; called once for each number, in order."""
         ...
 
     def expected(self, loop: LoopRange) -> int:
-        """How many numbers the loop will run, as far as is known."""
+        """Return the number of iterations that the loop will run, as far as it is known."""
         ...
 
     def ended(self, loop: LoopRange) -> None:
-        """The loop is over, or was left."""
+        """Take note that the loop is over, or was left early."""
         ...
 
 
 class LoopRange:
-    """Counts like the range that it stands for, but asks its owner about each number.
+    """Counts like the range that it replaces, but asks its owner about each number.
 
-    `len()` is what a progress bar should expect; all else is as in the range.
+    `len()` is the number of iterations that a progress bar should expect. Everything else is that of the range.
 
     Attributes:
-        numbers: the range that the loop asked for.
-        source: code of the function that asked, and what it had names for; None where nothing is to be read there.
-        current: number that was handed out last, None before the first and after the last.
+        numbers: The range that the loop asked for.
+        source: Code of the function that asked, with the names and values that it had; None if its conditions need not
+            be read.
+        current: The number that was returned last; None before the first and after the last.
     """
 
     def __init__(self, numbers: range, owner: Owner, source: tuple[CodeType, Mapping[str, Any]] | None = None) -> None:
@@ -65,7 +66,7 @@ class LoopRange:
     def __len__(self) -> int:
         return self._owner.expected(self)
 
-    # Python would ask for the length.
+    # Without this method Python would use the length.
     def __bool__(self) -> bool:
         return bool(self.numbers)
 
@@ -95,13 +96,13 @@ def require_planned(numbers: range, last: int) -> None:
 
 
 def replace_range(patches: Patches, names: dict[str, Any], functions: tuple[str, ...], owner: Owner) -> None:
-    """Let functions of a module that say `range(a, b)` get a `LoopRange`, until it is known which loop trains.
+    """Give functions of a module that call `range(a, b)` a `LoopRange`, until the training loop is known.
 
     Args:
-        patches: Where the replacement is listed.
+        patches: List of replacements, to which this one is added.
         names: Global names of the module.
-        functions: Names of the functions that hold the training loop.
-        owner: Whom to ask about numbers.
+        functions: Names of the functions that may hold the training loop.
+        owner: Decides about the numbers.
     """
     absent = object()
     before = names.get("range", absent)
@@ -129,10 +130,10 @@ def replace_range(patches: Patches, names: dict[str, Any], functions: tuple[str,
 
 @functools.cache
 def is_looped_over(code: CodeType, line: int) -> bool:
-    """Whether a loop of the function may run over what this line makes.
+    """Whether a loop of the function may run over the range that this line creates.
 
-    `progress_bar = tqdm(range(a, b))` that is moved on by hand counts all iterations; in `for step in progress_bar` it
-    counts those that run.
+    A bar `progress_bar = tqdm(range(a, b))` that the loop advances by hand counts all iterations. A bar in
+    `for step in progress_bar` counts the iterations that run.
     """
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(code)))
@@ -140,7 +141,7 @@ def is_looped_over(code: CodeType, line: int) -> bool:
         return True
     line -= code.co_firstlineno - 1
     made: set[str] = set()
-    given: list[tuple[set[str], set[str]]] = []  # names that assignments set, and those they read
+    given: list[tuple[set[str], set[str]]] = []  # names that an assignment sets, and names that it reads
     looped: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, (ast.For, ast.AsyncFor, ast.comprehension)):
@@ -168,7 +169,7 @@ def _names(node: ast.AST) -> set[str]:
 
 
 def line_of(code: CodeType) -> int:
-    """Line at which the running function of this code stands, looked for outwards from the caller; 0 without one."""
+    """Return the present line of the innermost running function with this code; 0 if none is running."""
     frame = sys._getframe(1)
     while frame is not None:
         if frame.f_code is code:

@@ -1,8 +1,8 @@
-"""Iterations that must run, read from the loop itself: its conditions on the iteration's number.
+"""Iterations that must run, found in the loop's conditions on the iteration's number.
 
 A training loop saves, evaluates, prunes and reports by number: `if iteration % 1000 == 0`, `if iteration in
-saving_iterations`. Such conditions are read from the source of the function and evaluated ahead of time. Nothing of
-the source is changed.
+saving_iterations`. This module reads such conditions from the source of the function and evaluates them ahead of time.
+It does not change the source.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.display import Moves, moves, only_shows
 from skipgs_plug.core.pace.settled import Settled
 
-SAFE = frozenset({"abs", "bool", "int", "len", "max", "min", "round"})
-# Methods by which lists, sets and queues change: their object differs in the next iteration.
+SAFE = frozenset({"abs", "bool", "int", "len", "max", "min", "round"})  # built-in functions that conditions may call
+# Methods that change lists, sets and queues, so that an object can differ from iteration to iteration.
 CHANGES = frozenset({"add", "append", "appendleft", "clear", "discard", "extend", "insert", "pop", "popleft", "remove"})
 _POINT = (ast.Eq, ast.NotEq, ast.In, ast.NotIn, ast.Is, ast.IsNot)
 _PLACE = (ast.Name, ast.Attribute, ast.Subscript)
 
 
 class _Leaf(NamedTuple):
-    """A part of a condition that is no `and`, `or` or `not`.
+    """A part of a condition that is not an `and`, `or` or `not`.
 
     Attributes:
-        code: Evaluated, with the number where it stands in the part; None if the value is not known.
-        unforeseeable: it depends on the number and on what only happens in the loop.
+        code: Code that gives the value for a number; None if the value is not known ahead.
+        unforeseeable: Whether the value depends on the number and on values that the loop computes.
     """
 
     code: CodeType | None
@@ -41,12 +41,12 @@ class _Leaf(NamedTuple):
 
 
 class Condition:
-    """One condition of the loop on its number, with those it is nested in.
+    """One condition of the loop on its number, with the conditions around it.
 
     Attributes:
-        text: as it stands in the source.
-        line: where.
-        shown: The `if` with it, or around it, that only moves a progress bar; None if there is none.
+        text: Source of the condition.
+        line: Line of the condition in the file.
+        shown: The `if` that has this condition, or contains it, and only advances a progress bar; None without one.
     """
 
     def __init__(self, test: ast.expr, path: list[ast.expr], loop: LoopCode) -> None:
@@ -59,10 +59,10 @@ class Condition:
         self._ordered: dict[int, list[ast.expr]] = {}
 
     def numbers(self, numbers: range, names: Mapping[str, Any]) -> set[int]:
-        """Return the numbers for which the condition takes the rarer of its two branches, whatever else it depends on.
+        """Return the numbers of the rarer of the condition's two branches, whatever else the condition depends on.
 
         Raises:
-            SkipGSError: It depends on something that changes in the loop.
+            SkipGSError: The condition depends on a value that the loop changes.
         """
         found: set[int] = set()
         for holds, others in self._branches(numbers, names):
@@ -70,7 +70,7 @@ class Condition:
         return found
 
     def holds(self, numbers: range, names: Mapping[str, Any]) -> set[int] | None:
-        """Return the numbers for which the condition holds; None if that depends on something else, too."""
+        """Return the numbers for which the condition holds; None if it also depends on other values."""
         try:
             (first, _), (second, _) = self._branches(numbers, names)
         except SkipGSError:
@@ -78,8 +78,8 @@ class Condition:
         return first if first == second else None
 
     def _branches(self, numbers: range, names: Mapping[str, Any]) -> Iterator[tuple[set[int], set[int]]]:
-        """Numbers of both branches, with each assumption about parts that say nothing of the number."""
-        values = dict(names)  # once: it holds every global name of the loop's module
+        """Yield the numbers of both branches, for each assumed value of the parts that do not depend on the number."""
+        values = dict(names)  # copied once, because it holds every global name of the loop's module
         for assumed in (True, False):
             holds: set[int] = set()
             others: set[int] = set()
@@ -106,15 +106,15 @@ class Condition:
             return assumed
         try:
             return bool(eval(leaf.code, values))
-        except Exception:  # a name that is not bound yet, a number of another kind
+        except Exception:  # a name is not bound yet, or a number has another type
             return assumed
 
     def is_of(self, statement: ast.If) -> bool:
-        """Whether it is the condition of this `if`."""
+        """Whether this is the condition of the `if` itself."""
         return _place(self._test) == _place(statement.test)
 
     def _parts(self, node: ast.BoolOp) -> list[ast.expr]:
-        """The parts of an `and` or `or`, those last that cannot be foreseen: others may decide without them."""
+        """Return the parts of an `and` or `or`, unforeseeable parts last, because other parts may decide alone."""
         found = self._ordered.get(id(node))
         if found is None:
             found = sorted(node.values, key=lambda part: any(self._leaf(leaf).unforeseeable for leaf in _leaves(part)))
@@ -122,7 +122,7 @@ class Condition:
         return found
 
     def _is_tested(self, node: ast.expr) -> bool:
-        """Whether a part is one of the condition itself, not of those around it, and picks single numbers."""
+        """Whether a part belongs to the condition itself, not to a condition around it, and picks single numbers."""
         return _is_point(node) and any(leaf is node for leaf in _leaves(self._test))
 
     def _leaf(self, node: ast.expr) -> _Leaf:
@@ -137,11 +137,11 @@ class LoopCode:
 
     Args:
         statement: The loop.
-        around: What it stands in: the function, or the module.
-        code: Of that.
-        names: What it has names for before the loop, and names that the loop gives a value which is known.
-        known: Which names these are.
-        pure: Functions that only look at numbers.
+        around: Syntax tree of the function or module that contains the loop.
+        code: Code of that function or module.
+        names: Names and values before the loop, and the values in `known`.
+        known: Names that the loop assigns and whose values are known before the loop.
+        pure: Names of functions that only read numbers.
     """
 
     def __init__(
@@ -171,16 +171,19 @@ class LoopCode:
         self._settled = Settled(code, around, names, self._changing | {self.target}, self._pure)
         self._names = names
         outermost: list[ast.If] = []
-        for node in (part for part in parts if isinstance(part, ast.If)):  # outer ones come first
+        for node in (part for part in parts if isinstance(part, ast.If)):  # outer statements come first
             if not any(_is_inside(node, outer) for outer in outermost) and only_shows(node, names, around):
                 outermost.append(node)
         self._shown = outermost
         self.body = self._spelled_out(statement.body, stored)
 
     def _spelled_out(self, body: list[ast.stmt], stored: list[str]) -> list[ast.stmt]:
-        """Replace names that stand for something of the number, `place = step % len(views)`, or for an option."""
+        """Replace names by the expression that they stand for, if it is of the number or of options.
+
+        An example is `place = step % len(views)`.
+        """
         for index in range(len(_assigned(body))):
-            place, value = _assigned(body)[index]  # what came before it is spelled out in it
+            place, value = _assigned(body)[index]  # earlier names are replaced in the value already
             text = ast.unparse(place)
             if not isinstance(place, (ast.Name, ast.Attribute)) or stored.count(text) != 1:
                 continue
@@ -189,7 +192,7 @@ class LoopCode:
         return body
 
     def shown_at(self, test: ast.expr) -> ast.If | None:
-        """The outermost `if` that only moves a progress bar, and has this condition as its own or inside it."""
+        """Return the outermost `if` that only advances a progress bar and has or contains this condition."""
         return next((one for one in self._shown if _is_inside(test, one)), None)
 
     def milestones(self, numbers: range) -> dict[str, set[int]]:
@@ -199,13 +202,13 @@ class LoopCode:
             numbers: Iterations that may be left out.
 
         Returns:
-            By "line N: condition", or "line N: list" of iterations that is handed to a function with the number. Of a
-            condition that holds for none of the numbers there are none. One that only moves a bar is not among them:
-            see `bar_moves`.
+            Sets of iterations by "line N: condition", or by "line N: list" for a list of iterations that the loop
+            passes to a function together with the number. The set of a condition that holds for no number is empty.
+            Conditions that only advance a progress bar are not included; see `bar_moves`.
 
         Warns:
-            RuntimeWarning: A condition is on what the loop counts by itself, and comes less often for each number left
-                out.
+            RuntimeWarning: A condition depends on a counter of the loop's own, so it holds less often if iterations are
+                left out.
 
         Raises:
             SkipGSError: A condition cannot be evaluated ahead.
@@ -213,7 +216,7 @@ class LoopCode:
         for leaf in self.counted_by_itself():
             caution(
                 f"Line {self.first_line + leaf.lineno - 1} of {self.file} ({ast.unparse(leaf)}) counts the iterations "
-                f"that run; where others are left out it happens less often. Decide by {self.target} if that matters."
+                f"that run, so it holds less often if others are left out. Decide by {self.target} if that matters."
             )
         found: dict[str, set[int]] = {}
         for condition in self.conditions():
@@ -233,7 +236,7 @@ class LoopCode:
         return found
 
     def bar_moves(self, numbers: range) -> list[Moves]:
-        """Return how the loop moves bars on by hand, in iterations that need not run for it."""
+        """Return how the loop advances progress bars by hand, in iterations that need not run for them."""
         found = [Moves(bar, by, numbers) for bar, by in moves(list(_always(self.body)), self._names)]
         for condition in self.conditions():
             if condition.shown is not None and condition.is_of(condition.shown):
@@ -263,17 +266,17 @@ class LoopCode:
         return compile(ast.Expression(node), self.file, "eval")
 
     def mentions(self, node: ast.AST) -> bool:
-        """Whether the number stands in this part of the source."""
+        """Whether the number occurs in this part of the source."""
         return any(isinstance(part, ast.Name) and part.id == self.target for part in ast.walk(node))
 
     def conditions(self) -> Iterator[Condition]:
-        """All conditions that hold for single numbers, not for a stretch of them."""
+        """Yield all conditions that hold for single numbers, not for a range of numbers."""
         for test, path in _tests(self.body, []):
             if self.mentions(test) and any(_is_point(leaf) and self.mentions(leaf) for leaf in _leaves(test)):
                 yield Condition(test, path, self)
 
     def counted_by_itself(self) -> Iterator[ast.expr]:
-        """All conditions on what the loop counts up by itself, which stands still where an iteration is left out."""
+        """Yield all conditions on a counter of the loop's own, which does not count left-out iterations."""
         for test, path in _tests(self.body, []):
             if any(self._is_off(outer) for outer in path):
                 continue
@@ -284,12 +287,12 @@ class LoopCode:
                     yield leaf
 
     def _is_off(self, test: ast.expr) -> bool:
-        """Whether an option that is off keeps this condition from ever holding."""
+        """Whether the condition never holds because an option is off."""
         parts = test.values if isinstance(test, ast.BoolOp) and isinstance(test.op, ast.And) else [test]
         return any(part in self._settled and not eval(self._compiled(part), dict(self._names)) for part in parts)
 
     def lists(self) -> Iterator[ast.expr]:
-        """What is handed on together with the number, where it may be a list of iterations."""
+        """Yield names that are passed to a function together with the number, and may be lists of iterations."""
         for statement in self.body:
             for call in ast.walk(statement):
                 if not isinstance(call, ast.Call):
@@ -300,7 +303,7 @@ class LoopCode:
 
 
 def _place(node: ast.stmt | ast.expr) -> tuple[int, int]:
-    """Where it begins. What is put in the place of a name stands where the name stood."""
+    """Return line and column where a node begins. An expression that replaces a name has the position of the name."""
     return node.lineno, node.col_offset
 
 
@@ -310,7 +313,7 @@ def _is_inside(node: ast.stmt | ast.expr, outer: ast.stmt) -> bool:
 
 
 def _always(body: list[ast.stmt]) -> Iterator[ast.stmt]:
-    """These statements, and in place of a `with` block those inside it."""
+    """Yield these statements, and the statements inside a `with` block in place of the block."""
     for node in body:
         if isinstance(node, (ast.With, ast.AsyncWith)):
             yield from _always(node.body)
@@ -319,7 +322,7 @@ def _always(body: list[ast.stmt]) -> Iterator[ast.stmt]:
 
 
 def _assigned(body: list[ast.stmt]) -> list[tuple[ast.expr, ast.expr]]:
-    """Places that these statements give a value to in every iteration, each with the value, in their order."""
+    """Return the names and attributes that these statements assign in every iteration, with their values, in order."""
     found: list[tuple[ast.expr, ast.expr]] = []
     for node in _always(body):
         if isinstance(node, ast.AnnAssign) and node.value is not None:
@@ -334,14 +337,14 @@ def _assigned(body: list[ast.stmt]) -> list[tuple[ast.expr, ast.expr]]:
 
 
 def _counted(body: list[ast.stmt]) -> Iterator[str]:
-    """Places to which these statements add a constant in every iteration."""
+    """Yield the names and attributes to which these statements add a constant in every iteration."""
     for node in _always(body):
         if isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add) and isinstance(node.value, ast.Constant):
             yield ast.unparse(node.target)
 
 
 class _Inline(ast.NodeTransformer):
-    """Puts an expression where a name or an attribute is read below a line; above, it is of the iteration before."""
+    """Replaces a name or attribute by an expression after a line; before it, the value is the previous iteration's."""
 
     def __init__(self, name: str, value: ast.expr, line: int) -> None:
         self._name, self._value, self._line = name, value, line
@@ -364,11 +367,11 @@ def read_loop(
     """Return the loop that asks for its numbers.
 
     Args:
-        code: Of the function that holds the loop.
-        line: Where the function stands when the loop asks for a number: in the first lines of its `for`.
-        names: What the function had names for before its loop began.
-        pure: Functions that only look at numbers, and may stand in conditions.
-        known: Values of names that the loop assigns, where they are known before it.
+        code: Code of the function that holds the loop.
+        line: Present line of the function when the loop asks for a number, which is in the head of its `for`.
+        names: Names and values that the function had before the loop.
+        pure: Names of functions that only read numbers, and may occur in conditions.
+        known: Values of names that the loop assigns, if they are known before the loop.
 
     Raises:
         SkipGSError: The source cannot be read, or has no loop.
@@ -376,17 +379,17 @@ def read_loop(
     known = known or {}
     function = code.co_flags & inspect.CO_NEWLOCALS
     try:
-        # Of a module, getsource gives what stands before its first function alone.
+        # For the code of a module, getsource returns only the part before its first function.
         source = inspect.getsource(code) if function else "".join(inspect.findsource(code)[0])
         tree = ast.parse(textwrap.dedent(source))
     except (OSError, TypeError, SyntaxError) as error:
         raise SkipGSError(
-            f"The source of {code.co_name}() in {code.co_filename} cannot be read ({error}), so it cannot be known "
+            f"The source of {code.co_name}() in {code.co_filename} cannot be read ({error}), so the gate cannot know "
             "which iterations must run; gate without share and refine_share, or name them (--always, always=)."
         ) from error
     first = _first_line(code)
     for node in ast.walk(tree):
-        # Loops inside and around it do not stand there.
+        # The head of a loop inside or around it lies on other lines.
         if (
             isinstance(node, ast.For)
             and isinstance(node.target, ast.Name)
@@ -400,19 +403,19 @@ def read_loop(
 
 
 def _is_list(value: Any) -> bool:
-    """Whether this can be a list of iterations; a range without gaps is the whole run."""
+    """Whether this can be a list of iterations. A range without gaps is the whole run."""
     if isinstance(value, range):
         return value.step != 1
     return isinstance(value, (list, tuple, set, frozenset)) and all(isinstance(entry, Integral) for entry in value)
 
 
 def _first_line(code: CodeType) -> int:
-    """Line of the file that is the first one of this code's source."""
+    """Return the line of the file where the source of this code begins."""
     return code.co_firstlineno if code.co_flags & inspect.CO_NEWLOCALS else 1
 
 
 def _tests(body: list[ast.stmt], path: list[ast.expr]) -> Iterator[tuple[ast.expr, list[ast.expr]]]:
-    """All conditions in these statements, each with those that must hold for it to be looked at."""
+    """Yield all conditions in these statements, each with the conditions under which it is evaluated."""
     for statement in body:
         if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
             continue
@@ -437,7 +440,7 @@ def _tests(body: list[ast.stmt], path: list[ast.expr]) -> Iterator[tuple[ast.exp
 
 
 def _values(node: ast.AST) -> Iterator[ast.expr]:
-    """Conditions inside an expression: `flag = iteration % 10 == 0`, `a if iteration in b else c`."""
+    """Yield conditions inside an expression, as in `flag = iteration % 10 == 0` or `a if iteration in b else c`."""
     if isinstance(node, (ast.BoolOp, ast.Compare)) or (isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not)):
         yield node
         return
@@ -461,10 +464,10 @@ def _leaves(node: ast.expr) -> Iterator[ast.expr]:
 
 
 def _is_point(leaf: ast.expr) -> bool:
-    """Whether a part of a condition picks single numbers: equality, membership, a remainder, or a function's word."""
+    """Whether a part picks single numbers, by equality, membership, a remainder or the result of a function."""
     if isinstance(leaf, ast.Compare):
         return any(isinstance(operator, _POINT) for operator in leaf.ops) or any(
             isinstance(part, ast.Mod) for part in ast.walk(leaf)
         )
-    # The training backward of a loop of one's own, which gets the number too, is no milestone.
+    # The training backward of a user's own loop receives the number too, but is not a milestone.
     return not (isinstance(leaf, ast.Call) and isinstance(leaf.func, ast.Attribute) and leaf.func.attr == "backward")

@@ -1,41 +1,52 @@
-"""Shares for "auto": how many iterations a phase needs, by what is known before it or measured in it."""
+"""Shares for "auto": the number of iterations that a phase needs."""
 
 from __future__ import annotations
 
 import math
 
 # Growing (before densification ends).
-LEAST_GROWING_SHARE = 0.12  # a tenth of 15,000 iterations is the least that held on bonsai and the room
-LEAST_GROWING_STEPS = 1200  # iterations at the trainer's own steps: 750 lost 0.3 dB on Lego and 0.7 dB on bonsai
-LEAST_GROWING_STEPS_LONGER = 600  # iterations with longer steps: 450 held on fern, 700 on bonsai
-GROWING_VISITS = 5.0  # of each view, at the trainer's own steps: 4.7 lost 0.5 dB on bonsai 399x266
-GROWING_VISITS_LONGER = 3.5  # of each view, with longer steps: 2.7 lost 0.002 SSIM on bonsai in 7,000 iterations
-NEARLY_ALL = 0.8  # share of the Gaussians that a view shows, from which growth is limited by the number of events
-# Iterations per event where each event adds a share of the Gaussians or a part of a budget: what an event adds must be
-# fitted before the next one copies it. 3DGS-MCMC from 1,500 points to 12,000 on fern loses 0.8 dB with 10 iterations
-# per event and nothing with 14. `LEAST_GROWING_STEPS` are enough for any number of events.
+# Least share of the iterations that run. A tenth of 15,000 iterations is the least that lost nothing on bonsai and on
+# room.
+LEAST_GROWING_SHARE = 0.12
+# Least number of iterations at the trainer's own rates. 750 iterations lost 0.3 dB on Lego and 0.7 dB on bonsai.
+LEAST_GROWING_STEPS = 1200
+# Least number of iterations with longer steps. 450 lost nothing on fern, 700 lost nothing on bonsai.
+LEAST_GROWING_STEPS_LONGER = 600
+# Least number of visits of each view at the trainer's own rates. 4.7 visits lost 0.5 dB on bonsai at 399x266 pixels.
+GROWING_VISITS = 5.0
+# Least number of visits of each view with longer steps. 2.7 visits lost 0.002 SSIM on bonsai in 7,000 iterations.
+GROWING_VISITS_LONGER = 3.5
+# Share of the Gaussians that a view shows from which the number of events, not of visits, limits growth.
+NEARLY_ALL = 0.8
+# Iterations per event, if each event adds a share of the Gaussians or a part of a budget: the new Gaussians must be
+# fitted before the following event copies them. 3DGS-MCMC that grows from 1,500 points to 12,000 on fern loses 0.8 dB
+# with 10 iterations per event and nothing with 14. `LEAST_GROWING_STEPS` are enough for any number of events.
 STEPS_PER_EVENT = 14
-# Iterations of growth that need no longer steps. With fewer, steps may be longer by the square of the lack: longer
-# schedules reset opacities more often than the few iterations between two resets can bear at long steps. Four times the
-# rate in 1,500 iterations cost bonsai 0.6 dB; in 700 to 900 iterations it won 0.5 dB and more.
+# Number of iterations of growth from which steps need not be longer. With fewer iterations, the factor grows with the
+# square of the lack. Longer schedules reset opacities more often, and the few iterations between two resets do not
+# tolerate long steps: four times the rate in 1,500 iterations cost bonsai 0.6 dB, but gained 0.5 dB and more in 700 to
+# 900 iterations.
 ENOUGH_STEPS = 2100
-LONGEST_STEPS = 4.0  # greatest factor while the scene grows; 8 is no better than 4
+LONGEST_STEPS = 4.0  # largest factor on rates while the scene grows; a factor of 8 is no better
 
-# Refining (after it).
-LEAST_SHARE = 0.2
-LEAST_STEPS = 400  # fewer have no room to shrink in: 300 after a thinned growth cost fern 0.1 to 0.15 dB
-# Share at one visit of each view in all of refinement; it falls with the fourth root of the visits. On bonsai nothing
-# is lost from 0.35, 0.3 and 0.25 on, at 2, 6 and 12 visits.
+# Refining (after densification ends).
+LEAST_SHARE = 0.2  # least share of the iterations that run, in any schedule
+# Least number of iterations, so that steps can shrink. After a sampled growing phase 300 iterations cost fern 0.10 to
+# 0.15 dB.
+LEAST_STEPS = 400
+# Share of the iterations that run if refinement shows each view once. The share falls with the fourth root of the
+# number of visits. On bonsai, shares of 0.35, 0.3 and 0.25 lose nothing at 2, 6 and 12 visits.
 RARE_SHARE = 0.46
-# The same where iterations were left out before refinement, too: 0.25 at 14 visits ended bonsai 0.002 SSIM too low.
+# The same share if iterations were left out before refinement too. A share of 0.25 at 14 visits lost 0.002 SSIM on
+# bonsai.
 RARE_SHARE_AFTER_FEW = 0.56
 
 
 def refining_share(iterations: int, epoch: int, grown_by_few: bool = False) -> float:
-    """Share of the refinement iterations that may be needed, known beforehand.
+    """Return the share of the refinement iterations that may be needed, as far as it is known beforehand.
 
-    A fifth, or more where views are many for so few iterations or these are few by themselves; all where not every view
-    comes up once.
+    The share is a fifth. It is larger in a schedule of few iterations, or of few iterations per view, and 1 if not
+    every view comes up once.
 
     Args:
         iterations: Refinement iterations of the schedule.
@@ -49,13 +60,13 @@ def refining_share(iterations: int, epoch: int, grown_by_few: bool = False) -> f
 
 
 def growing_share(iterations: int, epoch: int, longer: bool, events: int = 0) -> float:
-    """Share of the iterations before the end of densification that are needed.
+    """Return the share of the iterations before the end of densification that is needed.
 
     Args:
         iterations: Iterations of the schedule until densification ends.
-        epoch: Iterations in which each training view comes up once.
+        epoch: Number of iterations in which each training view comes up once.
         longer: Whether longer steps may replace iterations; see `growing_factor`.
-        events: Densification events, if all of them run; 0 where events are left out.
+        events: Number of densification events, if all of them run; 0 if events are left out.
     """
     if iterations < 1:
         return 1.0
@@ -67,10 +78,10 @@ def growing_share(iterations: int, epoch: int, longer: bool, events: int = 0) ->
 
 
 def growing_factor(iterations: int, share: float, visible: float | None) -> float:
-    """Factor on learning rates while the scene grows.
+    """Return the factor on learning rates while the scene grows.
 
-    Parameters do not travel far enough in few iterations. Longer steps make up for that, as far as they conserve the
-    path of the iterations left out: see `path_factor`, whose mean this is at most.
+    In few iterations parameters do not travel far enough, and longer steps make up for that. The factor is at most the
+    one that conserves the path of all iterations, which is the mean of `path_factor`.
 
     Args:
         iterations: Iterations of the schedule until densification ends.

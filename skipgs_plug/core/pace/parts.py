@@ -1,4 +1,4 @@
-"""What a group of parameters takes of the factor on learning rates, and facts about it that stay from step to step."""
+"""How each group of parameters shares in the factor on learning rates, and facts about groups that outlast a step."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from skipgs_plug.core.pace.visibility import POSITIONS
 
-# What a group of parameters takes of the factor that is meant for all. In refinement opacities are never raised.
+# Multiples of the common factor that groups of parameters take, by kind. In refinement opacities are never raised.
 HIGHER_BANDS, GEOMETRY, OTHERS, CONSTANT_BAND = 4.0, 2.0, 1.0, 0.5
 NAMED = {
     **dict.fromkeys(("f_rest", "shN", "features_rest"), HIGHER_BANDS),
@@ -18,22 +18,26 @@ NAMED = {
     **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
-# Greatest factor on the rate of opacities while the scene grows. They must come back from each reset in the few
-# iterations that run, and beyond it they flicker: on bonsai (7,000 iterations) 1, 2 and 4 times the rate end at 30.47,
-# 30.49 and 30.19 dB.
+# Largest factor on the rate of opacities while the scene grows. Opacities must recover from each reset in the few
+# iterations that run, but they flicker at larger factors: on bonsai (7,000 iterations) 1, 2 and 4 times the rate end at
+# 30.47, 30.49 and 30.19 dB.
 OPACITIES_GROWING = 2.0
-OTHERS_AT_MOST = 0.25  # of the trainer's rate, at most, for what has no row for each Gaussian
-GAUSSIAN_SHAPES = ((), (1,), (2,), (3,), (4,))  # shapes of its parameters beside colours [K, 3]
+# Largest factor on the rate of parameters without a row for each Gaussian (exposures, poses, networks). They must not
+# follow a model that is far off for a while.
+OTHERS_AT_MOST = 0.25
+GAUSSIAN_SHAPES = ((), (1,), (2,), (3,), (4,))  # shapes of one Gaussian's parameters, except colours [K, 3]
 
 
 def group_part(group: dict[str, Any], name: str | None = None) -> float | None:
-    """Return how many times the factor of all a group takes; None for opacities, which are never raised.
+    """Return the multiple of the common factor that a group takes; None for opacities.
 
-    The image is linear in the colours, so their higher bands, whose rate trainers set to a twentieth of the constant
-    band's, bear the longest steps, and the constant band, which all views agree on, needs shorter ones. Positions,
-    whose rate has fallen to a tenth when refinement begins, and scales bear longer steps. Opacities are never raised:
-    their rate is large as it is, and steps beyond it flicker. All are known by the group's name, or else the `name` of
-    its optimizer; without either by shape: [N, 1, 3] is the constant band, [N, K, 3] higher ones, [N, 1] opacities.
+    The image is linear in the colours. Trainers set the rate of the higher bands to a twentieth of the constant band's,
+    so the higher bands tolerate the longest steps. All views agree on the constant band, so it needs shorter steps.
+    Positions, whose rate has fallen to a tenth when refinement begins, and scales tolerate longer steps. Opacities are
+    not raised in refinement: their rate is large already, and longer steps make them flicker.
+
+    A group is identified by its name, or else by the `name` of its optimizer. Without either its shape decides:
+    [N, 1, 3] is the constant band, [N, K, 3] are higher bands, [N, 1] are opacities.
     """
     name = group.get("name", name)
     if name is not None:
@@ -49,19 +53,19 @@ def group_part(group: dict[str, Any], name: str | None = None) -> float | None:
 
 
 class GroupInfo:
-    """Facts about a group of parameters, found once and valid while its parameters are the same tensors.
+    """Facts about a group of parameters. They are found once, and hold while its parameters are the same tensors.
 
     Args:
         group: One of an optimizer's `param_groups`.
-        name: Of its optimizer, where groups have no names; None if unknown.
+        name: Name of the optimizer, if its groups have no names; None if unknown.
 
     Attributes:
-        group: as given.
-        part: as `group_part`.
-        first: its parameter, where it has one alone; else None.
-        positions: parameters that may be positions [N, 3].
-        betas: of the trainer, when they were made shorter last.
-        short: what they were made then.
+        group: The argument.
+        part: Multiple of the common factor; see `group_part`.
+        first: The parameter of a group that has only one; else None.
+        positions: Parameters that may be positions [N, 3].
+        betas: The trainer's betas when `shorter` was called last.
+        short: The betas that `shorter` returned then.
     """
 
     __slots__ = ("_known", "_params", "_shaped", "betas", "first", "group", "part", "positions", "short")
@@ -74,19 +78,20 @@ class GroupInfo:
         known = group.get("name", name)
         self._known = known is not None
         shapes = [tuple(param.shape[1:]) for param in self._params]
-        # Inria's exposures step before the positions do. Groups with names are a model's, of anchors for example.
+        # Inria's exposures step before the positions, so their rows cannot be compared. Groups with names belong to the
+        # model, even if their shapes are unusual, as those of anchors are.
         self._shaped = all(shape in GAUSSIAN_SHAPES or (len(shape) == 2 and shape[1] == 3) for shape in shapes)
         may_be = self._params if known is None or known in POSITIONS else []
         self.positions = [param for param in may_be if param.ndim == 2 and param.shape[1] == 3]
-        self.betas: Any = None  # of the trainer, for which `_short` was made
+        self.betas: Any = None
         self.short: Any = None
 
     def fits(self, now: list[Tensor]) -> bool:
-        """Whether the group's parameters `now` are those that these facts are about."""
+        """Whether `now`, the group's present parameters, are the tensors that these facts are about."""
         return len(now) == len(self._params) and all(map(_same, now, self._params))
 
     def of_gaussians(self, rows: int) -> bool:
-        """Whether all its parameters have a row for each of `rows` Gaussians; 0 where the number is not known."""
+        """Whether all parameters have a row for each of `rows` Gaussians; 0 if the number is not known."""
         if not rows:
             return self._known or self._shaped
         if self.first is not None:
@@ -106,13 +111,13 @@ class GroupInfo:
 
 
 class Share(NamedTuple):
-    """What a group takes of the factor on learning rates, as long as the number of Gaussians stays.
+    """A group's share in the factor on learning rates. It holds while the number of Gaussians stays the same.
 
     Attributes:
-        group: one of an optimizer's `param_groups`.
-        times: of the factor.
-        most: greatest factor that it takes this of.
-        longer: facts about the group if its steps are larger; None if they are at most as long as the trainer's.
+        group: One of an optimizer's `param_groups`.
+        times: Multiple of the factor that the group takes.
+        most: Bound on the factor, before it is multiplied.
+        longer: Facts about the group if its steps are larger; None if they are at most as long as the trainer's.
     """
 
     group: dict[str, Any]
@@ -122,17 +127,17 @@ class Share(NamedTuple):
 
 
 class OptimizerInfo:
-    """Facts about an optimizer, valid while its groups hold the same parameters.
+    """Facts about an optimizer. They hold while its groups have the same parameters.
 
     Args:
-        optimizer: They are about this one.
-        name: Of it, where its groups have none; None if unknown.
+        optimizer: The optimizer.
+        name: Name of the optimizer, if its groups have no names; None if unknown.
 
     Attributes:
-        groups: of each of its groups.
-        name: as given.
-        positions: parameters that may be positions [N, 3].
-        shares: of its groups, see `divide`.
+        groups: Facts about each group.
+        name: The argument.
+        positions: Parameters that may be positions [N, 3].
+        shares: Shares of the groups that are scaled; see `divide`.
         rows, growing: The arguments of `divide` that `shares` were found for.
     """
 
@@ -148,7 +153,7 @@ class OptimizerInfo:
         self._only = self.groups[0] if len(self.groups) == 1 and self.groups[0].first is not None else None
 
     def fits(self, optimizer: torch.optim.Optimizer) -> bool:
-        """Whether they still hold."""
+        """Whether these facts still hold."""
         groups, only = optimizer.param_groups, self._only
         if only is not None and len(groups) == 1:  # as in most trainers
             now = groups[0]["params"]
@@ -156,11 +161,12 @@ class OptimizerInfo:
         return len(groups) == len(self.groups) and all(map(_is_about, self.groups, groups))
 
     def divide(self, rows: int, growing: bool) -> None:
-        """Find `shares` where there are `rows` Gaussians, 0 if their number is not known.
+        """Find `shares`.
 
         Args:
-            rows: Only what has a row for each Gaussian takes larger steps.
-            growing: The scene still grows: everything else is left alone, and opacities take longer steps, too.
+            rows: Number of Gaussians; 0 if it is not known. Only parameters with as many rows take larger steps.
+            growing: The scene still grows: opacities take larger steps too, and parameters without a row for each
+                Gaussian keep their rates.
         """
         self.rows, self.growing = rows, growing
         self.shares = [share for one in self.groups if (share := _share(one, rows, growing)) is not None]

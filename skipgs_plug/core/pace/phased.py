@@ -1,4 +1,4 @@
-"""The pace of a run that leaves out iterations: joins the training loop, its phases and the learning rates."""
+"""The pace of a run that leaves out iterations. It connects the training loop, its phases and the learning rates."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
 
 class Phased(Pace):
-    """Asks the phase that an iteration belongs to whether it runs.
+    """Asks the phase of an iteration whether the iteration runs.
 
     Args:
-        config: With `leaves_out`.
+        config: Settings with `leaves_out`.
         rates: Scales learning rates.
-        go_on: Loads the state that belongs to the checkpoint which training goes on from with an iteration, if any.
-        giving_up: Told of errors, which it raises or has let go of the training.
+        go_on: Receives the first iteration of a resumed run, and loads the state of its checkpoint, if there is one.
+        giving_up: Receives errors, and raises them or releases the gate.
 
     Attributes:
-        refining: the phase after densification.
-        growing: the phase before; None if it runs whole.
+        refining: The phase after densification.
+        growing: The phase before the end of densification; None if that phase runs whole.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Phased(Pace):
         self._densification: Densification | None = None
         self._keeps_rates = False
         self._views: list[str] | None = None
-        self._epoch: int | None = None  # iterations in which every view comes up once; None: as many as there are views
+        self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
         self._start = 0
         self._last: int | None = None
         self._hidden: Always = nothing_always
@@ -57,13 +57,14 @@ class Phased(Pace):
         self._pure: tuple[str, ...] = ()
         self._known: Known = nothing_known
         self._required: set[int] = set()
-        self._conditions: tuple[dict[str, set[int]], dict[str, set[int]]] | None = None  # of both phases
+        # Iterations that the loop's conditions name, by condition: of the growing phase, and of the refining phase.
+        self._conditions: tuple[dict[str, set[int]], dict[str, set[int]]] | None = None
         self._left_out = 0
         self._bars = Bars([])
         self._attached = False  # by an adapter
-        self._asked = False  # for the loop, if it is not known in the first iteration
+        self._asked = False  # whether the user was told, in the first iteration, that the loop is not known
         self._configured = self._removed = False
-        self._planned = False  # the loop's conditions were read: nothing is refused any more
+        self._planned = False  # whether the loop's conditions were read; nothing is refused after that
 
     # Facts about the trainer.
 
@@ -115,7 +116,7 @@ class Phased(Pace):
         self._removed = True
         self.refining.remove()
 
-    # What the engine and the hooks ask.
+    # Questions and reports of the engine and the hooks.
 
     @property
     def leaves_out(self) -> bool:
@@ -127,28 +128,28 @@ class Phased(Pace):
         return None if loop is None else loop.current
 
     def begin(self, step: int, policy: Policy | None) -> None:
-        # An adapter's loop is looked for from the first iteration on: a refusal comes before anything is trained.
+        # An adapter's loop is searched for from the first iteration on, so that a refusal comes before any training.
         needed = self._attached or self.growing is not None or step >= self._start
         if not self._attached and self.number is None and not self._removed:
             self._ask_for_loop(needed)
         self._asked = True
         if self._finder.begins(step, needed) and step >= self._start and self.refining.first is None:
-            self.refining.first = step  # it began before its loop was known
+            self.refining.first = step  # this iteration began before its loop was known
             self.refining.counts()
 
-    # What loops ask.
+    # Questions of loops.
 
     @property
     def wants_loop(self) -> bool:
-        """Whether it is not known yet which loop trains."""
+        """Whether the training loop is not known yet."""
         return self._finder.found is None
 
     def runs(self, loop: LoopRange, number: int) -> bool:
-        """Whether the loop runs with this number; asked once for each, in order.
+        """Whether the loop runs with this number; called once for each number, in order.
 
         Raises:
-            SkipGSError: The loop's conditions cannot be evaluated ahead. Raised at the first number that could be left
-                out, never later.
+            SkipGSError: The loop's conditions cannot be evaluated ahead. It is raised at the first number that could be
+                left out, never later.
         """
         if self._removed:
             return True
@@ -179,7 +180,7 @@ class Phased(Pace):
         return runs
 
     def expected(self, loop: LoopRange) -> int:
-        """How many numbers the loop will run, as far as is known. Ranges that no loop runs over are never asked."""
+        """Return the number of iterations that the loop will run, as far as it is known."""
         numbers = loop.numbers
         if self._removed:
             return len(numbers)
@@ -188,7 +189,7 @@ class Phased(Pace):
         return round(before * grown) + round((len(numbers) - before) * (self.refining.share or 1.0))
 
     def ended(self, loop: LoopRange) -> None:
-        """The loop is over, or was left: whatever steps afterwards is no part of it."""
+        """Leave rates alone once the loop is over, or was left early: later optimizer steps are not part of it."""
         if loop is self._finder.found:
             self._rates.pause()
 
@@ -205,14 +206,14 @@ class Phased(Pace):
             caution(f"refine_share leaves out iterations from {self._start} on, {how}")
 
     def _read(self, loop: LoopRange, number: int) -> None:
-        """Read the loop's conditions, with its first number that can be left out: nothing is refused later."""
+        """Read the loop's conditions, at the first number that can be left out. Nothing is refused later."""
         self._require_events()
         if self._last is None:
             self._last = loop.numbers[-1]
         if self.refining.first is None:
             self.refining.first = max(self._start, number)
-        # On resume, include iterations that are done already: conditions are judged by how often they hold.
-        # A trainer that is trained in parts, train(until=1000) first, has more numbers than its first loop.
+        # On resume, include iterations that are done already, because conditions are judged by how often they hold.
+        # A trainer that is trained in parts, such as train(until=1000), has more numbers than its first loop.
         end = loop.numbers.stop if loop.source is not None else max(loop.numbers.stop, self._last + 1)
         refined = range(self.refining.first, end)
         begun = number if self.growing is None or self.growing.first is None else self.growing.first
@@ -224,7 +225,7 @@ class Phased(Pace):
             found = [read.milestones(numbers) if numbers else {} for numbers in (grown, refined)]
             self._bars = Bars(read.bar_moves(loop.numbers))
         elif self._conditions is not None:
-            found = list(self._conditions)  # of this loop, in which a state is loaded
+            found = list(self._conditions)  # a state is loaded inside this loop
         loop.source = None
         hidden = {n for n in (*self._hidden(refined), *self._chosen, *self._required) if n in refined}
         if hidden:
@@ -241,13 +242,17 @@ class Phased(Pace):
                 self._grow_whole(f"No condition of the loop that names {marks} holds before iteration {self._start}")
 
     def _require_events(self) -> None:
-        """Let growth run whole where its densification events are not known."""
+        """Let the growing phase run whole if its densification events are not known.
+
+        Raises:
+            SkipGSError: `grow_share` was given, which needs them.
+        """
         if self.growing is None or self._densification is not None or self._start == 0:
             return
         if self._config.share is None:
             raise SkipGSError(
-                "grow_share leaves out iterations of densification, whose events are not known in this trainer; leave "
-                "it out, or give events= to gate.iterations()."
+                "grow_share leaves out iterations of densification, but the densification events of this trainer are "
+                "not known; remove grow_share, or give events= to gate.iterations()."
             )
         self._grow_whole("In a loop of your own give events= to gate.iterations()")
 
@@ -260,7 +265,7 @@ class Phased(Pace):
 
     def _refine(self, number: int) -> bool:
         if self.growing is not None and self.refining.sampling.asked == 0:
-            self._rates.visibility.restart()  # what views show of the grown scene decides how long steps are
+            self._rates.visibility.restart()  # the grown scene decides how long steps are
         return self.refining.runs(number)
 
     # State and report.
@@ -297,7 +302,7 @@ class Phased(Pace):
         if self.growing is not None:
             self.growing.load_state_dict(state["growing"])
         self._finder.expected = state["next"]
-        # The loop asks about its first number before the trainer says anything.
+        # The loop asks about its first number before the trainer reports its facts.
         if not self._configured:
             self._start, self._last, self._keeps_rates = state["start"], state["last"], state["keeps_rates"]
             self._configured = True

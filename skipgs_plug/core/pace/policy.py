@@ -15,9 +15,13 @@ from skipgs_plug.core.state import refinement_policy_state
 
 
 class RefinementPolicy(Policy):
-    """Every backward runs, except on views that are watched only, and after refinement has ended.
+    """Runs every backward pass, except for watched views, and except after refinement has ended.
 
-    Structural changes need no pause: no mean decides.
+    Structural changes need no pause, because running means do not decide.
+
+    Args:
+        config: Settings in force.
+        refining: The refining phase.
     """
 
     def __init__(self, config: SkipConfig, refining: Refining) -> None:
@@ -31,17 +35,17 @@ class RefinementPolicy(Policy):
         return self._config.start_iter or 0
 
     def mean(self, view: Hashable) -> float | None:
-        """Running mean of a view's loss."""
+        """Return the running mean of a view's loss; None for a new view."""
         return self._means.get(view)
 
     def foreseen(self, view: Hashable, step: int) -> bool | None:
-        """True when refinement is over; False unless views are watched."""
+        """Return True when refinement is over, and False if the view is not watched."""
         if self._refining.over:
             return True
         return None if self._refining.watching and view in self._refining.watched else False
 
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
-        """Run the backward, unless the view is watched or refinement is over; the loss is finite."""
+        """Run the backward pass, unless the view is watched or refinement is over. The loss must be finite."""
         self._means.update(view, loss)
         refining = self._refining
         if refining.over:
@@ -53,7 +57,7 @@ class RefinementPolicy(Policy):
         return decision.FULL
 
     def notify_event(self, step: int, n_views: int) -> None:
-        """Tell the phase, which may have ended."""
+        """Pass the structural change on to the phase."""
         self._refining.notify_event(step, n_views)
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Larger, shrinking steps: other learning rates and a shorter memory, for the length of each optimizer step only."""
+"""Larger, shrinking steps: each optimizer step runs with changed learning rates and beta2, which are then restored."""
 
 from __future__ import annotations
 
@@ -22,32 +22,37 @@ from skipgs_plug.core.pace.visibility import Visibility
 Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
 Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 
-LEAST_PATH_SHARE = 0.25  # of the iterations; below, steps that are longer still lose more than the path gains
-VISIBLE = 1 / 3  # of the Gaussians by a view, where it is not known: as in a room photographed from within
-# Of Adam's running mean of squares (beta2), at most. By the gradient of a single view a parameter can move its rate
-# over the root of 1 - beta2: 32 times the rate at the usual 0.999, too far where rates are larger.
+# Least share of the iterations that steps are made longer for. With a smaller share, steps that conserve the whole path
+# are so long that they lose more than the path gains.
+LEAST_PATH_SHARE = 0.25
+# Share of the Gaussians that a view shows while it is not measured. A third is typical of a room photographed from
+# within.
+VISIBLE = 1 / 3
+# Largest beta2 of Adam during a longer step. The gradient of a single view can move a parameter by its rate divided by
+# the root of 1 - beta2: 32 times the rate at the usual 0.999, which is too far with larger rates, 7 times at 0.98.
 SQUARES_KEPT = 0.98
-# Iterations in a row that ran with larger steps while no optimizer of PyTorch stepped: then a warning, then an error.
+# Number of iterations in a row that ran with larger steps while no optimizer of PyTorch stepped. After the first number
+# the user is warned, after the second an error is raised.
 UNSTEPPED_WARNS, UNSTEPPED_RAISES = 50, 200
 
-_hooked: list[ScaledRates] = []  # all whose hooks PyTorch holds
+_hooked: list[ScaledRates] = []  # every instance whose hooks PyTorch holds
 
 
 def path_factor(share: float, progress: float, peak: float | None = None, visible: float | None = None) -> float:
-    """Factor on learning rates at some progress through refinement, when a share of the iterations runs.
+    """Return the factor on learning rates at a point of refinement, when a share of the iterations runs.
 
-    Adam's steps are about as long as its learning rate, and refinement is limited by how far parameters travel: a
-    share of the steps goes as far as all of them when their mean length is 1 / share. Chance is as large in each step
-    of a Gaussian, however rarely a view shows it, and what the views agree on grows with the root of how often they do:
-    with it grows what steps bear. So the factor begins with 2 sqrt(3 visible) / share, which conserves the path where a
-    view shows a third of the Gaussians, and falls linearly to 0, the shape that averages the noise of the last steps
-    out (Defazio et al., arXiv 2310.07831).
+    Adam's steps are about as long as its learning rate, and refinement is limited by how far parameters travel. A share
+    of the steps travels as far as all steps do when its mean length is 1 / share. The noise of a Gaussian's step does
+    not depend on how often views show it. The part of its steps that views agree on grows with the square root of that
+    frequency, and so does the step length that training tolerates. The factor therefore begins with
+    2 sqrt(3 visible) / share, which conserves the path if a view shows a third of the Gaussians. It falls linearly to
+    0, the shape that averages out the noise of the last steps (Defazio et al., arXiv 2310.07831).
 
     Args:
-        share: Share of the iterations that run, in (0, 1]; one below a quarter gets the steps of a quarter.
+        share: Share of the iterations that run, in (0, 1]. A share below a quarter gets the steps of a quarter.
         progress: Share of refinement that is over, in [0, 1].
-        peak: Factor at the beginning, instead of that.
-        visible: Share of the Gaussians that a view shows, in (0, 1]; None where it is not known.
+        peak: Factor at the beginning, in place of the formula.
+        visible: Share of the Gaussians that a view shows, in (0, 1]; None if it is not known.
     """
     if peak is None:
         peak = 2.0 * math.sqrt(3.0 * (VISIBLE if visible is None else visible)) / max(share, LEAST_PATH_SHARE)
@@ -55,26 +60,27 @@ def path_factor(share: float, progress: float, peak: float | None = None, visibl
 
 
 class ScaledRates:
-    """Multiplies the learning rates of optimizers that step in this thread, and puts them back afterwards.
+    """Multiplies the learning rates of optimizers that step in this thread, and restores them after each step.
 
-    Where a group has `betas`, as Adam's have, the second is at most `SQUARES_KEPT` for the length of the step.
+    If a group has `betas`, as Adam's groups have, the second is at most `SQUARES_KEPT` during the step.
 
-    PyTorch's own hooks are used, around `step` of every optimizer and, from its first larger step until `remove`, on
-    the optimizer itself: so fused, sparse and selective optimizers are reached alike, the trainer's schedule is never
-    disturbed, and a checkpoint holds the trainer's rates.
+    The class uses PyTorch's own hooks: one before `step` of every optimizer, and, from its first larger step until
+    `remove`, one after `step` of that optimizer. They reach fused, sparse and selective optimizers alike. They never
+    disturb the trainer's schedule, and a checkpoint holds the trainer's rates.
 
-    Only what has a row for each Gaussian takes larger steps, as soon as an optimizer has shown how many there are by
-    their positions. Exposures, camera poses and networks, which a trainer steps beside them, must not run after a model
-    that is far off meanwhile: their steps are a quarter as long as the trainer's, and shrink with the others.
+    Only parameters with a row for each Gaussian take larger steps. The number of Gaussians is known as soon as an
+    optimizer of their positions has stepped. A trainer also steps exposures, camera poses and networks. They must not
+    follow a model that is far off for a while: their steps are a quarter as long as the trainer's, and shrink with
+    those of the Gaussians.
 
     Args:
-        only: Gives the optimizers that are meant, by name where their groups have none; None for all that step, of
-            which the trainer alone knows.
+        only: Returns the optimizers whose rates are scaled, by name if their groups have no names. None scales every
+            optimizer that steps.
 
     Attributes:
-        only: as given.
-        visibility: share of the Gaussians that a view shows, by the steps scaled so far.
-        on_error: Told of errors in hooks, which it raises or has let go of the training; None raises them.
+        only: The argument.
+        visibility: Share of the Gaussians that a view shows, measured in the steps scaled so far.
+        on_error: Receives errors of hooks, and raises them or releases the gate. None raises them.
     """
 
     def __init__(self, only: Optimizers | None = None) -> None:
@@ -84,34 +90,34 @@ class ScaledRates:
         self._factor: float | None = None
         self._growing = False
         self._only_look = False
-        self._rows = self._rows_now = 0  # Gaussians in the iteration before and in this one; 0 where not known
+        self._rows = self._rows_now = 0  # number of Gaussians in the previous and in this iteration; 0 if unknown
         self._thread = get_ident()
-        self._under_way: list[_Steps] = []  # each within the step of the one before
+        self._under_way: list[_Steps] = []  # each was called by the step before it in the list
         self._handles: list[RemovableHandle] = []
         self._steps: dict[int, _Steps] = {}  # by id of the optimizer
-        self._foreign: set[int] = set()  # ids of optimizers that stepped in this iteration and are not meant
-        self._unstepped = 0  # iterations in a row that ran without a step
+        self._foreign: set[int] = set()  # ids of optimizers that stepped in this iteration and are not scaled
+        self._unstepped = 0  # number of iterations in a row that ran without a step
         self._removed = False
 
     def look(self) -> None:
-        """Measure what the next view shows and how many Gaussians there are, and change nothing.
+        """Count the Gaussians, and those that the next view shows; change no rate.
 
         Raises:
-            SkipGSError: As `scale`.
+            SkipGSError: Another gate scales the same steps; see `scale`.
         """
         self.scale(1.0)
         self._only_look = True
 
     def scale(self, factor: float, growing: bool = False) -> None:
-        """Scale the steps of the thread that calls this, which is the one that trains; see `group_factor`.
+        """Scale the next steps in the thread that calls this, which is the training thread; see `group_part`.
 
         Args:
-            factor: On learning rates.
+            factor: Factor on learning rates.
             growing: The scene still grows: opacities take up to `OPACITIES_GROWING` times their rate, and parameters
-                without a row for each Gaussian are left alone.
+                without a row for each Gaussian keep their rates.
 
         Raises:
-            SkipGSError: Another one scales steps in this thread, and one of the two does not know which are its own.
+            SkipGSError: Another gate scales steps in this thread, and one of the two does not know its own optimizers.
         """
         self.pause()
         if self._removed:
@@ -121,8 +127,8 @@ class ScaledRates:
             at_work = other is not self and other._factor is not None and other._thread == thread
             if at_work and (other.only is None or self.only is None):
                 raise SkipGSError(
-                    "Another gate makes steps larger in this thread, and each would scale those of both: detach() it "
-                    "first, or train in threads of their own."
+                    "Another gate makes steps larger in this thread, and each gate would scale the steps of both: "
+                    "detach() it first, or train in separate threads."
                 )
         self._factor, self._growing, self._only_look, self._thread = factor, growing, False, thread
         self._rows, self._rows_now = self._rows_now or self._rows, 0
@@ -136,15 +142,15 @@ class ScaledRates:
         return self._rows_now or self._rows
 
     def pause(self) -> None:
-        """Touch nothing until the next `scale`."""
+        """Leave all rates alone until the next `scale`."""
         self._factor = None
-        for step in self._under_way:  # one that raised had no end
+        for step in self._under_way:  # a step that raised has no end
             step.drop()
         self._under_way.clear()
         self._foreign.clear()
 
     def remove(self) -> None:
-        """Take the hooks back, for good."""
+        """Remove the hooks for good."""
         self.pause()
         self._removed = True
         for handles in (self._handles, *(steps.handles for steps in self._steps.values())):
@@ -154,19 +160,19 @@ class ScaledRates:
             _hooked.remove(self)
 
     def ran(self) -> None:
-        """A backward ran in the present iteration, so that some optimizer is about to step.
+        """Note that a backward pass ran in the present iteration, so that an optimizer is about to step.
 
         Raises:
-            SkipGSError: None has stepped for many iterations: larger steps do not arrive.
+            SkipGSError: No optimizer has stepped for many iterations, so larger steps have no effect.
         """
         if self._factor is None or self._factor == 1.0:
             return
         self._unstepped += 1
         if self._unstepped in (UNSTEPPED_WARNS, UNSTEPPED_RAISES):
             sentence = (
-                f"{self._unstepped} iterations ran with larger steps, and no torch.optim.Optimizer stepped: what "
-                "updates the parameters is none, so its steps are not larger. Derive it from torch.optim.Optimizer and "
-                "let it read the lr of its param_groups, or give compensate=False."
+                f"{self._unstepped} iterations ran with larger steps, and no torch.optim.Optimizer stepped. The "
+                "optimizer of this loop is not one of PyTorch's, so its steps are not larger: derive it from "
+                "torch.optim.Optimizer and let it read the lr of its param_groups, or give compensate=False."
             )
             if self._unstepped == UNSTEPPED_RAISES:
                 raise SkipGSError(sentence)
@@ -187,7 +193,7 @@ class ScaledRates:
             self._failed(error)
 
     def _failed(self, error: Exception) -> None:
-        """Raise an error of a hook, or tell the one who lets go of the training, whose step then goes on."""
+        """Handle an error of a hook: raise it, or pass it to `on_error`, after which the trainer's step goes on."""
         if self.on_error is None:
             raise error
         self.on_error(error)
@@ -202,7 +208,7 @@ class ScaledRates:
         self._unstepped = 0
         if not self.visibility.complete:
             self.visibility.see(optimizer.param_groups, info.name)
-        # Without names a camera's position has the shape of a Gaussian's, but there are fewer.
+        # In groups without names, positions of cameras have the shape of positions of Gaussians, but fewer rows.
         for param in info.positions:
             if param.shape[0] > self._rows_now:
                 self._rows_now = param.shape[0]
@@ -210,7 +216,7 @@ class ScaledRates:
         if info.rows != rows or info.growing is not self._growing:
             info.divide(rows, self._growing)
         shares = [] if self._only_look else info.shares
-        if under_way:  # an optimizer can be wrapped in another one, which has the same groups
+        if under_way:  # an optimizer can wrap another one that has the same groups
             scaled = {id(group) for other in under_way for group, _, _ in other.before}
             shares = [one for one in shares if id(one.group) not in scaled]
         under_way.append(step)
@@ -231,7 +237,7 @@ class ScaledRates:
             step.prepare(optimizer)
 
     def _begin_with(self, optimizer: torch.optim.Optimizer) -> _Steps | None:
-        """Make `_Steps` for an optimizer that was not seen before; None if it is not meant."""
+        """Create `_Steps` for an optimizer that steps for the first time; None if it is not scaled."""
         key, name = id(optimizer), None
         if self.only is not None:
             if key in self._foreign:
@@ -246,23 +252,23 @@ class ScaledRates:
         step = _Steps(optimizer, name, self._under_way, self._failed)
         step.handles = self._watch(optimizer, step)
         self._steps[key] = step
-        # Its number is given to another optimizer once it is gone.
+        # Python can give the id of a deleted optimizer to a new one.
         step.gone = weakref.ref(optimizer, lambda _, steps=self._steps: steps.pop(key, None))  # type: ignore[misc]
         return step
 
     def _pass_on(self, optimizer: torch.optim.Optimizer) -> None:
-        """An optimizer that is wrapped in another one steps inside its step, with the same groups."""
+        """Stop watching outer steps that share groups with this optimizer, which steps inside them."""
         own = {id(group) for group in optimizer.param_groups}
         for other in self._under_way:
             if other.watched is not None and any(id(one) in own or id(one.group) in own for one in other.watched):
                 other.stop_watching()
 
     def _watch(self, optimizer: torch.optim.Optimizer, step: _Steps) -> list[RemovableHandle]:
-        """Put the trainer's settings back before anybody else looks at them."""
+        """Add the hooks that restore the trainer's settings before other code reads them."""
         ends = optimizer.register_step_post_hook(step.end)
-        # The trainer's own hooks after a step, of a scheduler for example, find and set its rates.
+        # The trainer's own hooks after a step, such as a scheduler's, must find the trainer's rates.
         optimizer._optimizer_step_post_hooks.move_to_end(ends.id, last=False)  # type: ignore[attr-defined]
-        # A checkpoint is written although a step raised: it holds the trainer's rates, too.
+        # A checkpoint that is written after a step raised holds the trainer's rates too.
         return [ends, optimizer.register_state_dict_pre_hook(self._put_back_all)]
 
     def _put_back_all(self, _: torch.optim.Optimizer) -> None:
@@ -271,25 +277,26 @@ class ScaledRates:
 
 
 class _Steps:
-    """The steps of one optimizer: facts about its groups, and the settings that its trainer has while one is under way.
+    """The steps of one optimizer: facts about its groups, and the trainer's settings while a step is under way.
 
     Args:
-        optimizer: It steps.
-        name: Of it, where its groups have none; None if unknown.
-        under_way: Steps that have begun and not ended, the outermost first.
-        failed: Told of errors at the end of a step, which it raises or has let go of the training.
+        optimizer: The optimizer.
+        name: Name of the optimizer, if its groups have no names; None if unknown.
+        under_way: Steps of all optimizers that have begun and not ended, outermost first.
+        failed: Receives errors at the end of a step, and raises them or releases the gate.
 
     Attributes:
-        info: about its groups.
-        handles: of hooks on it.
-        gone: forgets these steps with the optimizer.
-        depth: calls of its `step` within each other.
-        before: groups, and the rate and betas that the trainer has set there; None for a setting that it lacks.
-        longer: groups with a gradient whose rates are other ones now; filled until it is judged.
-        watched: copies in place of all groups, in the first longer step of an optimizer that is not PyTorch's.
-        judged: whether it is known what its step reads.
-        literal: replaces betas that its step passes as literal numbers; None if it passes none.
-        memory_stays: whether its step keeps a memory of squares that cannot be made shorter from outside.
+        info: Facts about the groups.
+        handles: Handles of the hooks on the optimizer.
+        gone: Weak reference that removes this object together with the optimizer.
+        depth: Number of nested calls of the optimizer's `step`.
+        before: Groups with changed settings, each with the trainer's rate and betas; None for a setting that the group
+            does not have.
+        longer: Groups with a gradient and a changed rate; filled until the optimizer is judged.
+        watched: Copies that replace all groups during the first longer step of an optimizer that is not PyTorch's.
+        judged: Whether it is known which settings a step reads.
+        literal: Replaces betas that a step passes as literal numbers; None if it passes none.
+        memory_stays: Whether a step has a beta2 that cannot be changed from outside.
     """
 
     __slots__ = (
@@ -318,7 +325,7 @@ class _Steps:
         self._until_end: contextlib.ExitStack | None = None
 
     def end(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        """Hook of PyTorch: a step has ended; the settings are the trainer's again before anybody else looks."""
+        """Hook of PyTorch: a step has ended. Restore the trainer's settings before other code reads them."""
         if self.depth == 0:
             return
         self.depth -= 1
@@ -333,14 +340,14 @@ class _Steps:
             self._failed(error)
 
     def drop(self) -> None:
-        """A step that has begun has no end: it raised."""
+        """Forget a step that raised, and restore the trainer's settings."""
         self.depth = 0
         self.put_back()
         self.watched = None
         self.longer.clear()
 
     def prepare(self, optimizer: torch.optim.Optimizer) -> None:
-        """See what the first longer step reads; replace literal betas, which it may pass on."""
+        """Watch which settings the first longer step reads, and replace literal betas that it passes on."""
         self._until_end = contextlib.ExitStack()
         if not self.judged:
             betas = next((betas for _, _, betas in self.before if betas is not None), None)
@@ -351,13 +358,13 @@ class _Steps:
             self._until_end.enter_context(self.literal.in_place())
 
     def stop_watching(self) -> None:
-        """Nothing is to be said of this step, whose groups another optimizer inside it uses."""
+        """Do not judge this step: another optimizer uses its groups inside it."""
         if self._until_end is not None:
             self._until_end.close()
         self.watched = self.literal = None
 
     def put_back(self) -> None:
-        """Once: what the trainer sets afterwards stays."""
+        """Restore the trainer's settings, once: values that the trainer sets later stay."""
         for group, rate, betas in self.before:
             if rate is not None:
                 group["lr"] = rate
@@ -369,10 +376,10 @@ class _Steps:
             self._until_end = None
 
     def judge(self, optimizer: torch.optim.Optimizer) -> None:
-        """Say what the watched step read, which has ended.
+        """Judge the watched step, which has ended, by the settings that it read.
 
         Raises:
-            SkipGSError: Not the learning rates: larger steps never arrive.
+            SkipGSError: It did not read the learning rates, so larger steps have no effect.
         """
         watched, self.watched = self.watched or [], None
         longer = [group for group in watched if any(group.group is one for one in self.longer)]
@@ -381,7 +388,7 @@ class _Steps:
         kind = type(optimizer).__name__
         if any("lr" not in group.read or "lr" not in group for group in longer):
             raise SkipGSError(
-                f"Steps of {kind} do not read the lr of its param_groups, so they are not larger; let it read them, or "
+                f"Steps of {kind} do not read the lr of its param_groups, so they are not larger; let them read it, or "
                 "give compensate=False."
             )
         fixed = [group for group in longer if "betas" in group and "betas" not in group.read]
@@ -391,6 +398,6 @@ class _Steps:
         if fixed:
             bound = shorter_memory(fixed[0].group["betas"], SQUARES_KEPT)
             caution(
-                f"Steps of {kind} do not read the betas of its param_groups, so squares of gradients cannot be "
-                f"forgotten sooner: its learning rates are raised {bound:.2f} times as far."
+                f"Steps of {kind} do not read the betas of its param_groups, so its beta2 cannot be lowered; "
+                f"its learning rates are raised {bound:.2f} times as far instead."
             )

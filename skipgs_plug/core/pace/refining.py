@@ -16,30 +16,32 @@ from skipgs_plug.core.pace.sampling import Sampling
 
 log = logging.getLogger(__name__)
 
-RECOVERY = 500  # most iterations that run after a structural change which comes when refinement has ended
+# Largest number of iterations that run after a structural change that comes when refinement has ended. It is as long
+# as the gate's pause (`events.MIN_PAUSE_ITERS`).
+RECOVERY = 500
 # Reasons for which iterations run.
 OF_SHARE, OF_LOOP, OF_CHANGES = "share", "conditions", "changes"
 
 
 class Refining:
-    """Says which iterations of refinement run, and by what factor their learning rates are larger.
+    """Decides which iterations of refinement run, and the factor on their learning rates.
 
-    Where steps are larger and shrink to nothing, the iterations that run come first: trainers lower the rate of
-    positions by number, and an end that comes sooner leaves a finished model sooner. Elsewhere they are spread evenly.
+    If steps are larger and shrink to zero, the iterations that run come first: trainers lower the rate of positions by
+    the iteration's number, and a model that is finished early can be used early. Otherwise they are spread evenly.
 
     Args:
-        config: With `refining`.
+        config: Settings with `refining`.
         rates: Scales learning rates.
 
     Attributes:
-        share: of the iterations that run, or may run where it is found automatically; None before refinement.
-        sampling: counts the iterations that ran and that were left out.
-        stopping: follows the cycles of steps that shrink, one where the share is given; None where rates stay.
-        always: iterations that must run, by the reason.
-        ran_for: Number of the iterations that ran by their reason: the share, conditions of the loop when the share was
-            used up, or structural changes after that.
-        watched: views that are watched and not trained on while `stopping` says so.
-        first: first iteration of the phase; None before it is known.
+        share: Share of the iterations that run, or that may run with "auto"; None before refinement.
+        sampling: Counts the iterations that ran and that were left out.
+        stopping: Follows the cycles of shrinking steps, of which a given share has one; None if rates stay as they are.
+        always: Iterations that must run, by reason.
+        ran_for: Number of iterations that ran, by reason: the share, conditions of the loop after the share was used
+            up, or structural changes after that.
+        watched: Views that are watched and not trained on while `watching` is True.
+        first: First iteration of the phase; None before it is known.
     """
 
     def __init__(self, config: SkipConfig, rates: ScaledRates) -> None:
@@ -54,10 +56,10 @@ class Refining:
         self._last: int | None = None
         self._must: frozenset[int] = frozenset()
         self.ran_for = {OF_SHARE: 0, OF_LOOP: 0, OF_CHANGES: 0}
-        self._recovery = self._recovered = 0  # iterations to run after a change, and those that have
+        self._recovery = self._recovered = 0  # number of iterations to run after a change, and number that ran
         self._changed: int | None = None  # iteration of the last change
-        self._expected: int | None = None  # iteration of the next one; None if no more are
-        self._over = False  # holds for the present iteration
+        self._expected: int | None = None  # iteration in which another change is expected; None if no change is
+        self._over = False  # whether refinement has ended, for the present iteration
         self._begun = self._removed = False
 
     @property
@@ -73,17 +75,18 @@ class Refining:
         epoch: int | None,
         keeps_rates: bool,
     ) -> None:
-        """Refinement begins with iteration `first`.
+        """Begin refinement with iteration `first`.
 
         Args:
             last: Last iteration of the run.
-            always: Iterations that must run, by the reason.
+            always: Iterations that must run, by reason.
             views: Keys of all training views; None if unknown.
             epoch: Number of iterations in which every view comes up once; None if unknown.
-            keeps_rates: Leave learning rates alone: the trainer takes as many steps as before.
+            keeps_rates: Leave learning rates alone, because the trainer takes as many steps as in its own run.
 
         Raises:
-            SkipGSError: "auto" does not know the views, or a loaded state had larger steps, which are off now.
+            SkipGSError: "auto" needs the views and they are unknown, or a loaded state had larger steps and they are
+                off now.
         """
         assert self.first is not None
         self._begun, self._last, self.always = True, last, always
@@ -97,14 +100,14 @@ class Refining:
                 )
             self.share = refining_share(total, epoch, grown_by_few=self._config.growing is not None)
         assert self.share is not None
-        # Several processes train on different views at a time, so none can be kept out of training and watched.
+        # Several processes train on different views at a time, so no view can be watched and kept out of training.
         if self._auto and views is not None and self.stopping is None and distributed.group_size() == 1:
             self.watched = watched_views(views, self.share * total)
         if not self._scales(keeps_rates):
             if self.stopping is not None:
                 raise SkipGSError(
-                    "The gate state was saved with larger, shrinking steps, which are off now; go on with compensate "
-                    "as it was, or start the gate afresh."
+                    "The gate state was saved with larger, shrinking steps, which are off now; continue with the same "
+                    "compensate setting, or start the gate afresh."
                 )
             self.sampling.share = self.share
         elif self.stopping is None:
@@ -118,7 +121,7 @@ class Refining:
         )
 
     def runs(self, number: int) -> bool:
-        """Whether iteration `number` runs; asked once for each, in order."""
+        """Whether iteration `number` runs; called once for each number, in order."""
         if self._expected is not None and number > self._expected:
             assert self._last is not None
             self._recover(min(RECOVERY, self._last - self._expected))
@@ -135,16 +138,16 @@ class Refining:
         return runs
 
     def require(self, number: int) -> None:
-        """Iteration `number` must run, which is only known now."""
+        """Make iteration `number` run. Call it for a need that shows only during the run."""
         self._must |= {number}
 
     def counts(self) -> None:
-        """The present iteration began before the training loop was known: it counts as one that ran."""
+        """Count the present iteration, which began before the training loop was known, as one that ran."""
         self.sampling.runs(must=True)
         self.ran_for[OF_SHARE] += 1
 
     def remove(self) -> None:
-        """Watch no view any more, and train in every iteration."""
+        """Stop watching views, and train in every iteration."""
         self._removed = True
 
     @property
@@ -154,20 +157,20 @@ class Refining:
 
     @property
     def over(self) -> bool:
-        """Whether steps have shrunk to nothing, so that what still runs need not train."""
+        """Whether steps have shrunk to zero, so that iterations that still run need not train."""
         return self._over and not self._removed
 
     def notify_event(self, step: int, n_views: int) -> None:
-        """A structural change happened; when refinement has ended, the model is given time to recover.
+        """Take note of a structural change. If refinement has ended, iterations run so that the model recovers.
 
-        The next change is expected as far away as the last one was. Up to it the share of the iterations runs, so that
-        a trainer that prunes again and again still leaves most of them out. After the last change, or where none comes
-        as expected, all of them run, up to `RECOVERY`: with the share alone, five prunes cost Speedy-Splat 1.1 dB
-        (benchmarks/notes/EVIDENCE.md).
+        The distance to the following change is expected to be that to the previous one. Until then the share of the
+        iterations runs, so that a trainer that prunes again and again still leaves out most iterations. After the last
+        change, or if no change comes as expected, all iterations run, up to `RECOVERY`. With the share alone, five
+        prunes cost Speedy-Splat 1.1 dB (benchmarks/notes/EVIDENCE.md).
 
         Args:
             step: Iteration of the change.
-            n_views: Number of training views, each of which is to be seen once.
+            n_views: Number of training views; the model recovers for at least one visit of each.
         """
         before, self._changed = self._changed, step
         if self.stopping is None or not self.stopping.ended or step == before:
@@ -183,7 +186,7 @@ class Refining:
             self._recover(min(most, max(n_views, math.ceil(self.share * (step - before)))))
 
     def _recover(self, iterations: int) -> None:
-        """Let this many iterations run from now on."""
+        """Let this number of iterations run from now on."""
         self._recovery, self._recovered = iterations, 0
 
     @property
@@ -196,7 +199,7 @@ class Refining:
         return self._config.rate_peak is not None or (self.share is not None and self.share < 1.0)
 
     def _set_pace(self) -> None:
-        """Set the share and the factor with which the next number is decided on; without larger steps both stay."""
+        """Set the share and the factor for the iteration to decide on; without larger steps both stay."""
         if self.stopping is None:
             return
         assert self.first is not None and self._last is not None and self.share is not None
@@ -262,7 +265,7 @@ class Refining:
         self.watched = frozenset(state["watched"])
         self._recovery, self._recovered = state["recovery"]
         self._changed, self._expected = state.get("changed"), state.get("expected")
-        earlier = {OF_SHARE: self.sampling.run}  # of a version that did not count by reason
+        earlier = {OF_SHARE: self.sampling.run}  # earlier states have no counts by reason
         self.ran_for.update({reason: int(count) for reason, count in state.get("ran_for", earlier).items()})
         if state["stopping"] is not None:
             self.stopping = EarlyStopping(self._config.tolerance)

@@ -1,4 +1,4 @@
-"""Which iterations run: a share of them, evenly spread, and every one that something hangs on."""
+"""Choose the iterations that run: a share of them, evenly spread, and every iteration that must run."""
 
 from __future__ import annotations
 
@@ -6,41 +6,41 @@ from typing import Any
 
 
 class Sampling:
-    """Runs one iteration in each slot of 1 / share iterations, at a place in it that looks random.
+    """Runs one iteration in each slot of 1 / share iterations, at a position in the slot that looks random.
 
-    Strictly even gaps would meet loops that take view `step % n` at the same views again and again. An iteration
-    that must run is paid for by those after it, so that the share stays what was asked for as long as fewer
-    iterations must run than may.
+    With strictly even gaps, a loop that trains on view `step % n` would show the same few views again and again. An
+    iteration that must run takes the turn of a later one. So the share is met as long as fewer iterations must run than
+    the share allows.
 
     Args:
-        share: Share of iterations that run, in [0, 1].
+        share: Share of the iterations that run, in [0, 1].
 
     Attributes:
-        run, left_out: iterations counted so far.
+        run, left_out: Numbers of iterations so far.
     """
 
     def __init__(self, share: float) -> None:
         self.share = share
         self.run = 0
         self.left_out = 0
-        self._due = 0  # how many should have run by now
+        self._due = 0  # number of iterations that should have run by now
 
     @property
     def asked(self) -> int:
-        """Iterations counted so far."""
+        """Number of iterations so far."""
         return self.run + self.left_out
 
     @property
     def due(self) -> int:
-        """How many iterations the share has asked for by now; those that ran beyond it had to."""
+        """Number of iterations that the share has asked for by now; further ones ran because they must."""
         return self._due if 0.0 < self.share < 1.0 else self.run + (self.share > 0.0)
 
     def runs(self, must: bool, barred: bool = False) -> bool:
-        """Whether the next iteration runs.
+        """Decide whether the next iteration runs, and count it.
 
         Args:
-            must: It runs in any case.
-            barred: It does not run, and a later one takes its turn.
+            must: The iteration runs in any case.
+            barred: The iteration is left out, and a later one takes its turn.
         """
         if barred:
             self.left_out += 1
@@ -66,7 +66,7 @@ class Sampling:
 
 
 def _place(slot: int) -> float:
-    """Where in its slot an iteration runs, in [0, 1): always the same, with no period (SplitMix64's finaliser)."""
+    """Return the position in a slot, in [0, 1), by SplitMix64's finaliser: repeatable, and without a period."""
     mixed = (slot * 0x9E3779B97F4A7C15 + 0x9E3779B97F4A7C15) % (1 << 64)
     mixed = ((mixed ^ (mixed >> 30)) * 0xBF58476D1CE4E5B9) % (1 << 64)
     mixed = ((mixed ^ (mixed >> 27)) * 0x94D049BB133111EB) % (1 << 64)

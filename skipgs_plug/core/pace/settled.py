@@ -1,4 +1,4 @@
-"""Parts of a loop's conditions that have one value for the whole loop, known before it begins."""
+"""Parts of a loop's conditions whose value is known before the loop begins and stays the same in it."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 
 
 class Settled:
-    """Knows the options of a run: what a function has names for before its loop, and the loop does not assign.
+    """Recognises the options of a run: names that a function has before its loop and that the loop does not assign.
 
     Only plain values count (numbers, text, flags, None and lists of them), in variables of the function itself or in
-    objects that have no methods, such as a namespace of options. What has methods, a model for one, may change in them.
+    objects without methods, such as a namespace of options. Methods of other objects, such as a model, may change them.
 
     Args:
-        code: Of the function that holds the loop.
-        source: Its syntax; of a module's code that of the whole module.
-        names: What it has names for before the loop.
-        changing: Places that the loop assigns to or changes.
-        pure: Functions that only look at their arguments.
+        code: Code of the function that holds the loop.
+        source: Syntax tree of the function, or of the whole module for a loop at module level.
+        names: Names and values that the function has before the loop.
+        changing: Names and attributes that the loop assigns or changes.
+        pure: Names of functions that only read their arguments.
     """
 
     def __init__(
@@ -32,11 +32,11 @@ class Settled:
     ) -> None:
         own = {*code.co_varnames, *code.co_cellvars} if code.co_varnames or code.co_cellvars else set(code.co_names)
         shared = (node.names for node in ast.walk(source) if isinstance(node, (ast.Global, ast.Nonlocal)))
-        self._own = own.difference(*shared)  # other functions may change those
+        self._own = own.difference(*shared)  # other functions may change shared names
         self._names, self._changing, self._pure = names, changing, pure
 
     def __contains__(self, node: object) -> bool:
-        """Whether an expression is made of nothing else."""
+        """Whether an expression consists of options, constants and pure functions only."""
         if isinstance(node, ast.Constant):
             return True
         if isinstance(node, (ast.Name, ast.Attribute)):
@@ -50,7 +50,7 @@ class Settled:
         return False
 
     def _look_up(self, node: ast.expr) -> tuple[bool, Any]:
-        """Whether a name or an attribute of options is known, and its value."""
+        """Return whether a name or an attribute is a known option, and its value."""
         if ast.unparse(node) in self._changing:
             return False, None
         if isinstance(node, ast.Name):
@@ -69,7 +69,7 @@ def _is_plain(value: Any) -> bool:
 
 
 def _only_holds(value: Any) -> bool:
-    """Whether an object holds values and does nothing."""
+    """Whether an object only holds values and has no public methods."""
     kind = type(value)
     return hasattr(value, "__dict__") and not any(
         callable(getattr(kind, name)) for name in dir(kind) if not name.startswith("_")

@@ -1,4 +1,4 @@
-"""Whether an optimizer's step uses the settings of its groups, without which larger steps never arrive."""
+"""Find out whether an optimizer's step reads the settings of its groups; if not, larger steps have no effect."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ MISSING = object()
 
 
 class WatchedGroup(dict[str, Any]):
-    """A copy of a parameter group, in its place for one step, that knows what was read of it.
+    """A copy that replaces a parameter group for one step and records which settings were read.
 
     Attributes:
-        group: the group itself, which takes all that is written.
-        read: keys that were read.
+        group: The group itself, which receives everything that is written.
+        read: Keys that were read.
     """
 
     def __init__(self, group: dict[str, Any]) -> None:
@@ -76,7 +76,7 @@ class WatchedGroup(dict[str, Any]):
 
 
 def watch(groups: list[dict[str, Any]]) -> list[WatchedGroup]:
-    """Put watched copies in place of the groups of an optimizer."""
+    """Replace the groups of an optimizer by watched copies, and return the copies."""
     watched = [WatchedGroup(group) for group in groups]
     groups[:] = watched
     return watched
@@ -88,32 +88,36 @@ def unwatch(groups: list[dict[str, Any]]) -> None:
 
 
 def is_torchs(optimizer: torch.optim.Optimizer) -> bool:
-    """Whether its step is one of PyTorch's own, which read all settings."""
+    """Whether the optimizer's step is one of PyTorch's own; these read all settings."""
     return str(getattr(inspect.unwrap(type(optimizer).step), "__module__", "")).startswith("torch.optim")
 
 
 def shorter_memory(betas: tuple[Any, ...], second: float) -> float:
-    """Factor on the rate that bounds a step as a shorter memory does, where the memory stays.
+    """Return the factor on the rate that bounds a step as a lower beta2 does, for an optimizer that keeps its beta2.
 
-    By the gradient of one view a parameter moves its rate over the root of 1 - beta2 at most.
+    The gradient of one view moves a parameter by its rate divided by the root of 1 - beta2 at most.
+
+    Args:
+        betas: The optimizer's betas.
+        second: The lower beta2.
     """
     return min(1.0, math.sqrt((1.0 - betas[1]) / (1.0 - second))) if betas[1] > second else 1.0
 
 
 class LiteralBetas:
-    """Gives a step that passes its betas as literal numbers to an extension other ones.
+    """Replaces betas that a step passes to an extension as literal numbers.
 
-    `SparseGaussianAdam` of the accelerated rasterizers calls `_C.adamUpdate(..., lr, 0.9, 0.999, eps, N, M)`: `_C` is a
-    global name of the module of its `step`, and for the length of a step it is another object, whose functions replace
-    the pair among their arguments.
+    `SparseGaussianAdam` of the accelerated rasterizers calls `_C.adamUpdate(..., lr, 0.9, 0.999, eps, N, M)`, where
+    `_C` is a global name in the module of its `step`. During a step that name is bound to a stand-in, whose functions
+    replace the pair among their arguments.
 
     Args:
-        optimizer: Whose step is meant.
-        betas: The pair that it passes.
-        second: What takes the place of the second.
+        optimizer: The optimizer.
+        betas: The pair that its step passes.
+        second: The new second number.
 
     Attributes:
-        replaced: calls in which the pair was replaced, so far.
+        replaced: Number of calls so far in which the pair was replaced.
     """
 
     def __init__(self, optimizer: torch.optim.Optimizer, betas: tuple[float, float], second: float) -> None:
@@ -151,7 +155,7 @@ class LiteralBetas:
 
 
 class _Caller:
-    """Stands for a module, or a function of one, whose calls go through `call`."""
+    """Stand-in for a module, or for a function of a module, whose calls go through `call`."""
 
     def __init__(self, target: Any, call: Any) -> None:
         self._target, self._through = target, call

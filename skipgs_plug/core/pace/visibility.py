@@ -1,4 +1,4 @@
-"""Share of the Gaussians that a view shows, read off the gradients of a trainer that does not tell."""
+"""Share of the Gaussians that a view shows, measured by the gradients that the trainer computes."""
 
 from __future__ import annotations
 
@@ -10,21 +10,23 @@ from torch import Tensor
 
 from skipgs_plug.core import distributed
 
-POSITIONS = ("xyz", "means")  # no regulariser fills their gradient, as some do that of opacities and scales
-STEPS = 100  # that are looked at
-# Looks after which what lies on a device is read, or agreed on with other processes: each read waits for all work.
+# Names of the positions. Regularisers fill the gradients of opacities and scales in some trainers, but not theirs.
+POSITIONS = ("xyz", "means")
+STEPS = 100  # number of optimizer steps in the mean, so that it does not depend on the first few views
+# Numbers of measured steps after which sums on a device are read, or reduced over processes. Each read waits for all
+# work of the device, so there are ten, close together at first because the first steps decide on shares.
 READ_AT = frozenset((1, 2, 4, 8, 14, 20, 30, 45, 65, STEPS))
-ROWS = 8192  # of a gradient that are looked at
+ROWS = 8192  # rows of a gradient that are measured, evenly spread; the standard error of a share is below 0.006
 
 
 class Visibility:
-    """Mean over the first steps of the share of Gaussians whose positions have a gradient.
+    """Mean, over the first steps, of the share of the Gaussians whose positions have a gradient.
 
-    On the CPU each step counts at once. On a device, sums stay there and are read ten times in all; several processes
-    agree on their mean then, since each sees views of its own.
+    On the CPU each step counts at once. On a device, sums stay there and are read ten times in all. Several processes
+    then agree on their mean, since each of them trains on other views.
 
     Attributes:
-        complete: whether enough steps were looked at.
+        complete: Whether enough steps were measured.
     """
 
     def __init__(self) -> None:
@@ -32,29 +34,31 @@ class Visibility:
 
     @property
     def share(self) -> float | None:
-        """In (0, 1]; None before the first step, and of a model without such a group."""
+        """The mean, in (0, 1]; None before the first step, and for a model without a group of positions."""
         return self._sum / self._steps if self._steps else None
 
     @property
     def steps(self) -> int:
-        """Steps seen so far, at most `STEPS`; on a device, those that were read."""
+        """Number of steps in the mean, at most `STEPS`."""
         return round(self._steps)
 
     def restart(self) -> None:
-        """Forget everything: the scene has grown since."""
+        """Measure afresh, because the scene has grown."""
         self._sum = self._steps = 0.0
         self._looks = 0
         self.complete = False
-        self._unread: Tensor | None = None  # sum of shares and number of steps that are not in the above  # [2]
+        self._unread: Tensor | None = None  # sum of shares and number of steps that were not read yet  # [2]
 
     def finish(self) -> None:
-        """Look at no further steps until `restart`: on a device each look can be a read that waits for all work."""
+        """Measure no further steps until `restart`; on a device a measurement can wait for all work."""
         self.complete = True
 
     def see(self, groups: list[dict[str, Any]], name: str | None) -> None:
-        """An optimizer is about to step; `name` is that of groups without a `name`, if it is known.
+        """Measure a step that is about to run. Without names the first parameter [N, 3] counts as the positions.
 
-        Without names the first parameter [N, 3] is taken for the positions.
+        Args:
+            groups: The optimizer's `param_groups`.
+            name: Name of groups without a `name`; None if it is unknown.
         """
         if self.complete:
             return
@@ -64,7 +68,7 @@ class Visibility:
         share = reached_share(param.grad)
         if distributed.group_size() == 1 and share.device.type == "cpu":
             reached = share.item()
-            if reached > 0.0:  # else the step has no view
+            if reached > 0.0:  # a step without gradients belongs to no view
                 self._sum, self._steps, self._looks = self._sum + reached, self._steps + 1, self._looks + 1
                 self.complete = self._looks >= STEPS
             return
@@ -77,7 +81,7 @@ class Visibility:
             self._sum, self._steps, self._unread = self._sum + total, self._steps + steps, None
 
     def state_dict(self) -> list[float]:
-        """Sum of shares, steps, looks, and of what is not read yet the sum and steps."""
+        """Return the sum of shares, the steps in it, the measured steps, and the sum and steps that were not read."""
         unread = [0.0, 0.0] if self._unread is None else self._unread.cpu().tolist()
         return [self._sum, self._steps, self._looks, *unread]
 
@@ -98,7 +102,7 @@ def positions(groups: list[dict[str, Any]], name: str | None) -> Iterator[Tensor
 
 
 def reached_share(gradient: Tensor) -> Tensor:
-    """Return the share of rows of a gradient [N, K], dense or sparse, that are not all 0; where it lies, unread."""
+    """Return the share of the rows of a gradient [N, K], dense or sparse, that are not all 0, on its device."""
     count = max(len(gradient), 1)
     exact = torch.float64 if gradient.device.type == "cpu" else torch.float32  # some devices have no float64
     if gradient.is_sparse:

@@ -379,7 +379,7 @@ def test_a_second_one_that_scales_the_same_optimizers_is_refused(rates):
     second, own = ScaledRates(), ScaledRates(list)
     rates.scale(3.0)
     for other in (second, own):
-        with pytest.raises(SkipGSError, match=r"each would scale those of both: detach\(\) it first"):
+        with pytest.raises(SkipGSError, match=r"each gate would scale the steps of both: detach\(\) it first"):
             other.scale(2.0)
     rates.pause()
     second.scale(2.0)  # one after the other
