@@ -6,6 +6,7 @@ import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from skipgs_plug.trainer import ssim as ssim_module
 from skipgs_plug.trainer.metrics import batch, ssim
 from skipgs_plug.trainer.ssim import ssim_map
 
@@ -26,3 +27,10 @@ def test_it_is_that_of_torchmetrics(height: int, width: int, noise: float) -> No
     mask = rows > 0.5
     masked = float(windows[0].permute(1, 2, 0)[mask].mean())
     assert ssim(render, target, mask) == pytest.approx(masked, abs=1e-5)
+
+
+def test_bands_of_rows_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = torch.rand(2, 53, 40, 3, generator=torch.Generator().manual_seed(0))
+    whole = ssim_map(first, second)
+    monkeypatch.setattr(ssim_module, "BAND", 40 * 10)  # five of 10 rows, and one of 3
+    assert torch.equal(ssim_map(first, second), whole)
