@@ -89,8 +89,8 @@ class Events:
 
     def _distance(self, number: int) -> int:
         """Return the number of iterations from the previous event to this one in the trainer's own schedule."""
-        place = bisect.bisect_left(self._numbers, number)
-        before = self._numbers[place - 1] if place else 0
+        index = bisect.bisect_left(self._numbers, number)
+        before = self._numbers[index - 1] if index else 0
         return number - before
 
     def state_dict(self) -> dict[str, Any]:

@@ -25,7 +25,7 @@ SAFE = frozenset({"abs", "bool", "int", "len", "max", "min", "round"})  # built-
 # Methods that change lists, sets and queues, so that an object can differ from iteration to iteration.
 CHANGES = frozenset({"add", "append", "appendleft", "clear", "discard", "extend", "insert", "pop", "popleft", "remove"})
 _POINT = (ast.Eq, ast.NotEq, ast.In, ast.NotIn, ast.Is, ast.IsNot)
-_PLACE = (ast.Name, ast.Attribute, ast.Subscript)
+_ASSIGNABLE = (ast.Name, ast.Attribute, ast.Subscript)
 
 
 class _Leaf(NamedTuple):
@@ -46,14 +46,14 @@ class Condition:
     Attributes:
         text: Source of the condition.
         line: Line of the condition in the file.
-        shown: The `if` that has this condition, or contains it, and only advances a progress bar; None without one.
+        bar_if: The `if` that has this condition, or contains it, and only advances a progress bar; None without one.
     """
 
     def __init__(self, test: ast.expr, path: list[ast.expr], loop: LoopCode) -> None:
         self.text, self.line = ast.unparse(test), loop.first_line + test.lineno - 1
         self._loop = loop
         self._test = test
-        self.shown = loop.shown_at(test)
+        self.bar_if = loop.bar_if_of(test)
         self._path = path
         self._leaves: dict[int, _Leaf] = {}
         self._ordered: dict[int, list[ast.expr]] = {}
@@ -111,7 +111,7 @@ class Condition:
 
     def is_of(self, statement: ast.If) -> bool:
         """Whether this is the condition of the `if` itself."""
-        return _place(self._test) == _place(statement.test)
+        return _position(self._test) == _position(statement.test)
 
     def _parts(self, node: ast.BoolOp) -> list[ast.expr]:
         """Return the parts of an `and` or `or`, unforeseeable parts last, because other parts may decide alone."""
@@ -162,7 +162,7 @@ class LoopCode:
         stored = [
             ast.unparse(node)
             for node in parts
-            if isinstance(node, _PLACE) and not isinstance(node.ctx, ast.Load) and id(node) not in own
+            if isinstance(node, _ASSIGNABLE) and not isinstance(node.ctx, ast.Load) and id(node) not in own
         ]
         called = [node.func for node in parts if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
         self._counters = {text for text in _counted(statement.body) if stored.count(text) == 1}
@@ -174,26 +174,26 @@ class LoopCode:
         for node in (part for part in parts if isinstance(part, ast.If)):  # outer statements come first
             if not any(_is_inside(node, outer) for outer in outermost) and only_shows(node, names, around):
                 outermost.append(node)
-        self._shown = outermost
+        self._bar_ifs = outermost
         self.body = self._spelled_out(statement.body, stored)
 
     def _spelled_out(self, body: list[ast.stmt], stored: list[str]) -> list[ast.stmt]:
         """Replace names by the expression that they stand for, if it is of the number or of options.
 
-        An example is `place = step % len(views)`.
+        An example is `index = step % len(views)`.
         """
         for index in range(len(_assigned(body))):
-            place, value = _assigned(body)[index]  # earlier names are replaced in the value already
-            text = ast.unparse(place)
-            if not isinstance(place, (ast.Name, ast.Attribute)) or stored.count(text) != 1:
+            target, value = _assigned(body)[index]  # earlier names are replaced in the value already
+            text = ast.unparse(target)
+            if not isinstance(target, (ast.Name, ast.Attribute)) or stored.count(text) != 1:
                 continue
             if value in self._settled or (self.mentions(value) and not self.leaf(value).unforeseeable):
-                body = [_Inline(text, value, place.lineno).visit(copy.deepcopy(one)) for one in body]
+                body = [_Inline(text, value, target.lineno).visit(copy.deepcopy(one)) for one in body]
         return body
 
-    def shown_at(self, test: ast.expr) -> ast.If | None:
+    def bar_if_of(self, test: ast.expr) -> ast.If | None:
         """Return the outermost `if` that only advances a progress bar and has or contains this condition."""
-        return next((one for one in self._shown if _is_inside(test, one)), None)
+        return next((one for one in self._bar_ifs if _is_inside(test, one)), None)
 
     def milestones(self, numbers: range) -> dict[str, set[int]]:
         """Return the iterations that must run, by the condition that names them.
@@ -220,7 +220,7 @@ class LoopCode:
             )
         found: dict[str, set[int]] = {}
         for condition in self.conditions():
-            if condition.shown is not None:
+            if condition.bar_if is not None:
                 continue
             hits = condition.numbers(numbers, self._names)
             found.setdefault(f"line {condition.line}: {condition.text}", set()).update(hits)
@@ -239,10 +239,10 @@ class LoopCode:
         """Return how the loop advances progress bars by hand, in iterations that need not run for them."""
         found = [Moves(bar, by, numbers) for bar, by in moves(list(_always(self.body)), self._names)]
         for condition in self.conditions():
-            if condition.shown is not None and condition.is_of(condition.shown):
+            if condition.bar_if is not None and condition.is_of(condition.bar_if):
                 hits = condition.holds(numbers, self._names)
                 if hits is not None:
-                    found += [Moves(bar, by, frozenset(hits)) for bar, by in moves(condition.shown.body, self._names)]
+                    found += [Moves(bar, by, frozenset(hits)) for bar, by in moves(condition.bar_if.body, self._names)]
         return found
 
     def leaf(self, node: ast.expr) -> _Leaf:
@@ -255,10 +255,10 @@ class LoopCode:
             for name in ast.walk(part.target)
             if isinstance(name, ast.Name)
         }
-        places = {ast.unparse(part) for part in ast.walk(node) if isinstance(part, _PLACE)} - inner
+        read = {ast.unparse(part) for part in ast.walk(node) if isinstance(part, _ASSIGNABLE)} - inner
         calls = [part for part in ast.walk(node) if isinstance(part, ast.Call)]
         impure = any(not isinstance(call.func, ast.Name) or call.func.id not in self._pure for call in calls)
-        if impure or places & self._changing:
+        if impure or read & self._changing:
             return _Leaf(None, True)
         return _Leaf(self._compiled(node), False)
 
@@ -281,7 +281,7 @@ class LoopCode:
             if any(self._is_off(outer) for outer in path):
                 continue
             for leaf in _leaves(test):
-                read = {ast.unparse(part) for part in ast.walk(leaf) if isinstance(part, _PLACE)}
+                read = {ast.unparse(part) for part in ast.walk(leaf) if isinstance(part, _ASSIGNABLE)}
                 picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and _is_point(leaf)
                 if picks and read & self._counters and not self.mentions(leaf):
                     yield leaf
@@ -302,14 +302,14 @@ class LoopCode:
                     yield from (value for value in given if isinstance(value, (ast.Name, ast.Attribute)))
 
 
-def _place(node: ast.stmt | ast.expr) -> tuple[int, int]:
+def _position(node: ast.stmt | ast.expr) -> tuple[int, int]:
     """Return line and column where a node begins. An expression that replaces a name has the position of the name."""
     return node.lineno, node.col_offset
 
 
 def _is_inside(node: ast.stmt | ast.expr, outer: ast.stmt) -> bool:
     end = outer.end_lineno or outer.lineno, outer.end_col_offset or outer.col_offset
-    return _place(outer) <= _place(node) < end
+    return _position(outer) <= _position(node) < end
 
 
 def _always(body: list[ast.stmt]) -> Iterator[ast.stmt]:
@@ -328,11 +328,11 @@ def _assigned(body: list[ast.stmt]) -> list[tuple[ast.expr, ast.expr]]:
         if isinstance(node, ast.AnnAssign) and node.value is not None:
             found.append((node.target, node.value))
         elif isinstance(node, ast.Assign) and len(node.targets) == 1:
-            place, value = node.targets[0], node.value
-            if isinstance(place, ast.Tuple) and isinstance(value, ast.Tuple) and len(place.elts) == len(value.elts):
-                found += zip(place.elts, value.elts, strict=True)
+            target, value = node.targets[0], node.value
+            if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) and len(target.elts) == len(value.elts):
+                found += zip(target.elts, value.elts, strict=True)
             else:
-                found.append((place, value))
+                found.append((target, value))
     return found
 
 

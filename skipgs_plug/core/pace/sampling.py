@@ -46,7 +46,7 @@ class Sampling:
             self.left_out += 1
             return False
         if 0.0 < self.share < 1.0:
-            while (self._due + _place(self._due)) / self.share < self.asked + 1:
+            while (self._due + _position(self._due)) / self.share < self.asked + 1:
                 self._due += 1
             must = must or self.run < self._due
         else:
@@ -65,7 +65,7 @@ class Sampling:
         self.run, self.left_out, self._due = int(state["run"]), int(state["left_out"]), int(state["due"])
 
 
-def _place(slot: int) -> float:
+def _position(slot: int) -> float:
     """Return the position in a slot, in [0, 1), by SplitMix64's finaliser: repeatable, and without a period."""
     mixed = (slot * 0x9E3779B97F4A7C15 + 0x9E3779B97F4A7C15) % (1 << 64)
     mixed = ((mixed ^ (mixed >> 30)) * 0xBF58476D1CE4E5B9) % (1 << 64)
