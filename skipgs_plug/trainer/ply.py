@@ -229,12 +229,12 @@ def read_vertices(path: Path, rounded: bool = True) -> dict[str, np.ndarray]:
 
     check_header(path)
     try:
-        content = PlyData.read(without_blank_lines(path), mmap=False)
-        elements = {
-            element.name: {prop.name: np.asarray(element[prop.name]) for prop in element.properties}
-            for element in content.elements
-            if element.name in ("vertex", "chunk", "sh")
-        }
+        content = PlyData.read(without_blank_lines(path))  # maps a binary file: else plyfile reads number by number
+        elements: dict[str, dict[str, np.ndarray]] = {}
+        for element in content.elements:
+            if element.name in ("vertex", "chunk", "sh"):
+                data = np.array(element.data)  # a copy: the file may be replaced or cut off later
+                elements[element.name] = {prop.name: data[prop.name] for prop in element.properties}
         vertices = elements["vertex"]
         if is_compressed(vertices):
             if not rounded:
