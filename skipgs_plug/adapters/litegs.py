@@ -11,6 +11,7 @@ import torch
 
 from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
+from skipgs_plug.adapters.loop_bounds import ASSIGNED
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.unknown_forks import Survey
 from skipgs_plug.core.errors import AdapterMismatchError
@@ -21,7 +22,8 @@ MODULE, LOOP = "litegs.training.trainer", "start"
 EXPECTED = (LOOP, "densify", "render", "StatisticsHelperInst")
 CONTROLLER = "DensityControllerTamingGS"
 EVENTS = ("split_and_clone", "prune", "reset_opacity")
-KNOWN = ("is_densify_actived", "_get_params_from_optimizer")  # further methods that a controller runs
+# Further methods that a controller runs. Reordering Gaussians assigns to the data of parameters, and changes no image.
+KNOWN = ("is_densify_actived", "_get_params_from_optimizer", ASSIGNED)
 INDEX = 11  # place of the view's index (a tensor) among the arguments of `render_preprocess`
 
 
