@@ -17,6 +17,10 @@ VISITS_BEHIND = 20.0
 # The same if a view shows nearly all Gaussians. The number of events limits growth then: with every second event, Lego
 # ends with half of its Gaussians.
 VISITS_BEHIND_FULL_VIEWS = 8.0
+# Least number of events that a shortened phase keeps, whatever the visits; a schedule with fewer keeps all. An event at
+# most doubles the Gaussians. With 7 or 8 of 13 events, scripts on bonsai at 100x67 ended with half of their Gaussians and
+# 0.011 less SSIM.
+LEAST_EVENTS = 16
 # Share of the Gaussians that a view shows, until it is measured. It is measured again after each event.
 VISIBLE = 1 / 3
 
@@ -69,12 +73,13 @@ class Events:
         """Count an iteration that is left out, with its event if it has one."""
         self.left_out += number in self._known
 
-    def enough(self, number: int, visible: float | None) -> bool:
+    def enough(self, number: int, visible: float | None, iterations: float) -> bool:
         """Whether enough iterations ran before the event in iteration `number`.
 
         Args:
             number: Iteration with an event.
             visible: Share of the Gaussians that a view shows; None if unknown.
+            iterations: Iterations of the phase that run.
         """
         if self.all_run:
             return True
@@ -85,7 +90,7 @@ class Events:
             return behind >= distance
         visible = visible or VISIBLE
         visits = VISITS_BEHIND_FULL_VIEWS if visible >= NEARLY_ALL else VISITS_BEHIND
-        return behind * visible >= min(visits, distance * visible)
+        return behind * visible >= min(visits, iterations / LEAST_EVENTS * visible, distance * visible)
 
     def _distance(self, number: int) -> int:
         """Return the number of iterations from the previous event to this one in the trainer's own schedule."""
