@@ -18,8 +18,8 @@ VISITS_BEHIND = 20.0
 # ends with half of its Gaussians.
 VISITS_BEHIND_FULL_VIEWS = 8.0
 # Least number of events that a shortened phase keeps, whatever the visits; a schedule with fewer keeps all. An event
-# at most doubles the Gaussians. With 7 or 8 of 13 events, scripts on bonsai at 100x67 ended with half of their Gaussians
-# and 0.011 less SSIM.
+# at most doubles the Gaussians. With 7 or 8 of 13 events, scripts on bonsai at 100x67 ended with half of their
+# Gaussians and 0.011 less SSIM.
 LEAST_EVENTS = 16
 # Share of the Gaussians that a view shows, until it is measured. It is measured again after each event.
 VISIBLE = 1 / 3
