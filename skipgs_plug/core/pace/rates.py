@@ -265,7 +265,7 @@ class ScaledRates:
 
     def _watch(self, optimizer: torch.optim.Optimizer, step: _Steps) -> list[RemovableHandle]:
         """Add the hooks that restore the trainer's settings before other code reads them."""
-        ends = optimizer.register_step_post_hook(step.end)
+        ends = optimizer.register_step_post_hook(step.after_step)
         # The trainer's own hooks after a step, such as a scheduler's, must find the trainer's rates.
         optimizer._optimizer_step_post_hooks.move_to_end(ends.id, last=False)  # type: ignore[attr-defined]
         # A checkpoint that is written after a step raised holds the trainer's rates too.
@@ -324,20 +324,22 @@ class _Steps:
         self.memory_stays = False
         self._until_end: contextlib.ExitStack | None = None
 
-    def end(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        """Hook of PyTorch: a step has ended. Restore the trainer's settings before other code reads them."""
-        if self.depth == 0:
-            return
-        self.depth -= 1
+    def after_step(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        """Hook of PyTorch: a step has ended."""
         if self.depth:
-            return
-        try:
-            self._under_way.remove(self)
-            self.put_back()
-            if self.watched is not None:
-                self.judge(optimizer)
-        except Exception as error:
-            self._failed(error)
+            self.depth -= 1
+            if self.depth == 0:
+                try:
+                    self.end(optimizer)
+                except Exception as error:
+                    self._failed(error)
+
+    def end(self, optimizer: torch.optim.Optimizer) -> None:
+        """Restore the trainer's settings before other code reads them, and judge a watched step."""
+        self._under_way.remove(self)
+        self.put_back()
+        if self.watched is not None:
+            self.judge(optimizer)
 
     def drop(self) -> None:
         """Forget a step that raised, and restore the trainer's settings."""
