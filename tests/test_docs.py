@@ -57,7 +57,7 @@ def test_notes_and_inner_pages_are_listed_and_out_of_the_reading_path() -> None:
     assert links == ["../benchmarks/notes/README.md"]
 
 
-@pytest.mark.parametrize(("mark", "command"), [("demo", "skipgs-plug demo"), ("tests", "pytest")])
+@pytest.mark.parametrize(("mark", "command"), [("demo", "skipgs-plug demo"), ("tests", "pytest -n 2 --dist loadfile")])
 def test_marked_blocks_hold_one_command_line(mark: str, command: str) -> None:
     block = re.findall(rf"<!-- {mark} -->\n```sh\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     assert len(block) == 1 and len(block[0].splitlines()) == 1 and block[0].strip().endswith(command)
