@@ -182,8 +182,7 @@ def test_needs_of_an_event():
 
 def test_shares_that_auto_chooses():
     assert growing_share(15_000, 255, longer=True) == growing_share(15_000, 255, longer=False) == 0.12
-    assert growing_share(15_000, 1000, longer=False) == pytest.approx(1 / 3)
-    assert growing_share(15_000, 1000, longer=True) == pytest.approx(0.7 / 3)
+    assert growing_share(15_000, 1000, longer=True) == growing_share(15_000, 1000, longer=False) == pytest.approx(1 / 3)
     assert growing_share(1500, 17, longer=True) == 0.4
     assert growing_share(1500, 17, longer=False) == 0.8
     # Where all events run, each needs 14 iterations, as far as all need more than 600 and no more than 1,200.
