@@ -12,8 +12,8 @@ LEAST_GROWING_SHARE = 0.12
 LEAST_GROWING_STEPS = 1200
 # Least number of iterations with longer steps. 450 lost nothing on fern, 700 lost nothing on bonsai.
 LEAST_GROWING_STEPS_LONGER = 600
-# Least number of visits of each view, also with longer steps: 3.5 visits lost 0.003 SSIM on bonsai at 798x531 pixels in
-# 7,000 iterations, and 5 ended 0.002 above the trainer's own run. At its own rates 4.7 lost 0.5 dB at 399x266.
+# Least number of visits of each view, also with longer steps: 3.5 visits lost 0.003 SSIM on bonsai at 399x266 pixels in
+# 7,000 iterations, and 5 ended 0.002 above the trainer's own run. At its own rates 4.7 visits lost 0.5 dB there.
 GROWING_VISITS = 5.0
 # Share of the Gaussians that a view shows from which the number of events, not of visits, limits growth.
 NEARLY_ALL = 0.8
