@@ -285,5 +285,5 @@ def test_densify_stops_where_refinement_begins(scene):
 
 def test_processor_time_is_for_the_cpu(monkeypatch, tmp_path, scene):
     monkeypatch.setattr(runner, "resolve_backend", lambda name: SimpleNamespace(device=torch.device("cuda")))
-    with pytest.raises(InputError, match="--clock processor is for the CPU"):
+    with pytest.raises(InputError, match="do not include the work of a GPU"):
         runner.Bench(scene, TrainConfig(max_steps=40), BenchFolder(tmp_path), [0], ["own"], clock="processor")
