@@ -1,4 +1,4 @@
-"""SkipGate: the one object a user meets."""
+"""SkipGate: the class that users work with."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class SkipGate:
             that will run in this process.
         adapter: Name of the adapter, when the gate does not find the right one by itself.
         config: All settings in one object, instead of `config_fields`.
-        policy: Decides in place of `SkipPolicy`. Derive it from `skipgs_plug.core.policy.Policy`.
+        policy: The policy to use instead of `SkipPolicy`, of a subclass of `skipgs_plug.core.policy.Policy`.
         record_trace: Keep every decision in `trace`.
         **config_fields: Fields of `SkipConfig`.
 
@@ -113,7 +113,7 @@ class SkipGate:
             self._engine.configure(TrainerInfo(0 if policy is None else policy.start_iter))
         self._iteration = iteration = self._engine.iteration
         self._giving_up = self._engine.giving_up
-        # Around the gate's own code in a verb: an error there releases the gate, and the loop goes on.
+        # Wraps the gate's own code in a verb. An error there releases the gate, and the loop continues.
         self._guarded = self._giving_up.guarded(lambda: iteration.step)
 
     # Verbs for a loop of your own.
@@ -128,23 +128,24 @@ class SkipGate:
     ) -> LoopRange:
         """Return the iterations of your loop that run: `for step in gate.iterations(range(30_000))`.
 
-        It also suits a loop of yours around a trainer that the gate is attached to.
+        It also works for your own loop around a trainer that the gate is attached to.
 
-        Some iterations always run: the last one, and those for which a condition of your loop on the number holds
-        (`if step % 1000 == 0`). The conditions are read from the source of the loop. A scheduler that advances with
-        each call must be advanced by number instead.
+        Some iterations always run: the last one, and every iteration whose number fulfils a condition of your loop,
+        such as `if step % 1000 == 0`. The gate reads the conditions from the source of the loop. If a scheduler
+        advances by one with each call, set it to the number of the iteration instead.
 
         Args:
-            numbers: All iterations of the run, or all that are left, one by one.
-            always: Iterations that always run, instead of those read from the loop. Iterations that an adapter names
-                are added.
+            numbers: All iterations of the run, or all remaining ones, as a range with step 1.
+            always: Iterations that always run. They replace the iterations that the conditions of the loop name, and
+                the iterations that an adapter names are added.
             views: Keys of all training views. `share="auto"` and `refine_share="auto"` need them.
             events: Iterations in which your loop densifies, such as `range(600, 15_000, 100)`. `share` leaves out
                 some of them.
 
         Raises:
-            SkipGSError: The numbers do not increase by one. Before training has begun also: they go on after those of
-                an earlier plan, or a condition of the loop cannot be evaluated ahead; later the gate is released.
+            SkipGSError: `numbers` is not a range with step 1. Before training has begun, the gate also raises it if
+                `numbers` goes beyond an earlier call, or if a condition of the loop cannot be evaluated in advance.
+                During training, these two problems release the gate.
 
         Examples:
             Four of ten iterations run after densification, which ends here at iteration 10. The last one always runs.
@@ -171,19 +172,20 @@ class SkipGate:
         """Run `loss.backward()`, or skip it; return True when gradients were computed.
 
         Args:
-            loss: Scalar loss of this view. Or a list of per-view losses, with a list of keys as `view`: each view is
-                decided by itself, and one backward pass runs on the sum of the losses that are kept.
+            loss: Scalar loss of this view, or a list of per-view losses with a list of keys as `view`. For a list,
+                the gate decides on each view separately, and one backward pass runs on the sum of the kept losses.
             view: Stable key of the view: image name or index. For a joint loss of a batch, one constant key.
             step: Iteration, counted like `start_iter`.
             signal: Value (or list of values) to decide by, when it is not the loss itself: the image term, or
                 the loss before an AMP scaler.
 
         Raises:
-            GateOrderError: The view was decided already in this iteration, `update` has ended the iteration, or the
-                iteration number decreases.
-            SkipGSError: The loss is not a tensor, or losses stay non-finite. In the first iteration also: the key is
-                not usable, or a share is given and the loop does not run over `iterations`. Later such an error, like
-                any other of the gate itself, releases the gate with a warning; see `released`.
+            GateOrderError: `backward` was already called for this view in this iteration, `update` or `step` was
+                called before it, or the iteration number decreases.
+            SkipGSError: The loss is not a tensor, or losses stay non-finite. The first iteration also raises it if the
+                key is not usable, or if a share is given and the loop does not run over `iterations`. In later
+                iterations, such an error releases the gate with a warning, like any other error of the gate itself;
+                see `released`.
 
         Examples:
             A batch of two views in one iteration:
@@ -206,7 +208,7 @@ class SkipGate:
                 return self._gated_backward(loss, view, step, loss if signal is None else signal, run)
             except Exception as error:
                 if run.failed:
-                    raise  # of the loop's own backward
+                    raise  # the error comes from the loop's own backward pass
                 self._giving_up.on_error(error, step)
         now.begin(step, gated=False)
         now.ran = True
@@ -217,8 +219,9 @@ class SkipGate:
     def step(self, optimizer: Any, *args: Any) -> bool:
         """Call `optimizer.step(*args)` if a gradient is pending; return True when it stepped.
 
-        A pending gradient was computed in this iteration, or in an earlier one where gradients are accumulated, and
-        has not been used. Zero the gradients only when True is returned, with `set_to_none=True`.
+        A gradient is pending if no step has used it yet. It was computed in this iteration or, in a loop that
+        accumulates gradients, in an earlier one. Zero the gradients only when True is returned, with
+        `set_to_none=True`.
 
         Args:
             optimizer: One optimizer, or a list or dict of all that step together.
@@ -235,7 +238,7 @@ class SkipGate:
                 if id(one) in stepped:
                     raise GateOrderError("step() was called twice for one optimizer in this iteration.")
             stepped.update(map(id, optimizers))
-            if self._engine.config.enabled:  # without a gate all of them step
+            if self._engine.config.enabled:  # a disabled gate lets every optimizer step
                 with self._guarded:
                     stepping = [one for one in optimizers if has_pending_gradient(one)]
         for one in stepping:
@@ -245,8 +248,8 @@ class SkipGate:
     def update(self) -> None:
         """End the iteration and free the graph of a skipped backward pass.
 
-        This is optional: a new step number ends the iteration too. But in most loops the next forward pass has run
-        by then, and two graphs are in memory.
+        This call is optional: a new step number ends the iteration too. In most loops, however, the next forward pass
+        has run by then, so that two graphs are in memory at once.
 
         Raises:
             GateOrderError: `backward` was not called first in this iteration.
@@ -257,11 +260,11 @@ class SkipGate:
             self._engine.free_skipped()
 
     def notify_event(self, kind: str, step: int | None = None) -> None:
-        """Report a structural change: real backward passes follow for a while, and the means do not change.
+        """Report a structural change. The gate then skips no backward pass for a while and keeps the means as they are.
 
         Args:
             kind: Name of the change for the report, such as "prune" or "opacity reset".
-            step: Iteration of the change; default: the present one.
+            step: Iteration of the change; None for the current one.
 
         Raises:
             GateOrderError: No iteration has run yet and `step` is not given.
@@ -276,12 +279,12 @@ class SkipGate:
 
     @property
     def released(self) -> str | None:
-        """Why the gate let go of a run that then trained on without it; None where it did not."""
+        """Why the gate released a run, which then trained on without it; None if it did not."""
         return self._giving_up.reason
 
     @property
     def skipped(self) -> bool:
-        """Whether the backward pass of the present iteration was skipped."""
+        """Whether the backward pass of the current iteration was skipped."""
         return self._iteration.skipped
 
     @property
@@ -326,7 +329,7 @@ class SkipGate:
         return [*own, *self._adapter.replaced] if own and self._adapter is not None else own
 
     def stats(self) -> dict[str, Any]:
-        """Counters and times in seconds, with their names in skipgs.json; see `skipgs_plug.core.report`."""
+        """Counters, and times in seconds, under their names in skipgs.json; see `skipgs_plug.core.report`."""
         own = None if self.adapter is None else self.adapter.timing()
         times = self._engine.clock.times if own is None else own
         return counters(self._engine.stats, self._floor, times, self._engine.pace.report())
@@ -341,7 +344,7 @@ class SkipGate:
         return self._engine.stats.view_table(self._engine.mean)
 
     def scalars(self) -> dict[str, float]:
-        """Return numbers for a logger, with keys "skipgs/..."; call it in any iteration."""
+        """Return numbers for a logger, under keys "skipgs/..."; it may be called in any iteration."""
         scalars = self._engine.stats.scalars()
         scalars["skipgs/skipped"] = float(self.skipped)
         scalars["skipgs/floor"] = self._floor or 0.0
@@ -356,7 +359,7 @@ class SkipGate:
     def state_dict(self) -> dict[str, Any]:
         """Return the state from which `load_state_dict` continues exactly: plain values with string keys.
 
-        Save it after an iteration, beside the trainer's own checkpoint.
+        Save it at the end of an iteration, beside the trainer's own checkpoint.
 
         Returns:
             `version` (2), `policy` (see `SkipPolicy.state_dict`), `stats` (counts, per-view rows),
@@ -368,8 +371,8 @@ class SkipGate:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict()`, or from a state of the authors' controller (version 1).
 
-        A state of another scene with the same view names is noticed later: when the first ten losses are all far
-        from the means of their views, the tenth releases the gate.
+        A state of another scene with the same view names is noticed later: if the first ten losses are all far from
+        the means of their views, the gate is released at the tenth.
 
         Raises:
             SkipGSError: The state is damaged, has another version, or belongs to another scene.
@@ -390,7 +393,7 @@ class SkipGate:
             self._hooks.verify()
 
     def detach(self) -> None:
-        """Put back everything that was replaced. Counts and summary stay readable."""
+        """Restore everything that was replaced. Counters and summary stay readable."""
         if self._hooks is not None:
             self._hooks.restore()
         self._engine.release()
@@ -427,15 +430,15 @@ class SkipGate:
                 raise SkipGSError(f"backward() needs the loss itself, a tensor, not {type(one).__name__}.")
 
     def _gated_backward(self, loss: Any, view: Any, step: int, signal: Any, run: Original) -> bool:
-        """`backward`, as long as the gate holds on; `run` is the loop's own backward."""
+        """Do the work of `backward` while the gate is not released; `run` is the loop's own backward pass."""
         engine, now = self._engine, self._iteration
         if step != now.step:
             engine.open_iteration(step)
         elif now.ended or now.stepped:
             verb = "update" if now.ended else "step"
             raise GateOrderError(
-                f"backward() was called after {verb}() in iteration {step}; all backwards of an iteration "
-                "come first, and each iteration has its own step number."
+                f"backward() was called after {verb}() in iteration {step}; call backward() for all views of an "
+                "iteration first, and give each iteration its own step number."
             )
         if isinstance(view, list):
             return self._backward_batch(loss, view, signal, run)
@@ -455,7 +458,7 @@ class SkipGate:
         return bool(kept)
 
     def _new_in_iteration(self, view: Any) -> str:
-        """Return the key of a view that has no backward in this iteration yet.
+        """Return the key of a view that has had no backward pass in this iteration.
 
         Before `start_iter` an index on a device is not read: reading it would wait for the device.
         """
@@ -476,7 +479,7 @@ class SkipGate:
         if self._adapter is not None:
             raise GateOrderError(
                 f"{verb}() is for loops of your own; this gate is attached by adapter {self._adapter.name!r}, "
-                "and the trainer calls its own."
+                f"so leave out the call of {verb}()."
             )
 
     def _require_backward_before(self, verb: str) -> None:

@@ -13,11 +13,11 @@ ON_NONFINITE = ("skip", "raise", "pass")
 
 @dataclasses.dataclass(frozen=True)
 class SkipConfig:
-    """Settings of a gate. The first six have the names and defaults of the authors' controller.
+    """Settings of a gate. The first six fields have the names and defaults of the authors' controller.
 
     Args:
-        start_iter: First iteration that may be skipped, counted like the trainer does: the end of densification.
-            None if the adapter knows it.
+        start_iter: First iteration that may be skipped, usually the end of densification. It is counted as the
+            trainer counts. None takes the value of the adapter.
         threshold: Skip when loss <= mean * (1 + threshold). A larger value skips more.
         ema_decay: Decay of each view's running mean of its loss, per visit.
         warmup: Iterations after `start_iter` without skips. They seed the means and set the floor.
@@ -26,22 +26,21 @@ class SkipConfig:
         enabled: False leaves training bit-identical to training without a gate.
         on_nonfinite: How to treat a NaN or infinite loss: "skip" its backward pass, "raise" an error, or "pass" it
             on. It never enters a mean.
-        pause_iters: Real backward passes after a structural change. None is max(number of views, 500).
+        pause_iters: Number of backward passes that run after a structural change. None is max(number of views, 500).
         share: Share of all iterations that runs, densification included, or "auto" for as many as the scene needs. It
-            sets `grow_share` and `refine_share` where they are None.
+            is the value of `grow_share` and `refine_share` where they are None.
         grow_share: Share of the iterations until densification ends that runs, or "auto". Densification events with
             too few iterations before them are left out.
         refine_share: Share of the iterations from `start_iter` on that runs, or "auto". None for the paper's gate,
             unless `share` is given.
         max_gaussians: With `share` or `grow_share`: densification stops before an event could exceed this number
             of Gaussians. None for no bound.
-        always: With a share: iterations that always run, instead of those that the conditions of the loop name. None
-            to read the conditions.
-        tolerance: Decibels. "auto" ends refinement when the rest would gain less.
-        compensate: Make up for iterations that are left out with larger, shrinking steps. None is True with a share
+        always: With a share: iterations that always run. None reads them from the conditions of the loop.
+        tolerance: With "auto": refinement ends when the remaining iterations would gain less than this, in decibels.
+        compensate: Take larger, shrinking steps to make up for iterations that are left out. None is True with a share
             and False with the paper's gate.
-        rate_peak: Factor on learning rates when refinement begins; it falls linearly to 0. Higher SH bands, positions
-            and scales take a multiple of it, the constant band half, opacities at most 1. None is
+        rate_peak: Factor on learning rates when refinement begins. It falls linearly to 0. Higher SH bands, positions
+            and scales take a multiple of it, the constant SH band takes half of it, and opacities at most 1. None is
             2 / max(refine_share, 0.25) * sqrt(3 * visible), where `visible` is the measured share of the Gaussians that
             a view shows.
 
@@ -99,7 +98,7 @@ class SkipConfig:
             if self.growing is None and self.enabled:
                 raise SkipGSError("max_gaussians needs share or grow_share; give one of them too.")
         if self.always is not None:
-            # A frozen dataclass takes any collection of whole numbers, and holds a tuple.
+            # Accept any collection of whole numbers and store a tuple. The class is frozen, hence object.__setattr__.
             object.__setattr__(self, "always", tuple(sorted(int(number) for number in self.always)))
         if not (_is_number(self.tolerance) and self.tolerance >= 0.0):
             raise SkipGSError(f"tolerance must be a number of decibels >= 0, not {self.tolerance!r}.")

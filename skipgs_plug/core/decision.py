@@ -10,10 +10,12 @@ class Decision(NamedTuple):
 
     Attributes:
         skip: True if the backward pass is skipped.
-        reason: Why: "warm-up", "new view", "deviation" (loss against the view's mean), "budget" (the floor forbids a
-            skip), "pause", "non-finite", "inactive", "forced" (the adapter forbids a skip in this iteration),
-            "other rank" (another process needs the backward pass), "full" (with a share, an iteration that is not
-            left out runs whole), "watched" (the view is not trained on for a while) or "over" (refinement has ended).
+        reason: One of "warm-up", "new view", "deviation" (the loss was compared with the view's mean), "budget" (the
+            floor forbids a skip), "pause" (after a structural change), "non-finite" (the loss is NaN or infinite),
+            "inactive" (the gate is off, or has not started), "forced" (the adapter forbids a skip in this iteration),
+            "other rank" (another process needs the backward pass), "full" (with a share: the iteration is not left
+            out, so it runs whole), "watched" (the view is temporarily not trained on) and "over" (refinement has
+            ended).
 
     Examples:
         >>> from skipgs_plug import Decision
@@ -25,7 +27,7 @@ class Decision(NamedTuple):
     reason: str
 
 
-# One object per answer: a decision costs no allocation.
+# Shared instances, so that a decision allocates no memory.
 INACTIVE = Decision(False, "inactive")
 WARM_UP = Decision(False, "warm-up")
 NEW_VIEW = Decision(False, "new view")

@@ -1,4 +1,4 @@
-"""Optimizer steps of a gated loop: only with a pending gradient."""
+"""Helpers for the optimizer steps of a gated loop."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import torch
 
 
 def has_pending_gradient(optimizer: torch.optim.Optimizer) -> bool:
-    """Whether some parameter of the optimizer has a gradient that no step has used yet."""
+    """Whether a parameter of the optimizer has a gradient."""
     return any(p.grad is not None for group in optimizer.param_groups for p in group["params"])
 
 
 def listed(optimizer: Any) -> list[torch.optim.Optimizer]:
-    """Return one optimizer, a collection or a dict of them as a list."""
+    """Return the optimizers as a list, given one optimizer or a list, tuple or mapping of optimizers."""
     if isinstance(optimizer, Mapping):
         return list(optimizer.values())
     if isinstance(optimizer, (list, tuple)):

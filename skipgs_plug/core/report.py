@@ -13,6 +13,7 @@ from skipgs_plug.core.stats import GateStats
 from skipgs_plug.files import write_aside
 
 SCHEMA_VERSION = 1
+# The entries of skipgs.json about whole iterations, for a gate that leaves out none.
 NO_REFINEMENT: dict[str, Any] = {
     "refine_share": None,
     "gaussians_shown": None,
@@ -36,15 +37,15 @@ def counters(
     """Return counters and times.
 
     Returns:
-        `iterations` (training backwards seen, run or skipped); `gated_iterations` (those from start_iter on,
-        `backwards_run` + `backwards_skipped`); `min_bwd_ratio_effective` (floor in force, None for a policy
-        without); `paused`, `non_finite` (gated iterations with that reason); `reasons` (all of them);
-        `events` (structural changes by kind); `t_total`, `t_post` (seconds of training, and of its part from
-        start_iter on), `t_total_processor`, `t_post_processor` (the same in processor seconds, see `Times`);
-        `refine_share` (share of the iterations from start_iter on that run or may run, None when none is left out),
-        `gaussians_shown` (share of the Gaussians that a view shows, None where it is not known),
-        `iterations_run`, `iterations_skipped`, `ran_for`, `always_run`, `early_stopping` (see
-        `Refining.report`), `growing` (see `Growing.report`; None if that phase runs whole).
+        `iterations` (training backward passes seen, run or skipped); `gated_iterations` (backward passes seen from
+        start_iter on, which is `backwards_run` + `backwards_skipped`); `min_bwd_ratio_effective` (floor in force; None
+        if the policy has no floor); `paused`, `non_finite` (gated iterations with that reason); `reasons` (gated
+        iterations by reason); `events` (structural changes by kind); `t_total`, `t_post` (seconds of all iterations,
+        and of the iterations from start_iter on), `t_total_processor`, `t_post_processor` (the same in processor
+        seconds, see `Times`); `refine_share` (share of the iterations from start_iter on that run or may run; None if
+        no iteration is left out), `gaussians_shown` (share of the Gaussians that a view shows; None if unknown),
+        `iterations_run`, `iterations_skipped`, `ran_for`, `always_run`, `early_stopping` (see `Refining.report`),
+        `growing` (see `Growing.report`; None if all iterations before the end of densification run).
     """
     return {
         "iterations": stats.iterations,
@@ -94,21 +95,22 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
     ]
     if counted["gaussians_shown"] is not None:
         lines.append(
-            f"  each view shows {100 * counted['gaussians_shown']:.0f} % of the Gaussians, which decides how long "
-            "steps are"
+            f"  each view shows {100 * counted['gaussians_shown']:.0f} % of the Gaussians; this share sets the "
+            "length of the steps"
         )
     wanted, ran_for = counted["refine_share"], counted["ran_for"]
     if run > wanted * (run + skipped) + 1:
         lines.append(
-            f"  more than the share of {wanted:.2f}: {ran_for['share']:,} for the share, {ran_for['conditions']:,} by "
-            f"conditions of the loop, {ran_for['changes']:,} after prunes and resets at the end of refinement "
+            f"  this is more than the share of {wanted:.2f}: {ran_for['share']:,} ran for the share, "
+            f"{ran_for['conditions']:,} for conditions of the loop, "
+            f"{ran_for['changes']:,} after prunes and resets at the end of refinement "
             f"({sum(counted['events'].values()):,} changes in all)"
         )
     stopping = counted["early_stopping"]
     if stopping is not None and not stopping["watched"]:
         lines.append(
-            f"  no view is watched, so the whole share runs: a twelfth of the views must be {LEAST_WATCHED} or more, "
-            f"the first {CYCLE_ENDS[0]:.1%} of what runs must show each view, and one process must train"
+            f"  no view is watched, so the whole share runs: watching needs {LEAST_WATCHED} views in a twelfth of all "
+            f"views, each view in the first {CYCLE_ENDS[0]:.1%} of the iterations that run, and training in one process"
         )
     elif stopping is not None:
         worth = stopping["rest_worth_db"]
@@ -135,14 +137,14 @@ def _summarise_growing(growing: dict[str, Any]) -> str:
 
 
 def write_report(gate: Reporting, path: str | Path, **more: Any) -> None:
-    """Write `gate.report()` as JSON, with entries of the trainer (`more`)."""
+    """Write `gate.report()` as JSON, plus the trainer's own entries (`more`)."""
     text = json.dumps(_finite({**gate.report(), **more}), indent=2, allow_nan=False) + "\n"
     with write_aside(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def _finite(value: Any) -> Any:
-    """JSON knows no NaN: a loss that is not finite is written as null."""
+    """Replace non-finite numbers by None, because JSON has no NaN and no infinity."""
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list):

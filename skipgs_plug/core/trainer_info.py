@@ -15,11 +15,12 @@ class Densification:
     Args:
         marks: Names that identify the condition of densification among the loop's conditions on its number, such as
             `densification_interval`.
-        numbers: Returns the iterations with an event out of a range, if a strategy object decides by itself.
-        needs: Requirement for an event to be kept. "visits": enough visits of each Gaussian before it for a mean over
-            them, or as many iterations as in the trainer's own schedule; other events are left out. "iterations": as
-            many iterations as in the trainer's own schedule, for thresholds on counts of visits. "nothing": every
-            event is kept, for growth by a budget or by a constant share per event.
+        numbers: For a strategy object that decides by itself: returns the iterations of a range that have an event.
+        needs: Requirement for an event to be kept; events that do not meet it are left out. "visits": since the last
+            event, each Gaussian had enough visits for a mean over them, or as many iterations ran as in the trainer's
+            own schedule. "iterations": as many iterations ran as in the trainer's own schedule; this suits thresholds
+            on counts of visits. "nothing": every event is kept; this suits growth by a budget or by a constant share
+            per event.
     """
 
     marks: tuple[str, ...] = ()
@@ -29,22 +30,23 @@ class Densification:
 
 @dataclass(frozen=True)
 class TrainerInfo:
-    """Facts that an adapter passes to `Hooks.ready`. All but the first may stay unknown.
+    """Facts that an adapter passes to `Hooks.ready`. Every field but the first is optional.
 
     Args:
-        start_iter: First iteration after densification, counted like the trainer does; None if it does not densify.
-            It is used if the settings do not give one.
+        start_iter: First iteration after densification, counted as the trainer counts; None if the trainer does not
+            densify. It is used if the settings have no `start_iter`.
         view_names: Keys of all training views, checked for uniqueness.
-        epoch: Number of iterations in which every view comes up once; None if an iteration shows one of `view_names`.
+        epoch: Number of iterations in which every view comes up once. None if each iteration shows one of
+            `view_names`, so that an epoch has as many iterations as views.
         max_steps: Last iteration. A gate that starts after it gives a warning.
         world_size: Number of processes, if the trainer knows better than WORLD_SIZE.
-        gradients_read_until: Until this iteration, code other than the optimizers reads gradients, such as
-            densification. A gate that the user starts earlier is refused.
+        gradients_read_until: Until this iteration, code other than the optimizers, such as densification, reads
+            gradients. A gate that the user starts earlier is refused.
         accumulates: Optimizers step on gradients that are accumulated over a fixed number of iterations. The number
             of steps does not change when iterations are left out, so steps are not made larger.
-        densification: The densification events, for a growing phase with fewer iterations; None if that phase must
-            run whole.
-        defaults: Settings that suit this trainer. They are used where the user gave none.
+        densification: How to find the densification events, so that fewer iterations can run before densification
+            ends; None if all of them must run.
+        defaults: Settings that suit this trainer. They are used where the user gave no value.
     """
 
     start_iter: int | None
