@@ -1,9 +1,9 @@
-r"""2D Gaussian Splatting, its own training script, unedited and gated.
+r"""Run the training script of 2D Gaussian Splatting, unedited and with a gate. It needs CUDA.
 
     python examples/train_2dgs.py --repo path/to/2d-gaussian-splatting -- \
         -s data/garden --eval
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

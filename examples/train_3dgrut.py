@@ -1,9 +1,9 @@
-r"""3DGRUT, its own training script, unedited and gated; needs CUDA.
+r"""Run the training script of 3DGRUT, unedited and with a gate. It needs CUDA.
 
     python examples/train_3dgrut.py --repo path/to/3dgrut -- \
         --config-name apps/colmap_3dgut.yaml path=data/garden out_dir=runs
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

@@ -1,9 +1,9 @@
-r"""DashGaussian, its own training script, unedited and gated.
+r"""Run the training script of DashGaussian, unedited and with a gate.
 
     python examples/train_dash_gaussian.py --repo path/to/DashGaussian -- \
         -s data/garden --eval --disable_viewer
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

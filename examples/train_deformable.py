@@ -1,9 +1,9 @@
-r"""Deformable 3D Gaussians, its own training script, unedited and gated.
+r"""Run the training script of Deformable 3D Gaussians, unedited and with a gate. It needs CUDA.
 
     python examples/train_deformable.py --repo path/to/Deformable-3D-Gaussians -- \
         -s data/hook --is_blender
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

@@ -1,9 +1,9 @@
-r"""EDGS, its own training script, unedited and gated; needs CUDA.
+r"""Run the training script of EDGS, unedited and with a gate. It needs CUDA.
 
     python examples/train_edgs.py --repo path/to/EDGS -- \
         train.gs_epochs=30000 gs.dataset.source_path=data/garden gs.dataset.model_path=output
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

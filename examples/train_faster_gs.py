@@ -1,9 +1,9 @@
-r"""Faster-GS in NeRFICG, its own training script, unedited and gated; needs CUDA.
+r"""Run the training script of Faster-GS in NeRFICG, unedited and with a gate. It needs CUDA.
 
     python examples/train_faster_gs.py --repo path/to/nerficg -- \
         -c configs/garden.yaml
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

@@ -1,9 +1,9 @@
-r"""FastGS, its own training script, unedited and gated.
+r"""Run the training script of FastGS, unedited and with a gate.
 
     python examples/train_fastgs.py --repo path/to/FastGS -- \
         -s data/garden -i images_4 --eval --densification_interval 500
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

@@ -1,9 +1,9 @@
-r"""fVDB Reality Capture, its own training script, unedited and gated; needs CUDA.
+r"""Run the training script of fVDB Reality Capture, unedited and with a gate. It needs CUDA.
 
     python examples/train_fvdb.py --repo path/to/fvdb-reality-capture -- \
         --dataset-path data/garden
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

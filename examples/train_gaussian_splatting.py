@@ -1,8 +1,8 @@
-"""The pip package gaussian-splatting, its own command, unedited and gated.
+"""Run the training command of the pip package gaussian-splatting, unedited and with a gate.
 
     python examples/train_gaussian_splatting.py -- -s data/garden -d output/garden -i 30000 --mode densify
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the command after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the command after it.
 """
 
 import sys

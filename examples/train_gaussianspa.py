@@ -1,9 +1,9 @@
-r"""GaussianSpa, its own training script, unedited and gated.
+r"""Run the training script of GaussianSpa, unedited and with a gate.
 
     python examples/train_gaussianspa.py --repo path/to/GaussianSpa -- \
         -s data/garden --eval --prune_ratio2 0.7 --imp_metric outdoor --iterations 40000
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 `--script` chooses among its three scripts; the default is train_imp_score.py.
 """
 

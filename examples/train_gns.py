@@ -1,10 +1,10 @@
-r"""GNS, its own training script, unedited and gated.
+r"""Run the training script of GNS, unedited and with a gate.
 
     python examples/train_gns.py --repo path/to/GNS -- \
         -s data/garden --eval
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
-`--script` chooses between train.py and train-fast.py; the default is the first.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
+`--script` chooses between train.py and train-fast.py; the default is train.py.
 """
 
 import sys

@@ -1,9 +1,9 @@
-r"""Gaussian Opacity Fields, its own training script, unedited and gated.
+r"""Run the training script of Gaussian Opacity Fields, unedited and with a gate. It needs CUDA.
 
     python examples/train_gof.py --repo path/to/gaussian-opacity-fields -- \
         -s data/garden --eval
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

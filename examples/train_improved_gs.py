@@ -1,9 +1,9 @@
-r"""Improved-GS, its own training script, unedited and gated.
+r"""Run the training script of Improved-GS, unedited and with a gate.
 
     python examples/train_improved_gs.py --repo path/to/Improved-GS -- \
         -s data/garden --eval --budget 2000000
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

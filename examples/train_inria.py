@@ -1,9 +1,9 @@
-r"""Inria's 3D Gaussian Splatting (classic or current), its own training script, unedited and gated.
+r"""Run the training script of Inria's 3D Gaussian Splatting (classic or current), unedited and with a gate.
 
     python examples/train_inria.py --repo path/to/gaussian-splatting -- \
         -s data/garden --eval --disable_viewer
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

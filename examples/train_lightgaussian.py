@@ -1,9 +1,9 @@
-r"""LightGaussian, its own training script, unedited and gated.
+r"""Run the training script of LightGaussian, unedited and with a gate.
 
     python examples/train_lightgaussian.py --repo path/to/LightGaussian -- \
         -s data/garden --eval --start_checkpoint chkpnt30000.pth --iterations 35000
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 `--script` chooses among its three scripts; the default is prune_finetune.py.
 """
 

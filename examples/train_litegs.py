@@ -1,9 +1,9 @@
-r"""LiteGS, its own training script, unedited and gated; needs CUDA.
+r"""Run the training script of LiteGS, unedited and with a gate. It needs CUDA.
 
     python examples/train_litegs.py --repo path/to/LiteGS -- \
         -s data/garden -i images_4 -m output
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

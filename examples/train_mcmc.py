@@ -1,9 +1,9 @@
-r"""3DGS-MCMC, its own training script, unedited and gated.
+r"""Run the training script of 3DGS-MCMC, unedited and with a gate.
 
     python examples/train_mcmc.py --repo path/to/3dgs-mcmc -- \
         -s data/garden --cap_max 1000000
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

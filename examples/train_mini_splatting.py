@@ -1,10 +1,10 @@
-r"""Mini-Splatting, its own training script, unedited and gated.
+r"""Run the training script of Mini-Splatting, unedited and with a gate.
 
     python examples/train_mini_splatting.py --repo path/to/mini-splatting -- \
         -s data/garden --eval --imp_metric outdoor
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
-`--script` chooses between ms/train.py and ms_d/train.py; the default is the first.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
+`--script` chooses between ms/train.py and ms_d/train.py; the default is ms/train.py.
 """
 
 import sys

@@ -1,10 +1,10 @@
-r"""Mini-Splatting2, its own training script, unedited and gated.
+r"""Run the training script of Mini-Splatting2, unedited and with a gate. It needs CUDA.
 
     python examples/train_mini_splatting2.py --repo path/to/mini-splatting2 -- \
         -s data/garden --eval --imp_metric outdoor
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
-`--script` chooses between msv2/train.py and msv2_d/train.py; the default is the first.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
+`--script` chooses between msv2/train.py and msv2_d/train.py; the default is msv2/train.py.
 """
 
 import sys

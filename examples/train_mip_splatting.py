@@ -1,9 +1,9 @@
-r"""Mip-Splatting, its own training script, unedited and gated.
+r"""Run the training script of Mip-Splatting, unedited and with a gate.
 
     python examples/train_mip_splatting.py --repo path/to/mip-splatting -- \
         -s data/garden --eval
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

@@ -1,8 +1,8 @@
-"""nerfstudio's splatfacto, its own command, unedited and gated.
+"""Run the training command of nerfstudio's splatfacto, unedited and with a gate.
 
     python examples/train_nerfstudio.py -- splatfacto --data data/garden
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the command after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the command after it.
 """
 
 import sys

@@ -1,9 +1,9 @@
-r"""Octree-GS, its own training script, unedited and gated.
+r"""Run the training script of Octree-GS, unedited and with a gate.
 
     python examples/train_octree_gs.py --repo path/to/Octree-GS -- \
         -s data/garden --eval
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

@@ -1,9 +1,9 @@
-r"""PGSR, its own training script, unedited and gated.
+r"""Run the training script of PGSR, unedited and with a gate. It needs CUDA.
 
     python examples/train_pgsr.py --repo path/to/PGSR -- \
         -s data/garden --eval
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

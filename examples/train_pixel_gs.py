@@ -1,9 +1,9 @@
-r"""Pixel-GS, its own training script, unedited and gated.
+r"""Run the training script of Pixel-GS, unedited and with a gate.
 
     python examples/train_pixel_gs.py --repo path/to/Pixel-GS -- \
         -s data/garden --eval
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

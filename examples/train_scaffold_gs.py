@@ -1,9 +1,9 @@
-r"""Scaffold-GS, its own training script, unedited and gated.
+r"""Run the training script of Scaffold-GS, unedited and with a gate.
 
     python examples/train_scaffold_gs.py --repo path/to/Scaffold-GS -- \
         -s data/garden --eval -m output/garden
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

@@ -1,9 +1,9 @@
-r"""Taming 3DGS, its own training script, unedited and gated.
+r"""Run the training script of Taming 3DGS, unedited and with a gate.
 
     python examples/train_taming.py --repo path/to/taming-3dgs -- \
         -s data/garden -i images_4 --eval --budget 15 --mode multiplier --densification_interval 500
 
-Options of the gate (`skipgs-plug run --help`) stand before `--`, options of the script after it.
+Put options of the gate (see `skipgs-plug run --help`) before `--`, and options of the script after it.
 """
 
 import sys

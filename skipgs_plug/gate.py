@@ -54,7 +54,7 @@ class SkipGate:
             that will run in this process.
         adapter: Name of the adapter, when the gate does not find the right one by itself.
         config: All settings in one object, instead of `config_fields`.
-        policy: The policy to use instead of `SkipPolicy`, of a subclass of `skipgs_plug.core.policy.Policy`.
+        policy: An instance of a subclass of `skipgs_plug.core.policy.Policy`, used instead of `SkipPolicy`.
         record_trace: Keep every decision in `trace`.
         **config_fields: Fields of `SkipConfig`.
 

@@ -57,6 +57,20 @@ def test_notes_and_inner_pages_are_listed_and_out_of_the_reading_path() -> None:
     assert links == ["../benchmarks/notes/README.md"]
 
 
+def test_table_of_contents_of_the_notes_names_every_section() -> None:
+    folder = ROOT / "benchmarks/notes"
+    # One block a page: a heading with the page's link, then one item for each section, in the page's order.
+    blocks = re.split(r"^## ", (folder / "README.md").read_text(), flags=re.MULTILINE)[1:]
+    listed = {}
+    for block in blocks:
+        page = re.match(r"\[[^]]*\]\(([^)]+)\)", block)
+        assert page, block
+        listed[page[1]] = re.findall(r"^- \[(.*)\]\(", block, re.MULTILINE)
+    pages = sorted(page for page in folder.glob("*.md") if page.name != "README.md")
+    headings = {page.name: re.findall(r"^## (.*)$", page.read_text(), re.MULTILINE) for page in pages}
+    assert listed == headings
+
+
 @pytest.mark.parametrize(("mark", "command"), [("demo", "skipgs-plug demo"), ("tests", "pytest -n 2 --dist loadfile")])
 def test_marked_blocks_hold_one_command_line(mark: str, command: str) -> None:
     block = re.findall(rf"<!-- {mark} -->\n```sh\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)

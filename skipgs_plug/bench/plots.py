@@ -23,8 +23,8 @@ COLOURS = ("#000000", "#D55E00", "#E69F00", "#CC79A7", "#0072B2", "#56B4E9", "#0
 MARKERS = "so^vDPX"
 PHASES = {"forward": "#0072B2", "loss": "#56B4E9", "backward": "#D55E00", "optimizer": "#E69F00", "strategy": "#009E73"}
 NOT_VISITED, RUN, SKIPPED = 0, 1, 2
-EXAMPLES = 3  # views with a plot of their own, so that all fit on one page
-SMALL = 9  # font size of legends in points: small enough for eleven policies
+EXAMPLES = 3  # number of views with a plot of their own; three plots fit on one page
+SMALL = 9  # font size of legends in points, small enough for eleven policies
 
 
 def write_plots(
@@ -48,10 +48,13 @@ def write_plots(
 
 
 def style(policy: str, whole: bool = False) -> tuple[str, str]:
-    """Return colour and marker of a policy by its place in the table. An unknown policy gets the last place."""
+    """Return colour and marker of a policy by its place in the table.
+
+    An unknown policy gets a place that depends on its name only.
+    """
     known = list(known_policies(whole))
     index = known.index(policy) if policy in known else zlib.crc32(policy.encode()) % len(COLOURS) - len(COLOURS)
-    # Markers shift against colours by one per round, so that all pairs differ.
+    # Each round through the colours shifts the markers by one, so that all pairs differ.
     return COLOURS[index % len(COLOURS)], MARKERS[(index + index // len(COLOURS)) % len(MARKERS)]
 
 
@@ -61,7 +64,7 @@ def looks_at_losses(run: RunRecord) -> bool:
 
 
 def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row], whole: bool = False) -> Figure:
-    """Mean held-out PSNR over seeds against seconds, of the whole run or of refinement, one curve per policy."""
+    """Plot the mean held-out PSNR over seeds against seconds of the whole run or of refinement, a curve per policy."""
     figure, axes = new_figure(9.0, 4.6)
     for row in rows:
         runs = [r for r in records if r.policy == row.policy]
@@ -79,7 +82,10 @@ def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row], whole: boo
 
 
 def time_against_error(rows: Sequence[Row], whole: bool = False) -> Figure:
-    """Time of the whole run or of refinement against final PSNR: absolute, and against the own run of the same seed."""
+    """Plot final PSNR against time, absolute and relative to the own run of the same seed.
+
+    Time is that of the whole run, or that of refinement.
+    """
     name, label = ("t_total", "time of the whole run T_total") if whole else ("t_post", "refinement time T_post")
     paired = any("psnr_gain" in row.values for row in rows)
     figure, *axes = new_figure(9.6 if paired else 6.0, 4.4, columns=2 if paired else 1)
@@ -117,7 +123,7 @@ def bar(quantity: Quantity) -> float:
 
 
 def phases(rows: Sequence[Row], whole: bool = False) -> Figure:
-    """Seconds of the whole run or of refinement by phase, one bar per policy."""
+    """Plot the seconds of each phase of the whole run or of refinement, one bar per policy."""
     time = "t_total" if whole else "t_post"
     rows = [row for row in rows if row.seeds]
     figure, axes = new_figure(7.6, 0.9 + 0.45 * len(rows))
@@ -138,7 +144,7 @@ def phases(rows: Sequence[Row], whole: bool = False) -> Figure:
 
 
 def skipped_views(runs: Sequence[RunRecord], n_views: int) -> Figure:
-    """Views by time: which visits of a view were skipped, one panel per policy."""
+    """Plot for every view which visits were skipped over time, one panel per policy."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
@@ -180,7 +186,7 @@ def visit_map(trace: Trace, n_views: int) -> np.ndarray:
 
 
 def loss_and_mean(run: RunRecord, view_names: Sequence[str]) -> Figure:
-    """Loss of single views against their running mean: the most, a middling and the least skipped view."""
+    """Plot the loss of three views and its running mean: the most skipped view, one in the middle, and the least."""
     trace = run.trace
     assert trace is not None
     by_view: dict[int, list[int]] = {}

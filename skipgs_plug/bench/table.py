@@ -1,4 +1,4 @@
-"""The tables, and the sentences under them."""
+"""The tables of a bench, and the sentences under them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,15 @@ from skipgs_plug.trainer.metrics import METRICS, Metric
 
 @dataclass(frozen=True)
 class Column:
-    """A column: heading, name in `Row.values`, digits after the point, with a sign or not, text without a value."""
+    """A column of a table.
+
+    Attributes:
+        heading: Text above the column.
+        name: Key in `Row.values`.
+        digits: Number of digits after the decimal point.
+        signed: Whether positive values have a sign.
+        absent: Text of a cell without a value.
+    """
 
     heading: str
     name: str
@@ -26,7 +34,7 @@ class Column:
 
 
 def metric_columns(metric: Metric) -> tuple[Column, Column]:
-    """Return the held-out value and its difference to the own run."""
+    """Return the columns of a metric on held-out views, and of its difference from the own run."""
     gain = Column(f"vs own {metric.unit}".strip(), f"{metric.name}_gain", metric.digits, signed=True)
     return Column(metric.heading, metric.name, metric.digits), gain
 
@@ -45,7 +53,7 @@ REFINEMENT = (
 WHOLE = (
     Column("T_total s", "t_total", 1),
     Column("% of own", "t_total_share", 1),
-    Column("on the wall s", "t_total_wall", 1),
+    Column("wall-clock s", "t_total_wall", 1),
     Column("s to own PSNR", "time_to_own", 1, absent="not reached"),
     Column("T_post s", "t_post", 1),
     Column("iterations", "iterations_run", 0),
@@ -56,19 +64,21 @@ WHOLE = (
 )
 TRAINING = tuple(Column(metric.heading, f"train_{metric.name}", metric.digits) for metric in METRICS.values())
 SHARES = tuple(Column(phase, f"share_{phase}", 1) for phase in PHASES)
-CLOCKS = {"wall": "on the wall", "processor": "for which its threads were running"}
+CLOCKS = {"wall": "wall-clock seconds", "processor": "processor seconds, summed over threads,"}
 REFINEMENT_READING = (
-    "Mean ± sample standard deviation over seeds; saved % and vs own within each seed. T_post: seconds of refinement "
-    "{clock}, T_total: densification too; evaluation and compilation are in neither. S to own PSNR: of refinement "
-    "until the final held-out PSNR of the same seed's own run, interpolated between evaluations. Backwards % of the "
-    "iterations of the own run."
+    "Values are mean ± sample standard deviation over seeds. Saved % and vs own compare runs of the same seed. "
+    "T_post: {clock} of refinement. T_total: the same, with densification. Both exclude evaluation and "
+    "compilation. S to own PSNR: seconds of refinement until a run reaches the final held-out PSNR of the own run of "
+    "the same seed, interpolated between evaluations. Backwards %: backward passes in percent of the iterations of the "
+    "own run."
 )
 WHOLE_READING = (
-    "Mean ± sample standard deviation over seeds; % of own and vs own within each seed. T_total: seconds of the whole "
-    "run {clock}, T_post: of its refinement; evaluation and compilation are in neither. S to own PSNR: of the whole "
-    "run until the final held-out PSNR of the same seed's own run, interpolated between evaluations. More Gaussians "
-    "are a better picture at more memory: compare pictures at equal numbers. Peak GiB: most memory beyond what other "
-    "runs held, on the CPU that of the process."
+    "Values are mean ± sample standard deviation over seeds. % of own and vs own compare runs of the same seed. "
+    "T_total: {clock} of the whole run. T_post: {clock} of its refinement. Both exclude evaluation and "
+    "compilation. S to own PSNR: seconds of the whole run until it reaches the final held-out PSNR of the own run of "
+    "the same seed, interpolated between evaluations. More Gaussians make better images and need more memory: compare "
+    "image quality at equal numbers of Gaussians. Peak GiB: largest memory in use, on a GPU without the memory that "
+    "other runs held, on the CPU that of the whole process."
 )
 
 
@@ -84,7 +94,10 @@ def tables(rows: Sequence[Row], whole: bool = False) -> list[tuple[str, list[lis
 
 
 def cell(row: Row, column: Column) -> str:
-    """Return "mean ± spread" ("mean" with one seed), the number of seeds if some have no value, or the empty text."""
+    """Return the text of a cell: "mean ± spread", or "mean" with one seed, or `Column.absent` without a value.
+
+    If some seeds have no value, the number of seeds with a value follows.
+    """
     value = row.values.get(column.name)
     if value is None:
         return column.absent if row.seeds else "-"
@@ -95,9 +108,9 @@ def cell(row: Row, column: Column) -> str:
 
 
 def cells(rows: Sequence[Row], columns: Sequence[Column]) -> list[list[str]]:
-    """Return heading and rows as text: policy, number of seeds (marked when some are left out), values.
+    """Return heading and rows as text: policy, number of seeds (marked if some are left out), and values.
 
-    A column that no row has a value for is left out.
+    A column without any value is left out.
     """
     columns = [column for column in columns if any(column.name in row.values for row in rows)]
     lines = [["policy", "seeds", *(column.heading for column in columns)]]
@@ -137,19 +150,19 @@ def notes(rows: Sequence[Row], bench: dict[str, Any]) -> list[str]:
         if "wanted" in row.values:
             wanted, held_back = row.values["wanted"].mean, row.values["held_back"].mean
             sentences.append(
-                f"After warm-up the rule of {row.policy} asked for a backward in {wanted:.1f} % of the iterations; in "
-                f"{held_back:.1f} % its floor forbade a skip."
+                f"After warm-up, the rule of {row.policy} asked for a backward pass in {wanted:.1f} % of the "
+                f"iterations; in {held_back:.1f} % its floor forbade a skip."
             )
     if bench["timing_noise"] is not None:
         sentences.append(
-            "The forward pass is nearly the same work under every policy; within a seed its time per iteration "
-            f"differed by up to {bench['timing_noise']:.0f} %. Differences in time below that are noise of the machine."
+            "The forward pass does nearly the same work under every policy. Within a seed, its time per iteration "
+            f"differed by up to {bench['timing_noise']:.0f} %; smaller differences in time are noise of the machine."
         )
     for run in bench["runs"]:
         if run.get("exact_views"):
             sentences.append(
-                f"Seed {run['seed']} of {run['policy']} hits {run['exact_views']} held-out views exactly (background "
-                f"alone, say); their PSNR is infinite and counts as {MOST_DB:.0f} dB."
+                f"Seed {run['seed']} of {run['policy']} renders {run['exact_views']} held-out views without any error, "
+                f"for example views of background only. Their PSNR is infinite and counts as {MOST_DB:.0f} dB."
             )
         sentences += [searched(run)] if run.get("tries") else []
     shown = [metric for metric in METRICS.values() if any(metric.name in row.values for row in rows)]
@@ -176,7 +189,7 @@ def notes(rows: Sequence[Row], bench: dict[str, Any]) -> list[str]:
 
 
 def searched(run: dict[str, Any]) -> str:
-    """Return a sentence about the tries of a search."""
+    """Return a sentence that lists the tries of a search."""
     tries = "; ".join(", ".join(f"{name} {value:.6g}" for name, value in one.items()) for one in run["tries"])
     return f"Seed {run['seed']} of {run['policy']} was found by these tries: {tries}."
 
@@ -187,6 +200,6 @@ def is_whole(bench: dict[str, Any]) -> bool:
 
 
 def legend(rows: Sequence[Row], whole: bool = False) -> list[tuple[str, str]]:
-    """Return (policy, meaning) of every row, of whole runs or of refinements."""
+    """Return the policy of every row and its meaning, for whole runs or for refinements."""
     found = [(row.policy, find_policy(row.policy, whole)) for row in rows]
     return [(name, "a policy of another version" if spec is None else spec.meaning) for name, spec in found]

@@ -1,6 +1,7 @@
 """A small ray tracer in numpy: spheres, boxes and a floor, one light, hard shadows, one mirror bounce.
 
-Arrays hold one value per ray or point, [R], or one row per coordinate, [3, R]: numpy works on long rows.
+The z axis points up, and the floor is the plane z = 0. An array holds one value per ray or point, [R], or one row per
+coordinate, [3, R], because numpy is faster on long rows.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ from skipgs_plug.trainer.textures import TEXTURES
 
 Array = np.ndarray
 
-SKY = (0.62, 0.71, 0.80)
-LIGHT = np.array([0.45, -0.35, 0.82]) / np.linalg.norm([0.45, -0.35, 0.82])
-FLOOR_HALF = 2.6
+SKY = (0.62, 0.71, 0.80)  # RGB in [0, 1] of rays that hit nothing
+LIGHT = np.array([0.45, -0.35, 0.82]) / np.linalg.norm([0.45, -0.35, 0.82])  # unit vector towards the light
+FLOOR_HALF = 2.6  # half of the floor's side in scene units
+# Scene units that a ray must travel before it can hit. It keeps a ray from hitting the surface it starts on.
 EPS = 1e-4
-BATCH = 4096  # rays that are traced together: their arrays stay in the processor's caches
+BATCH = 4096  # number of rays that are traced at once, so that their arrays stay in the processor's caches
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ FLOOR, FIRST_BOX = len(SPHERES) + len(BOXES), len(SPHERES)
 
 
 def trace_view(viewmat: Array, K: Array, width: int, height: int) -> Array:
-    """Return the image [H, W, 3] in [0, 1], mean of 2x2 samples per pixel."""
+    """Return the image [H, W, 3] in [0, 1]. Each pixel is the mean of 2x2 samples."""
     x, y = np.meshgrid((np.arange(2 * width) + 0.5) / 2, (np.arange(2 * height) + 0.5) / 2)
     rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)]).reshape(3, -1)
     rays /= np.sqrt(dot(rays, rays))
@@ -61,7 +63,7 @@ def trace_view(viewmat: Array, K: Array, width: int, height: int) -> Array:
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the products [R] of vectors [3, R]; either may be one for all, [3, 1]."""
+    """Return the dot products [R] of vectors [3, R]. Either argument may be a single vector, [3, 1]."""
     product: Array = a[0] * b[0]
     product += a[1] * b[1]
     product += a[2] * b[2]
@@ -69,7 +71,7 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def column(vector: tuple[float, ...] | Array) -> Array:
-    """Return a vector or colour [3, 1], which goes with [3, R]."""
+    """Return a vector or colour as an array [3, 1], which broadcasts with [3, R]."""
     return np.asarray(vector, dtype=float)[:, None]
 
 
@@ -99,13 +101,16 @@ def shade(origins: Array, directions: Array, bounces: int) -> Array:
 
 
 def lit_albedo(points: Array, lifted: Array, item: Array, normal: Array) -> tuple[Array, Array]:
-    """Return the matte colour [3, R] under light and shadow, and the light's share [R]."""
+    """Return the matte colour [3, R] with light and shadow, and the share of the light [R] that arrives."""
     lit = dot(column(LIGHT), normal).clip(0) * ~occluded(lifted)
     return albedo(points, item) * (0.35 + 0.65 * lit), lit
 
 
 def intersect(origins: Array, directions: Array) -> tuple[Array, Array, Array]:
-    """Return distance [R], item [R] (-1 for none) and normal [3, R] of the nearest surface."""
+    """Return distance [R], item [R] and normal [3, R] of the nearest surface. The item is -1 where a ray hits nothing.
+
+    Items are numbered: first the spheres, then the boxes, then the floor.
+    """
     rays = directions.shape[1]
     nearest, item, normal = np.full(rays, np.inf), np.full(rays, -1), np.zeros((3, rays))
     for k, sphere in enumerate(SPHERES):
@@ -118,7 +123,7 @@ def intersect(origins: Array, directions: Array) -> tuple[Array, Array, Array]:
         t, near = box_distance(origins, directions, box)
         closer = np.flatnonzero(t < nearest)
         nearest[closer], item[closer] = t[closer], FIRST_BOX + k
-        axis = near[:, closer].argmax(axis=0)  # of the face that was hit
+        axis = near[:, closer].argmax(axis=0)  # axis of the normal of the face that was hit
         normal[:, closer] = 0.0
         normal[axis, closer] = -np.sign(directions[axis, closer])
     t = floor_distance(origins, directions)
@@ -128,7 +133,7 @@ def intersect(origins: Array, directions: Array) -> tuple[Array, Array, Array]:
 
 
 def occluded(origins: Array) -> Array:
-    """Return whether something stands between each point [3, R] and the light."""
+    """Return whether a sphere or a box stands between each point [3, R] and the light, as booleans [R]."""
     directions = column(LIGHT)
     blocked = np.zeros(origins.shape[1], dtype=bool)
     for sphere in SPHERES:
@@ -139,7 +144,10 @@ def occluded(origins: Array) -> Array:
 
 
 def sphere_distance(origins: Array, directions: Array, sphere: Sphere) -> Array:
-    """Return the distance [R] along rays [3, R], infinite where they miss; directions may be one for all, [3, 1]."""
+    """Return the distance [R] to a sphere along rays [3, R], infinite where they miss it.
+
+    `directions` may be a single direction, [3, 1].
+    """
     offset = origins - column(sphere.centre)
     b = dot(offset, directions)
     root = b * b - dot(offset, offset) + sphere.radius**2
@@ -148,7 +156,10 @@ def sphere_distance(origins: Array, directions: Array, sphere: Sphere) -> Array:
 
 
 def box_distance(origins: Array, directions: Array, box: Box) -> tuple[Array, Array]:
-    """Return the distance [R] as `sphere_distance`, and where rays enter the slab of each axis [3, R]."""
+    """Return the distance [R] to a box, and the distance [3, R] at which each ray enters the slab of each axis.
+
+    The distance to the box is infinite where a ray misses it. `directions` may be a single direction, [3, 1].
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         near = (column(box.low) - origins) / directions
         far = (column(box.high) - origins) / directions
@@ -159,7 +170,7 @@ def box_distance(origins: Array, directions: Array, box: Box) -> tuple[Array, Ar
 
 
 def floor_distance(origins: Array, directions: Array) -> Array:
-    """Return the distance [R] as `sphere_distance`."""
+    """Return the distance [R] to the floor along rays [3, R], infinite where they miss it."""
     with np.errstate(divide="ignore", invalid="ignore"):
         t = -origins[2] / directions[2]
         x, y = (origins[i] + t * directions[i] for i in (0, 1))
@@ -168,7 +179,7 @@ def floor_distance(origins: Array, directions: Array) -> Array:
 
 
 def albedo(points: Array, item: Array) -> Array:
-    """Return the unlit colour [3, R] of surface points by their item."""
+    """Return the colour [3, R] without light of surface points [3, R], each on its item [R]."""
     colour = np.empty(points.shape)
     textures = [sphere.texture for sphere in SPHERES] + [box.texture for box in BOXES] + ["tiles"]
     for k, texture in enumerate(textures):

@@ -1,4 +1,4 @@
-"""nerfstudio folders: transforms.json with calibrated, maybe distorted photographs, and a point cloud as PLY."""
+"""nerfstudio folders: transforms.json with calibrated photographs, distorted or not, and a point cloud as PLY."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def load_nerfstudio(
     images: ImageStore,
     cloud: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Scene:
-    """Load transforms.json; `cloud` (points, colours) replaces its point cloud. See `load_scene`."""
+    """Load transforms.json. `cloud` (points, colours) replaces its point cloud. See `load_scene` for the rest."""
     source = path / FILE
     content = read_object(source)
     frames = content.get("frames")
@@ -53,19 +53,19 @@ def load_nerfstudio(
         if model_name(camera) not in PINHOLE_MODELS:
             distorted.add(model_name(camera) + lost_angle(camera, views[-1]))
     if distorted:
-        log.warning("%s: lens distortion (%s) is removed, and the result kept.", source, ", ".join(sorted(distorted)))
+        log.warning("%s: lens distortion (%s) is removed; the result is cached.", source, ", ".join(sorted(distorted)))
     for folder in sorted({path / full.relative_to(path).parts[0] for full in paths} - set(paths)):
         say_what_is_unlisted(folder, paths, f"frame of {FILE}")
     say_bare(subfolder(path, "masks"), masks)
     if len({repr(frame.get("time")) for frame in frames}) > 1:
-        log.warning("%s: its frames have different times; whatever moved between them will be blurred.", source)
+        log.warning("%s: the frames have different times; objects that move will be blurred.", source)
     train, test = own_split(content, views, path, source) or split_views(views, test_every)
     points, colours = cloud or read_cloud(path, content, source)
     return assemble_scene(source, path.resolve().name, train, test, points, colours)
 
 
 def mask_of(path: Path, frame: dict[str, Any], name: str, source: Path) -> Path | None:
-    """Return the mask of a frame: its `mask_path`, else masks/x.png for images/x.jpg where it exists."""
+    """Return the mask of a frame: its `mask_path`, else masks/x.png for images/x.jpg if that exists, else None."""
     given = frame.get("mask_path")
     if given is not None:
         return find_image(path, read_string(given, f"mask_path of {name!r}", source))
@@ -74,7 +74,10 @@ def mask_of(path: Path, frame: dict[str, Any], name: str, source: Path) -> Path 
 
 
 def reduced_image(path: Path, full: Path, data_factor: int) -> tuple[Path, int]:
-    """Return the image to read and the factor that is left: images_4/x.png for images/x.png where it exists."""
+    """Return the image to read, and the factor by which it must still be reduced.
+
+    For a factor of 4, images_4/x.png is read instead of images/x.png if the folder images_4 exists.
+    """
     first, _, rest = full.relative_to(path).as_posix().partition("/")
     folder = path / f"{first}_{data_factor}"
     if data_factor > 1 and rest and folder.is_dir():
@@ -85,7 +88,10 @@ def reduced_image(path: Path, full: Path, data_factor: int) -> tuple[Path, int]:
 def own_split(
     content: dict[str, Any], views: list[View], path: Path, source: Path
 ) -> tuple[list[View], list[View]] | None:
-    """Return training and held-out views as the file lists them (val_filenames and test_filenames are held out)."""
+    """Return training and held-out views as the file lists them; None if it lists no training views.
+
+    The views of val_filenames and test_filenames are held out.
+    """
     named: dict[str, set[str]] = {}
     for key in SPLITS:
         names = content.get(key)
@@ -108,7 +114,7 @@ def own_split(
 
 
 def read_cloud(path: Path, content: dict[str, Any], source: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and colours of `ply_file_path`, in the frame of the poses as nerfstudio has it."""
+    """Return points and colours of `ply_file_path`, or of sparse_pc.ply. nerfstudio gives them in the poses' frame."""
     name = content.get("ply_file_path")
     if name is None and os.path.isfile(path / "sparse_pc.ply"):
         name = "sparse_pc.ply"

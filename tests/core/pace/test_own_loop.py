@@ -277,7 +277,7 @@ def test_the_summary_says_why_more_than_the_share_ran():
             if step % 2 == 0:
                 reached.append(step)
     assert gate.report()["iterations_run"] == 101
-    assert "share of 0.25: 50 for the share, 51 by conditions of the loop, 0 after prunes" in gate.summary()
+    assert "share of 0.25: 50 ran for the share, 51 for conditions of the loop, 0 after prunes" in gate.summary()
 
 
 def test_auto_leaves_a_short_refinement_as_it_is():

@@ -23,12 +23,12 @@ const start = async () => {
     noanim: true,
     renderer: new URL(location.href).searchParams.has('webgl') ? 'webgl' : 'webgpu',
   });
-  viewer.state.showAnnotations = false; // cameras of photographs, which the panel goes to
+  viewer.state.showAnnotations = false; // They mark the cameras of the photographs, and the panel goes to them.
   viewer.events.on('progress:changed', (share) => {
     element('status').textContent = `Loading the model, ${share} % …`;
   });
   const loaded = () => {
-    viewer.state.cameraMode = 'orbit'; // instead of the viewer's own flight
+    viewer.state.cameraMode = 'orbit'; // The viewer's default is a flight through the scene.
     element('status').hidden = true;
     document.body.dataset.loaded = Math.round(performance.now());
   };
@@ -37,14 +37,14 @@ const start = async () => {
   if (about.views.length) panel(viewer, about);
 };
 
-// The viewer's list of controls would cover the model there; its button opens it.
+// On a phone the viewer's list of controls would cover the model. A button still opens the list.
 const foldHelpOnPhones = () => {
   try {
     if (innerWidth <= 640 && localStorage.getItem('controlsPanelOpen') === null) {
       localStorage.setItem('controlsPanelOpen', 'false');
     }
   } catch {
-    // Pages in frames may have no storage.
+    // A page inside a frame may have no storage.
   }
 };
 
@@ -57,7 +57,7 @@ const panel = (viewer, about) => {
     element('quality').textContent = 'Rendering …';
     try {
       const found = await fetch(`compare/${asked}.json`).then((answer) => answer.json());
-      if (asked !== chosen) return; // another one was asked for meanwhile
+      if (asked !== chosen) return; // Meanwhile the user asked for another photograph.
       for (const name of ['photograph', 'render', 'error']) element(name).src = found[name];
       element('gain').textContent = `Error ×${found.gain}`;
       element('quality').textContent = `PSNR ${found.psnr.toFixed(2)} dB, ${kind}`;
