@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 COLOURS = ("#000000", "#D55E00", "#E69F00", "#CC79A7", "#0072B2", "#56B4E9", "#009E73")
 MARKERS = "so^vDPX"
 PHASES = {"forward": "#0072B2", "loss": "#56B4E9", "backward": "#D55E00", "optimizer": "#E69F00", "strategy": "#009E73"}
-NOT_VISITED, RUN, SKIPPED = 0, 1, 2
+NOT_VISITED, RUN, SKIPPED = 0, 1, 2  # values of `visit_map`, and indices of colours
 EXAMPLES = 3  # number of views with a plot of their own; three plots fit on one page
 SMALL = 9  # font size of legends in points, small enough for eleven policies
 
@@ -172,9 +172,9 @@ def skipped_views(runs: Sequence[RunRecord], n_views: int) -> Figure:
 
 
 def visit_map(trace: Trace, n_views: int) -> np.ndarray:
-    """Return [n_views, epochs]: NOT_VISITED, RUN or SKIPPED.
+    """Return an array [n_views, epochs] of NOT_VISITED, RUN or SKIPPED.
 
-    Training visits every view once in an epoch; refinement begins and ends within one.
+    Training visits every view once in an epoch. Refinement may begin and end in the middle of an epoch.
     """
     first = trace.start // n_views
     last = (trace.start + len(trace.view) - 1) // n_views
