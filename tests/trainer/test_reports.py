@@ -395,7 +395,7 @@ def test_transforms_from_powershell(nerf: Path) -> None:
 def test_moving_scenes_are_named(nerf: Path, caplog: pytest.LogCaptureFixture) -> None:
     change_frames(nerf, lambda number, frame: frame.update(time=number / 10))
     load_scene(nerf)
-    assert "its frames have different times" in caplog.text
+    assert "the frames have different times" in caplog.text
 
 
 def test_masks_of_transparency_and_of_lossy_formats(colmap: Path) -> None:
