@@ -175,7 +175,7 @@ class CallReader:
                 return max(known) if len(known) == len(ends) else None
             case ast.Compare(option, [ast.Is() | ast.IsNot()], [ast.Constant(None)]):
                 # An option that is not given: the whole run goes past the call.
-                return 0 if _is_plain_place(option) and _held(test, scope) is (not holds) else None
+                return 0 if _is_plain_place(option) and _evaluated(test, scope) is (not holds) else None
             case ast.Compare(left, [operator], [right]) if not holds:
                 negated = _NEGATED.get(type(operator))
                 return None if negated is None else _end_of_one(left, negated(), right, scope)
@@ -293,16 +293,12 @@ def _value(node: ast.expr, scope: Scope) -> Any:
     """Value of an expression of names, attributes, numbers and pure functions; None for anything else."""
     if not all(_is_plain(part) for part in ast.walk(node)) or any(text in scope.numbers for text in _places(node)):
         return None
+    return _evaluated(node, scope)
+
+
+def _evaluated(node: ast.expr, scope: Scope) -> Any:
     try:
         return eval(compile(ast.Expression(node), "<condition>", "eval"), {"__builtins__": PURE}, scope.values)
-    except Exception:
-        return None
-
-
-def _held(test: ast.expr, scope: Scope) -> bool | None:
-    """Whether a condition holds when the loop begins; None if that is not known."""
-    try:
-        return bool(eval(compile(ast.Expression(test), "<condition>", "eval"), {"__builtins__": {}}, scope.values))
     except Exception:
         return None
 
