@@ -129,6 +129,13 @@ class InriaFamily(AbstractAdapter):
         """
         return int(opt.densify_until_iter)
 
+    def settled_iter(self, opt: Any, loop: Mapping[str, Any]) -> int | None:
+        """Return the first iteration after the last prune that is known; None if that is `start_iter`.
+
+        Arguments as for `start_iter`.
+        """
+        return None
+
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
         """Return the first iteration whose gradients only the optimizers read. Arguments as for `start_iter`."""
         return int(opt.densify_until_iter)
@@ -299,6 +306,7 @@ class InriaFamily(AbstractAdapter):
         hooks.ready(
             TrainerInfo(
                 self._start_after_changes(opt, loop),
+                settled_iter=self.settled_iter(opt, loop),
                 view_names=[view_key(key) for key in self.view_keys(cameras)],
                 max_steps=opt.iterations,
                 gradients_read_until=self.gradients_read_until(opt, loop),

@@ -24,7 +24,10 @@ class LightGaussian(InriaFamily):
         "`train_densify_prune.py`: from `densify_until_iter` on; later prunes pause the gate. `distill_train.py`: from "
         "the first iteration on."
     )
-    with_share = "`train_densify_prune.py`: by visits. The other two scripts do not densify."
+    with_share = (
+        "`train_densify_prune.py`: by visits; with `share` or `refine_share`, refinement begins after the last of "
+        "`prune_iterations`. The other two scripts do not densify."
+    )
     left_alone = "With `--augmented_view`, jittered cameras (two of three iterations) have means of their own."
     stand_ins = "lightgaussian"
     mark = "calculate_v_imp_score"
@@ -45,6 +48,12 @@ class LightGaussian(InriaFamily):
         if finetunes(loop):
             return first + (first in loop["args"].prune_iterations)
         return int(opt.densify_until_iter)
+
+    def settled_iter(self, opt: Any, loop: Mapping[str, Any]) -> int | None:
+        if distills(loop) or finetunes(loop):
+            return None
+        pruned = [int(number) for number in loop["args"].prune_iterations if int(number) < int(opt.iterations)]
+        return max(self.start_iter(opt, loop), *(number + 1 for number in pruned)) if pruned else None
 
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return 0 if distills(loop) or finetunes(loop) else int(opt.densify_until_iter)

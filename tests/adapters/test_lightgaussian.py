@@ -14,6 +14,13 @@ def test_start_is_relative_to_the_first_iteration():
     assert run(script("", lightgaussian_densify_prune), **settings)[1].config.start_iter == 20
 
 
+def test_refinement_begins_after_the_last_prune_if_iterations_are_left_out():
+    gated, gate = run(script("", lightgaussian_densify_prune), share=0.5)
+    assert [step for step, kind, _ in gated.structure if kind == "prune"][-2:] == [30, 45]
+    assert gate.config.start_iter == 46
+    assert run(script("", lightgaussian_densify_prune), refine_share=0.5)[1].config.start_iter == 46
+
+
 def test_jittered_views_have_means_of_their_own():
     _, gate = run(script("", lightgaussian_distill), **RULE)
     for row in gate.trace:

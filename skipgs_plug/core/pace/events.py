@@ -10,10 +10,10 @@ from skipgs_plug.core.pace.needs import NEARLY_ALL
 from skipgs_plug.core.trainer_info import Densification
 
 # Visits of each Gaussian before an event that is kept. Densification splits Gaussians whose mean gradient over their
-# visits is large. With fewer visits the means are noisier, and more of them exceed the threshold: bonsai with 10 visits
-# gets 17 to 90 % more Gaussians. With more visits there are fewer events, and a scene that must grow a lot, such as
-# Lego, does not get there. With 20 visits bonsai has 86 to 103 % of its Gaussians.
-VISITS_BEHIND = 20.0
+# visits is large. With fewer visits the means are noisier, and more of them exceed the threshold. With more visits
+# there are fewer events, and a scene that must grow a lot, such as Lego, does not get there. With 14 visits bonsai has
+# 91 to 99 % of its Gaussians.
+VISITS_BEHIND = 14.0
 # The same if a view shows nearly all Gaussians. The number of events limits growth then: with every second event, Lego
 # ends with half of its Gaussians.
 VISITS_BEHIND_FULL_VIEWS = 8.0

@@ -10,7 +10,7 @@ from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.base import NAMED
 from skipgs_plug.core.pace.events import Events
-from skipgs_plug.core.pace.needs import growing_factor, growing_share
+from skipgs_plug.core.pace.needs import growing_factor, growing_share, opacity_factor
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.sampling import Sampling
 from skipgs_plug.core.trainer_info import Densification
@@ -121,7 +121,7 @@ class Growing:
 
     def runs(self, number: int) -> bool:
         """Whether iteration `number` runs; called once for each number, in order."""
-        assert self.events is not None
+        assert self.events is not None and self._first_number is not None
         self._settle()
         assert self.share is not None
         must, barred = number in self._must, False
@@ -138,9 +138,10 @@ class Growing:
                 self._rates.visibility.restart()
         else:
             self.events.skipped(number)
-        factor = self._factor
-        if factor > 1.0:
-            self._rates.scale(factor, growing=True)
+        # After the last event iterations stand for themselves alone: prunes and terms of the loss wait for their own.
+        if self._scales and number < self._first_number + self._length:
+            assert self.share is not None
+            self._rates.scale(self._factor, opacity_factor(self.share))
         elif self._measuring or self._config.max_gaussians is not None:
             self._rates.look()
         else:
@@ -165,10 +166,17 @@ class Growing:
             self.share = growing_share(self._length, self._epoch, longer, events)
 
     @property
+    def _scales(self) -> bool:
+        """Whether steps are longer: some iterations are left out, and the share that a view shows is known."""
+        leaves_out = self.share is not None and self.share < 1.0
+        return leaves_out and self._config.compensates and self._visible is not None
+
+    @property
     def _factor(self) -> float:
-        """Present factor on learning rates."""
-        if self.share is None or not self._config.compensates:
+        """Factor on learning rates, except those of opacities, until the last event."""
+        if not self._scales:
             return 1.0
+        assert self.share is not None
         return growing_factor(self._length, self.share, self._visible)
 
     def _full(self) -> bool:
@@ -183,15 +191,20 @@ class Growing:
         return rows + self._grown > bound
 
     def report(self) -> dict[str, Any]:
-        """Return `share`, `iterations_run`, `iterations_skipped`, `events_run`, `events_skipped`, `always_run`."""
-        events = self.events
+        """Return the entries of skipgs.json about this phase.
+
+        `share`, `iterations_run`, `iterations_skipped`, `events_run`, `events_skipped`, `rate_factor`,
+        `opacity_rate_factor`, `always_run`.
+        """
+        events, share = self.events, self.share if self._config.compensates else None
         return {
             "share": self.share,
             "iterations_run": self.sampling.run,
             "iterations_skipped": self.sampling.left_out,
             "events_run": 0 if events is None else events.kept,
             "events_skipped": 0 if events is None else events.left_out,
-            "rate_factor": None if self.share is None or not self._config.compensates else self._factor,
+            "rate_factor": None if share is None else self._factor,
+            "opacity_rate_factor": None if share is None else opacity_factor(share) if self._scales else 1.0,
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
         }
 

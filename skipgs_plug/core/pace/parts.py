@@ -18,10 +18,6 @@ NAMED = {
     **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
-# Largest factor on the rate of opacities while the scene grows. Opacities must recover from each reset in the few
-# iterations that run, but they flicker at larger factors: on bonsai (7,000 iterations) 1, 2 and 4 times the rate end at
-# 30.47, 30.49 and 30.19 dB.
-OPACITIES_GROWING = 2.0
 # Largest factor on the rate of parameters without a row for each Gaussian (exposures, poses, networks). They must not
 # follow a model that is far off for a while.
 OTHERS_AT_MOST = 0.25
@@ -118,12 +114,14 @@ class Share(NamedTuple):
         times: Multiple of the factor that the group takes.
         most: Bound on the factor, before it is multiplied.
         longer: Facts about the group if its steps are larger; None if they are at most as long as the trainer's.
+        of_opacities: Whether the group holds opacities.
     """
 
     group: dict[str, Any]
     times: float
     most: float
     longer: GroupInfo | None
+    of_opacities: bool = False
 
 
 class OptimizerInfo:
@@ -138,10 +136,10 @@ class OptimizerInfo:
         name: The argument.
         positions: Parameters that may be positions [N, 3].
         shares: Shares of the groups that are scaled; see `divide`.
-        rows, growing: The arguments of `divide` that `shares` were found for.
+        rows, opacities: The arguments of `divide` that `shares` were found for.
     """
 
-    __slots__ = ("_only", "groups", "growing", "name", "positions", "rows", "shares")
+    __slots__ = ("_only", "groups", "name", "opacities", "positions", "rows", "shares")
 
     def __init__(self, optimizer: torch.optim.Optimizer, name: str | None) -> None:
         self.name = name
@@ -149,7 +147,7 @@ class OptimizerInfo:
         self.positions = [param for group in self.groups for param in group.positions]
         self.shares: list[Share] = []
         self.rows: int | None = None
-        self.growing = False
+        self.opacities: float | None = None
         self._only = self.groups[0] if len(self.groups) == 1 and self.groups[0].first is not None else None
 
     def fits(self, optimizer: torch.optim.Optimizer) -> bool:
@@ -160,23 +158,23 @@ class OptimizerInfo:
             return groups[0] is only.group and len(now) == 1 and now[0] is only.first
         return len(groups) == len(self.groups) and all(map(_is_about, self.groups, groups))
 
-    def divide(self, rows: int, growing: bool) -> None:
+    def divide(self, rows: int, opacities: float | None) -> None:
         """Find `shares`.
 
         Args:
             rows: Number of Gaussians; 0 if it is not known. Only parameters with as many rows take larger steps.
-            growing: The scene still grows: opacities take larger steps too, and parameters without a row for each
-                Gaussian keep their rates.
+            opacities: Multiple of their rate that opacities take while the scene grows. Parameters without a row for
+                each Gaussian then keep their rates. None in refinement, in which opacities are never raised.
         """
-        self.rows, self.growing = rows, growing
-        self.shares = [share for one in self.groups if (share := _share(one, rows, growing)) is not None]
+        self.rows, self.opacities = rows, opacities
+        self.shares = [share for one in self.groups if (share := _share(one, rows, opacities)) is not None]
 
 
-def _share(info: GroupInfo, rows: int, growing: bool) -> Share | None:
+def _share(info: GroupInfo, rows: int, opacities: float | None) -> Share | None:
     if not info.of_gaussians(rows):
-        return None if growing else Share(info.group, OTHERS_AT_MOST, 1.0, None)
+        return Share(info.group, OTHERS_AT_MOST, 1.0, None) if opacities is None else None
     if info.part is None:
-        return Share(info.group, 1.0, OPACITIES_GROWING if growing else 1.0, info)
+        return Share(info.group, opacities or 1.0, 1.0, info, of_opacities=True)
     return Share(info.group, info.part, math.inf, info)
 
 

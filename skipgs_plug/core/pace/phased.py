@@ -232,14 +232,15 @@ class Phased(Pace):
             found[1][NAMED] = hidden
         self._conditions = found[0], found[1]
         epoch = self._epoch or (None if self._views is None else len(self._views))
-        held = {reason: hits for reason, hits in found[1].items() if hits}
-        self.refining.begin(self._last, held, self._views, epoch, self._keeps_rates)
         if self.growing is not None and grown:
             assert self._densification is not None
             hidden = {n for n in (*self._hidden(grown), *self._chosen, *self._required) if n in grown}
             if not self.growing.begin(grown, found[0], hidden, self._densification, epoch):
                 marks = ", ".join(self._densification.marks)
                 self._grow_whole(f"No condition of the loop that names {marks} holds before iteration {self._start}")
+        held = {reason: hits for reason, hits in found[1].items() if hits}
+        by_few = self.growing is not None and bool(grown)
+        self.refining.begin(self._last, held, self._views, epoch, self._keeps_rates, by_few)
 
     def _require_events(self) -> None:
         """Let the growing phase run whole if its densification events are not known.

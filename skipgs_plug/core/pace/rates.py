@@ -88,7 +88,7 @@ class ScaledRates:
         self.visibility = Visibility()
         self.on_error: Callable[[Exception], None] | None = None
         self._factor: float | None = None
-        self._growing = False
+        self._opacities: float | None = None
         self._only_look = False
         self._rows = self._rows_now = 0  # number of Gaussians in the previous and in this iteration; 0 if unknown
         self._thread = get_ident()
@@ -108,13 +108,13 @@ class ScaledRates:
         self.scale(1.0)
         self._only_look = True
 
-    def scale(self, factor: float, growing: bool = False) -> None:
+    def scale(self, factor: float, opacities: float | None = None) -> None:
         """Scale the next steps in the thread that calls this, which is the training thread; see `group_part`.
 
         Args:
             factor: Factor on learning rates.
-            growing: The scene still grows: opacities take up to `OPACITIES_GROWING` times their rate, and parameters
-                without a row for each Gaussian keep their rates.
+            opacities: While the scene grows, the multiple of their rate that opacities take. `factor` is at least 1
+                then, and parameters without a row for each Gaussian keep their rates. None in refinement.
 
         Raises:
             SkipGSError: Another gate scales steps in this thread, and one of the two does not know its own optimizers.
@@ -130,7 +130,7 @@ class ScaledRates:
                     "Another gate makes steps larger in this thread, and each gate would scale the steps of both: "
                     "detach() it first, or train in separate threads."
                 )
-        self._factor, self._growing, self._only_look, self._thread = factor, growing, False, thread
+        self._factor, self._opacities, self._only_look, self._thread = factor, opacities, False, thread
         self._rows, self._rows_now = self._rows_now or self._rows, 0
         if not self._handles:
             _hooked.append(self)
@@ -213,15 +213,17 @@ class ScaledRates:
             if param.shape[0] > self._rows_now:
                 self._rows_now = param.shape[0]
         rows = self._rows_now if self._rows_now > self._rows else self._rows
-        if info.rows != rows or info.growing is not self._growing:
-            info.divide(rows, self._growing)
+        if info.rows != rows or info.opacities != self._opacities:
+            info.divide(rows, self._opacities)
         shares = [] if self._only_look else info.shares
+        if factor == 1.0 and self._opacities is not None:  # the others keep their rates
+            shares = [one for one in shares if one.of_opacities]
         if under_way:  # an optimizer can wrap another one that has the same groups
             scaled = {id(group) for other in under_way for group, _, _ in other.before}
             shares = [one for one in shares if id(one.group) not in scaled]
         under_way.append(step)
         before = step.before
-        for group, part, most, longer in shares:
+        for group, part, most, longer, _ in shares:
             times = part * (factor if factor < most else most)
             rate, betas = group.get("lr"), group.get("betas")
             before.append((group, rate, betas))

@@ -1,13 +1,15 @@
 """Fewer iterations and fewer densification events while the scene grows."""
 
 import json
+import math
 
 import pytest
 import torch
 
 from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.core.pace import needs
 from skipgs_plug.core.pace.events import LEAST_EVENTS, Events
-from skipgs_plug.core.pace.needs import growing_factor, growing_share, refining_share
+from skipgs_plug.core.pace.needs import growing_factor, growing_share, opacity_factor, refining_share
 from skipgs_plug.core.trainer_info import Densification
 
 VIEWS = [f"{i}.png" for i in range(4)]
@@ -95,6 +97,59 @@ def test_rates_stay_while_the_scene_grows_unless_longer_steps_replace_iterations
     assert gate.report()["growing"]["rate_factor"] == pytest.approx(4.0)
 
 
+class Opaque(Loop):
+    """The same loop with opacities, whose rates it records."""
+
+    def __init__(self):
+        super().__init__()
+        self.opacities = torch.nn.Parameter(torch.zeros(6, 1))
+        self.optimizer.add_param_group({"params": [self.opacities], "name": "opacity", "lr": 0.05})
+        self.optimizer.register_step_pre_hook(self.note)
+
+    def note(self, optimizer, args, kwargs):
+        self.opacities.grad = torch.ones_like(self.opacities)
+        self.rates[self.ran[-1]] = tuple(group["lr"] / lr for group, lr in zip(optimizer.param_groups, (0.1, 0.05)))
+
+    def between(self, first, last):
+        return {tuple(round(factor, 3) for factor in self.rates[n]) for n in self.rates if first <= n < last}
+
+
+@pytest.mark.parametrize(("share", "longer"), [(0.25, 8.0), (0.64, 2.0 * math.sqrt(3.0) / 0.64)])
+def test_opacities_take_the_root_of_the_path_until_the_last_event(share, longer):
+    loop = Opaque()
+    with SkipGate(start_iter=START + 100, share=share) as gate:
+        loop.train(gate)
+    assert gate.report()["growing"]["opacity_rate_factor"] == pytest.approx(share**-0.5)
+    # Once visibility is measured; the last event is in iteration 380, and another would follow in iteration 400.
+    assert loop.between(200, START) == {(round(longer, 3), round(share**-0.5, 3))}
+    # Until refinement begins, iterations stand for themselves alone.
+    assert loop.between(START, START + 100) == {(1.0, 1.0)}
+
+
+def test_opacities_alone_take_longer_steps_where_iterations_are_enough(monkeypatch):
+    monkeypatch.setattr(needs, "ENOUGH_STEPS", 1)
+    loop = Opaque()
+    with SkipGate(start_iter=START, share=0.25) as gate:
+        loop.train(gate)
+    assert loop.between(200, START) == {(1.0, 2.0)}
+
+
+def test_refinement_does_not_end_early_after_few_iterations_of_growth():
+    names = [f"{i}.png" for i in range(40)]
+    reports = {}
+    for kind, settings in {"both": {"share": "auto"}, "refinement": {"refine_share": "auto"}}.items():
+        with SkipGate(start_iter=1000, **settings) as gate:
+            means = torch.nn.Parameter(torch.ones(6, 3))
+            optimizer = torch.optim.SGD([{"params": [means], "name": "xyz"}], lr=1e-4)
+            for step in gate.iterations(range(6000), views=names, events=range(100, 1000, 100)):
+                if gate.backward(means.square().sum(), names[step % 40], step):
+                    optimizer.step()
+                    optimizer.zero_grad()
+        reports[kind] = gate.report()
+    assert reports["both"]["early_stopping"] is None
+    assert reports["refinement"]["early_stopping"]["watched"]
+
+
 def test_interrupted_and_resumed_leaves_out_the_same():
     with SkipGate(start_iter=START, share=0.25) as gate:
         whole = Loop().train(gate)
@@ -170,7 +225,7 @@ def test_needs_of_an_event():
 
     assert kept("nothing", 0.3, 10) == list(range(100, 2001, 100))
     assert kept("visits", 1.0, 1) == list(range(100, 2001, 100))
-    assert kept("visits", 0.3, 5)[:2] == [400, 800]  # 67 iterations show each Gaussian 20 times
+    assert kept("visits", 0.3, 5)[:2] == [300, 600]  # 47 iterations show each Gaussian 14 times
     # Where a view shows nearly all, 8 times are enough: a tenth of the iterations keeps each event.
     assert kept("visits", 0.95, 10)[:3] == [100, 200, 300]
     assert kept("visits", 0.95, 20)[:2] == [200, 400]
@@ -181,7 +236,7 @@ def test_needs_of_an_event():
 
 
 def test_shares_that_auto_chooses():
-    assert growing_share(15_000, 255, longer=True) == growing_share(15_000, 255, longer=False) == 0.12
+    assert growing_share(15_000, 255, longer=True) == growing_share(15_000, 255, longer=False) == 0.1
     assert growing_share(15_000, 1000, longer=True) == growing_share(15_000, 1000, longer=False) == pytest.approx(1 / 3)
     assert growing_share(1500, 17, longer=True) == 0.4
     assert growing_share(1500, 17, longer=False) == 0.8
@@ -190,7 +245,9 @@ def test_shares_that_auto_chooses():
     assert growing_share(2500, 17, longer=True, events=58) == 14 * 58 / 2500
     assert growing_share(2500, 17, longer=True, events=97) == growing_share(2500, 17, longer=False) == 1200 / 2500
     assert growing_share(500, 17, longer=True) == growing_share(0, 17, longer=True) == 1.0
-    assert refining_share(3500, 255) < refining_share(3500, 255, grown_by_few=True) == pytest.approx(0.291, abs=1e-3)
+    assert refining_share(3500, 255) < refining_share(3500, 255, grown_by_few=True) == pytest.approx(0.26, abs=1e-3)
+    assert refining_share(15_000, 255, grown_by_few=True) == pytest.approx(0.1806, abs=1e-3)
+    assert refining_share(15_000, 17, grown_by_few=True) == 0.12 < refining_share(15_000, 17) == 0.2
 
 
 def test_factors_while_the_scene_grows():
@@ -199,3 +256,4 @@ def test_factors_while_the_scene_grows():
     assert growing_factor(700, 0.9, 1 / 3) == pytest.approx(1 / 0.9)  # the path of the iterations left out, no more
     assert growing_factor(15_000, 0.12, 0.96) == pytest.approx((2100 / 1800) ** 2)
     assert growing_factor(15_000, 0.2, 0.96) == 1.0
+    assert opacity_factor(0.25) == 2.0 and opacity_factor(1.0) == 1.0
