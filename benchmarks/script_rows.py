@@ -105,7 +105,7 @@ ROWS = {
         "LightGaussian `train_densify_prune.py`",
         "VITA-Group/LightGaussian",
         "LightGaussian",
-        f"{_INRIA.replace('train.py', 'train_densify_prune.py')}--prune_iterations {{two_thirds}} {{late}}",
+        f"{_INRIA.replace('train.py', 'train_densify_prune.py')}{_COARSE}--prune_iterations {{two_thirds}} {{late}}",
     ),
     "mini_splatting": Row(
         "Mini-Splatting `ms/train.py`",
@@ -117,7 +117,7 @@ ROWS = {
         "GaussianSpa `train_op.py`",
         "noodle-lab/GaussianSpa",
         "GaussianSpa",
-        f"{_INRIA.replace('train.py', 'train_op.py')}--optimizing_spa_start_iter {{half}} "
+        f"{_INRIA.replace('train.py', 'train_op.py')}{_COARSE}--optimizing_spa_start_iter {{half}} "
         "--optimizing_spa_stop_iter {two_thirds}",
     ),
     "perceptual_gs": Row("Perceptual-GS", "eezkni/Perceptual-GS", "Perceptual-GS", _INRIA),
