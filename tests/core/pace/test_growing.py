@@ -108,7 +108,8 @@ class Opaque(Loop):
 
     def note(self, optimizer, args, kwargs):
         self.opacities.grad = torch.ones_like(self.opacities)
-        self.rates[self.ran[-1]] = tuple(group["lr"] / lr for group, lr in zip(optimizer.param_groups, (0.1, 0.05), strict=True))
+        groups = zip(optimizer.param_groups, (0.1, 0.05), strict=True)
+        self.rates[self.ran[-1]] = tuple(group["lr"] / rate for group, rate in groups)
 
     def between(self, first, last):
         return {tuple(round(factor, 3) for factor in self.rates[n]) for n in self.rates if first <= n < last}
