@@ -26,7 +26,9 @@ STEPS_PER_EVENT = 14
 # tolerate long steps: four times the rate in 1,500 iterations cost bonsai 0.6 dB, but gained 0.5 dB and more in 700 to
 # 900 iterations.
 ENOUGH_STEPS = 2100
-LONGEST_STEPS = 4.0  # largest factor on rates while the scene grows; a factor of 8 is no better
+# Largest factor on rates while the scene grows. With 4 Lego (6,000 iterations) ends with 108 and 118 % of its Gaussians on
+# two seeds, with 3 with 99 and 105 %, at a better picture than its own run. With 2.5 its picture loses 0.1 to 0.25 dB.
+LONGEST_STEPS = 3.0
 
 # Refining (after densification ends).
 LEAST_SHARE = 0.2  # least share of the iterations that run, in any schedule
