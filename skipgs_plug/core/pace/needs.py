@@ -26,8 +26,8 @@ STEPS_PER_EVENT = 14
 # tolerate long steps: four times the rate in 1,500 iterations cost bonsai 0.6 dB, but gained 0.5 dB and more in 700 to
 # 900 iterations.
 ENOUGH_STEPS = 2100
-# Largest factor on rates while the scene grows. With 4 Lego (6,000 iterations) ends with 108 and 118 % of its Gaussians on
-# two seeds, with 3 with 99 and 105 %, at a better picture than its own run. With 2.5 its picture loses 0.1 to 0.25 dB.
+# Largest factor on rates while the scene grows. On two seeds of 6,000 iterations Lego ends with 108 and 118 % of its
+# Gaussians with a factor of 4, with 99 and 105 % with 3, and 0.1 to 0.25 dB lower with 2.5.
 LONGEST_STEPS = 3.0
 
 # Refining (after densification ends).
