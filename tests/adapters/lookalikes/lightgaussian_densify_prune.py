@@ -9,6 +9,7 @@ from torch.optim.lr_scheduler import ExponentialLR
 
 SCRIPT = "train_densify_prune.py"
 ADAPTER, FIRST, START, LAST = "lightgaussian", 1, 20, 60
+SETTLED = 46  # after the last prune: refinement begins here if iterations are left out
 
 
 class GaussianModel(SplatModel):
