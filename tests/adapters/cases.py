@@ -80,6 +80,11 @@ class Case:
     leaves_out: bool = True
 
     @property
+    def refined_from(self) -> int:
+        """Return the iteration from which refinement leaves out iterations; SETTLED of the module, or its START."""
+        return getattr(self.module, "SETTLED", self.module.START)
+
+    @property
     def iterations(self) -> range:
         return range(self.module.FIRST, self.module.LAST + 1)
 

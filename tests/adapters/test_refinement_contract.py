@@ -28,7 +28,7 @@ def test_a_share_of_the_iterations_runs_and_nothing_that_hangs_on_numbers_is_los
     plain = run(case)[0]
     begun.clear()
     gated, gate = run(case, refine_share=SHARE, pause_iters=0)
-    start, last = case.module.START, case.module.LAST
+    start, last = case.refined_from, case.module.LAST
     assert begun[: start - case.module.FIRST] == list(range(case.module.FIRST, start))
     refined = [n for n in begun if n >= start]
     report = gate.report()

@@ -63,7 +63,7 @@ def test_events_are_thinned_and_everything_else_happens_exactly_as_often(case, s
     events = set(plain.behind)
     begun.clear()
     gated, gate = run(case, share=share, pause_iters=0)
-    report, start = gate.report(), getattr(case.module, "SETTLED", case.module.START)
+    report, start = gate.report(), case.refined_from
     grown = [n for n in begun if n < start]
     assert begun == sorted(set(begun)) and begun[-1] == case.module.LAST
     assert gated.happened == plain.happened  # SH, saves, ADMM and the like
@@ -117,7 +117,7 @@ def test_leaving_out_nothing_leaves_the_whole_run_bit_identical(case, settings):
 def test_interrupted_and_resumed_leaves_out_the_same(case, grows, thinned, begun, short):
     settings = {"share": SHARE, "pause_iters": 0}
     whole, numbers = thinned(case)
-    start, first, last = case.module.START, case.module.FIRST, case.module.LAST
+    start, first, last = case.refined_from, case.module.FIRST, case.module.LAST
     there = [n for n in numbers if (first + 3 <= n < start - 3 if grows else last - 16 <= n < last)]
     if not there:
         pytest.skip("nothing grows in this script" if grows else "no iteration without pending gradients")
