@@ -48,7 +48,7 @@ def short(monkeypatch):
     monkeypatch.setattr(needs, "LEAST_GROWING_STEPS_LONGER", 6)
     monkeypatch.setattr(needs, "STEPS_PER_EVENT", 1)
     monkeypatch.setattr(needs, "GROWING_VISITS", 1.0)
-    monkeypatch.setattr(needs, "LEAST_STEPS", 8)
+    monkeypatch.setattr(needs, "LEAST_STEPS_AFTER_FEW", 8)
 
 
 def beside(entries, events):
