@@ -248,6 +248,7 @@ def test_shares_that_auto_chooses():
     assert growing_share(500, 17, longer=True) == growing_share(0, 17, longer=True) == 1.0
     assert refining_share(3500, 255) < refining_share(3500, 255, grown_by_few=True) == pytest.approx(0.26, abs=1e-3)
     assert refining_share(1000, 17) == 0.4 and refining_share(1000, 17, grown_by_few=True) == 0.55
+    assert refining_share(500, 17, grown_by_few=True) == 0.8
     assert refining_share(15_000, 255, grown_by_few=True) == pytest.approx(0.1806, abs=1e-3)
     assert refining_share(15_000, 17, grown_by_few=True) == 0.12 < refining_share(15_000, 17) == 0.2
 
