@@ -98,10 +98,10 @@ HOOKS = {
     "wrap": "(self, owner: 'Any', name: 'str', around: 'Around') -> 'None'",
 }
 FACTS = (
-    "(start_iter: 'int | None', *, view_names: 'Iterable[str] | None' = None, epoch: 'int | None' = None, "
-    "max_steps: 'int | None' = None, world_size: 'int | None' = None, gradients_read_until: 'int | None' = None, "
-    "accumulates: 'bool' = False, densification: 'Densification | None' = None, "
-    "defaults: 'Mapping[str, Any]' = <factory>) -> None"
+    "(start_iter: 'int | None', *, settled_iter: 'int | None' = None, view_names: 'Iterable[str] | None' = None, "
+    "epoch: 'int | None' = None, max_steps: 'int | None' = None, world_size: 'int | None' = None, "
+    "gradients_read_until: 'int | None' = None, accumulates: 'bool' = False, "
+    "densification: 'Densification | None' = None, defaults: 'Mapping[str, Any]' = <factory>) -> None"
 )
 POLICY = {
     "decide": "(self, view: 'Hashable', loss: 'float', step: 'int') -> 'Decision'",

@@ -25,8 +25,8 @@ class LightGaussian(InriaFamily):
         "the first iteration on."
     )
     with_share = (
-        "`train_densify_prune.py`: by visits; with `share` or `refine_share`, refinement begins after the last of "
-        "`prune_iterations`. The other two scripts do not densify."
+        "`train_densify_prune.py`: by visits; refinement begins after the last of `prune_iterations`. The other two "
+        "scripts do not densify."
     )
     left_alone = "With `--augmented_view`, jittered cameras (two of three iterations) have means of their own."
     stand_ins = "lightgaussian"
