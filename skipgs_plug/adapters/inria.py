@@ -130,10 +130,7 @@ class InriaFamily(AbstractAdapter):
         return int(opt.densify_until_iter)
 
     def settled_iter(self, opt: Any, loop: Mapping[str, Any]) -> int | None:
-        """Return the first iteration after the last prune that is known; None if that is `start_iter`.
-
-        Arguments as for `start_iter`.
-        """
+        """Return the first iteration after the last known prune; None without one. Arguments as for `start_iter`."""
         return None
 
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:

@@ -52,8 +52,8 @@ class LightGaussian(InriaFamily):
     def settled_iter(self, opt: Any, loop: Mapping[str, Any]) -> int | None:
         if distills(loop) or finetunes(loop):
             return None
-        pruned = [int(number) for number in loop["args"].prune_iterations if int(number) < int(opt.iterations)]
-        return max(self.start_iter(opt, loop), *(number + 1 for number in pruned)) if pruned else None
+        pruned = (int(number) for number in loop["args"].prune_iterations)
+        return max((number + 1 for number in pruned if number < int(opt.iterations)), default=None)
 
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return 0 if distills(loop) or finetunes(loop) else int(opt.densify_until_iter)

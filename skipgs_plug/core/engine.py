@@ -117,7 +117,7 @@ class Engine:
         if self.config.start_iter is None:
             settings["start_iter"] = 0 if info.start_iter is None and not self.config.enabled else info.start_iter
             if self.pace.leaves_out and info.settled_iter is not None:
-                settings["start_iter"] = info.settled_iter
+                settings["start_iter"] = max(info.start_iter or 0, info.settled_iter)
         self.config = config = dataclasses.replace(self.config, **settings)
         if config.start_iter is None:
             raise SkipGSError("This trainer does not densify, so the gate cannot know when to begin; give start_iter=.")

@@ -36,8 +36,8 @@ class TrainerInfo:
         start_iter: First iteration after densification, counted as the trainer counts; None if the trainer does not
             densify. It is used if the settings have no `start_iter`.
         settled_iter: First iteration after the last change of the model that is known beforehand, such as a prune
-            after densification; None if that is `start_iter`. If iterations are left out, refinement begins there: its
-            steps shrink to zero once, and what is pruned afterwards has few steps to recover.
+            after densification; None without one. If iterations are left out, refinement begins there, but not before
+            `start_iter`: its steps shrink to zero once, and a model that is pruned afterwards has few steps to recover.
         view_names: Keys of all training views, checked for uniqueness.
         epoch: Number of iterations in which every view comes up once. None if each iteration shows one of
             `view_names`, so that an epoch has as many iterations as views.
