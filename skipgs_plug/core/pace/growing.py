@@ -139,9 +139,9 @@ class Growing:
         else:
             self.events.skipped(number)
         # After the last event iterations stand for themselves alone: prunes and terms of the loss wait for their own.
-        if self._scales and number < self._first_number + self._length:
-            assert self.share is not None
-            self._rates.scale(self._factor, opacity_factor(self.share))
+        factor, opacities = self._factors if number < self._first_number + self._length else (1.0, 1.0)
+        if opacities > 1.0:
+            self._rates.scale(factor, opacities)
         elif self._measuring or self._config.max_gaussians is not None:
             self._rates.look()
         else:
@@ -166,18 +166,11 @@ class Growing:
             self.share = growing_share(self._length, self._epoch, longer, events)
 
     @property
-    def _scales(self) -> bool:
-        """Whether steps are longer: some iterations are left out, and the share that a view shows is known."""
-        leaves_out = self.share is not None and self.share < 1.0
-        return leaves_out and self._config.compensates and self._visible is not None
-
-    @property
-    def _factor(self) -> float:
-        """Factor on learning rates, except those of opacities, until the last event."""
-        if not self._scales:
-            return 1.0
-        assert self.share is not None
-        return growing_factor(self._length, self.share, self._visible)
+    def _factors(self) -> tuple[float, float]:
+        """Factors on learning rates until the last event: of all parameters but opacities, and of opacities."""
+        if self.share is None or self._visible is None or not self._config.compensates:
+            return 1.0, 1.0
+        return growing_factor(self._length, self.share, self._visible), opacity_factor(self.share)
 
     def _full(self) -> bool:
         """Whether one more event could exceed the number of Gaussians that the user allows."""
@@ -196,15 +189,17 @@ class Growing:
         `share`, `iterations_run`, `iterations_skipped`, `events_run`, `events_skipped`, `rate_factor`,
         `opacity_rate_factor`, `always_run`.
         """
-        events, share = self.events, self.share if self._config.compensates else None
+        events = self.events
+        known = self.share is not None and self._config.compensates
+        factor, opacities = self._factors if known else (None, None)
         return {
             "share": self.share,
             "iterations_run": self.sampling.run,
             "iterations_skipped": self.sampling.left_out,
             "events_run": 0 if events is None else events.kept,
             "events_skipped": 0 if events is None else events.left_out,
-            "rate_factor": None if share is None else self._factor,
-            "opacity_rate_factor": None if share is None else opacity_factor(share) if self._scales else 1.0,
+            "rate_factor": factor,
+            "opacity_rate_factor": opacities,
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
         }
 

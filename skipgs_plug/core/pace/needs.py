@@ -36,7 +36,7 @@ LEAST_SHARE = 0.2  # least share of the iterations that run, in any schedule
 LEAST_SHARE_AFTER_FEW = 0.12
 LEAST_STEPS = 400  # least number of iterations, so that steps can shrink
 # The same if iterations were left out before refinement too. With 400 scripts of 3,000 iterations end 0.1 to 0.2 dB
-# lower on bonsai than with 600, and up to 0.2 dB below their own runs. 600 would take more than 40 % of the time there.
+# lower on bonsai than with 600, and up to 0.2 dB below their own runs. 600 would take over 40 % of the time on fern.
 LEAST_STEPS_AFTER_FEW = 550
 # Largest share that this number asks for. Where all iterations run, steps are not longer and do not shrink: 500 such
 # iterations after its last prune ended 0.3 dB lower than 400 for LightGaussian.

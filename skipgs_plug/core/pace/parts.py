@@ -114,14 +114,12 @@ class Share(NamedTuple):
         times: Multiple of the factor that the group takes.
         most: Bound on the factor, before it is multiplied.
         longer: Facts about the group if its steps are larger; None if they are at most as long as the trainer's.
-        of_opacities: Whether the group holds opacities.
     """
 
     group: dict[str, Any]
     times: float
     most: float
     longer: GroupInfo | None
-    of_opacities: bool = False
 
 
 class OptimizerInfo:
@@ -174,7 +172,7 @@ def _share(info: GroupInfo, rows: int, opacities: float | None) -> Share | None:
     if not info.of_gaussians(rows):
         return Share(info.group, OTHERS_AT_MOST, 1.0, None) if opacities is None else None
     if info.part is None:
-        return Share(info.group, opacities or 1.0, 1.0, info, of_opacities=True)
+        return Share(info.group, opacities or 1.0, 1.0, info)
     return Share(info.group, info.part, math.inf, info)
 
 

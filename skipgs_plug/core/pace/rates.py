@@ -216,14 +216,14 @@ class ScaledRates:
         if info.rows != rows or info.opacities != self._opacities:
             info.divide(rows, self._opacities)
         shares = [] if self._only_look else info.shares
-        if factor == 1.0 and self._opacities is not None:  # the others keep their rates
-            shares = [one for one in shares if one.of_opacities]
+        if factor == 1.0 and self._opacities is not None:  # only opacities, which have no part, are scaled
+            shares = [one for one in shares if one.longer is not None and one.longer.part is None]
         if under_way:  # an optimizer can wrap another one that has the same groups
             scaled = {id(group) for other in under_way for group, _, _ in other.before}
             shares = [one for one in shares if id(one.group) not in scaled]
         under_way.append(step)
         before = step.before
-        for group, part, most, longer, _ in shares:
+        for group, part, most, longer in shares:
             times = part * (factor if factor < most else most)
             rate, betas = group.get("lr"), group.get("betas")
             before.append((group, rate, betas))

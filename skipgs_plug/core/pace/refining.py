@@ -75,7 +75,7 @@ class Refining:
         views: list[str] | None,
         epoch: int | None,
         keeps_rates: bool,
-        grown_by_few: bool = False,
+        grown_by_few: bool,
     ) -> None:
         """Begin refinement with iteration `first`.
 
