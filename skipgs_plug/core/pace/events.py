@@ -44,8 +44,8 @@ class Events:
         self._needs = densification.needs
         self.kept = self.left_out = 0
         # Number of iterations that ran since the last event, and of surplus ones before it.
-        self._behind = 0.0
-        self._surplus = 0.0  # iterations that the following event can count as its own, if this one runs
+        self._behind = 0
+        self._surplus = 0  # iterations that the following event can count as its own, if this one runs
 
     def __contains__(self, number: int) -> bool:
         return number in self._known
@@ -67,7 +67,7 @@ class Events:
         """Count an iteration that runs, with its event if it has one."""
         if number in self._known:
             self.kept += 1
-            self._behind, self._surplus = self._surplus, 0.0
+            self._behind, self._surplus = self._surplus, 0
         else:
             self._behind += 1
 
@@ -91,9 +91,9 @@ class Events:
         if self._needs == "iterations":
             return behind >= distance
         needed = STEPS_BEHIND * (1.0 - (visible or VISIBLE)) ** NARROW_VIEWS
-        needed = min(needed, iterations / LEAST_EVENTS, distance)
+        needed = int(min(needed, iterations / LEAST_EVENTS, distance))
         # Without a surplus, 40 iterations per event would be as good as 25 if 50 are needed: every second event.
-        self._surplus = min(max(behind - needed, 0.0), needed)
+        self._surplus = min(max(behind - needed, 0), needed)
         return behind >= needed
 
     def _distance(self, number: int) -> int:
@@ -106,4 +106,4 @@ class Events:
         return {"kept": self.kept, "left_out": self.left_out, "behind": self._behind}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.kept, self.left_out, self._behind = int(state["kept"]), int(state["left_out"]), float(state["behind"])
+        self.kept, self.left_out, self._behind = int(state["kept"]), int(state["left_out"]), int(state["behind"])
