@@ -8,8 +8,9 @@ and the result is cached on disk.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from skipgs_plug.lazy import attach
 
 if TYPE_CHECKING:
     from .ahead import load_kernels_ahead
@@ -70,14 +71,4 @@ _HOMES = {
     "usable_cores": "runtime.cores",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = attach(__name__, _HOMES)

@@ -5,8 +5,9 @@ It knows nothing of the gate, which is attached to it like to any other trainer.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from skipgs_plug.lazy import attach
 
 if TYPE_CHECKING:
     from skipgs_plug.trainer.config import TrainConfig
@@ -39,14 +40,4 @@ _HOMES = {
     "save_packed": "loaders.packed",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = attach(__name__, _HOMES)

@@ -169,9 +169,8 @@ class Trainer:
                 before, self.step = self.step, step
                 self._since = before
                 loss = self.train_step()
-                bar.update(
-                    self.step - before
-                )  # outside the iteration, since it raises when the reader of the output is gone
+                # Outside of the iteration, since it raises if the reader of the output is gone.
+                bar.update(self.step - before)
                 if self.ran % 10 == 0:
                     bar.set_postfix_str(f"loss={loss:.3f} | GS={self.num_gaussians}", refresh=False)
                 if self.stop_requested:

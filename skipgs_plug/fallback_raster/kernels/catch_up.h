@@ -45,8 +45,8 @@ static constexpr auto distance = [](const MissedSteps& missed, float eps, v16 m,
 static constexpr int ROW_VECTORS = 3;  // vectors of 16 floats in a row: 45 coefficients of the higher bands at most
 static_assert(ROW_VECTORS * 16 == 3 * (HIGHER_BANDS + 1) && FACTOR_FLOATS == 4, "an outer product fills a row");
 static constexpr auto catch_up = [](const int* rows, int* done, const GradientFactors& factors, const Moments& parameter,
-                                    const MissedSteps& missed, const Decay& decay, const SafeRange& safe, int m, int n, int width,
-                                    int now, int with_gradient, int first, int last) INLINE {
+                                    const MissedSteps& missed, const Decay& decay, const SafeRange& safe, int m, int n,
+                                    int width, int now, int with_gradient, int first, int last) INLINE {
     alignas(64) float bands[16][16];  // values of the higher bands for the next 16 rows
     for (int i = first; i < last; ++i) {
         if (with_gradient && (i - first) % 16 == 0) {
@@ -97,7 +97,8 @@ static constexpr auto catch_up = [](const int* rows, int* done, const GradientFa
             g[v] = with_gradient ? load(g_row + offset[v]) : (v16)0.0f;
             // A load that spans two recent stores would have to wait for both: shuffle the registers instead.
             if (width == 45 && v == 2 && with_gradient)
-                g[v] = __builtin_shufflevector(product[1], product[2], 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28);
+                g[v] = __builtin_shufflevector(product[1], product[2],  //
+                                               13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28);
             some |= (m[v] != 0.0f) | (s[v] != 0.0f) | (g[v] != 0.0f);
         }
         if (!bits(some)) continue;  // zero gradient and moments: nothing changes
@@ -108,8 +109,9 @@ static constexpr auto catch_up = [](const int* rows, int* done, const GradientFa
             for (int v = 0; v < ROW_VECTORS; ++v) {
                 const v16 size = vabs(m[v]);
                 zero[v] = m[v] == 0.0f;
-                extreme |=
-                    ~zero[v] & ~((size >= safe.least_mean) & (size <= safe.most_mean) & (s[v] >= safe.least_square) & (s[v] <= 0x1p20f));
+                const i16 safe_mean = (size >= safe.least_mean) & (size <= safe.most_mean);
+                const i16 safe_square = (s[v] >= safe.least_square) & (s[v] <= 0x1p20f);
+                extreme |= ~zero[v] & ~(safe_mean & safe_square);
                 // A step shorter than a quarter of the distance to the next float changes nothing, and later steps are
                 // shorter.
                 const v16 longest = 0x1p20f * (safe.longest_rate * size), least = 0x1p-7f * x[v];

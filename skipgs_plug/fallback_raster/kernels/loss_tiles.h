@@ -66,9 +66,9 @@ static constexpr auto blur_along = [](const float* p, int channels) INLINE -> v1
     for (int k = 1; k <= WINDOW_RADIUS; ++k) sum += w[WINDOW_RADIUS - k] * (load(p - k * channels) + load(p + k * channels));
     return sum;
 };
-static constexpr auto loss_tiles = [](const float* image, const auto* target, float* gradient, float* sums, const ImageSize& size,
-                                      const LossWeights& weights, int tiles, int valid, int with_gradient, int first,
-                                      int last) INLINE {
+static constexpr auto loss_tiles = [](const float* image, const auto* target, float* gradient, float* sums,
+                                      const ImageSize& size, const LossWeights& weights, int tiles, int valid,
+                                      int with_gradient, int first, int last) INLINE {
     const int height = size.height, channels = size.channels;
     const int span = size.width * channels, vectors = (span + 15) / 16;  // floats, and vectors of 16, in a row
     const int reach = WINDOW_RADIUS * channels, side = (reach + 15) / 16;  // of the window to one side

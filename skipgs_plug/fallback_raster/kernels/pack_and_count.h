@@ -73,8 +73,10 @@ static constexpr auto pack_and_count =
             // The tiles of a small box that the ellipse meets.
             const i16 columns = last_column - first_column, lines = last_row - first_row;
             const i16 small = (columns < BOX_COLUMNS) & (lines < BOX_ROWS);
-            Records16 record = {mx, my, along, along * slope, across, log2_opacity, half_h, half_w, {}, -slope, -steepness, reach,
-                                1.0f / along};
+            Records16 record = {
+                mx,     my, along,  along * slope, across, log2_opacity, half_h,
+                half_w, {}, -slope, -steepness,    reach,  1.0f / along,
+            };
             const Ellipses ellipses(record);
             i16 meets = (i16)0, met = (i16)0;
             const int deepest = __builtin_reduce_max(small ? lines : (i16)0);

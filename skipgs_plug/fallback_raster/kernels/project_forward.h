@@ -70,8 +70,8 @@ static constexpr auto project_forward = [](const Gaussians& gaussians, const flo
         }
         scatter2(projected.means2d, row, visible ? u : none, visible ? v : none, lanes);
         store_some(projected.depths + base, visible ? z : none, lanes);
-        scatter3(projected.conics, row, visible ? cov.conic_a : none, visible ? cov.conic_b : none, visible ? cov.conic_c : none,
-                 lanes);
+        scatter3(projected.conics, row, visible ? cov.conic_a : none, visible ? cov.conic_b : none,
+                 visible ? cov.conic_c : none, lanes);
         scatter2(projected.sigmas, row, visible ? sigma_x : none, visible ? sigma_y : none, lanes);
         if (antialiased) store_some(projected.compensations + base, visible ? compensation : none, lanes);
         if (raw) store_some(projected.opacities + base, visible ? opacity : none, lanes);

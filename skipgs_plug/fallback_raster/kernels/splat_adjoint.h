@@ -32,7 +32,8 @@ static constexpr auto splat_adjoint =
             }
         const RowList visible = {sums.rows, sums.block_start};
         // Strides of raw parameters as constants, so that the compiler drops the other cases.
-        const Harmonics raw_sh = {sh.position, sh.sh0, sh.shN, /* sh0_stride */ 3, sh.shN_stride, /* shN_offset */ 0, sh.degree};
+        const Harmonics raw_sh = {sh.position,   sh.sh0,         sh.shN, /* sh0_stride */ 3,
+                                  sh.shN_stride, /* shN_offset */ 0, sh.degree};
         sh_block_adjoint(first, gaussians.means, raw_sh, visible, rendered.colors, v_splats.colors, v_gaussians.means, v_sh,
                          factors, /* v_position */ nullptr, n, v_sh.factored, /* with_position */ 0, optimizations);
         const ProjectedGradients v_projected = {v_splats.means2d, /* depths */ nullptr, v_splats.conics,

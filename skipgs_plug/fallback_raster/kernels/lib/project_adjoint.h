@@ -163,8 +163,9 @@ static constexpr auto project_block_adjoint =
                  - 2.0f * qz * (v_M[0][0] + v_M[1][1]);
         v16 along = qw * v_qw + qx * v_qx + qy * v_qy + qz * v_qz;
         v16 back = rotation.norm * rotation.scale;
-        scatter4(v_gaussians.quats, row, saturated((v_qw - along * qw) * back, 1e38f), saturated((v_qx - along * qx) * back, 1e38f),
-                 saturated((v_qy - along * qy) * back, 1e38f), saturated((v_qz - along * qz) * back, 1e38f), lanes);
+        scatter4(v_gaussians.quats, row, saturated((v_qw - along * qw) * back, 1e38f),
+                 saturated((v_qx - along * qx) * back, 1e38f), saturated((v_qy - along * qy) * back, 1e38f),
+                 saturated((v_qz - along * qz) * back, 1e38f), lanes);
     }
     if (with_pose)
         for (int i = 0; i < 12; ++i) v_poses[12 * block + i] = sum(pose[i]);

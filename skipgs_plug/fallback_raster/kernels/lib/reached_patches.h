@@ -27,7 +27,8 @@ static constexpr auto reached_patches = [](const Record* const* r, int x0, int y
             default: return __builtin_shufflevector(all, all, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11, 11, 15, 15, 15, 15);
         }
 #else
-        return __builtin_shufflevector((v8)((const float*)r[0])[c], (v8)((const float*)r[1])[c], 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+        return __builtin_shufflevector((v8)((const float*)r[0])[c], (v8)((const float*)r[1])[c],  //
+                                       0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
 #endif
     };
 #define FIELD(name) column(__builtin_offsetof(Record, name) / sizeof(float))
