@@ -51,7 +51,7 @@ MOST_SHARE_OF_STEPS = 0.8
 RARE_SHARE = 0.46
 # The same share if iterations were left out before refinement too. On bonsai at 59 visits (30,000 iterations) a share
 # of 0.18 loses nothing, and 0.15 loses 0.2 dB.
-RARE_SHARE_AFTER_FEW = 0.5
+RARE_SHARE_AFTER_FEW = 0.48
 
 
 def refining_share(iterations: int, epoch: int, grown_by_few: bool = False) -> float:
