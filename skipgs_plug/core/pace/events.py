@@ -8,16 +8,16 @@ from typing import Any
 
 from skipgs_plug.core.trainer_info import Densification
 
-# Iterations before an event that is kept, times (1 - share of the Gaussians that a view shows) to the power
-# `NARROW_VIEWS`. Densification splits Gaussians whose mean gradient over their visits is large. Where a view shows a
-# third of the Gaussians, means over few visits are noisy, and with every event kept a tenth of 15,000 iterations ends
-# with 170 % of the Gaussians on bonsai; where a view shows three quarters, with 190 % on a ray-traced scene. Where a
-# view shows all of them, as on Lego and fern, the number of events limits growth: with every second event, they end
-# with half to three quarters of their Gaussians. Between the two the power is fitted: bonsai needs about 47 iterations,
-# the ray-traced scene 31, and 40 per event are none too few on fern, nor 10 on Lego.
+# Iterations that a densification event needs if a view shows almost none of the Gaussians. With more of them shown, an
+# event needs fewer: times (1 - share shown) to the power `NARROW_VIEWS`. A thinned run is less far at each event than
+# the trainer's own, so more gradients exceed the threshold. With every event kept, a tenth of 15,000 iterations ends
+# with 170 % of the Gaussians on bonsai, where a view shows a third of them, and with 190 % on a ray-traced scene, where
+# it shows three quarters. Where it shows nearly all, as on Lego and fern, the number of events limits growth: with every
+# second event they end with half to three quarters. The two numbers are fitted: for as many Gaussians as in the own run,
+# bonsai needs about 47 iterations per event, the ray-traced scene 32, fern at most 40 and Lego at most 10.
 STEPS_BEHIND = 55.0
 NARROW_VIEWS = 0.4
-# Least number of events that a shortened phase keeps, whatever the visits; a schedule with fewer keeps all. An event
+# Least number of events that a shortened phase keeps, whatever they need; a schedule with fewer keeps all. An event
 # at most doubles the Gaussians. With 7 or 8 of 13 events, scripts on bonsai at 100x67 ended with half of their
 # Gaussians and 0.011 less SSIM.
 LEAST_EVENTS = 16
@@ -43,9 +43,8 @@ class Events:
         self._known = frozenset(self._numbers)
         self._needs = densification.needs
         self.kept = self.left_out = 0
-        # Number of iterations that ran since the last event, and of surplus ones before it.
-        self._behind = 0
-        self._surplus = 0  # iterations that the following event can count as its own, if this one runs
+        self._behind = 0  # number of iterations that ran since the last event, and of surplus ones before it
+        self._surplus = 0  # number of iterations that the following event can count as its own, if this one runs
 
     def __contains__(self, number: int) -> bool:
         return number in self._known
