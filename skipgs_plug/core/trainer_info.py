@@ -16,11 +16,11 @@ class Densification:
         marks: Names that identify the condition of densification among the loop's conditions on its number, such as
             `densification_interval`.
         numbers: For a strategy object that decides by itself: returns the iterations of a range that have an event.
-        needs: Requirement for an event to be kept; events that do not meet it are left out. "visits": enough
-            iterations ran since the last event for a mean over the visits of each Gaussian; a view that shows fewer
-            Gaussians needs more, at most as many as in the trainer's own schedule. "iterations": as many iterations ran as in the trainer's own schedule; this suits thresholds
-            on counts of visits. "nothing": every event is kept; this suits growth by a budget or by a constant share
-            per event.
+        needs: Requirement for an event to be kept; events that do not meet it are left out. "visits": enough iterations
+            ran since the last event for a mean over the visits of each Gaussian; a view that shows fewer Gaussians
+            needs more, at most as many as in the trainer's own schedule. "iterations": as many iterations ran as in the
+            trainer's own schedule; this suits thresholds on counts of visits. "nothing": every event is kept; this
+            suits growth by a budget or by a constant share per event.
     """
 
     marks: tuple[str, ...] = ()

@@ -12,9 +12,9 @@ from skipgs_plug.core.trainer_info import Densification
 # event needs fewer: times (1 - share shown) to the power `NARROW_VIEWS`. A thinned run is less far at each event than
 # the trainer's own, so more gradients exceed the threshold. With every event kept, a tenth of 15,000 iterations ends
 # with 170 % of the Gaussians on bonsai, where a view shows a third of them, and with 190 % on a ray-traced scene, where
-# it shows three quarters. Where it shows nearly all, as on Lego and fern, the number of events limits growth: with every
-# second event they end with half to three quarters. The two numbers are fitted: for as many Gaussians as in the own run,
-# bonsai needs about 47 iterations per event, the ray-traced scene 32, fern at most 40 and Lego at most 10.
+# it shows three quarters. Where it shows nearly all, as on Lego and fern, the number of events limits growth: with
+# every second event they end with half to three quarters. The two numbers are fitted: for as many Gaussians as in the
+# own run, bonsai needs about 47 iterations per event, the ray-traced scene 32, fern at most 40 and Lego at most 10.
 STEPS_BEHIND = 55.0
 NARROW_VIEWS = 0.4
 # Least number of events that a shortened phase keeps, whatever they need; a schedule with fewer keeps all. An event
