@@ -8,14 +8,14 @@ import math
 # Least share of the iterations that run. A tenth of 15,000 iterations is the least that lost nothing on bonsai and on
 # room. With 8.5 % bonsai ends with three quarters of its Gaussians.
 LEAST_GROWING_SHARE = 0.1
-# Length of growth, in iterations, that this share suits. A shorter one needs more, by the power `SHORTER_GROWTH` of the
-# length. Of 6,000, a tenth lost 0.26 dB on a ray-traced scene, and 14 % lost nothing.
-LONG_GROWTH = 15000
-SHORTER_GROWTH = 0.4
 # Least number of iterations at the trainer's own rates. 750 iterations lost 0.3 dB on Lego and 0.7 dB on bonsai.
 LEAST_GROWING_STEPS = 1200
-# Least number of iterations with longer steps. 450 lost nothing on fern, 700 lost nothing on bonsai.
+# Least number of iterations with longer steps, in a schedule that grows for `SHORT_PHASE` iterations. 450 lost nothing
+# on fern, 700 lost nothing on bonsai. Longer schedules need more, by the power `LONGER_PHASE` of their length: of 3,000
+# and 6,000 iterations, 600 lost 0.17 dB on 46 views of bonsai and 0.26 dB on a ray-traced scene, and 765 and 950 nothing.
 LEAST_GROWING_STEPS_LONGER = 600
+SHORT_PHASE = 1500
+LONGER_PHASE = 0.35
 # Least number of visits of each view, also with longer steps: 3.5 visits lost 0.003 SSIM on bonsai at 399x266 pixels in
 # 7,000 iterations, and 5 ended 0.002 above the trainer's own run. At its own rates 4.7 visits lost 0.5 dB there.
 GROWING_VISITS = 5.0
@@ -39,10 +39,8 @@ LEAST_SHARE_AFTER_FEW = 0.12
 LEAST_STEPS = 400  # least number of iterations, so that steps can shrink
 # The same if iterations were left out before refinement too. With 400 scripts of 3,000 iterations end 0.1 to 0.2 dB
 # lower on bonsai than with 600, and up to 0.2 dB below their own runs. 600 would take over 40 % of the time on fern.
+# Longer schedules need more, as while the scene grows: of 3,000 iterations, 550 lost 0.1 dB on a ray-traced scene.
 LEAST_STEPS_AFTER_FEW = 550
-# Length of refinement, in iterations, for which these are enough. They grow with the fourth root of the length, as with
-# the number of visits: of 3,000 iterations, 550 lost 0.05 to 0.1 dB on a ray-traced scene, and 700 nothing.
-SHORT_REFINEMENT = 1500
 # Largest share that this number asks for. Where all iterations run, steps are not longer and do not shrink: 500 such
 # iterations after its last prune ended 0.3 dB lower than 400 for LightGaussian.
 MOST_SHARE_OF_STEPS = 0.8
@@ -70,9 +68,13 @@ def refining_share(iterations: int, epoch: int, grown_by_few: bool = False) -> f
     rare, least, steps = RARE_SHARE, LEAST_SHARE, float(LEAST_STEPS)
     if grown_by_few:
         rare, least = RARE_SHARE_AFTER_FEW, LEAST_SHARE_AFTER_FEW
-        steps = LEAST_STEPS_AFTER_FEW * max(1.0, iterations / SHORT_REFINEMENT) ** 0.25
-        steps = min(steps, MOST_SHARE_OF_STEPS * iterations)
+        steps = min(LEAST_STEPS_AFTER_FEW * _longer(iterations), MOST_SHARE_OF_STEPS * iterations)
     return min(1.0, max(least, steps / iterations, rare * (epoch / iterations) ** 0.25))
+
+
+def _longer(iterations: int) -> float:
+    """Return the factor on the least number of iterations of a phase, for a schedule of so many iterations."""
+    return max(1.0, iterations / SHORT_PHASE) ** LONGER_PHASE
 
 
 def growing_share(iterations: int, epoch: int, longer: bool, events: int = 0) -> float:
@@ -86,11 +88,10 @@ def growing_share(iterations: int, epoch: int, longer: bool, events: int = 0) ->
     """
     if iterations < 1:
         return 1.0
-    steps = LEAST_GROWING_STEPS_LONGER if longer else LEAST_GROWING_STEPS
+    steps = LEAST_GROWING_STEPS_LONGER * _longer(iterations) if longer else LEAST_GROWING_STEPS
     steps = max(steps, min(STEPS_PER_EVENT * events, LEAST_GROWING_STEPS))
     needed = max(steps, GROWING_VISITS * epoch)
-    least = LEAST_GROWING_SHARE * max(1.0, LONG_GROWTH / iterations) ** SHORTER_GROWTH
-    return min(1.0, max(least, needed / iterations))
+    return min(1.0, max(LEAST_GROWING_SHARE, needed / iterations))
 
 
 def growing_factor(iterations: int, share: float, visible: float | None) -> float:
