@@ -11,8 +11,8 @@ LEAST_GROWING_SHARE = 0.1
 # Least number of iterations at the trainer's own rates. 750 iterations lost 0.3 dB on Lego and 0.7 dB on bonsai.
 LEAST_GROWING_STEPS = 1200
 # Least number of iterations with longer steps, in a schedule that grows for `SHORT_PHASE` iterations. 450 lost nothing
-# on fern, 700 lost nothing on bonsai. Longer schedules need more, by the power `LONGER_PHASE` of their length: of 3,000
-# and 6,000 iterations, 600 lost 0.17 dB on 46 views of bonsai and 0.26 dB on a ray-traced scene, and 765 and 950 nothing.
+# on fern, 700 lost nothing on bonsai. Longer schedules need more, by the power `LONGER_PHASE` of their length: 600 lost
+# 0.17 dB of 3,000 on 46 views of bonsai, and 0.26 dB of 6,000 on a ray-traced scene. 765 and 950 lost nothing.
 LEAST_GROWING_STEPS_LONGER = 600
 SHORT_PHASE = 1500
 LONGER_PHASE = 0.35
