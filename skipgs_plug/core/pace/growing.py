@@ -126,8 +126,8 @@ class Growing:
         assert self.share is not None
         must, barred = number in self._must, False
         if number in self.events and not must:
-            iterations = self.share * self._length
-            must = (self.share >= 1.0 or self.events.enough(number, self._visible_now, iterations)) and not self._full()
+            enough = self.share >= 1.0 or self.events.enough(number, self._visible_now, self.share, self._length)
+            must = enough and not self._full()
             barred = not must
         self.sampling.share = self.share
         runs = self.sampling.runs(must, barred)

@@ -209,12 +209,12 @@ def test_what_shares_its_number_with_events_keeps_it_if_it_is_rarer():
 
 
 def test_needs_of_an_event():
-    def kept(needs, shown, every, numbers=range(100, 2001, 100), last=2000, iterations=10_000):
+    def kept(needs, shown, every, numbers=range(100, 2001, 100), last=2000, length=100_000):
         events = Events(numbers, Densification(needs=needs))
         found = []
         for number in range(last + 1):
             if number in events:
-                if events.enough(number, shown, iterations):
+                if events.enough(number, shown, 0.1, length):
                     found.append(number)
                     events.ran(number)
                 else:
@@ -231,8 +231,8 @@ def test_needs_of_an_event():
     assert kept("visits", 0.95, 20)[:2] == [400, 800]  # 16 iterations, of 4 per event
     assert kept("iterations", 0.95, 5)[:2] == [600, 1200]
     # At least 16 events are kept, or all of fewer.
-    assert len(kept("visits", 0.3, 10, range(100, 1301, 100), iterations=130)) == 13
-    assert kept("visits", 0.3, 5, iterations=400)[:2] == [200, 300]  # 25 iterations each, of 20 and 40
+    assert len(kept("visits", 0.3, 10, range(100, 1301, 100), length=1300)) == 13
+    assert kept("visits", 0.3, 5, length=4000)[:2] == [200, 300]  # 25 iterations each, of 20 and 40
 
 
 def test_shares_that_auto_chooses():
@@ -265,12 +265,12 @@ def test_factors_while_the_scene_grows():
     assert opacity_factor(0.25) == 2.0 and opacity_factor(1.0) == 1.0
 
 
-def events_run(visible: float, per_event: int, count: int = 60) -> list[int]:
+def events_run(visible: float, per_event: int, share: float = 0.1, count: int = 60) -> list[int]:
     """Return the events, numbered from 1, that run if `per_event` iterations run before each of `count` events."""
     events = Events(range(100, 100 * count + 1, 100), Densification())
     kept = []
     for number in range(1, 100 * count + 1):
-        if number % 100 == 0 and events.enough(number, visible, per_event * count):
+        if number % 100 == 0 and events.enough(number, visible, share, round(per_event * count / share)):
             kept.append(number // 100)
             events.ran(number)
         elif number % 100 and number % 100 < per_event:
@@ -289,6 +289,12 @@ def test_events_wait_longer_the_fewer_gaussians_a_view_shows():
     assert shares[2] == pytest.approx(20 / 31.6, abs=0.03)
 
 
+def test_events_need_more_iterations_if_a_larger_share_of_them_runs():
+    # 31.6 iterations with a tenth, and 8 ** (1 / 3) times as many with eight tenths
+    assert len(events_run(0.75, 20)) == pytest.approx(60 * 20 / 31.6, abs=2)
+    assert len(events_run(0.75, 20, share=0.8)) == pytest.approx(60 * 20 / 63.2, abs=2)
+
+
 def test_surplus_iterations_count_for_the_following_event_alone():
     kept = events_run(0.75, 20)
     gaps = {after - before for before, after in itertools.pairwise(kept)}
@@ -296,7 +302,7 @@ def test_surplus_iterations_count_for_the_following_event_alone():
     events = Events(range(100, 1001, 100), Densification())
     for number in range(1, 400):
         events.ran(number) if number % 100 else events.skipped(number)
-    assert events.enough(400, 0.75, 1e6)
+    assert events.enough(400, 0.75, 0.1, 1_000_000)
     events.ran(400)
     assert events.state_dict()["behind"] <= 32  # hundreds of iterations do not pay for several events
     resumed = Events(range(100, 1001, 100), Densification())
