@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -95,7 +96,7 @@ class Events:
         if self._needs == "iterations":
             return behind >= distance
         needed = STEPS_BEHIND * (1.0 - (visible or VISIBLE)) ** NARROW_VIEWS * (share / 0.1) ** LARGER_SHARE
-        needed = int(min(needed, share * length / LEAST_EVENTS, distance))
+        needed = min(int(needed), math.ceil(share * length / LEAST_EVENTS), distance)
         # Without a surplus, 40 iterations per event would be as good as 25 if 50 are needed: every second event.
         self._surplus = min(max(behind - needed, 0), needed)
         return behind >= needed

@@ -66,7 +66,7 @@ def test_a_share_of_both_phases_runs_and_nothing_that_depends_on_numbers_is_lost
 def test_an_event_waits_until_enough_stands_behind_it():
     with SkipGate(start_iter=START, share=0.25) as gate:
         loop = Loop().train(gate)
-    needed = int(0.25 * START / LEAST_EVENTS)
+    needed = math.ceil(0.25 * START / LEAST_EVENTS)
     chosen = [event for event in loop.grown if event % 60]  # a save must run, and its event with it
     for kept, event in enumerate(chosen, start=1):
         assert sum(step <= event for step in loop.ran) >= kept * needed
