@@ -170,7 +170,9 @@ class Growing:
         """Factors on learning rates until the last event: of all parameters but opacities, and of opacities."""
         if self.share is None or self._visible is None or not self._config.compensates:
             return 1.0, 1.0
-        return growing_factor(self._length, self.share, self._visible), opacity_factor(self.share)
+        by_budget = self.events is not None and self.events.all_run
+        factor = growing_factor(self._length, self.share, self._visible, by_budget)
+        return factor, opacity_factor(self.share)
 
     def _full(self) -> bool:
         """Whether one more event could exceed the number of Gaussians that the user allows."""

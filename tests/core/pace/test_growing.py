@@ -259,6 +259,7 @@ def test_shares_that_auto_chooses():
 def test_factors_while_the_scene_grows():
     assert growing_factor(1500, 0.4, None) == growing_factor(1500, 1.0, 0.96) == 1.0
     assert growing_factor(1500, 0.25, 0.96) == 3.0  # the longest that pay
+    assert growing_factor(1500, 0.25, 0.96, by_budget=True) == 4.0  # the number of Gaussians does not rise with them
     assert growing_factor(700, 0.9, 1 / 3) == pytest.approx(1 / 0.9)  # the path of the iterations left out, no more
     assert growing_factor(15_000, 0.12, 0.96) == pytest.approx((2100 / 1800) ** 2)
     assert growing_factor(15_000, 0.2, 0.96) == 1.0
