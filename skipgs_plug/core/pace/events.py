@@ -7,6 +7,8 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+from skipgs_plug.core.pace.needs import LEAST_GROWING_SHARE
+from skipgs_plug.core.pace.visibility import VISIBLE
 from skipgs_plug.core.trainer_info import Densification
 
 # Iterations that a densification event needs if a view shows almost none of the Gaussians. With more of them shown, an
@@ -28,8 +30,6 @@ LARGER_SHARE = 0.5
 # at most doubles the Gaussians. With 7 or 8 of 13 events, scripts on bonsai at 100x67 ended with half of their
 # Gaussians and 0.011 less SSIM.
 LEAST_EVENTS = 16
-# Share of the Gaussians that a view shows, until it is measured. It is measured again after each event.
-VISIBLE = 1 / 3
 
 
 class Events:
@@ -82,7 +82,7 @@ class Events:
         self.left_out += number in self._known
 
     def enough(self, number: int, visible: float | None, share: float, length: int) -> bool:
-        """Whether enough iterations ran before the event in iteration `number`.
+        """Whether enough iterations ran before the event in iteration `number`; notes the surplus for the next one.
 
         Args:
             number: Iteration with an event.
@@ -98,7 +98,8 @@ class Events:
         if self._needs == "iterations":
             return behind >= distance
         visible = visible or VISIBLE
-        needed = STEPS_BEHIND * (1.0 - visible) ** NARROW_VIEWS * (share / 0.1) ** (LARGER_SHARE * visible**2)
+        larger = (share / LEAST_GROWING_SHARE) ** (LARGER_SHARE * visible**2)
+        needed = STEPS_BEHIND * (1.0 - visible) ** NARROW_VIEWS * larger
         needed = min(int(needed), math.ceil(share * length / LEAST_EVENTS), distance)
         # Without a surplus, 40 iterations per event would be as good as 25 if 50 are needed: every second event.
         self._surplus = min(max(behind - needed, 0), needed)

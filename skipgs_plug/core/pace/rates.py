@@ -17,7 +17,7 @@ from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.parts import OptimizerInfo
 from skipgs_plug.core.pace.step_reads import LiteralBetas, WatchedGroup, is_torchs, shorter_memory, unwatch, watch
-from skipgs_plug.core.pace.visibility import Visibility
+from skipgs_plug.core.pace.visibility import VISIBLE, Visibility
 
 Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
 Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
@@ -25,9 +25,6 @@ Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 # Least share of the iterations that steps are made longer for. With a smaller share, steps that conserve the whole path
 # are so long that they lose more than the path gains.
 LEAST_PATH_SHARE = 0.25
-# Share of the Gaussians that a view shows while it is not measured. A third is typical of a room photographed from
-# within.
-VISIBLE = 1 / 3
 # Largest beta2 of Adam during a longer step. The gradient of a single view can move a parameter by its rate divided by
 # the root of 1 - beta2: 32 times the rate at the usual 0.999, which is too far with larger rates, 7 times at 0.98.
 SQUARES_KEPT = 0.98

@@ -12,6 +12,9 @@ from skipgs_plug.core import distributed
 
 # Names of the positions. Regularisers fill the gradients of opacities and scales in some trainers, but not theirs.
 POSITIONS = ("xyz", "means")
+# Share of the Gaussians that a view shows while it is not measured. A third is typical of a room photographed from
+# within.
+VISIBLE = 1 / 3
 STEPS = 100  # number of optimizer steps in the mean, so that it does not depend on the first few views
 # Numbers of measured steps after which sums on a device are read, or reduced over processes. Each read waits for all
 # work of the device, so there are ten, close together at first because the first steps decide on shares.
