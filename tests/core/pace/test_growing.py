@@ -208,21 +208,23 @@ def test_what_shares_its_number_with_events_keeps_it_if_it_is_rarer():
     assert len(set(range(20, 800, 20)) & set(ran)) < 25
 
 
-def test_needs_of_an_event():
-    def kept(needs, shown, every, numbers=range(100, 2001, 100), last=2000, length=100_000):
-        events = Events(numbers, Densification(needs=needs))
-        found = []
-        for number in range(last + 1):
-            if number in events:
-                if events.enough(number, shown, 0.1, length):
-                    found.append(number)
-                    events.ran(number)
-                else:
-                    events.skipped(number)
-            elif number % every == 0:
+def kept(needs, shown, every, numbers=range(100, 2001, 100), share=0.1, length=100_000):
+    """Return the events that run if every `every`-th iteration runs, and each event that has enough before it."""
+    events = Events(numbers, Densification(needs=needs))
+    found = []
+    for number in range(numbers[-1] + 1):
+        if number in events:
+            if events.enough(number, shown, share, length):
+                found.append(number)
                 events.ran(number)
-        return found
+            else:
+                events.skipped(number)
+        elif number % every == 0:
+            events.ran(number)
+    return found
 
+
+def test_needs_of_an_event():
     assert kept("nothing", 0.3, 10) == list(range(100, 2001, 100))
     assert kept("visits", 1.0, 1) == list(range(100, 2001, 100))
     assert kept("visits", 0.3, 5)[:2] == [300, 500]  # 55 * 0.7 ** 0.4 = 47.7 iterations; the third 100 has surplus ones
@@ -266,24 +268,12 @@ def test_factors_while_the_scene_grows():
     assert opacity_factor(0.25) == 2.0 and opacity_factor(1.0) == 1.0
 
 
-def events_run(visible: float, per_event: int, share: float = 0.1, count: int = 60) -> list[int]:
-    """Return the events, numbered from 1, that run if `per_event` iterations run before each of `count` events."""
-    events = Events(range(100, 100 * count + 1, 100), Densification())
-    kept = []
-    for number in range(1, 100 * count + 1):
-        if number % 100 == 0 and events.enough(number, visible, share, round(per_event * count / share)):
-            kept.append(number // 100)
-            events.ran(number)
-        elif number % 100 and number % 100 < per_event:
-            events.ran(number)
-        else:
-            events.skipped(number)
-    return kept
+LONG = range(100, 6001, 100)  # 60 events, with 20 iterations for each if every fifth runs
 
 
 def test_events_wait_longer_the_fewer_gaussians_a_view_shows():
-    assert events_run(1.0, 10) == list(range(1, 61))
-    shares = [len(events_run(visible, 20)) / 60 for visible in (0.3, 0.5, 0.75, 0.9, 0.999)]
+    assert kept("visits", 1.0, 10, LONG) == list(LONG)
+    shares = [len(kept("visits", visible, 5, LONG)) / 60 for visible in (0.3, 0.5, 0.75, 0.9, 0.999)]
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     # 55 * 0.25 ** 0.4 = 31.6 iterations per event, of which 20 run between two events of the trainer
@@ -292,17 +282,16 @@ def test_events_wait_longer_the_fewer_gaussians_a_view_shows():
 
 def test_events_need_more_iterations_if_a_larger_share_of_them_runs():
     # 31.6 iterations with a tenth, and 8 ** (0.75**2 / 2) times as many with eight tenths
-    assert len(events_run(0.75, 20)) == pytest.approx(60 * 20 / 31.6, abs=2)
-    assert len(events_run(0.75, 20, share=0.8)) == pytest.approx(60 * 20 / 56.7, abs=2)
+    assert len(kept("visits", 0.75, 5, LONG)) == pytest.approx(60 * 20 / 31.6, abs=2)
+    assert len(kept("visits", 0.75, 5, LONG, share=0.8)) == pytest.approx(60 * 20 / 56.7, abs=2)
     # Where a view shows a third, they hardly need more.
-    few = len(events_run(1 / 3, 20))
-    assert few - 3 <= len(events_run(1 / 3, 20, share=0.8)) <= few
+    few = len(kept("visits", 1 / 3, 5, LONG))
+    assert few - 3 <= len(kept("visits", 1 / 3, 5, LONG, share=0.8)) <= few
 
 
 def test_surplus_iterations_count_for_the_following_event_alone():
-    kept = events_run(0.75, 20)
-    gaps = {after - before for before, after in itertools.pairwise(kept)}
-    assert gaps == {1, 2}  # without the surplus, every second event
+    gaps = {after - before for before, after in itertools.pairwise(kept("visits", 0.75, 5, LONG))}
+    assert gaps == {100, 200}  # without the surplus, every second event
     events = Events(range(100, 1001, 100), Densification())
     for number in range(1, 400):
         events.ran(number) if number % 100 else events.skipped(number)
