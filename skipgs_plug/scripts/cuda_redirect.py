@@ -61,6 +61,8 @@ REPLACED: dict[str, Any] = {
     # Scripts assert that there is a device, and count them to decide on one process per device.
     "torch.cuda.is_available": lambda: True,
     "torch.cuda.device_count": lambda: 1,
+    # torch's own optimizers ask it once a device is there; without a driver, a build with CUDA raises.
+    "torch.cuda.is_current_stream_capturing": lambda: False,
     "torch.cuda.FloatTensor": torch.FloatTensor,
     "torch.cuda.IntTensor": torch.IntTensor,
     "torch.cuda.LongTensor": torch.LongTensor,

@@ -110,6 +110,18 @@ def test_torch_itself_finds_no_device(monkeypatch):
     assert leaf[0] < 1 and torch.accelerator.current_accelerator().type == "cuda"
 
 
+def test_torch_optimizers_step_without_a_driver(monkeypatch):
+    def no_driver() -> bool:  # as a build with CUDA answers where there is no driver
+        raise RuntimeError("CUDA driver version is insufficient for CUDA runtime version")
+
+    monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", no_driver)
+    with cuda_on_cpu():
+        leaf = torch.ones(2, device="cuda", requires_grad=True)
+        leaf.sum().backward()
+        torch.optim.Adam([leaf]).step()
+    assert leaf[0] < 1
+
+
 @pytest.mark.parametrize("fails", [False, True])
 def test_everything_is_back_afterwards(fails):
     missing = object()

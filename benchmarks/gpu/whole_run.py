@@ -1,0 +1,207 @@
+"""Train gsplat and FastGS from first to last iteration, without a gate and with share="auto", on this GPU.
+
+    python -m benchmarks.gpu.whole_run SCENE CHECKOUTS --steps 30000 --out gpu_whole.json
+
+Both projects' own scripts run unedited, each in a process of its own, one after the other, with their own settings. The
+pictures of held-out views that they write are measured by one tool for both. Each finished run is stored at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from skipgs_plug.files import write_aside
+from skipgs_plug.trainer.metrics import chosen, measure
+
+MODES = {"auto": ["--share", "auto"], "own": ["--no-gate"]}  # the shorter run first: a failure shows early
+
+
+class Script(NamedTuple):
+    """A project's training script.
+
+    Attributes:
+        folder: Name of its checkout in the folder of all checkouts.
+        train: Command line, with placeholders {scene}, {out} and {n}, the iterations.
+        render: Command line that writes pictures of held-out views, if training does not.
+        seconds: Pattern of the training seconds that the script prints or stores, evaluation and loading left out.
+        gaussians: Pattern of the number of Gaussians that it prints or stores.
+    """
+
+    folder: str
+    train: str
+    render: str | None
+    seconds: str
+    gaussians: str
+
+
+SCRIPTS = {
+    "gsplat": Script(
+        "gsplat",
+        "examples/simple_trainer.py default --data_dir {scene} --data_factor 1 --result_dir {out} --max_steps {n} "
+        "--eval_steps {n} --save_steps {n} --disable_viewer --disable_video",
+        None,
+        r'"ellipse_time": ([\d.]+)',
+        r'"num_GS": (\d+)',
+    ),
+    # The settings of FastGS' own train_base.sh for this scene.
+    "fastgs": Script(
+        "FastGS",
+        "train.py -s {scene} -i images --eval -m {out} --iterations {n} --save_iterations {n} --test_iterations -1 "
+        "--densification_interval 500 --optimizer_type default --highfeature_lr 0.02 --grad_abs_thresh 0.0006",
+        "render.py -m {out} --skip_train",
+        r"Training time: ([\d.]+)",
+        r"Gaussian number: (\d+)",
+    ),
+}
+
+
+def main(argv: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu.whole_run", description=__doc__.splitlines()[0])
+    parser.add_argument("scene", type=Path, help="COLMAP folder")
+    parser.add_argument("checkouts", type=Path, help="folder with the checkouts gsplat and FastGS")
+    parser.add_argument("--steps", type=int, default=30_000, help="iterations of the schedule")
+    parser.add_argument("--only", nargs="+", choices=SCRIPTS, default=list(SCRIPTS), help="scripts to run")
+    parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES), help="with or without a gate")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="time limit of all runs")
+    parser.add_argument("--lpips", choices=("alex", "vgg"), help="measure LPIPS too, with this backbone")
+    parser.add_argument("--out", type=Path, default=Path("gpu_whole.json"), help="file to write")
+    asked = parser.parse_args(argv)
+    if not torch.cuda.is_available():
+        print("torch sees no CUDA device here; this measures one.", file=sys.stderr)
+        return 2
+    end = time.monotonic() + asked.seconds
+    result: dict[str, Any] = {
+        "device": torch.cuda.get_device_name(),
+        "torch": torch.__version__,
+        "scene": asked.scene.name,
+        "iterations": asked.steps,
+        "runs": [],
+    }
+    failed = False
+    for name in asked.only:
+        for mode in asked.modes:
+            left = end - time.monotonic()
+            if left < 1.0:
+                print(f"No time left for {name}, {mode}.", file=sys.stderr)
+                failed = True
+                continue
+            record = run(name, mode, asked, left)
+            failed |= "error" in record
+            result["runs"].append(record)
+            with write_aside(asked.out) as temporary:
+                temporary.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    print(table(result))
+    return int(failed)
+
+
+def run(name: str, mode: str, asked: argparse.Namespace, seconds: float) -> dict[str, Any]:
+    """Run a script once and return its record, with `error` if it failed or took longer than `seconds`."""
+    script = SCRIPTS[name]
+    folder = (asked.out.parent / f"{name}_{mode}").resolve()
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    filled = {"scene": asked.scene.resolve(), "out": folder, "n": asked.steps}
+    peak = folder / "peak.json"
+    record: dict[str, Any] = {"script": name, "mode": mode}
+    command = ["-P", "-m", "benchmarks.gpu.peak", str(peak), "skipgs_plug", "run", "auto", *MODES[mode], "--"]
+    begun = time.monotonic()
+    error = call([*command, *script.train.format(**filled).split()], asked.checkouts / script.folder, folder, seconds)
+    record["wall_seconds"] = time.monotonic() - begun
+    if error is None and script.render:
+        error = call(script.render.format(**filled).split(), asked.checkouts / script.folder, folder, 120.0)
+    if error is not None:
+        return record | {"error": error}
+    written = "\n".join(path.read_text(errors="replace") for path in [folder / "log.txt", *folder.glob("stats/train*")])
+    report = next(folder.rglob("skipgs.json"), None)
+    return record | {
+        "train_seconds": float(re.findall(script.seconds, written)[-1]),
+        "gaussians": int(re.findall(script.gaussians, written)[-1]),
+        **json.loads(peak.read_text()),
+        **measure_pictures(folder, asked.lpips),
+        "report": None if report is None else json.loads(report.read_text(encoding="utf-8")),
+    }
+
+
+def call(arguments: list[str], checkout: Path, folder: Path, seconds: float) -> str | None:
+    """Run Python with `arguments`. Return None, or what went wrong."""
+    with (folder / "log.txt").open("a") as log:
+        try:
+            done = subprocess.run(
+                [sys.executable, *arguments], cwd=checkout, stdout=log, stderr=subprocess.STDOUT, timeout=seconds
+            )
+        except subprocess.TimeoutExpired:
+            return f"it took longer than {seconds:.0f} s"
+    if done.returncode == 0:
+        return None
+    lines = (folder / "log.txt").read_text(errors="replace").strip().splitlines()
+    return lines[-1] if lines else f"it ended with {done.returncode}"
+
+
+def measure_pictures(folder: Path, lpips_net: str | None) -> dict[str, float]:
+    """Return means over pictures of held-out views: in folders `renders` and `gt`, or side by side in one file."""
+    photographs = next((path for path in folder.rglob("gt") if path.is_dir()), None)
+    if photographs is None:
+        pairs = [pixels(path).chunk(2, dim=1)[::-1] for path in sorted(folder.glob("renders/val_step*.png"))]
+    else:
+        names = sorted(path.name for path in photographs.iterdir())
+        pairs = [(pixels(photographs.parent / "renders" / name), pixels(photographs / name)) for name in names]
+    rows = [measure(chosen(lpips_net), render.contiguous(), target.contiguous()) for render, target in pairs]
+    return {**{key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}, "views": len(rows)}
+
+
+def pixels(path: Path) -> Tensor:
+    """Return a picture as a tensor [H, W, 3] in [0, 1] on the GPU."""
+    return torch.from_numpy(np.array(Image.open(path).convert("RGB"))).cuda().float() / 255
+
+
+def table(result: dict[str, Any]) -> str:
+    """Return the records as a Markdown table."""
+    lines = [
+        f"{result['device']}, torch {result['torch']}, {result['scene']}, {result['iterations']:,} iterations",
+        "",
+        "| script | run | wall s | training s | iterations run | Gaussians | peak GiB | PSNR | SSIM | LPIPS |",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for one in result["runs"]:
+        if "error" in one:
+            lines.append(f"| {one['script']} | {one['mode']} | {one['wall_seconds']:.1f} | {one['error']} |")
+            continue
+        lpips = next((one[key] for key in one if key.startswith("lpips")), None)
+        cells = [
+            one["script"],
+            one["mode"],
+            f"{one['wall_seconds']:.1f}",
+            f"{one['train_seconds']:.1f}",
+            f"{iterations_run(one, result['iterations']):,}",
+            f"{one['gaussians']:,}",
+            f"{one['peak_bytes'] / 2**30:.2f}",
+            f"{one['psnr']:.2f}",
+            f"{one['ssim']:.4f}",
+            "" if lpips is None else f"{lpips:.4f}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def iterations_run(record: dict[str, Any], iterations: int) -> int:
+    """Return the number of iterations that ran."""
+    report = record["report"] or {}
+    growing = report.get("growing") or {}
+    return iterations - report.get("iterations_skipped", 0) - growing.get("iterations_skipped", 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
