@@ -132,7 +132,19 @@ def _summarise_growing(growing: dict[str, Any]) -> str:
     return (
         f"SkipGS: {run:,} of {run + skipped:,} iterations run ({share:.1f} %) until densification ends, with "
         f"{growing['events_run']:,} of {growing['events_run'] + growing['events_skipped']:,} densification "
-        f"events{longer}."
+        f"events{longer}.{_why_more(growing)}"
+    )
+
+
+def _why_more(growing: dict[str, Any]) -> str:
+    """Return a line that says why more than the share of the growing phase ran; empty if it did not."""
+    run, asked = growing["iterations_run"], growing["iterations_run"] + growing["iterations_skipped"]
+    times = growing["times_grown"]
+    if growing["share"] is None or times is None or run <= 1.1 * growing["share"] * asked or times <= 1.0:
+        return ""
+    return (
+        f"\n  this is more than the share of {growing['share']:.2f}, because the scene grew to {times:.1f} times its "
+        "Gaussians, or because conditions of the loop need iterations"
     )
 
 

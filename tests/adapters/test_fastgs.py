@@ -6,6 +6,7 @@ from cases import SkipAlways, run, script
 from lookalikes import fastgs, taming
 from lookalikes.splats import Log
 
+from skipgs_plug.adapters import fastgs as adapter
 from skipgs_plug.adapters.fastgs import FastGS
 from skipgs_plug.core import decision
 from skipgs_plug.core.trainer_info import Densification
@@ -55,3 +56,12 @@ def test_growth_without_an_event_that_the_loop_tells_runs_whole(monkeypatch):
     with pytest.warns(RuntimeWarning, match="that names interval_of_another_name holds before iteration 20"):
         gated, _ = run(CASES["fastgs"], share=0.5)
     assert gated.backwards[:19] == list(range(1, 20)) and len(gated.backwards) < 64
+
+
+@pytest.mark.parametrize(("first_prune", "whole"), [(32, True), (64, False)])
+def test_densification_runs_whole_before_prunes_by_opacity(monkeypatch, first_prune, whole):
+    monkeypatch.setattr(adapter, "FIRST_FINAL_PRUNE", first_prune)
+    gated, _ = run(CASES["fastgs"], share=0.5)
+    grown = [step for step in gated.backwards if step < 20]
+    assert (grown == list(range(1, 20))) is whole
+    assert len([step for step in gated.backwards if step >= 20]) < 45

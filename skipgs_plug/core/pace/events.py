@@ -43,6 +43,7 @@ class Events:
 
     Attributes:
         kept, left_out: Numbers of events so far.
+        rows: Number of Gaussians now; 0 if it is not known. The caller sets it.
     """
 
     def __init__(self, numbers: Iterable[int], densification: Densification) -> None:
@@ -52,6 +53,7 @@ class Events:
         self.kept = self.left_out = 0
         self._behind = 0  # number of iterations that ran since the last event, and of surplus ones before it
         self._surplus = 0  # number of iterations that the following event can count as its own, if this one runs
+        self.rows = self._rows_before = 0  # now, and before the last event that ran
 
     def __contains__(self, number: int) -> bool:
         return number in self._known
@@ -74,6 +76,7 @@ class Events:
         if number in self._known:
             self.kept += 1
             self._behind, self._surplus = self._surplus, 0
+            self._rows_before = self.rows
         else:
             self._behind += 1
 
@@ -81,7 +84,17 @@ class Events:
         """Count an iteration that is left out, with its event if it has one."""
         self.left_out += number in self._known
 
-    def enough(self, number: int, visible: float | None, share: float, length: int) -> bool:
+    @property
+    def grown(self) -> int:
+        """Number of Gaussians that the last event added; 0 if it is not known, or if prunes and resets removed more."""
+        return max(self.rows - self._rows_before, 0) if self._rows_before else 0
+
+    @property
+    def growth(self) -> float:
+        """Number of Gaussians that the last event added, as a share of those before it."""
+        return self.grown / self._rows_before if self._rows_before else 0.0
+
+    def enough(self, number: int, visible: float | None, share: float, length: int, sooner: float = 1.0) -> bool:
         """Whether enough iterations ran before the event in iteration `number`; notes the surplus for the next one.
 
         Args:
@@ -89,6 +102,7 @@ class Events:
             visible: Share of the Gaussians that a view shows; None if unknown.
             share: Share of the iterations that runs.
             length: Iterations of the phase, whether they run or not.
+            sooner: Factor by which the event needs fewer iterations.
         """
         if self.all_run:
             return True
@@ -99,7 +113,7 @@ class Events:
             return behind >= distance
         visible = visible or VISIBLE
         larger = (share / LEAST_GROWING_SHARE) ** (LARGER_SHARE * visible**2)
-        needed = STEPS_BEHIND * (1.0 - visible) ** NARROW_VIEWS * larger
+        needed = STEPS_BEHIND * (1.0 - visible) ** NARROW_VIEWS * larger / sooner
         needed = min(int(needed), math.ceil(share * length / LEAST_EVENTS), distance)
         # Without a surplus, 40 iterations per event would be as good as 25 if 50 are needed: every second event.
         self._surplus = min(max(behind - needed, 0), needed)
@@ -112,7 +126,9 @@ class Events:
         return number - before
 
     def state_dict(self) -> dict[str, Any]:
-        return {"kept": self.kept, "left_out": self.left_out, "behind": self._behind}
+        rows = [self._rows_before, self.rows]
+        return {"kept": self.kept, "left_out": self.left_out, "behind": self._behind, "gaussians": rows}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.kept, self.left_out, self._behind = int(state["kept"]), int(state["left_out"]), int(state["behind"])
+        self._rows_before, self.rows = state.get("gaussians", (0, 0))

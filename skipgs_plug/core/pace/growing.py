@@ -10,7 +10,14 @@ from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.base import NAMED
 from skipgs_plug.core.pace.events import Events
-from skipgs_plug.core.pace.needs import growing_factor, growing_share, opacity_factor
+from skipgs_plug.core.pace.needs import (
+    LEAST_GROWING_SHARE,
+    for_new_gaussians,
+    growing_factor,
+    growing_share,
+    hurry,
+    opacity_factor,
+)
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.sampling import Sampling
 from skipgs_plug.core.trainer_info import Densification
@@ -48,15 +55,16 @@ class Growing:
         self.events: Events | None = None
         self.always: dict[str, set[int]] = {}
         self._must: frozenset[int] = frozenset()
+        self._must_share = 0.0  # share of the iterations that must run
         self._first_number: int | None = None
         self._length = 0
         self._epoch = 0
         self._visible: float | None = None  # share that a view shows, in the first measurement; it settles `share`
         self._visible_now: float | None = None  # the same in the latest measurement
+        self._share_now: float | None = None  # share of the present iterations; None for `share`
+        self._rows_at_first = 0
         self._measuring = True
         self._saved_events: dict[str, Any] | None = None
-        # Number of Gaussians at the last event, and number that the event before it added.
-        self._rows = self._grown = 0
 
     @property
     def first(self) -> int | None:
@@ -112,8 +120,21 @@ class Growing:
             self._first_number = numbers.start
         # Prunes and selections after the last event need no further iterations.
         self._length = min(numbers.stop, self.events.end or numbers.stop) - self._first_number
+        self._must_share = min(1.0, len(self._must.intersection(numbers)) / max(self._length, 1))
         self._epoch = epoch or self._epoch
         return True
+
+    @property
+    def stretch(self) -> float:
+        """Factor on the share of the iterations for Gaussians that were added, also in refinement; at least 1."""
+        if self.events is None or not self.leaves_out:
+            return 1.0
+        return for_new_gaussians(self._rows_at_first, self.events.rows)
+
+    @property
+    def leaves_out(self) -> bool:
+        """Whether any iteration can be left out; False if all of them must run."""
+        return self._must_share < 1.0
 
     def require(self, number: int) -> None:
         """Make iteration `number` run. Call it for a need that shows only during the run."""
@@ -124,12 +145,20 @@ class Growing:
         assert self.events is not None and self._first_number is not None
         self._settle()
         assert self.share is not None
+        if number in self.events:
+            self.events.rows = distributed.largest(self._rates.rows)  # ranks leave out the same events
+            self._rows_at_first = self._rows_at_first or self.events.rows
+            if self._config.growing == "auto" and self._visible is not None:
+                least = LEAST_GROWING_SHARE * self._hurry * self.stretch
+                self._share_now = min(1.0, max(self.share, least))
         must, barred = number in self._must, False
         if number in self.events and not must:
-            enough = self.share >= 1.0 or self.events.enough(number, self._visible_now, self.share, self._length)
-            must = enough and not self._full()
+            must = self._event_runs(number, self.share) and not self._full()
             barred = not must
-        self.sampling.share = self.share
+        if self._share_now is None:
+            self.sampling.share = self.share
+        else:
+            self.sampling.turn(self._share_now)
         runs = self.sampling.runs(must, barred)
         if runs:
             self.events.ran(number)
@@ -147,6 +176,18 @@ class Growing:
         else:
             self._rates.pause()
         return runs
+
+    def _event_runs(self, number: int, share: float) -> bool:
+        """Whether enough iterations ran before the event in iteration `number`."""
+        assert self.events is not None
+        # Events come sooner only in a scene with many new Gaussians. The ray-traced scene, which grows to e times as
+        # many at most, ended with a tenth more Gaussians otherwise.
+        sooner = self._hurry if self.stretch > 1.0 else 1.0
+        return share >= 1.0 or self.events.enough(number, self._visible_now, share, self._length, sooner)
+
+    @property
+    def _hurry(self) -> float:
+        return 1.0 if self.events is None or self._config.growing != "auto" else hurry(self.events.growth)
 
     def _settle(self) -> None:
         """Use the present measurement; the share of the phase is fixed once enough steps are measured."""
@@ -171,25 +212,21 @@ class Growing:
         if self.share is None or self._visible is None or not self._config.compensates:
             return 1.0, 1.0
         by_budget = self.events is not None and self.events.all_run
-        factor = growing_factor(self._length, self.share, self._visible, by_budget)
-        return factor, opacity_factor(self.share)
+        share = max(self._share_now or self.share, self._must_share)
+        factor = growing_factor(self._length, share, self._visible, by_budget)
+        return factor, opacity_factor(share)
 
     def _full(self) -> bool:
         """Whether one more event could exceed the number of Gaussians that the user allows."""
-        bound = self._config.max_gaussians
-        if bound is None:
-            return False
-        rows = distributed.largest(self._rates.rows)  # ranks leave out the same events
-        if self._rows:
-            self._grown = max(rows - self._rows, 0)
-        self._rows = rows
-        return rows + self._grown > bound
+        bound, events = self._config.max_gaussians, self.events
+        return bound is not None and events is not None and events.rows + events.grown > bound
 
     def report(self) -> dict[str, Any]:
         """Return the entries of skipgs.json about this phase.
 
         `share`, `iterations_run`, `iterations_skipped`, `events_run`, `events_skipped`, `rate_factor`,
-        `opacity_rate_factor`, `always_run`.
+        `opacity_rate_factor`, `times_grown` (Gaussians at the last event, as a multiple of those at the first; None if
+        unknown), `always_run`.
         """
         events = self.events
         known = self.share is not None and self._config.compensates
@@ -202,6 +239,7 @@ class Growing:
             "events_skipped": 0 if events is None else events.left_out,
             "rate_factor": factor,
             "opacity_rate_factor": opacities,
+            "times_grown": events.rows / self._rows_at_first if events is not None and self._rows_at_first else None,
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
         }
 
@@ -212,6 +250,8 @@ class Growing:
             "first": self._first_number,
             "views": self._epoch,
             "gaussians_shown": [self._visible, self._visible_now],
+            "share_now": self._share_now,
+            "gaussians_at_first": self._rows_at_first,
             "measuring": self._measuring,
             "sampling": self.sampling.state_dict(),
             "events": self._saved_events if self.events is None else self.events.state_dict(),
@@ -222,6 +262,7 @@ class Growing:
         self.share, self._first_number = state["share"], state["first"]
         self._epoch = state["views"]
         self._measuring = state["measuring"]
+        self._share_now, self._rows_at_first = state.get("share_now"), state.get("gaussians_at_first", 0)
         self._visible, self._visible_now = state["gaussians_shown"]
         self.sampling.load_state_dict(state["sampling"])
         self._saved_events, self.events = state["events"], None

@@ -239,7 +239,7 @@ class Phased(Pace):
                 marks = ", ".join(self._densification.marks)
                 self._grow_whole(f"No condition of the loop that names {marks} holds before iteration {self._start}")
         held = {reason: hits for reason, hits in found[1].items() if hits}
-        by_few = self.growing is not None and bool(grown)
+        by_few = self.growing is not None and bool(grown) and self.growing.leaves_out
         self.refining.begin(self._last, held, self._views, epoch, self._keeps_rates, by_few)
 
     def _require_events(self) -> None:
@@ -267,6 +267,7 @@ class Phased(Pace):
     def _refine(self, number: int) -> bool:
         if self.growing is not None and self.refining.sampling.asked == 0:
             self._rates.visibility.restart()  # the grown scene decides how long steps are
+            self.refining.stretch(self.growing.stretch)
         return self.refining.runs(number)
 
     # State and report.

@@ -123,6 +123,14 @@ class Refining:
             len(self._must),
         )
 
+    def stretch(self, factor: float) -> None:
+        """Raise the share of "auto" for Gaussians that densification added. Call it before the first iteration."""
+        assert self.share is not None
+        if self._auto:
+            self.share = min(1.0, self.share * factor)
+            if self.stopping is None:
+                self.sampling.share = self.share
+
     def runs(self, number: int) -> bool:
         """Whether iteration `number` runs; called once for each number, in order."""
         if self._expected is not None and number > self._expected:

@@ -24,6 +24,12 @@ class Sampling:
         self.run = 0
         self.left_out = 0
         self._due = 0  # number of iterations that should have run by now
+        self._since = (0, 0)  # numbers of iterations, and of those due, before the present share
+
+    def turn(self, share: float) -> None:
+        """Run another share from now on, and keep no account of the iterations before."""
+        if share != self.share:
+            self.share, self._due, self._since = share, self.run, (self.asked, self.run)
 
     @property
     def asked(self) -> int:
@@ -46,7 +52,8 @@ class Sampling:
             self.left_out += 1
             return False
         if 0.0 < self.share < 1.0:
-            while (self._due + _position(self._due)) / self.share < self.asked + 1:
+            asked, due = self._since
+            while (self._due - due + _position(self._due)) / self.share < self.asked - asked + 1:
                 self._due += 1
             must = must or self.run < self._due
         else:
@@ -58,11 +65,13 @@ class Sampling:
         return must
 
     def state_dict(self) -> dict[str, Any]:
-        return {"share": self.share, "run": self.run, "left_out": self.left_out, "due": self._due}
+        return {"share": self.share, "run": self.run, "left_out": self.left_out, "due": self._due, "since": self._since}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.share = float(state["share"])
         self.run, self.left_out, self._due = int(state["run"]), int(state["left_out"]), int(state["due"])
+        asked, due = state.get("since", (0, 0))  # absent from states of before
+        self._since = (int(asked), int(due))
 
 
 def _position(slot: int) -> float:

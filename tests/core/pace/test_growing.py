@@ -10,7 +10,14 @@ import torch
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.core.pace import needs
 from skipgs_plug.core.pace.events import LEAST_EVENTS, Events
-from skipgs_plug.core.pace.needs import growing_factor, growing_share, opacity_factor, refining_share
+from skipgs_plug.core.pace.needs import (
+    for_new_gaussians,
+    growing_factor,
+    growing_share,
+    hurry,
+    opacity_factor,
+    refining_share,
+)
 from skipgs_plug.core.trainer_info import Densification
 
 VIEWS = [f"{i}.png" for i in range(4)]
@@ -134,6 +141,14 @@ def test_opacities_alone_take_longer_steps_where_iterations_are_enough(monkeypat
     assert loop.between(200, START) == {(1.0, 2.0)}
 
 
+def test_steps_stay_where_all_iterations_must_run():
+    loop = Opaque()
+    with SkipGate(start_iter=START, share=0.25) as gate:
+        loop.train(gate, always=range(START))
+    assert loop.between(0, START) == {(1.0, 1.0)}
+    assert loop.ran[:START] == list(range(START)) and len(loop.ran) < LAST
+
+
 def test_refinement_does_not_end_early_after_few_iterations_of_growth():
     names = [f"{i}.png" for i in range(40)]
     reports = {}
@@ -235,6 +250,77 @@ def test_needs_of_an_event():
     # At least 16 events are kept, or all of fewer.
     assert len(kept("visits", 0.3, 10, range(100, 1301, 100), length=1300)) == 13
     assert kept("visits", 0.3, 5, length=4000)[:2] == [200, 300]  # 25 iterations each, of 20 and 40
+
+
+def test_an_event_can_come_sooner():
+    events = Events(range(100, 1001, 100), Densification())
+    for sooner, needed in ((1.0, 47), (2.0, 23), (10.0, 4)):
+        found = []
+        for behind in range(1, 60):
+            events.load_state_dict({**events.state_dict(), "behind": behind - 1})
+            if events.enough(200, 0.3, 0.1, 100_000, sooner):
+                found.append(behind)
+        assert found[0] == needed
+
+
+def test_growth_is_that_of_the_last_event():
+    events = Events(range(100, 1001, 100), Densification())
+    events.rows = 1000
+    assert events.growth == 0.0  # no event yet
+    events.ran(100)
+    events.rows = 1060
+    assert events.grown == 60 and events.growth == pytest.approx(0.06)
+    events.ran(150)  # no event
+    assert events.grown == 60
+    events.rows = 900  # a prune removed more than the event added
+    assert events.grown == 0 and events.growth == 0.0
+
+
+def test_new_gaussians_ask_for_more_iterations():
+    assert hurry(0.0) == hurry(0.03) == 1.0 and hurry(0.09) == pytest.approx(3.0)
+    assert for_new_gaussians(0, 500) == for_new_gaussians(500, 100) == for_new_gaussians(1000, 2718) == 1.0
+    assert for_new_gaussians(3000, 97_000) == pytest.approx(1.82, abs=0.01)
+
+
+class Multiplies(Loop):
+    """The same loop, in which each event adds a share of the Gaussians."""
+
+    def __init__(self, growth):
+        super().__init__()
+        self.growth, self.means = growth, torch.nn.Parameter(torch.rand(100, 3))
+        self.optimizer = torch.optim.Adam([{"params": [self.means], "name": "xyz"}], lr=0.1)
+
+    def train(self, gate):
+        for step in gate.iterations(range(6000), views=VIEWS, events=range(20, 3000, 20)):
+            self.ran.append(step)
+            if gate.backward(self.means.square().sum(), view=VIEWS[step % 4], step=step):
+                self.optimizer.step()
+                self.optimizer.zero_grad(set_to_none=True)
+            if step % 20 == 0 and 0 < step < 3000:
+                self.grown.append(step)
+                rows = min(len(self.means) * (1 + self.growth), 10_000)
+                self.means = torch.nn.Parameter(torch.rand(int(rows), 3))
+                self.optimizer = torch.optim.Adam([{"params": [self.means], "name": "xyz"}], lr=0.1)
+        return self
+
+
+def test_a_scene_that_grows_strongly_gets_more_iterations_in_both_phases():
+    reports, loops = {}, {}
+    for growth in (0.0, 0.02, 0.1):
+        with SkipGate(start_iter=3000, share="auto") as gate:
+            loops[growth] = Multiplies(growth).train(gate)
+        reports[growth] = gate.report()
+        assert ("because the scene grew to 100.0 times" in gate.summary()) is (growth == 0.1)
+    still, little, much = (reports[growth] for growth in (0.0, 0.02, 0.1))
+    assert little["growing"]["iterations_run"] == still["growing"]["iterations_run"]
+    assert much["growing"]["iterations_run"] > still["growing"]["iterations_run"]
+    assert len(loops[0.1].grown) >= len(loops[0.0].grown)
+    factor = for_new_gaussians(100, 10_000)
+    assert much["refine_share"] == pytest.approx(factor * still["refine_share"], rel=0.02)
+    with SkipGate(start_iter=3000, share=0.2) as gate:  # a number is a promise
+        Multiplies(0.1).train(gate)
+    assert gate.report()["refine_share"] == 0.2
+    assert gate.report()["growing"]["iterations_run"] == pytest.approx(600, abs=3)
 
 
 def test_shares_that_auto_chooses():

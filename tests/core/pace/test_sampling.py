@@ -48,6 +48,18 @@ def test_no_view_starves_in_a_loop_that_takes_them_in_turn(share: float, n_views
     assert min(visits) >= 0.6 * share * rounds
 
 
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.floats(0.05, 1.0), st.integers(50, 400)), min_size=1, max_size=6))
+def test_a_share_that_turns_is_kept_from_then_on(parts: list[tuple[float, int]]) -> None:
+    sampling = Sampling(1.0)
+    for share, count in parts:
+        sampling.turn(share)
+        before = sampling.run
+        for _ in range(count):
+            sampling.runs(False)
+        assert abs(sampling.run - before - share * count) <= 2.0
+
+
 def test_a_saved_state_goes_on() -> None:
     whole = ran(0.37, range(500))
     first = Sampling(0.37)
