@@ -216,6 +216,11 @@ class Growing:
         factor = growing_factor(self._length, share, self._visible, by_budget)
         return factor, opacity_factor(share)
 
+    @property
+    def _times_grown(self) -> float | None:
+        """Present number of Gaussians, as a multiple of those at the first event; None if unknown."""
+        return None if self.events is None or not self._rows_at_first else self.events.rows / self._rows_at_first
+
     def _full(self) -> bool:
         """Whether one more event could exceed the number of Gaussians that the user allows."""
         bound, events = self._config.max_gaussians, self.events
@@ -239,7 +244,7 @@ class Growing:
             "events_skipped": 0 if events is None else events.left_out,
             "rate_factor": factor,
             "opacity_rate_factor": opacities,
-            "times_grown": events.rows / self._rows_at_first if events is not None and self._rows_at_first else None,
+            "times_grown": self._times_grown,
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
         }
 

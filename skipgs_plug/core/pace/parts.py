@@ -17,6 +17,9 @@ NAMED = {
     **dict.fromkeys(("f_dc", "sh0", "features_dc"), CONSTANT_BAND),
     **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
 }
+# The same of positions while the scene grows, when their rate is still high. With twice the factor, fern that grows from
+# 4,000 to 74,000 Gaussians ended 4 dB below its own run, and with the factor itself 0.2 dB above.
+POSITIONS_GROWING = 1.0
 OPACITIES = ("opacity", "opacities")
 # Largest factor on the rate of parameters without a row for each Gaussian (exposures, poses, networks). They must not
 # follow a model that is far off for a while.
@@ -173,7 +176,9 @@ def _share(info: GroupInfo, rows: int, opacities: float | None) -> Share | None:
         return Share(info.group, OTHERS_AT_MOST, 1.0, None) if opacities is None else None
     if info.part is None:
         return Share(info.group, opacities or 1.0, 1.0, info)
-    return Share(info.group, info.part, math.inf, info)
+    grows = opacities is not None
+    part = min(info.part, POSITIONS_GROWING) if grows and info.positions else info.part
+    return Share(info.group, part, math.inf, info)
 
 
 def _is_about(info: GroupInfo, group: dict[str, Any]) -> bool:
