@@ -62,7 +62,13 @@ class ClockState(TypedDict):
     t_post_processor: float
 
 
-class SamplingState(TypedDict):
+class NewerSamplingState(TypedDict, total=False):
+    """Entry that states of earlier versions do not have."""
+
+    since: tuple[int, int]
+
+
+class SamplingState(NewerSamplingState):
     """Content of `Sampling.state_dict()`."""
 
     share: float
@@ -103,7 +109,13 @@ class RefiningState(NewerRefiningState):
     stopping: EarlyStoppingState | None
 
 
-class EventsState(TypedDict):
+class NewerEventsState(TypedDict, total=False):
+    """Entry that states of earlier versions do not have."""
+
+    gaussians: tuple[int, int]
+
+
+class EventsState(NewerEventsState):
     """Content of `Events.state_dict()`."""
 
     kept: int
@@ -111,7 +123,14 @@ class EventsState(TypedDict):
     behind: int
 
 
-class GrowingState(TypedDict):
+class NewerGrowingState(TypedDict, total=False):
+    """Entries that states of earlier versions do not have."""
+
+    share_now: float | None
+    gaussians_at_first: int
+
+
+class GrowingState(NewerGrowingState):
     """Content of `Growing.state_dict()`."""
 
     asked: float | str

@@ -17,7 +17,9 @@ from skipgs_plug.core.pace.needs import (
     growing_share,
     hurry,
     opacity_factor,
+    positions_part,
 )
+from skipgs_plug.core.pace.parts import GrowingParts
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.sampling import Sampling
 from skipgs_plug.core.trainer_info import Densification
@@ -27,6 +29,7 @@ MEASURED = 20
 # The same after each event that was kept. The share falls as the scene grows, on bonsai from 46 % to 30 %. A few steps
 # are precise enough to count visits, and each measured step can cost a read of the GPU.
 MEASURED_AGAIN = 8
+UNCHANGED = 1.0, GrowingParts(1.0, 1.0)  # factor and parts of the trainer's own steps
 
 
 class Growing:
@@ -168,9 +171,9 @@ class Growing:
         else:
             self.events.skipped(number)
         # After the last event iterations stand for themselves alone: prunes and terms of the loss wait for their own.
-        factor, opacities = self._factors if number < self._first_number + self._length else (1.0, 1.0)
-        if opacities > 1.0:
-            self._rates.scale(factor, opacities)
+        factor, parts = self._factors if number < self._first_number + self._length else UNCHANGED
+        if parts.opacities > 1.0:
+            self._rates.scale(factor, parts)
         elif self._measuring or self._config.max_gaussians is not None:
             self._rates.look()
         else:
@@ -207,14 +210,14 @@ class Growing:
             self.share = growing_share(self._length, self._epoch, longer, events)
 
     @property
-    def _factors(self) -> tuple[float, float]:
-        """Factors on learning rates until the last event: of all parameters but opacities, and of opacities."""
+    def _factors(self) -> tuple[float, GrowingParts]:
+        """Factor on learning rates until the last event, and the parts of opacities and positions."""
         if self.share is None or self._visible is None or not self._config.compensates:
-            return 1.0, 1.0
+            return UNCHANGED
         by_budget = self.events is not None and self.events.all_run
         share = max(self._share_now or self.share, self._must_share)
         factor = growing_factor(self._length, share, self._visible, by_budget)
-        return factor, opacity_factor(share)
+        return factor, GrowingParts(opacity_factor(share), positions_part(factor, by_budget))
 
     @property
     def _times_grown(self) -> float | None:
@@ -235,7 +238,7 @@ class Growing:
         """
         events = self.events
         known = self.share is not None and self._config.compensates
-        factor, opacities = self._factors if known else (None, None)
+        factor, parts = self._factors if known else (None, None)
         return {
             "share": self.share,
             "iterations_run": self.sampling.run,
@@ -243,7 +246,7 @@ class Growing:
             "events_run": 0 if events is None else events.kept,
             "events_skipped": 0 if events is None else events.left_out,
             "rate_factor": factor,
-            "opacity_rate_factor": opacities,
+            "opacity_rate_factor": None if parts is None else parts.opacities,
             "times_grown": self._times_grown,
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
         }

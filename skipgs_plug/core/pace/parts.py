@@ -17,9 +17,6 @@ NAMED = {
     **dict.fromkeys(("f_dc", "sh0", "features_dc"), CONSTANT_BAND),
     **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
 }
-# The same of positions while the scene grows, when their rate is still high. With twice the factor, fern that grows from
-# 4,000 to 74,000 Gaussians ended 4 dB below its own run, and with the factor itself 0.2 dB above.
-POSITIONS_GROWING = 1.0
 OPACITIES = ("opacity", "opacities")
 # Largest factor on the rate of parameters without a row for each Gaussian (exposures, poses, networks). They must not
 # follow a model that is far off for a while.
@@ -63,11 +60,23 @@ class GroupInfo:
         part: Multiple of the common factor; see `group_part`.
         first: The parameter of a group that has only one; else None.
         positions: Parameters that may be positions [N, 3].
+        named_positions: Whether the name says that they are positions.
         betas: The trainer's betas when `shorter` was called last.
         short: The betas that `shorter` returned then.
     """
 
-    __slots__ = ("_known", "_params", "_shaped", "betas", "first", "group", "part", "positions", "short")
+    __slots__ = (
+        "_known",
+        "_params",
+        "_shaped",
+        "betas",
+        "first",
+        "group",
+        "named_positions",
+        "part",
+        "positions",
+        "short",
+    )
 
     def __init__(self, group: dict[str, Any], name: str | None) -> None:
         self.group = group
@@ -80,6 +89,7 @@ class GroupInfo:
         # Inria's exposures step before the positions, so their rows cannot be compared. Groups with names belong to the
         # model, even if their shapes are unusual, as those of anchors are.
         self._shaped = all(shape in GAUSSIAN_SHAPES or (len(shape) == 2 and shape[1] == 3) for shape in shapes)
+        self.named_positions = known in POSITIONS
         may_be = self._params if known is None or known in POSITIONS else []
         self.positions = [param for param in may_be if param.ndim == 2 and param.shape[1] == 3]
         self.betas: Any = None
@@ -125,6 +135,18 @@ class Share(NamedTuple):
     longer: GroupInfo | None
 
 
+class GrowingParts(NamedTuple):
+    """How two kinds of parameters share in longer steps while the scene grows.
+
+    Attributes:
+        opacities: Multiple of their rate that opacities take.
+        positions: Multiple of the common factor that positions take.
+    """
+
+    opacities: float
+    positions: float
+
+
 class OptimizerInfo:
     """Facts about an optimizer. They hold while its groups have the same parameters.
 
@@ -137,10 +159,10 @@ class OptimizerInfo:
         name: The argument.
         positions: Parameters that may be positions [N, 3].
         shares: Shares of the groups that are scaled; see `divide`.
-        rows, opacities: The arguments of `divide` that `shares` were found for.
+        rows, growing: The arguments of `divide` that `shares` were found for.
     """
 
-    __slots__ = ("_only", "groups", "name", "opacities", "positions", "rows", "shares")
+    __slots__ = ("_only", "groups", "growing", "name", "positions", "rows", "shares")
 
     def __init__(self, optimizer: torch.optim.Optimizer, name: str | None) -> None:
         self.name = name
@@ -148,7 +170,7 @@ class OptimizerInfo:
         self.positions = [param for group in self.groups for param in group.positions]
         self.shares: list[Share] = []
         self.rows: int | None = None
-        self.opacities: float | None = None
+        self.growing: GrowingParts | None = None
         self._only = self.groups[0] if len(self.groups) == 1 and self.groups[0].first is not None else None
 
     def fits(self, optimizer: torch.optim.Optimizer) -> bool:
@@ -159,25 +181,24 @@ class OptimizerInfo:
             return groups[0] is only.group and len(now) == 1 and now[0] is only.first
         return len(groups) == len(self.groups) and all(map(_is_about, self.groups, groups))
 
-    def divide(self, rows: int, opacities: float | None) -> None:
+    def divide(self, rows: int, growing: GrowingParts | None) -> None:
         """Find `shares`.
 
         Args:
             rows: Number of Gaussians; 0 if it is not known. Only parameters with as many rows take larger steps.
-            opacities: Multiple of their rate that opacities take while the scene grows. Parameters without a row for
-                each Gaussian then keep their rates. None in refinement, in which opacities are never raised.
+            growing: While the scene grows, the parts of opacities and positions. Parameters without a row for each
+                Gaussian then keep their rates. None in refinement, in which opacities are never raised.
         """
-        self.rows, self.opacities = rows, opacities
-        self.shares = [share for one in self.groups if (share := _share(one, rows, opacities)) is not None]
+        self.rows, self.growing = rows, growing
+        self.shares = [share for one in self.groups if (share := _share(one, rows, growing)) is not None]
 
 
-def _share(info: GroupInfo, rows: int, opacities: float | None) -> Share | None:
+def _share(info: GroupInfo, rows: int, growing: GrowingParts | None) -> Share | None:
     if not info.of_gaussians(rows):
-        return Share(info.group, OTHERS_AT_MOST, 1.0, None) if opacities is None else None
+        return Share(info.group, OTHERS_AT_MOST, 1.0, None) if growing is None else None
     if info.part is None:
-        return Share(info.group, opacities or 1.0, 1.0, info)
-    grows = opacities is not None
-    part = min(info.part, POSITIONS_GROWING) if grows and info.positions else info.part
+        return Share(info.group, 1.0 if growing is None else growing.opacities, 1.0, info)
+    part = info.part if growing is None or not info.named_positions else growing.positions
     return Share(info.group, part, math.inf, info)
 
 

@@ -15,7 +15,7 @@ from torch.utils.hooks import RemovableHandle
 
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.pace.parts import OptimizerInfo
+from skipgs_plug.core.pace.parts import GrowingParts, OptimizerInfo
 from skipgs_plug.core.pace.step_reads import LiteralBetas, WatchedGroup, is_torchs, shorter_memory, unwatch, watch
 from skipgs_plug.core.pace.visibility import VISIBLE, Visibility
 
@@ -85,7 +85,7 @@ class ScaledRates:
         self.visibility = Visibility()
         self.on_error: Callable[[Exception], None] | None = None
         self._factor: float | None = None
-        self._opacities: float | None = None
+        self._growing: GrowingParts | None = None
         self._only_look = False
         self._rows = self._rows_now = 0  # number of Gaussians in the previous and in this iteration; 0 if unknown
         self._thread = get_ident()
@@ -105,13 +105,13 @@ class ScaledRates:
         self.scale(1.0)
         self._only_look = True
 
-    def scale(self, factor: float, opacities: float | None = None) -> None:
+    def scale(self, factor: float, growing: GrowingParts | None = None) -> None:
         """Scale the next steps in the thread that calls this, which is the training thread; see `group_part`.
 
         Args:
             factor: Factor on learning rates.
-            opacities: While the scene grows, the multiple of their rate that opacities take. `factor` is at least 1
-                then, and parameters without a row for each Gaussian keep their rates. None in refinement.
+            growing: While the scene grows, the parts of opacities and positions. `factor` is at least 1 then, and
+                parameters without a row for each Gaussian keep their rates. None in refinement.
 
         Raises:
             SkipGSError: Another gate scales steps in this thread, and one of the two does not know its own optimizers.
@@ -127,7 +127,7 @@ class ScaledRates:
                     "Another gate makes steps larger in this thread, and each gate would scale the steps of both: "
                     "detach() it first, or train in separate threads."
                 )
-        self._factor, self._opacities, self._only_look, self._thread = factor, opacities, False, thread
+        self._factor, self._growing, self._only_look, self._thread = factor, growing, False, thread
         self._rows, self._rows_now = self._rows_now or self._rows, 0
         if not self._handles:
             _hooked.append(self)
@@ -210,10 +210,10 @@ class ScaledRates:
             if param.shape[0] > self._rows_now:
                 self._rows_now = param.shape[0]
         rows = self._rows_now if self._rows_now > self._rows else self._rows
-        if info.rows != rows or info.opacities != self._opacities:
-            info.divide(rows, self._opacities)
+        if info.rows != rows or info.growing != self._growing:
+            info.divide(rows, self._growing)
         shares = [] if self._only_look else info.shares
-        if factor == 1.0 and self._opacities is not None:  # only opacities, which have no part, are scaled
+        if factor == 1.0 and self._growing is not None:  # only opacities, which have no part, are scaled
             shares = [one for one in shares if one.longer is not None and one.longer.part is None]
         if under_way:  # an optimizer can wrap another one that has the same groups
             scaled = {id(group) for other in under_way for group, _, _ in other.before}
