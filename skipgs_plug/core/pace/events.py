@@ -94,7 +94,9 @@ class Events:
         """Number of Gaussians that the last event added, as a share of those before it."""
         return self.grown / self._rows_before if self._rows_before else 0.0
 
-    def enough(self, number: int, visible: float | None, share: float, length: int, sooner: float = 1.0) -> bool:
+    def enough(
+        self, number: int, visible: float | None, share: float, length: int, sooner: float | None = None
+    ) -> bool:
         """Whether enough iterations ran before the event in iteration `number`; notes the surplus for the next one.
 
         Args:
@@ -102,7 +104,8 @@ class Events:
             visible: Share of the Gaussians that a view shows; None if unknown.
             share: Share of the iterations that runs.
             length: Iterations of the phase, whether they run or not.
-            sooner: Factor by which the event needs fewer iterations.
+            sooner: In a scene with many new Gaussians, the factor by which the event needs fewer iterations, at least
+                1; a larger share asks for no more there. None in other scenes.
         """
         if self.all_run:
             return True
@@ -113,7 +116,7 @@ class Events:
             return behind >= distance
         visible = visible or VISIBLE
         larger = (share / LEAST_GROWING_SHARE) ** (LARGER_SHARE * visible**2)
-        needed = STEPS_BEHIND * (1.0 - visible) ** NARROW_VIEWS * larger / sooner
+        needed = STEPS_BEHIND * (1.0 - visible) ** NARROW_VIEWS * (larger if sooner is None else 1.0 / sooner)
         needed = min(int(needed), math.ceil(share * length / LEAST_EVENTS), distance)
         # Without a surplus, 40 iterations per event would be as good as 25 if 50 are needed: every second event.
         self._surplus = min(max(behind - needed, 0), needed)

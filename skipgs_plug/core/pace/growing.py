@@ -185,7 +185,7 @@ class Growing:
         assert self.events is not None
         # Events come sooner only in a scene with many new Gaussians. The ray-traced scene, which grows to e times as
         # many at most, ended with a tenth more Gaussians otherwise.
-        sooner = self._hurry if self.stretch > 1.0 else 1.0
+        sooner = self._hurry if self.stretch > 1.0 else None
         return share >= 1.0 or self.events.enough(number, self._visible_now, share, self._length, sooner)
 
     @property

@@ -31,7 +31,7 @@ STEPS_PER_EVENT = 14
 GROWTH_PER_EVENT = 0.03
 # How much a share is raised for Gaussians that are new: by a part of the logarithm of their number, as a multiple of
 # the number at the beginning. Up to e times as many need nothing more.
-NEW_GAUSSIANS = 1 / 3
+NEW_GAUSSIANS = 0.5
 # Number of iterations of growth from which steps need not be longer. With fewer iterations, the factor grows with the
 # square of the lack. Longer schedules reset opacities more often, and the few iterations between two resets do not
 # tolerate long steps: four times the rate in 1,500 iterations cost bonsai 0.6 dB, but gained 0.5 dB and more in 700 to
