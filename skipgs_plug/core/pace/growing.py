@@ -217,7 +217,7 @@ class Growing:
         by_budget = self.events is not None and self.events.all_run
         share = max(self._share_now or self.share, self._must_share)
         factor = growing_factor(self._length, share, self._visible, by_budget)
-        return factor, GrowingParts(opacity_factor(share), positions_part(factor, by_budget))
+        return factor, GrowingParts(opacity_factor(share), positions_part(factor))
 
     @property
     def _times_grown(self) -> float | None:

@@ -31,7 +31,7 @@ STEPS_PER_EVENT = 14
 GROWTH_PER_EVENT = 0.03
 # How much a share is raised for Gaussians that are new: by a part of the logarithm of their number, as a multiple of
 # the number at the beginning. Up to e times as many need nothing more.
-NEW_GAUSSIANS = 0.5
+NEW_GAUSSIANS = 1 / 3
 # Number of iterations of growth from which steps need not be longer. With fewer iterations, the factor grows with the
 # square of the lack. Longer schedules reset opacities more often, and the few iterations between two resets do not
 # tolerate long steps: four times the rate in 1,500 iterations cost bonsai 0.6 dB, but gained 0.5 dB and more in 700 to
@@ -45,8 +45,8 @@ LONGEST_STEPS = 3.0
 LONGEST_STEPS_BY_BUDGET = 4.0
 
 # Largest factor on the rate of positions, which take twice the common factor elsewhere. With 6, fern that grows from
-# 4,000 to 74,000 Gaussians ended 4 dB below its own run, with 4 and 3 it ended 0.6 and 0.2 dB above. Two times 1.96 is
-# right for bonsai, and with 1.96 alone it loses 0.1 dB.
+# 4,000 to 74,000 Gaussians ended 4 dB below its own run, with 4 and 3 it ended 0.6 and 0.2 dB above. gsplat's MCMC on
+# bonsai lost 1 dB with 8, and 0.6 dB with 4. With 1.96 instead of 3.9 bonsai loses 0.1 dB.
 LONGEST_STEPS_OF_POSITIONS = 4.0
 
 # Refining (after densification ends).
@@ -149,12 +149,9 @@ def growing_factor(iterations: int, share: float, visible: float | None, by_budg
     return max(1.0, min(longest, conserved, (ENOUGH_STEPS / math.ceil(share * iterations)) ** 2))
 
 
-def positions_part(factor: float, by_budget: bool = False) -> float:
-    """Return the multiple of the common factor that positions take while the scene grows, from 1 to 2.
-
-    It is always 2 where a budget or a share per event sets the number of Gaussians: 3DGS-MCMC lost 0.2 dB with 1.
-    """
-    return GEOMETRY if by_budget else min(GEOMETRY, max(1.0, LONGEST_STEPS_OF_POSITIONS / factor))
+def positions_part(factor: float) -> float:
+    """Return the multiple of the common factor that positions take while the scene grows, from 1 to 2."""
+    return min(GEOMETRY, max(1.0, LONGEST_STEPS_OF_POSITIONS / factor))
 
 
 def opacity_factor(share: float) -> float:
