@@ -35,9 +35,10 @@ UNCHANGED = 1.0, GrowingParts(1.0, 1.0)  # factor and parts of the trainer's own
 class Growing:
     """Decides which iterations run while the scene grows, and scales learning rates if that replaces iterations.
 
-    The iterations that run are spread evenly. A densification event runs if enough iterations ran before it. The
-    iteration of any other event is left out, so that its statistics go on to the following event. Everything else that
-    depends on the iteration's number happens as in the trainer's own run.
+    The iterations that run are spread evenly. With "auto", more of them run after an event that added many Gaussians.
+    A densification event runs if enough iterations ran before it. The iteration of any other event is left out, so that
+    its statistics go on to the following event. Everything else that depends on the iteration's number happens as in
+    the trainer's own run.
 
     Args:
         config: Settings with `growing`.
@@ -65,7 +66,7 @@ class Growing:
         self._visible: float | None = None  # share that a view shows, in the first measurement; it settles `share`
         self._visible_now: float | None = None  # the same in the latest measurement
         self._share_now: float | None = None  # share of the present iterations; None for `share`
-        self._rows_at_first = 0
+        self._rows_at_first = 0  # number of Gaussians at the first event
         self._measuring = True
         self._saved_events: dict[str, Any] | None = None
 
@@ -151,7 +152,7 @@ class Growing:
         if number in self.events:
             self.events.rows = distributed.largest(self._rates.rows)  # ranks leave out the same events
             self._rows_at_first = self._rows_at_first or self.events.rows
-            if self._config.growing == "auto" and self._visible is not None:
+            if self._auto and self._visible is not None:
                 least = LEAST_GROWING_SHARE * self._hurry * self.stretch
                 self._share_now = min(1.0, max(self.share, least))
         must, barred = number in self._must, False
@@ -185,12 +186,17 @@ class Growing:
         assert self.events is not None
         # Events come sooner only in a scene with many new Gaussians. The ray-traced scene, which grows to e times as
         # many at most, ended with a tenth more Gaussians otherwise.
-        sooner = self._hurry if self.stretch > 1.0 else None
+        sooner = self._hurry if self._auto and self.stretch > 1.0 else None
         return share >= 1.0 or self.events.enough(number, self._visible_now, share, self._length, sooner)
 
     @property
+    def _auto(self) -> bool:
+        return self._config.growing == "auto"
+
+    @property
     def _hurry(self) -> float:
-        return 1.0 if self.events is None or self._config.growing != "auto" else hurry(self.events.growth)
+        """Factor on the share of the iterations after the last event, by the Gaussians that it added; at least 1."""
+        return 1.0 if self.events is None else hurry(self.events.growth)
 
     def _settle(self) -> None:
         """Use the present measurement; the share of the phase is fixed once enough steps are measured."""
@@ -204,7 +210,7 @@ class Growing:
         if settled:
             return
         self._visible = self._visible_now
-        if self._config.growing == "auto":
+        if self._auto:
             longer = self._config.compensates and self._visible is not None
             events = len(self.events) if self.events.all_run else 0
             self.share = growing_share(self._length, self._epoch, longer, events)
