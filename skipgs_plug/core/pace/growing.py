@@ -59,7 +59,7 @@ class Growing:
         self.events: Events | None = None
         self.always: dict[str, set[int]] = {}
         self._must: frozenset[int] = frozenset()
-        self._must_share = 0.0  # share of the iterations that must run
+        self._must_share = 0.0  # share of the iterations until the last event that must run
         self._first_number: int | None = None
         self._length = 0
         self._epoch = 0
@@ -124,7 +124,8 @@ class Growing:
             self._first_number = numbers.start
         # Prunes and selections after the last event need no further iterations.
         self._length = min(numbers.stop, self.events.end or numbers.stop) - self._first_number
-        self._must_share = min(1.0, len(self._must.intersection(numbers)) / max(self._length, 1))
+        grows = range(self._first_number, self._first_number + self._length)
+        self._must_share = len(self._must.intersection(grows)) / max(self._length, 1)
         self._epoch = epoch or self._epoch
         return True
 
@@ -137,7 +138,7 @@ class Growing:
 
     @property
     def leaves_out(self) -> bool:
-        """Whether any iteration can be left out; False if all of them must run."""
+        """Whether any iteration until the last event can be left out; False if all of them must run."""
         return self._must_share < 1.0
 
     def require(self, number: int) -> None:

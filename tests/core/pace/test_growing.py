@@ -149,6 +149,14 @@ def test_steps_stay_where_all_iterations_must_run():
     assert loop.ran[:START] == list(range(START)) and len(loop.ran) < LAST
 
 
+def test_what_must_run_after_the_last_event_does_not_shorten_steps_before_it():
+    loop = Opaque()
+    with SkipGate(start_iter=START + 100, share=0.16) as gate:
+        loop.train(gate, always=range(START, START + 100))
+    assert loop.between(200, START) == {(4.0, 2.5)}
+    assert set(range(START, START + 100)) <= set(loop.ran)
+
+
 def test_refinement_does_not_end_early_after_few_iterations_of_growth():
     names = [f"{i}.png" for i in range(40)]
     reports = {}
