@@ -27,6 +27,7 @@ import tyro
 from PIL import Image
 from torch import Tensor
 
+from benchmarks.pictures import find_pictures, means, measure_pictures
 from benchmarks.script_rows import ROWS, Row, schedule
 from skipgs_plug.fallback_raster import rasterization
 from skipgs_plug.files import write_aside
@@ -165,11 +166,10 @@ def judge(row: Row, folder: Path, scene: Path, factor: int) -> dict[str, Any]:
     plys = sorted(folder.rglob("point_cloud*.ply"), key=lambda path: path.stat().st_mtime)
     if not row.pictures:
         return measure_ply(plys[-1], scene, factor)
-    pictures = [path.parent for path in folder.rglob("gt") if path.is_dir()] + list(folder.glob("renders"))
     from plyfile import PlyData
 
     count = PlyData.read(str(plys[-1]))["vertex"].count if plys else None
-    return {**measure_pictures(max(pictures, key=lambda path: path.stat().st_mtime)), "gaussians": count}
+    return {**measure_pictures(find_pictures(folder)), "gaussians": count}
 
 
 def facts(folder: Path, iterations: int) -> dict[str, Any]:
@@ -261,32 +261,6 @@ def smoothing_filter(path: Path) -> Tensor | None:
     if "filter_3D" not in vertices.data.dtype.names:
         return None
     return torch.tensor(np.array(vertices["filter_3D"]), dtype=torch.float32)[:, None]
-
-
-def measure_pictures(folder: Path) -> dict[str, Any]:
-    """Return means of PSNR and SSIM over pictures, and their number.
-
-    Renders and photographs lie in folders `renders` and `gt` (Inria's family), or side by side in one file (gsplat).
-    """
-    if (folder / "gt").is_dir():
-        names = sorted(path.name for path in (folder / "gt").iterdir())
-        pairs = [(pixels(folder / "renders" / name), pixels(folder / "gt" / name)) for name in names]
-    else:
-        pairs = []
-        for path in sorted(folder.glob("val_step*.png")):
-            photograph, render = pixels(path).chunk(2, dim=1)
-            pairs.append((render.contiguous(), photograph.contiguous()))
-    return means([measure(chosen(), render, photograph) for render, photograph in pairs])
-
-
-def pixels(path: Path) -> Tensor:
-    """Return a picture as a tensor [H, W, 3] in [0, 1]."""
-    return torch.from_numpy(np.array(Image.open(path).convert("RGB"))).float() / 255
-
-
-def means(rows: list[dict[str, float]]) -> dict[str, Any]:
-    """Return means by name, and the number of views."""
-    return {**{name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}, "views": len(rows)}
 
 
 def table(runs: list[dict[str, Any]]) -> str:

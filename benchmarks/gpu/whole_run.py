@@ -18,13 +18,10 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from PIL import Image
-from torch import Tensor
 
+from benchmarks.pictures import find_pictures, measure_pictures
 from skipgs_plug.files import write_aside
-from skipgs_plug.trainer.metrics import chosen, measure
 
 MODES = {"auto": ["--share", "auto"], "own": ["--no-gate"]}  # the shorter run first: a failure shows early
 
@@ -130,7 +127,7 @@ def run(name: str, mode: str, asked: argparse.Namespace, seconds: float) -> dict
         "train_seconds": float(re.findall(script.seconds, written)[-1]),
         "gaussians": int(re.findall(script.gaussians, written)[-1]),
         **json.loads(peak.read_text()),
-        **measure_pictures(folder, asked.lpips),
+        **measure_pictures(find_pictures(folder), asked.lpips, "cuda"),
         "report": None if report is None else json.loads(report.read_text(encoding="utf-8")),
     }
 
@@ -148,23 +145,6 @@ def call(arguments: list[str], checkout: Path, folder: Path, seconds: float) -> 
         return None
     lines = (folder / "log.txt").read_text(errors="replace").strip().splitlines()
     return lines[-1] if lines else f"it ended with {done.returncode}"
-
-
-def measure_pictures(folder: Path, lpips_net: str | None) -> dict[str, float]:
-    """Return means over pictures of held-out views: in folders `renders` and `gt`, or side by side in one file."""
-    photographs = next((path for path in folder.rglob("gt") if path.is_dir()), None)
-    if photographs is None:
-        pairs = [pixels(path).chunk(2, dim=1)[::-1] for path in sorted(folder.glob("renders/val_step*.png"))]
-    else:
-        names = sorted(path.name for path in photographs.iterdir())
-        pairs = [(pixels(photographs.parent / "renders" / name), pixels(photographs / name)) for name in names]
-    rows = [measure(chosen(lpips_net), render.contiguous(), target.contiguous()) for render, target in pairs]
-    return {**{key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}, "views": len(rows)}
-
-
-def pixels(path: Path) -> Tensor:
-    """Return a picture as a tensor [H, W, 3] in [0, 1] on the GPU."""
-    return torch.from_numpy(np.array(Image.open(path).convert("RGB"))).cuda().float() / 255
 
 
 def table(result: dict[str, Any]) -> str:
