@@ -122,12 +122,16 @@ def _world() -> Any:
     return dist.group.WORLD
 
 
-_own_groups: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()  # gloo group by the trainer's group
+# Our gloo group by the trainer's group. Both references are weak: `destroy_process_group` must be able to end our
+# group's threads. A group that lives until the interpreter ends can abort the process there.
+_own_groups: weakref.WeakKeyDictionary[Any, weakref.ref[Any]] = weakref.WeakKeyDictionary()
 
 
 def _gloo_group() -> Any:
     """Return a CPU group for a process group without one, such as `cuda:nccl`; all ranks create it together."""
     world = _world()
-    if world not in _own_groups:
-        _own_groups[world] = dist.new_group(backend="gloo")
-    return _own_groups[world]
+    own = _own_groups[world]() if world in _own_groups else None
+    if own is None:
+        own = dist.new_group(backend="gloo")  # PyTorch holds it until `destroy_process_group`
+        _own_groups[world] = weakref.ref(own)
+    return own

@@ -16,6 +16,10 @@ from pathlib import Path
 import pytest
 import torch
 import torch.distributed as dist
+
+# The functions of this module have the process group as a default argument. PyTorch imports it at an optimizer's first
+# step. A group that exists by then lives until the interpreter's end, and its threads can abort the process there.
+import torch.distributed.nn
 import torch.multiprocessing as mp
 
 from skipgs_plug import SkipGate, SkipGSError
@@ -162,6 +166,8 @@ def refine(rank: int, folder: str, share: float | str, nothing_on_the_cpu: bool)
     result = {"ran": ran, "shown": report["gaussians_shown"], "share": report["refine_share"], "end": value.tolist()}
     Path(folder, f"{rank}.json").write_text(json.dumps(result))
     dist.destroy_process_group()
+    # A group of ours that outlived the trainer's would end in the interpreter's last moments, and could abort it.
+    assert not any(own() for own in distributed._own_groups.values())
 
 
 @pytest.mark.timeout(120)
