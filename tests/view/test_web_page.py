@@ -89,10 +89,10 @@ def test_the_page_shows_the_model_and_a_photograph_beside_its_render(
         sides = browser.evaluate(
             "['photograph', 'render'].map(n => document.getElementById(n).getBoundingClientRect().right)"
         )
-        if width >= 600:
-            below = "document.querySelector('.sse-buttonsContainer').getBoundingClientRect().top"
-            panel = "document.getElementById('panel').getBoundingClientRect().bottom"
-            assert browser.evaluate(panel) < browser.evaluate(below), "the panel covers the buttons of the viewer"
+        browser.screenshot(picture)
+        below = "document.querySelector('.sse-buttonsContainer').getBoundingClientRect().top"
+        panel = "document.getElementById('panel').getBoundingClientRect().bottom"
+        assert browser.evaluate(panel) < browser.evaluate(below), "the panel covers the buttons of the viewer"
         assert max(sides) <= width and browser.evaluate("document.documentElement.scrollWidth") <= width
         small = "[...document.querySelectorAll('#panel button, #open')].map(b => b.getBoundingClientRect().height)"
         assert min(browser.evaluate(small)) >= 44  # a finger's
