@@ -132,9 +132,7 @@ class Growing:
     @property
     def stretch(self) -> float:
         """Factor on the share of the iterations for Gaussians that were added, also in refinement; at least 1."""
-        if self.events is None or not self.leaves_out:
-            return 1.0
-        return for_new_gaussians(self._rows_at_first, self.events.rows)
+        return for_new_gaussians(self._times_grown) if self.leaves_out else 1.0
 
     @property
     def leaves_out(self) -> bool:

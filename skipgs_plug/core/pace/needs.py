@@ -120,14 +120,13 @@ def hurry(growth: float) -> float:
     return max(1.0, growth / GROWTH_PER_EVENT)
 
 
-def for_new_gaussians(before: int, now: int) -> float:
+def for_new_gaussians(times_grown: float | None) -> float:
     """Return the factor on the share of the iterations for Gaussians that densification added, at least 1.
 
     Args:
-        before: Number of Gaussians when densification began; 0 if it is not known.
-        now: Their present number.
+        times_grown: Present number of Gaussians, as a multiple of those when densification began; None if unknown.
     """
-    return 1.0 + NEW_GAUSSIANS * max(math.log(now / before) - 1.0, 0.0) if 0 < before < now else 1.0
+    return 1.0 if times_grown is None else 1.0 + NEW_GAUSSIANS * max(math.log(max(times_grown, 1.0)) - 1.0, 0.0)
 
 
 def growing_factor(iterations: int, share: float, visible: float | None, by_budget: bool = False) -> float:

@@ -286,8 +286,8 @@ def test_growth_is_that_of_the_last_event():
 
 def test_new_gaussians_ask_for_more_iterations():
     assert hurry(0.0) == hurry(0.03) == 1.0 and hurry(0.09) == pytest.approx(3.0)
-    assert for_new_gaussians(0, 500) == for_new_gaussians(500, 100) == for_new_gaussians(1000, 2718) == 1.0
-    assert for_new_gaussians(3000, 97_000) == pytest.approx(1.82, abs=0.01)
+    assert for_new_gaussians(None) == for_new_gaussians(0.2) == for_new_gaussians(2.718) == 1.0
+    assert for_new_gaussians(97 / 3) == pytest.approx(1.82, abs=0.01)
 
 
 class Multiplies(Loop):
@@ -323,7 +323,7 @@ def test_a_scene_that_grows_strongly_gets_more_iterations_in_both_phases():
     assert little["growing"]["iterations_run"] == still["growing"]["iterations_run"]
     assert much["growing"]["iterations_run"] > still["growing"]["iterations_run"]
     assert len(loops[0.1].grown) >= len(loops[0.0].grown)
-    factor = for_new_gaussians(100, 10_000)
+    factor = for_new_gaussians(100.0)
     assert much["refine_share"] == pytest.approx(factor * still["refine_share"], rel=0.02)
     with SkipGate(start_iter=3000, share=0.2) as gate:  # a number is a promise
         Multiplies(0.1).train(gate)
