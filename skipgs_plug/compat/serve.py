@@ -53,8 +53,8 @@ FAMILIES: dict[str, _Source] = {
     "gsplat": _SSIM,
     "nerfstudio": {},  # gsplat contains all CUDA code that splatfacto needs
 }
-# Modules that are also served if torchvision cannot be imported.
-_WITHOUT_TORCHVISION: dict[str, _Source] = {"scaffold_gs": {"lpips": (".lpips", ("LPIPS",))}}
+# Modules that are also served if torchvision cannot be imported: LPIPS of pip, and the copy that most trainers bring.
+_WITHOUT_TORCHVISION: _Source = {"lpips": (".lpips", ("LPIPS",)), "lpipsPyTorch": (".lpips", ("LPIPS", "lpips"))}
 
 
 @contextmanager
@@ -76,7 +76,7 @@ def serve(family: str) -> Iterator[None]:
     # gsplat's script has no use for torchvision.
     if family != "gsplat" and not usable("torchvision"):
         served |= importlib.import_module(".vision", __package__).modules()
-        served |= {name: _module(name, *source) for name, source in _WITHOUT_TORCHVISION.get(family, {}).items()}
+        served |= {name: _module(name, *source) for name, source in _WITHOUT_TORCHVISION.items()}
     before = {name: sys.modules.get(name) for name in served}
     try:
         # `_extras` first: it imports torchmetrics, which must not find the served part of torchvision.

@@ -215,6 +215,10 @@ def test_missing_torchvision_is_stood_in_for(tmp_path):
         assert gray.shape == (1, 5, 7)
         with pytest.raises(RuntimeError, match="vgg16 needs torchvision"):
             torchvision.models.vgg16()
+        from lpipsPyTorch import lpips
+
+        with pytest.warns(UserWarning, match="LPIPS needs torchvision"):  # an evaluation must not end the run
+            assert lpips(picture, picture, net_type="vgg").isnan()
 
 
 def test_mip_splatting_filters_conserve_opacity_and_sum_absolute_gradients():
