@@ -12,6 +12,7 @@ from skipgs_plug.core.pace.base import NAMED
 from skipgs_plug.core.pace.events import Events
 from skipgs_plug.core.pace.needs import (
     LEAST_GROWING_SHARE,
+    MOST_RAISED_SHARE,
     for_new_gaussians,
     growing_factor,
     growing_share,
@@ -152,8 +153,8 @@ class Growing:
             self.events.rows = distributed.largest(self._rates.rows)  # ranks leave out the same events
             self._rows_at_first = self._rows_at_first or self.events.rows
             if self._auto and self._visible is not None:
-                least = LEAST_GROWING_SHARE * self._hurry * self.stretch
-                self._share_now = min(1.0, max(self.share, least))
+                wanted = LEAST_GROWING_SHARE * self._hurry * self.stretch if self._has_room(number) else 0.0
+                self._share_now = min(1.0, max(self.share, wanted))
         must, barred = number in self._must, False
         if number in self.events and not must:
             must = self._event_runs(number, self.share) and not self._full()
@@ -179,6 +180,12 @@ class Growing:
         else:
             self._rates.pause()
         return runs
+
+    def _has_room(self, number: int) -> bool:
+        """Whether more iterations than `share` can run from `number` on, by `MOST_RAISED_SHARE` of the phase."""
+        assert self.share is not None and self._first_number is not None
+        left = self._length - (number - self._first_number)
+        return self.sampling.run + self.share * left < MOST_RAISED_SHARE * self._length
 
     def _event_runs(self, number: int, share: float) -> bool:
         """Whether enough iterations ran before the event in iteration `number`."""

@@ -10,7 +10,7 @@ from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, ONE_CYCLE, EarlyStopping, watched_views
-from skipgs_plug.core.pace.needs import refining_share
+from skipgs_plug.core.pace.needs import MOST_RAISED_SHARE, refining_share
 from skipgs_plug.core.pace.rates import ScaledRates, path_factor
 from skipgs_plug.core.pace.sampling import Sampling
 
@@ -127,7 +127,7 @@ class Refining:
         """Raise the share of "auto" for Gaussians that densification added. Call it before the first iteration."""
         assert self.share is not None
         if self._auto:
-            self.share = min(1.0, self.share * factor)
+            self.share = max(self.share, min(self.share * factor, MOST_RAISED_SHARE))
             if self.stopping is None:
                 self.sampling.share = self.share
 

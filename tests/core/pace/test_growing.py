@@ -321,10 +321,9 @@ def test_a_scene_that_grows_strongly_gets_more_iterations_in_both_phases():
         assert ("because the scene grew to 100.0 times" in gate.summary()) is (growth == 0.1)
     still, little, much = (reports[growth] for growth in (0.0, 0.02, 0.1))
     assert little["growing"]["iterations_run"] == still["growing"]["iterations_run"]
-    assert much["growing"]["iterations_run"] > still["growing"]["iterations_run"]
+    assert still["growing"]["iterations_run"] < much["growing"]["iterations_run"] <= 0.41 * 3000  # the bound is 0.4
     assert len(loops[0.1].grown) >= len(loops[0.0].grown)
-    factor = for_new_gaussians(100.0)
-    assert much["refine_share"] == pytest.approx(factor * still["refine_share"], rel=0.02)
+    assert much["refine_share"] == 0.4 < for_new_gaussians(100.0) * still["refine_share"]  # the bound
     with SkipGate(start_iter=3000, share=0.2) as gate:  # a number is a promise
         Multiplies(0.1).train(gate)
     assert gate.report()["refine_share"] == 0.2
