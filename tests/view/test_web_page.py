@@ -89,7 +89,6 @@ def test_the_page_shows_the_model_and_a_photograph_beside_its_render(
         sides = browser.evaluate(
             "['photograph', 'render'].map(n => document.getElementById(n).getBoundingClientRect().right)"
         )
-        browser.screenshot(picture)
         below = "document.querySelector('.sse-buttonsContainer').getBoundingClientRect().top"
         panel = "document.getElementById('panel').getBoundingClientRect().bottom"
         assert browser.evaluate(panel) < browser.evaluate(below), "the panel covers the buttons of the viewer"

@@ -153,8 +153,8 @@ class Growing:
             self.events.rows = distributed.largest(self._rates.rows)  # ranks leave out the same events
             self._rows_at_first = self._rows_at_first or self.events.rows
             if self._auto and self._visible is not None:
-                wanted = LEAST_GROWING_SHARE * self._hurry * self.stretch if self._has_room(number) else 0.0
-                self._share_now = min(1.0, max(self.share, wanted))
+                wanted = min(1.0, LEAST_GROWING_SHARE * self._hurry * self.stretch)
+                self._share_now = max(self.share, wanted) if self._has_room(number) else self.share
         must, barred = number in self._must, False
         if number in self.events and not must:
             must = self._event_runs(number, self.share) and not self._full()

@@ -323,6 +323,8 @@ def test_a_scene_that_grows_strongly_gets_more_iterations_in_both_phases():
     assert little["growing"]["iterations_run"] == still["growing"]["iterations_run"]
     assert still["growing"]["iterations_run"] < much["growing"]["iterations_run"] <= 0.41 * 3000  # the bound is 0.4
     assert len(loops[0.1].grown) >= len(loops[0.0].grown)
+    assert (factor := for_new_gaussians(little["growing"]["times_grown"])) > 1.0
+    assert little["refine_share"] == pytest.approx(factor * still["refine_share"], rel=0.02)
     assert much["refine_share"] == 0.4 < for_new_gaussians(100.0) * still["refine_share"]  # the bound
     with SkipGate(start_iter=3000, share=0.2) as gate:  # a number is a promise
         Multiplies(0.1).train(gate)
