@@ -119,7 +119,7 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
             f"  {'ended early' if stopping['ended_early'] else 'not ended early'}, in cycle {stopping['cycle'] + 1}; "
             f"the rest {judged} (tolerance {config.tolerance} dB, {len(stopping['watched'])} views watched)"
         )
-    elif config.refine_share == "auto":
+    elif config.refine_share == "auto" and not skipped:
         lines.append("  all iterations run: refinement is too short, or views come up too seldom, to leave some out")
     return "\n".join(lines)
 

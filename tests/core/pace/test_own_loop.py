@@ -288,6 +288,10 @@ def test_auto_leaves_a_short_refinement_as_it_is():
         same.train(gate, views=VIEWS)
     assert same.ran == plain.ran and torch.equal(same.value, plain.value)
     assert "refinement is too short, or views come up too seldom" in gate.summary()
+    longer = Loop(end=1040)
+    with SkipGate(start_iter=40, refine_share="auto", compensate=False) as gate:
+        longer.train(gate, views=VIEWS)
+    assert len(longer.ran) < 600 and "refinement is too short" not in gate.summary()
 
 
 def test_auto_must_know_the_views():
