@@ -4,7 +4,7 @@ import pytest
 import torch
 from cases import SkipAlways, run, script
 from lookalikes import fastgs, taming
-from lookalikes.splats import Log
+from lookalikes.splats import Log, SplatModel, log
 
 from skipgs_plug.adapters import fastgs as adapter
 from skipgs_plug.adapters.fastgs import FastGS
@@ -65,3 +65,27 @@ def test_opacities_recover_from_the_last_reset_before_prunes_by_opacity(monkeypa
     grown = [step for step in gated.backwards if step < 20]
     assert ({16, 17, 18, 19} <= set(grown)) is prunes_by_opacity  # opacities are reset in iterations 8 and 16
     assert len(grown) < 16 and len([step for step in gated.backwards if step >= 20]) < 45
+
+
+@pytest.mark.parametrize("compensate", [None, False])
+def test_steps_with_fewer_gradients_shrink_in_refinement(monkeypatch, compensate):
+    monkeypatch.setattr(adapter, "ACCUMULATES_FROM", 20)
+    monkeypatch.setattr(adapter, "interval", lambda iteration: 8)
+    factors = {}
+
+    class Adam(torch.optim.Adam):
+        def step(self, closure=None):
+            for group in self.param_groups:
+                factors[log.now, group["name"]] = group["lr"] / SplatModel.rates[group["name"]]
+            return super().step(closure)
+
+    monkeypatch.setattr(fastgs.GaussianModel, "adam", Adam)
+    monkeypatch.setattr(fastgs.GaussianModel, "update_learning_rate", lambda self, iteration: None)
+    gated, _ = run(CASES["fastgs"], refine_share=0.25, compensate=compensate)
+    # All steps of the own run happen: every 8th but the last; 32 is a prune, whose new parameters have no gradient.
+    assert [step for step in gated.steps if step > 20] == [24, 40, 48, 56]
+    for step in (24, 40, 48, 56):
+        shrunk = 2.0 * (1.0 - (step - 20) / 45)  # refinement has 45 iterations
+        assert factors[step, "rotation"] == pytest.approx(1.0 if compensate is False else shrunk)
+        assert factors[step, "opacity"] == pytest.approx(1.0 if compensate is False else min(shrunk, 1.0))
+    assert factors[19, "rotation"] == 1.0

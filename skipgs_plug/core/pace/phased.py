@@ -47,7 +47,7 @@ class Phased(Pace):
         self.growing: Growing | None = None if config.growing is None else Growing(config, rates)
         self._finder = LoopFinder()
         self._densification: Densification | None = None
-        self._keeps_rates = False
+        self._keeps_steps = False
         self._views: list[str] | None = None
         self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
         self._start = 0
@@ -70,7 +70,7 @@ class Phased(Pace):
 
     def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
         self._start, self._last, self._views = start, info.max_steps, views
-        self._keeps_rates, self._epoch = info.accumulates, info.epoch
+        self._keeps_steps, self._epoch = info.accumulates, info.epoch
         self._densification = info.densification or self._densification
         self._configured = True
 
@@ -240,7 +240,7 @@ class Phased(Pace):
                 self._grow_whole(f"No condition of the loop that names {marks} holds before iteration {self._start}")
         held = {reason: hits for reason, hits in found[1].items() if hits}
         by_few = self.growing is not None and bool(grown) and self.growing.leaves_out
-        self.refining.begin(self._last, held, self._views, epoch, self._keeps_rates, by_few)
+        self.refining.begin(self._last, held, self._views, epoch, self._keeps_steps, by_few)
 
     def _require_events(self) -> None:
         """Let the growing phase run whole if its densification events are not known.
@@ -283,7 +283,7 @@ class Phased(Pace):
         return {
             "start": self._start,
             "last": self._last,
-            "keeps_rates": self._keeps_rates,
+            "keeps_rates": self._keeps_steps,
             "next": self._finder.expected,
             "required": sorted(self._required),
             "refining": self.refining.state_dict(),
@@ -306,7 +306,7 @@ class Phased(Pace):
         self._finder.expected = state["next"]
         # The loop asks about its first number before the trainer reports its facts.
         if not self._configured:
-            self._start, self._last, self._keeps_rates = state["start"], state["last"], state["keeps_rates"]
+            self._start, self._last, self._keeps_steps = state["start"], state["last"], state["keeps_rates"]
             self._configured = True
         if self._finder.found is not None and self._conditions is not None:
             self._read(self._finder.found, max(self._start, state["next"] or 0))

@@ -205,11 +205,13 @@ class ScaledRates:
         self._unstepped = 0
         if not self.visibility.complete:
             self.visibility.see(optimizer.param_groups, info.name)
-        # In groups without names, positions of cameras have the shape of positions of Gaussians, but fewer rows.
-        for param in info.positions:
-            if param.shape[0] > self._rows_now:
-                self._rows_now = param.shape[0]
-        rows = self._rows_now if self._rows_now > self._rows else self._rows
+        if info.named_positions is not None:
+            rows = self._rows = self._rows_now = info.named_positions.shape[0]
+        else:  # in groups without names, positions of cameras have the shape of positions of Gaussians, but fewer rows
+            for param in info.positions:
+                if param.shape[0] > self._rows_now:
+                    self._rows_now = param.shape[0]
+            rows = self._rows_now if self._rows_now > self._rows else self._rows
         if info.rows != rows or info.growing != self._growing:
             info.divide(rows, self._growing)
         shares = [] if self._only_look else info.shares

@@ -60,6 +60,7 @@ class Refining:
         self._changed: int | None = None  # iteration of the last change
         self._expected: int | None = None  # iteration in which another change is expected; None if no change is
         self._over = False  # whether refinement has ended, for the present iteration
+        self._shrinks = False  # whether the steps, as many as in the trainer's own run, shrink with its schedule
         self._grown_by_few = False
         self._begun = self._removed = False
 
@@ -74,7 +75,7 @@ class Refining:
         always: dict[str, set[int]],
         views: list[str] | None,
         epoch: int | None,
-        keeps_rates: bool,
+        keeps_steps: bool,
         grown_by_few: bool,
     ) -> None:
         """Begin refinement with iteration `first`.
@@ -84,7 +85,8 @@ class Refining:
             always: Iterations that must run, by reason.
             views: Keys of all training views; None if unknown.
             epoch: Number of iterations in which every view comes up once; None if unknown.
-            keeps_rates: Leave learning rates alone, because the trainer takes as many steps as in its own run.
+            keeps_steps: The trainer takes as many steps as in its own run, each with fewer gradients. Steps shrink
+                with its schedule then.
             grown_by_few: Whether iterations are left out before refinement, too.
 
         Raises:
@@ -106,7 +108,10 @@ class Refining:
         # Several processes train on different views at a time, so no view can be watched and kept out of training.
         if self._judges and views is not None and self.stopping is None and distributed.group_size() == 1:
             self.watched = watched_views(views, self.share * total)
-        if not self._scales(keeps_rates):
+        # Iterations are spread evenly if gradients accumulate, so that each step gets some.
+        scales = self._scales
+        self._shrinks = scales and keeps_steps
+        if not scales or keeps_steps:
             if self.stopping is not None:
                 raise SkipGSError(
                     "The gate state was saved with larger, shrinking steps, which are off now; continue with the same "
@@ -137,7 +142,7 @@ class Refining:
             assert self._last is not None
             self._recover(min(RECOVERY, self._last - self._expected))
             self._expected = None
-        self._set_pace()
+        self._set_pace(number)
         recovers = self._recovered < self._recovery
         runs = self.sampling.runs(number in self._must or number == self._last)
         if runs and recovers:
@@ -213,16 +218,21 @@ class Refining:
         """
         return self._auto and not self._grown_by_few
 
-    def _scales(self, keeps_rates: bool) -> bool:
-        if keeps_rates or not self._config.compensates:
+    @property
+    def _scales(self) -> bool:
+        """Whether learning rates change."""
+        if not self._config.compensates:
             return False
         return self._config.rate_peak is not None or (self.share is not None and self.share < 1.0)
 
-    def _set_pace(self) -> None:
-        """Set the share and the factor for the iteration to decide on; without larger steps both stay."""
-        if self.stopping is None:
-            return
+    def _set_pace(self, number: int) -> None:
+        """Set the share and the factor for iteration `number`; without larger steps both stay."""
         assert self.first is not None and self._last is not None and self.share is not None
+        if self.stopping is None:
+            if self._shrinks:
+                progress = (number - self.first) / (self._last + 1 - self.first)
+                self._rates.scale(path_factor(1.0, progress, self._config.rate_peak))
+            return
         if self._recovered < self._recovery:
             factor = 1.0 - self._recovered / self._recovery
             self._over = False
