@@ -52,7 +52,6 @@ class Events:
         self._needs = densification.needs
         self.kept = self.left_out = 0
         self._behind = 0  # number of iterations that ran since the last event, and of surplus ones before it
-        self._surplus = 0  # number of iterations that the following event can count as its own, if this one runs
         self.rows = self._rows_before = 0  # now, and before the last event that ran
 
     def __contains__(self, number: int) -> bool:
@@ -71,11 +70,22 @@ class Events:
         """Whether each event runs, however few iterations ran before it."""
         return self._needs == "nothing"
 
-    def ran(self, number: int) -> None:
-        """Count an iteration that runs, with its event if it has one."""
+    @property
+    def behind(self) -> int:
+        """Number of iterations that add to the statistics of an event in the present iteration, which is one of them."""
+        return self._behind + 1
+
+    def ran(self, number: int, needed: int = 0) -> None:
+        """Count an iteration that runs, with its event if it has one.
+
+        Args:
+            number: The iteration.
+            needed: Number of iterations that the event needed. The following event can count as many surplus ones.
+        """
         if number in self._known:
             self.kept += 1
-            self._behind, self._surplus = self._surplus, 0
+            # Without a surplus, 40 iterations per event would be as good as 25 if 50 are needed: every second event.
+            self._behind = min(max(self.behind - needed, 0), needed) if self._needs == "visits" else 0
             self._rows_before = self.rows
         else:
             self._behind += 1
@@ -94,10 +104,10 @@ class Events:
         """Number of Gaussians that the last event added, as a share of those before it."""
         return self.grown / self._rows_before if self._rows_before else 0.0
 
-    def enough(
+    def needed(
         self, number: int, visible: float | None, share: float, length: int, sooner: float | None = None
-    ) -> bool:
-        """Whether enough iterations ran before the event in iteration `number`; notes the surplus for the next one.
+    ) -> int:
+        """Return the number of iterations that the event in iteration `number` needs; compare with `behind`.
 
         Args:
             number: Iteration with an event.
@@ -107,20 +117,15 @@ class Events:
             sooner: In a scene with many new Gaussians, the factor by which the event needs fewer iterations, at least
                 1; a larger share asks for no more there. None in other scenes.
         """
-        if self.all_run:
-            return True
+        if self.all_run or share >= 1.0:
+            return 0
         distance = self._distance(number)
-        # The iteration of the event adds to the statistics too.
-        behind = self._behind + 1
         if self._needs == "iterations":
-            return behind >= distance
+            return distance
         visible = visible or VISIBLE
         larger = (share / LEAST_GROWING_SHARE) ** (LARGER_SHARE * visible**2)
         needed = STEPS_BEHIND * (1.0 - visible) ** NARROW_VIEWS * (larger if sooner is None else 1.0 / sooner)
-        needed = min(int(needed), math.ceil(share * length / LEAST_EVENTS), distance)
-        # Without a surplus, 40 iterations per event would be as good as 25 if 50 are needed: every second event.
-        self._surplus = min(max(behind - needed, 0), needed)
-        return behind >= needed
+        return min(int(needed), math.ceil(share * length / LEAST_EVENTS), distance)
 
     def _distance(self, number: int) -> int:
         """Return the number of iterations from the previous event to this one in the trainer's own schedule."""

@@ -155,9 +155,10 @@ class Growing:
             if self._auto and self._visible is not None:
                 wanted = min(1.0, LEAST_GROWING_SHARE * self._hurry * self.stretch)
                 self._share_now = max(self.share, wanted) if self._has_room(number) else self.share
-        must, barred = number in self._must, False
+        must, barred, needed = number in self._must, False, 0
         if number in self.events and not must:
-            must = self._event_runs(number, self.share) and not self._full()
+            needed = self._needed(number)
+            must = self.events.behind >= needed and not self._full()
             barred = not must
         if self._share_now is None:
             self.sampling.share = self.share
@@ -165,7 +166,7 @@ class Growing:
             self.sampling.turn(self._share_now)
         runs = self.sampling.runs(must, barred)
         if runs:
-            self.events.ran(number)
+            self.events.ran(number, needed)
             if self._visible is not None and number in self.events:
                 self._measuring = True
                 self._rates.visibility.restart()
@@ -187,13 +188,13 @@ class Growing:
         left = self._length - (number - self._first_number)
         return self.sampling.run + self.share * left < MOST_RAISED_SHARE * self._length
 
-    def _event_runs(self, number: int, share: float) -> bool:
-        """Whether enough iterations ran before the event in iteration `number`."""
-        assert self.events is not None
+    def _needed(self, number: int) -> int:
+        """Return the number of iterations that must run before the event in iteration `number`."""
+        assert self.events is not None and self.share is not None
         # Events come sooner only in a scene with many new Gaussians. The ray-traced scene, which grows to e times as
         # many at most, ended with a tenth more Gaussians otherwise.
         sooner = self._hurry if self._auto and self.stretch > 1.0 else None
-        return share >= 1.0 or self.events.enough(number, self._visible_now, share, self._length, sooner)
+        return self.events.needed(number, self._visible_now, self.share, self._length, sooner)
 
     @property
     def _auto(self) -> bool:
@@ -228,7 +229,7 @@ class Growing:
             return UNCHANGED
         by_budget = self.events is not None and self.events.all_run
         share = max(self._share_now or self.share, self._must_share)
-        factor = growing_factor(self._length, share, self._visible, by_budget)
+        factor = growing_factor(self._length, share, self._visible, by_budget, self._times_grown)
         return factor, GrowingParts(opacity_factor(share), positions_part(factor))
 
     @property

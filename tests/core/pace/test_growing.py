@@ -237,9 +237,10 @@ def kept(needs, shown, every, numbers=range(100, 2001, 100), share=0.1, length=1
     found = []
     for number in range(numbers[-1] + 1):
         if number in events:
-            if events.enough(number, shown, share, length):
+            needed = events.needed(number, shown, share, length)
+            if events.behind >= needed:
                 found.append(number)
-                events.ran(number)
+                events.ran(number, needed)
             else:
                 events.skipped(number)
         elif number % every == 0:
@@ -266,7 +267,7 @@ def test_an_event_can_come_sooner():
         found = []
         for behind in range(1, 60):
             events.load_state_dict({**events.state_dict(), "behind": behind - 1})
-            if events.enough(200, 0.3, 0.1, 100_000, sooner):
+            if events.behind >= events.needed(200, 0.3, 0.1, 100_000, sooner):
                 found.append(behind)
         assert found[0] == needed
 
@@ -359,7 +360,9 @@ def test_factors_while_the_scene_grows():
     assert growing_factor(1500, 0.25, 0.96, by_budget=True) == 4.0  # the number of Gaussians does not rise with them
     assert growing_factor(700, 0.9, 1 / 3) == pytest.approx(1 / 0.9)  # the path of the iterations left out, no more
     assert growing_factor(15_000, 0.12, 0.96) == pytest.approx((2100 / 1800) ** 2)
-    assert growing_factor(15_000, 0.2, 0.96) == 1.0
+    assert growing_factor(15_000, 0.2, 0.96) == growing_factor(15_000, 0.2, 0.96, times_grown=math.e) == 1.0
+    assert growing_factor(15_000, 0.2, 0.96, times_grown=math.e**1.5) == pytest.approx((1.5 * 2100 / 3000) ** 2)
+    assert growing_factor(15_000, 0.2, 0.96, times_grown=12.0) == pytest.approx((2 * 2100 / 3000) ** 2)
     assert opacity_factor(0.25) == 2.0 and opacity_factor(1.0) == 1.0
 
 
@@ -390,8 +393,9 @@ def test_surplus_iterations_count_for_the_following_event_alone():
     events = Events(range(100, 1001, 100), Densification())
     for number in range(1, 400):
         events.ran(number) if number % 100 else events.skipped(number)
-    assert events.enough(400, 0.75, 0.1, 1_000_000)
-    events.ran(400)
+    needed = events.needed(400, 0.75, 0.1, 1_000_000)
+    assert needed == 31 and events.behind > 10 * needed
+    events.ran(400, needed)
     assert events.state_dict()["behind"] <= 32  # hundreds of iterations do not pay for several events
     resumed = Events(range(100, 1001, 100), Densification())
     resumed.load_state_dict(events.state_dict())
