@@ -17,10 +17,9 @@ class FastGS(InriaFamily):
     """`optimizer_step(iteration)` stays untouched: it applies the gradients gathered since its last step.
 
     It is called in skipped iterations too, and may apply gradients of earlier iterations there. After densification,
-    Gaussians are pruned at iterations 18,000, 21,000, 24,000 and 27,000, among them all with an opacity below 0.1. With
-    a tenth of the iterations of densification, opacities do not recover from resets until then: 76 % of the Gaussians
-    went at once, and bonsai lost 3.4 dB on a GPU. So all iterations from the last reset to the end of densification run
-    in schedules with such a prune.
+    Gaussians are pruned at iterations 18,000, 21,000, 24,000 and 27,000, among them all with an opacity below 0.1. In
+    schedules with such a prune densification is nearly all of the training: 15,000 of 15,312 steps of the optimizer.
+    With half of its iterations bonsai (100x67, 255 views) loses 0.3 dB and 0.008 SSIM, so all of them run.
     """
 
     name = "fastgs"
@@ -32,8 +31,8 @@ class FastGS(InriaFamily):
         "in a skipped iteration."
     )
     with_share = (
-        "In schedules of more than 18,000 iterations, all iterations from the last opacity reset to the end of "
-        "densification run: later prunes remove everything whose opacity has not recovered from it."
+        "In schedules of more than 18,000 iterations densification runs whole, since few steps follow it. In "
+        "refinement steps keep their number, are longer and shrink."
     )
     stand_ins = "fastgs"
     mark = "render_fastgs"
@@ -43,13 +42,12 @@ class FastGS(InriaFamily):
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
-        self._recovery = range(0)  # iterations from the last reset of opacities to the end of densification
+        self._grows_whole = range(0)  # iterations of a densification that runs whole
 
     def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
         super().begin(opt, loop)
         if int(opt.iterations) > FIRST_FINAL_PRUNE:
-            end, every = int(opt.densify_until_iter), int(opt.opacity_reset_interval)
-            self._recovery = range((end - 1) // every * every, end)
+            self._grows_whole = range(int(opt.densify_until_iter))
 
     def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
         default = getattr(opt, "optimizer_type", "default") == "default"
@@ -57,7 +55,7 @@ class FastGS(InriaFamily):
 
     def always_run(self, numbers: range) -> Iterable[int]:
         """Return the iterations in which `optimizer_step` steps with gathered gradients, and those that must run."""
-        return (n for n in numbers if n in self._recovery or n % interval(n) == 0)
+        return (n for n in numbers if n in self._grows_whole or n % interval(n) == 0)
 
 
 def interval(iteration: int) -> int:

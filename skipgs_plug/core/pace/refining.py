@@ -85,8 +85,8 @@ class Refining:
             always: Iterations that must run, by reason.
             views: Keys of all training views; None if unknown.
             epoch: Number of iterations in which every view comes up once; None if unknown.
-            keeps_steps: The trainer takes as many steps as in its own run, each with fewer gradients. Steps shrink
-                with its schedule then.
+            keeps_steps: The trainer takes as many steps as in its own run, each with fewer gradients. Steps become
+                longer and shrink with its schedule then.
             grown_by_few: Whether iterations are left out before refinement, too.
 
         Raises:
@@ -230,8 +230,9 @@ class Refining:
         assert self.first is not None and self._last is not None and self.share is not None
         if self.stopping is None:
             if self._shrinks:
+                # The noise of a step grows with the root of the number of gradients that it lacks.
                 progress = (number - self.first) / (self._last + 1 - self.first)
-                self._rates.scale(path_factor(1.0, progress, self._config.rate_peak))
+                self._rates.scale(path_factor(math.sqrt(self.share), progress, self._config.rate_peak))
             return
         if self._recovered < self._recovery:
             factor = 1.0 - self._recovered / self._recovery
