@@ -72,7 +72,7 @@ class Events:
 
     @property
     def behind(self) -> int:
-        """Number of iterations that add to the statistics of an event in the present iteration, which is one of them."""
+        """Number of iterations that add to the statistics of an event in the present iteration, this one included."""
         return self._behind + 1
 
     def ran(self, number: int, needed: int = 0) -> None:
@@ -104,9 +104,7 @@ class Events:
         """Number of Gaussians that the last event added, as a share of those before it."""
         return self.grown / self._rows_before if self._rows_before else 0.0
 
-    def needed(
-        self, number: int, visible: float | None, share: float, length: int, sooner: float | None = None
-    ) -> int:
+    def needed(self, number: int, visible: float | None, share: float, length: int, sooner: float | None = None) -> int:
         """Return the number of iterations that the event in iteration `number` needs; compare with `behind`.
 
         Args:
