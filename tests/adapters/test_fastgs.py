@@ -81,7 +81,7 @@ def test_steps_with_fewer_gradients_are_longer_and_shrink(monkeypatch, compensat
 
     monkeypatch.setattr(fastgs.GaussianModel, "adam", Adam)
     monkeypatch.setattr(fastgs.GaussianModel, "update_learning_rate", lambda self, iteration: None)
-    gated, _ = run(CASES["fastgs"], refine_share=0.25, compensate=compensate)
+    gated, gate = run(CASES["fastgs"], refine_share=0.25, compensate=compensate)
     # All steps of the own run happen: every 8th but the last; 32 is a prune, whose new parameters have no gradient.
     assert [step for step in gated.steps if step > 20] == [24, 40, 48, 56]
     for step in (24, 40, 48, 56):
@@ -89,3 +89,4 @@ def test_steps_with_fewer_gradients_are_longer_and_shrink(monkeypatch, compensat
         assert factors[step, "rotation"] == pytest.approx(1.0 if compensate is False else shrunk)
         assert factors[step, "opacity"] == pytest.approx(1.0 if compensate is False else min(shrunk, 1.0))
     assert factors[19, "rotation"] == 1.0
+    assert gate.report()["gaussians_shown"] is None  # several views stand behind a gradient

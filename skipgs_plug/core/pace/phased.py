@@ -275,7 +275,8 @@ class Phased(Pace):
     def report(self) -> dict[str, Any]:
         return {
             **self.refining.report(),
-            "gaussians_shown": self._rates.visibility.share,
+            # Gradients of several views come together where they accumulate.
+            "gaussians_shown": None if self._keeps_steps else self._rates.visibility.share,
             "growing": None if self.growing is None else self.growing.report(),
         }
 
