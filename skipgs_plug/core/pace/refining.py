@@ -230,7 +230,8 @@ class Refining:
         assert self.first is not None and self._last is not None and self.share is not None
         if self.stopping is None:
             if self._shrinks:
-                # The noise of a step grows with the root of the number of gradients that it lacks.
+                # With a share of its gradients a step is noisier by 1 / sqrt(share). Adam shortens the part that views
+                # agree on by as much.
                 progress = (number - self.first) / (self._last + 1 - self.first)
                 self._rates.scale(path_factor(math.sqrt(self.share), progress, self._config.rate_peak))
             return
