@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.adapters.inria import GROWS_WHOLE, InriaFamily
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import Densification
 
@@ -33,7 +33,7 @@ class GNS(InriaFamily):
     )
     with_share = (
         "All events are kept. All iterations of the selection run: its term would act alone if iterations between "
-        "were left out. `train-fast.py` runs all iterations of densification, 500 to 7,000."
+        f"were left out. {GROWS_WHOLE}"
     )
     left_alone = (
         "Both optimizers step every 5th and later every 20th iteration with the gradients gathered since, even in a "

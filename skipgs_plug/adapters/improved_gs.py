@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.adapters.inria import GROWS_WHOLE, InriaFamily
 from skipgs_plug.core.trainer_info import Densification
 
 ACCUMULATES_FROM = 15_000  # iteration; a constant of the loop
@@ -14,7 +14,9 @@ ACCUMULATES_FROM = 15_000  # iteration; a constant of the loop
 class ImprovedGS(InriaFamily):
     """Both optimizers step every 5th iteration from 15,001 on and every 20th from 22,501 on, as upstream.
 
-    They are called in skipped iterations too, and may apply gradients of earlier iterations there.
+    They are called in skipped iterations too, and may apply gradients of earlier iterations there. With a tenth of
+    densification bonsai (100x67, 255 views, 30,000 iterations) lost 1.6 dB; with all of it, and a fifth of refinement,
+    it loses nothing.
     """
 
     name = "improved_gs"
@@ -25,6 +27,7 @@ class ImprovedGS(InriaFamily):
         "Both optimizers step every 5th and later every 20th iteration with the gradients gathered since, even in a "
         "skipped iteration."
     )
+    with_share = f"All events are kept. {GROWS_WHOLE}"
     stand_ins = "improved_gs"
     mark = "compute_edge_score"
     calls = ("add_densification_stats_abs", "densify_and_prune_Improved")

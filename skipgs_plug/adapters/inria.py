@@ -34,6 +34,10 @@ from skipgs_plug.core.views import view_key
 RENDERER, MODEL = "gaussian_renderer", "scene.gaussian_model"
 
 
+# Effect of `share` on trainers that accumulate gradients after densification; see `Phased`.
+GROWS_WHOLE = "If steps accumulate gradients after densification, it runs whole, since few steps follow it."
+
+
 class InriaFamily(AbstractAdapter):
     """Base of Inria 3DGS and its forks: only the backward is gated, and optimizers keep their schedules.
 

@@ -143,7 +143,13 @@ class GrowingState(NewerGrowingState):
     events: EventsState | None
 
 
-class PaceState(TypedDict):
+class NewerPaceState(TypedDict, total=False):
+    """An entry that states of earlier versions do not have."""
+
+    grow_asked: float | str | None
+
+
+class PaceState(NewerPaceState):
     """Content of `Phased.state_dict()`."""
 
     start: int

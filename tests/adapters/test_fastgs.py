@@ -58,13 +58,18 @@ def test_growth_without_an_event_that_the_loop_tells_runs_whole(monkeypatch):
     assert gated.backwards[:19] == list(range(1, 20)) and len(gated.backwards) < 64
 
 
-@pytest.mark.parametrize("prunes_by_opacity", [True, False])
-def test_densification_runs_whole_before_prunes_by_opacity(monkeypatch, prunes_by_opacity):
-    monkeypatch.setattr(adapter, "FIRST_FINAL_PRUNE", 32 if prunes_by_opacity else 64)
-    gated, _ = run(CASES["fastgs"], share=0.4)
-    grown = [step for step in gated.backwards if step < 20]
-    assert grown == list(range(1, 20)) if prunes_by_opacity else len(grown) < 16
-    assert len([step for step in gated.backwards if step >= 20]) < 45
+@pytest.mark.parametrize("settings", [{"share": 0.4}, {"grow_share": 0.4}])
+def test_densification_runs_whole_before_steps_with_accumulated_gradients(monkeypatch, settings):
+    shorter, _ = run(CASES["fastgs"], **settings)
+    monkeypatch.setattr(adapter, "ACCUMULATES_FROM", 20)
+    monkeypatch.setattr(adapter, "interval", lambda iteration: 8)
+    gated, gate = run(CASES["fastgs"], **settings)
+    grown, before = ([step for step in one.backwards if step < 20] for one in (gated, shorter))
+    assert len(before) < 16
+    assert grown == list(range(1, 20)) if "share" in settings else len(grown) < 16  # the user asked for it
+    if "share" in settings:
+        assert len([step for step in gated.backwards if step >= 20]) < 45
+        assert "18 of 18 iterations run (100.0 %) until densification ends" in gate.summary()
 
 
 @pytest.mark.parametrize("compensate", [None, False])

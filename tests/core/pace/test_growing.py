@@ -35,10 +35,8 @@ class Loop:
             self.optimizer.load_state_dict(moments)
         self.ran, self.grown, self.saved, self.rates = [], [], [], {}
 
-    def train(self, gate, until=LAST, **options):
-        for step in gate.iterations(
-            range(self.begin, LAST), views=VIEWS, events=range(INTERVAL, START, INTERVAL), **options
-        ):
+    def train(self, gate, until=LAST, events=range(INTERVAL, START, INTERVAL), **options):
+        for step in gate.iterations(range(self.begin, LAST), views=VIEWS, events=events, **options):
             self.ran.append(step)
             loss = (self.means - step % 3).square().sum()
             if gate.backward(loss, view=VIEWS[step % 4], step=step):
@@ -185,6 +183,23 @@ def test_interrupted_and_resumed_leaves_out_the_same():
             other = Loop(one.ran[-1] + 1, one.means.detach(), one.optimizer.state_dict()).train(second)
         assert one.ran + other.ran == whole.ran
         assert torch.equal(other.means, whole.means)
+
+
+def test_a_run_whose_densification_runs_whole_is_resumed():
+    with SkipGate(start_iter=START, share=0.25) as gate, pytest.warns(RuntimeWarning, match="runs whole"):
+        whole = Loop().train(gate, events=None)
+    assert whole.ran[:START] == list(range(START)) and len(whole.ran) < START + 60
+    for until in (100, whole.ran[-20]):
+        with SkipGate(start_iter=START, share=0.25) as first, pytest.warns(RuntimeWarning, match="runs whole"):
+            one = Loop().train(first, until, events=None)
+            state = json.loads(json.dumps(first.state_dict()))
+        with SkipGate(start_iter=START, share=0.25) as second:
+            second.load_state_dict(state)
+            other = Loop(one.ran[-1] + 1, one.means.detach(), one.optimizer.state_dict()).train(second, events=None)
+        assert one.ran + other.ran == whole.ran
+        assert torch.equal(other.means, whole.means)
+    with SkipGate(start_iter=START, share=0.5) as other, pytest.raises(SkipGSError, match=r"grow_share=0\.25, not"):
+        other.load_state_dict(state)
 
 
 def test_off_is_bit_identical():
