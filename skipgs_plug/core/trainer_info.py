@@ -47,7 +47,8 @@ class TrainerInfo:
             gradients. A gate that the user starts earlier is refused.
         accumulates: Optimizers step on gradients that are accumulated over a fixed number of iterations. The number
             of steps does not change when iterations are left out. Each step has fewer gradients then, so steps of
-            refinement are longer by the root of their share only, and shrink.
+            refinement are longer by the root of their share only, and shrink. With `share`, densification runs whole,
+            since few steps follow it.
         densification: How to find the densification events, so that fewer iterations can run before densification
             ends; None if all of them must run.
         defaults: Settings that suit this trainer. They are used where the user gave no value.

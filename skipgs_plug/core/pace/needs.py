@@ -134,7 +134,12 @@ def for_new_gaussians(times_grown: float | None) -> float:
     Args:
         times_grown: Present number of Gaussians, as a multiple of those when densification began; None if unknown.
     """
-    return 1.0 if times_grown is None else 1.0 + NEW_GAUSSIANS * max(math.log(max(times_grown, 1.0)) - 1.0, 0.0)
+    return 1.0 + NEW_GAUSSIANS * (_strongly_grown(times_grown) - 1.0)
+
+
+def _strongly_grown(times_grown: float | None) -> float:
+    """Return the logarithm of the multiple by which a scene grew, or 1 if it grew to e times its Gaussians at most."""
+    return 1.0 if times_grown is None else math.log(max(times_grown, math.e))
 
 
 def growing_factor(
@@ -160,8 +165,8 @@ def growing_factor(
         return 1.0
     conserved = math.sqrt(3.0 * visible) / share
     longest = LONGEST_STEPS_BY_BUDGET if by_budget else LONGEST_STEPS
-    new = min(MOST_FOR_NEW_GAUSSIANS, max(1.0, math.log(max(times_grown or 1.0, 1.0))))
-    return max(1.0, min(longest, conserved, (new * ENOUGH_STEPS / math.ceil(share * iterations)) ** 2))
+    enough = ENOUGH_STEPS * min(MOST_FOR_NEW_GAUSSIANS, _strongly_grown(times_grown))
+    return max(1.0, min(longest, conserved, (enough / math.ceil(share * iterations)) ** 2))
 
 
 def positions_part(factor: float) -> float:

@@ -158,19 +158,19 @@ class OptimizerInfo:
         groups: Facts about each group.
         name: The argument.
         positions: Parameters that may be positions [N, 3].
-        named_positions: Positions [N, 3], if a name says so, which tell the number of Gaussians; else None.
+        known_positions: Positions [N, 3], if a name says so, which tell the number of Gaussians; else None.
         shares: Shares of the groups that are scaled; see `divide`.
         rows, growing: The arguments of `divide` that `shares` were found for.
     """
 
-    __slots__ = ("_only", "groups", "growing", "name", "named_positions", "positions", "rows", "shares")
+    __slots__ = ("_only", "groups", "growing", "known_positions", "name", "positions", "rows", "shares")
 
     def __init__(self, optimizer: torch.optim.Optimizer, name: str | None) -> None:
         self.name = name
         self.groups = [GroupInfo(group, name) for group in optimizer.param_groups]
         self.positions = [param for group in self.groups for param in group.positions]
         named = [param for group in self.groups if group.named_positions for param in group.positions]
-        self.named_positions = named[0] if len(named) == 1 else None
+        self.known_positions = named[0] if len(named) == 1 else None
         self.shares: list[Share] = []
         self.rows: int | None = None
         self.growing: GrowingParts | None = None

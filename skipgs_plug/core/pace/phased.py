@@ -234,11 +234,12 @@ class Phased(Pace):
         epoch = self._epoch or (None if self._views is None else len(self._views))
         if self.growing is not None and grown:
             assert self._densification is not None
-            hidden = {n for n in (*self._hidden(grown), *self._chosen, *self._required) if n in grown}
             if self._keeps_steps and self._config.grow_share is None:
                 # Refinement on accumulated gradients has few steps: 312 of 15,000 iterations in FastGS. Densification
                 # is nearly all of the training then, so all of it runs.
                 hidden = set(grown)
+            else:
+                hidden = {n for n in (*self._hidden(grown), *self._chosen, *self._required) if n in grown}
             if not self.growing.begin(grown, found[0], hidden, self._densification, epoch):
                 marks = ", ".join(self._densification.marks)
                 self._grow_whole(f"No condition of the loop that names {marks} holds before iteration {self._start}")
@@ -279,8 +280,7 @@ class Phased(Pace):
     def report(self) -> dict[str, Any]:
         return {
             **self.refining.report(),
-            # Gradients of several views come together where they accumulate.
-            "gaussians_shown": None if self._keeps_steps else self._rates.visibility.share,
+            "gaussians_shown": self._rates.visibility.share,
             "growing": None if self.growing is None else self.growing.report(),
         }
 

@@ -205,8 +205,8 @@ class ScaledRates:
         self._unstepped = 0
         if not self.visibility.complete:
             self.visibility.see(optimizer.param_groups, info.name)
-        if info.named_positions is not None:
-            rows = self._rows = self._rows_now = info.named_positions.shape[0]
+        if info.known_positions is not None:
+            rows = self._rows = self._rows_now = info.known_positions.shape[0]
         else:  # in groups without names, positions of cameras have the shape of positions of Gaussians, but fewer rows
             for param in info.positions:
                 if param.shape[0] > self._rows_now:

@@ -230,6 +230,7 @@ class Refining:
         assert self.first is not None and self._last is not None and self.share is not None
         if self.stopping is None:
             if self._shrinks:
+                self._rates.visibility.finish()  # gradients of several views come together
                 # With a share of its gradients a step is noisier by 1 / sqrt(share). Adam shortens the part that views
                 # agree on by as much.
                 progress = (number - self.first) / (self._last + 1 - self.first)
