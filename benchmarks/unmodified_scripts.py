@@ -1,11 +1,12 @@
-"""Runs other projects' scripts with `skipgs-plug run`: makes their scenes, measures their models, and prints the table.
+"""Runs other projects' scripts with `skipgs-plug run`: makes their scenes, and measures their models.
 
     python benchmarks/unmodified_scripts.py scene ../shared/data/bonsai OUT --keep-every 5 --factors 4 8
     python benchmarks/unmodified_scripts.py run fastgs auto CHECKOUTS OUT --data-factor 4  # one row of script_rows.py
     python benchmarks/unmodified_scripts.py measure MODEL.ply SCENE --data-factor 8
     python benchmarks/unmodified_scripts.py pictures OUT/test/ours_3000
-    python benchmarks/unmodified_scripts.py table benchmarks/results/scripts/runs.json
+    python benchmarks/script_table.py benchmarks/results/scripts/runs.json > benchmarks/results/scripts/table.md
 
+These scripts fix their seeds. A second run starts from another draw of the scene's points (`scene --seed 1`).
 All scripts are measured alike: this package renders their PLY from the held-out cameras. A PLY of Mip-Splatting
 contains a 3D filter, which is applied together with its 2D filter of 0.1 square pixels. For scripts without a PLY in
 the scene's coordinates (Scaffold-GS, gsplat) the pictures that the script wrote are measured, in 8 bits.
@@ -37,6 +38,7 @@ from skipgs_plug.trainer.ply import read_ply
 
 RUNS = Path(__file__).parent / "results/scripts/runs.json"
 MODES = {"own": ["--no-gate"], "auto": ["--share", "auto"]}
+DRAWN = "drawn.json"  # file in a scene's folder about the draw of its points
 MIP_FILTER = 0.1  # 2D filter that Mip-Splatting trains with, square pixels
 
 
@@ -75,6 +77,7 @@ def thin_scene(
     for number in sorted(set(model.points3D) - set(drawn.tolist())):
         model.delete_point3D(number)
     (out / "sparse/0").mkdir(parents=True)
+    (out / DRAWN).write_text(json.dumps({"points": len(drawn), "seed": seed}) + "\n", encoding="utf-8")
     model.write(str(out / "sparse/0"))
     for factor in (1, *factors):
         folder = out / ("images" if factor == 1 else f"images_{factor}")
@@ -109,7 +112,7 @@ def run(
         row: Name of the row in script_rows.py.
         mode: "auto" runs with the gate, "own" without.
         checkouts: Folder with the checkouts of all projects.
-        scene: COLMAP folder with images_{data_factor}.
+        scene: Folder that the command `scene` wrote.
         data_factor: Factor by which the photographs are reduced.
         iterations: Iterations of the schedule.
         out: Folder for the output of scripts.
@@ -141,6 +144,7 @@ def run(
     judged = judge(one, folder, scene, data_factor)
     record = {
         "scene": named(scene, data_factor),
+        "points_seed": json.loads((scene / DRAWN).read_text(encoding="utf-8"))["seed"],
         "script": one.label,
         "mode": mode,
         "iterations": iterations,
@@ -196,7 +200,7 @@ def keep(record: dict[str, Any], runs: Path) -> None:
     if record["project_commit"] is None:
         same = [one["project_commit"] for one in whole["runs"] if one["project"] == record["project"]]
         record["project_commit"] = next(iter(same), None)
-    key = ("scene", "script", "mode", "iterations")
+    key = ("scene", "points_seed", "script", "mode", "iterations")
     equal = [i for i, one in enumerate(whole["runs"]) if all(one[name] == record[name] for name in key)]
     if equal:
         whole["runs"][equal[0]] = record
@@ -263,51 +267,6 @@ def smoothing_filter(path: Path) -> Tensor | None:
     return torch.tensor(np.array(vertices["filter_3D"]), dtype=torch.float32)[:, None]
 
 
-def table(runs: list[dict[str, Any]]) -> str:
-    """Return a Markdown table with one row for each pair of runs, by scene, in the order of the records.
-
-    Seconds from a core that other programs used have a star. They are compared only with each other.
-    """
-    pairs: dict[tuple[str, str, int], dict[str, dict[str, Any]]] = {}
-    for run in runs:
-        pairs.setdefault((run["scene"], run["script"], run["iterations"]), {})[run["mode"]] = run
-    lines: list[str] = []
-    for scene in dict.fromkeys(key[0] for key in pairs):
-        lines += [
-            f"{scene}:",
-            "",
-            "| script | iterations | run with auto | s | s with auto | % of own | Gaussians | with auto "
-            "| PSNR (SSIM) | with auto | difference dB |",
-            "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
-            *(row(key, pair) for key, pair in pairs.items() if key[0] == scene and {"own", "auto"} <= pair.keys()),
-            "",
-        ]
-    return "\n".join(lines)
-
-
-def row(key: tuple[str, str, int], pair: dict[str, dict[str, Any]]) -> str:
-    """Return one row of the table."""
-    own, auto = pair["own"], pair["auto"]
-    alike = own.get("busy_core", False) == auto.get("busy_core", False)
-    cells = [
-        key[1],
-        f"{key[2]:,}",
-        f"{auto['iterations_run']:,}",
-        seconds(own),
-        seconds(auto),
-        f"{100 * auto['seconds'] / own['seconds']:.0f}" if alike else "",
-        *("" if run["gaussians"] is None else f"{run['gaussians']:,}" for run in (own, auto)),
-        *(f"{run['psnr']:.2f} ({run['ssim']:.4f})" for run in (own, auto)),
-        f"{auto['psnr'] - own['psnr']:+.2f}",
-    ]
-    return f"| {' | '.join(cells)} |"
-
-
-def seconds(run: dict[str, Any]) -> str:
-    """Return the seconds of a run, with a star if other programs used its core, which makes them too high."""
-    return f"{run['seconds']:.0f}{'*' if run.get('busy_core') else ''}"
-
-
 def print_ply(model: tyro.conf.Positional[Path], scene: tyro.conf.Positional[Path], data_factor: int = 1) -> None:
     """Measure a PLY on the held-out views."""
     print(json.dumps(measure_ply(model, scene, data_factor)))
@@ -318,12 +277,7 @@ def print_pictures(folder: tyro.conf.Positional[Path]) -> None:
     print(json.dumps(measure_pictures(folder)))
 
 
-def print_table(runs: tyro.conf.Positional[Path]) -> None:
-    """Print the table of recorded runs."""
-    print(table(json.loads(runs.read_text(encoding="utf-8"))["runs"]))
-
-
 if __name__ == "__main__":
     tyro.extras.subcommand_cli_from_dict(
-        {"scene": thin_scene, "run": run, "measure": print_ply, "pictures": print_pictures, "table": print_table}
+        {"scene": thin_scene, "run": run, "measure": print_ply, "pictures": print_pictures}
     )

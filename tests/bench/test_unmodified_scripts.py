@@ -10,6 +10,7 @@ from PIL import Image
 
 from benchmarks import unmodified_scripts
 from benchmarks.script_rows import Row
+from benchmarks.script_table import table
 
 # In place of Python: logs its arguments, and leaves a report and the pictures that a gsplat run would have written.
 STAND_IN = """#!/bin/sh
@@ -26,6 +27,8 @@ def checkouts(tmp_path: Path) -> Path:
     """A folder with a checkout, and a folder with the files that the stand-in's run leaves."""
     (tmp_path / "checkouts/project").mkdir(parents=True)
     (tmp_path / "ready/renders").mkdir(parents=True)
+    (tmp_path / "fern").mkdir()
+    (tmp_path / "fern/drawn.json").write_text('{"points": 10, "seed": 0}')
     pair = np.full((16, 32, 3), 100, np.uint8)  # photograph and render side by side
     pair[:, 16:] = 110
     Image.fromarray(pair).save(tmp_path / "ready/renders/val_step99_0000.png")
@@ -67,9 +70,25 @@ def test_second_run_replaces_the_record_of_the_same_mode_alone(checkouts, monkey
     runs = json.loads((checkouts.parent / "runs.json").read_text())["runs"]
     runs = [{**one, "seconds": 1.0} for one in runs]  # the stand-in takes none
     assert [one["mode"] for one in runs] == ["own", "auto"]
-    assert "| Tiny | 100 | 70 |" in unmodified_scripts.table(runs)
+    assert "| Tiny | 100 | 70 |" in table(runs)
 
 
 def test_script_that_fails_is_named_with_its_log(checkouts, monkeypatch, capsys):
     assert run(checkouts, monkeypatch, code=3)["exit_code"] == 3
     assert "The script ended with 3; its log is " in capsys.readouterr().err
+
+
+def test_table_has_means_over_draws_of_the_points_and_each_difference():
+    def one(mode, seed, psnr, **changed):
+        run = {"scene": "fern", "script": "Tiny", "iterations": 100, "mode": mode, "points_seed": seed, "psnr": psnr}
+        return {**run, "iterations_run": 40, "seconds": 2.0, "gaussians": 10, "ssim": 0.5, **changed}
+
+    runs = [one("own", 0, 30.0), one("auto", 0, 31.0, seconds=1.0, gaussians=None)]
+    assert table(runs).splitlines()[-1] == (
+        "| Tiny | 100 | 40 | 2 | 1 | 50 | 10 |  | 30.00 (0.5000) | 31.00 (0.5000) | +1.00 |"
+    )
+    runs += [one("own", 1, 32.0, seconds=4.0, ssim=0.6), one("own", 2, 20.0)]  # the last has no partner
+    runs += [one("auto", 1, 31.5, gaussians=30, iterations_run=50, busy_core=True)]
+    assert table(runs).splitlines()[-1] == (
+        "| Tiny | 100 | 45 | 3 | 2* | 50 | 10 |  | 31.00 (0.5500) | 31.25 (0.5000) | +0.25 (+1.00, -0.50) |"
+    )
