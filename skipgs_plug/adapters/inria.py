@@ -19,7 +19,6 @@ import torch
 
 from skipgs_plug.adapters import registry
 from skipgs_plug.adapters.base import AbstractAdapter
-from skipgs_plug.adapters.drift_check import DriftCheck
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import last_calls
 from skipgs_plug.adapters.loop_code import LOOP, LoopCode
@@ -68,7 +67,6 @@ class InriaFamily(AbstractAdapter):
         self._model: Callable[[], Any] = lambda: None  # a new model means a new run
         self._label = "image_name"  # attribute of a camera that names its view
         self._code: LoopCode | None = None
-        self._drift: DriftCheck
         self.known_names: dict[str, Any] = {}
         self._unknown = Unrecognised(*5 * (frozenset(),))
 
@@ -228,14 +226,13 @@ class InriaFamily(AbstractAdapter):
                 self._refuse_fork(LoopCode.of_module(frame.f_globals))
                 self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
                 self._model = weakref.ref(model)
-                self._drift = DriftCheck(hooks.state)
+                hooks.unmoved(self._optimizers_of_model)
             else:
                 self._step = hooks.number(self._step + 1)
-                own = [one for one in vars(model).values() if isinstance(one, torch.optim.Optimizer)]
-                if moved := self._drift.moved(own):
-                    self._give_up(hooks, moved)
-                    return
             hooks.iteration(self._step)
+
+    def _optimizers_of_model(self) -> list[torch.optim.Optimizer]:
+        return [one for one in vars(self._model()).values() if isinstance(one, torch.optim.Optimizer)]
 
     def _attach_to_loop(self, hooks: Hooks, script: dict[str, Any]) -> None:
         """Attach to the loop's backward and to its range."""
@@ -275,14 +272,6 @@ class InriaFamily(AbstractAdapter):
                 f"Adapter {self.name!r} is for {self.checked}, but {code.source} "
                 f"looks like the training script of {right.name!r}."
             )
-
-    def _give_up(self, hooks: Hooks, moved: list[str]) -> None:
-        """Release the gate, and let training go on: an error would lose the run."""
-        hooks.release(
-            f"The loop moved {', '.join(moved)} in iteration {self._step - 1}, whose backward was skipped, by code "
-            f"that adapter {self.name!r} does not know. The gate is detached, and training goes on without it. Gate "
-            "this loop by hand with SkipGate(start_iter=...).",
-        )
 
     def _read_run(self, hooks: Hooks, loop: Mapping[str, Any]) -> None:
         """Read options, views and first iteration from the loop's variables."""

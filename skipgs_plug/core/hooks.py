@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Protocol
 import torch
 
 from skipgs_plug.core.clock import Times
+from skipgs_plug.core.drift_check import DriftCheck, Optimizers
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.intercept import Around, Original, Patches, intercept_tensor_backward
@@ -71,6 +72,7 @@ class Hooks:
         self._ready = False
         self.script_globals: dict[str, Any] = {}
         self._iteration = engine.iteration
+        self._drift: DriftCheck | None = None
         self._iterations = 0
         self._backwards = 0
         self._odd_iterations = 0  # iterations with a number of backward passes other than one, so far
@@ -101,6 +103,9 @@ class Hooks:
                 raise self._mismatch("the trainer iterates before it said when densification ends")
             if self._iterations == CHECKED_ITERATIONS:
                 self._require_one_backward_each()
+            if self._drift is not None and (moved := self._drift.moved()):
+                self._release_moved(moved)
+                return
             self._iterations += 1
             self._odd_iterations += 1  # until its backward is seen
             self._engine.open_iteration(step)
@@ -292,6 +297,20 @@ class Hooks:
     def gate_tensor_backward(self, *callers: str) -> None:
         """Gate the scalar `Tensor.backward` that functions of these names call themselves."""
         intercept_tensor_backward(self._patches, callers, self.backward)
+
+    def unmoved(self, optimizers: Optimizers) -> None:
+        """Check that nothing moves the parameters of these optimizers in skipped iterations; see `DriftCheck`.
+
+        A fork of a trainer can do that. The gate is then released, and training goes on without it.
+        """
+        self._drift = DriftCheck(self._engine, optimizers)
+
+    def _release_moved(self, names: list[str]) -> None:
+        self.release(
+            f"The loop moved {', '.join(names)} in iteration {self._iteration.step}, whose backward was skipped, by "
+            f"code that adapter {self._adapter.name!r} does not know. The gate is detached, and training goes on "
+            "without it. Gate this loop by hand with SkipGate(start_iter=...)."
+        )
 
     def on_detach(self, label: str, undo: Callable[[], None]) -> None:
         """Add a function that undoes another change at `detach`."""

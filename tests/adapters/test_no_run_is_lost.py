@@ -5,9 +5,9 @@ from cases import CASES, alone
 from lookalikes.splats import log, new_log
 
 from skipgs_plug import SkipGate
-from skipgs_plug.adapters import base, drift_check, inria, nerfstudio, step_trainer
+from skipgs_plug.adapters import base, nerfstudio, step_trainer
 from skipgs_plug.adapters.registry import get_adapter
-from skipgs_plug.core import caution
+from skipgs_plug.core import caution, drift_check
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.rates import ScaledRates, _Steps
@@ -135,7 +135,7 @@ def test_a_rank_whose_code_fails_raises_since_others_would_wait(monkeypatch):
     case = next(case for case in cases if case.name == "inria")
     new_log()
     trainer, train = case.make()
-    fail_from(monkeypatch, inria.DriftCheck, "moved", case.module.START - 3)
+    fail_from(monkeypatch, drift_check.DriftCheck, "moved", case.module.START - 3)
     monkeypatch.setattr("skipgs_plug.core.distributed.group_size", lambda: 2)
     with SkipGate(trainer) as gate, pytest.raises(ZeroDivisionError, match="of moved"):
         train()

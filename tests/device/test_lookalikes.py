@@ -97,7 +97,7 @@ class Counts:
     def __init__(self, gate: list[tuple[str, str, int, int]]) -> None:
         self.looks = self.visibility = self.waits = self.reads = 0
         for kind, file, _, count in gate:
-            if file == "adapters/drift_check.py":
+            if file == "core/drift_check.py":
                 self.looks += count
             elif file == "core/distributed.py":
                 self.visibility += count

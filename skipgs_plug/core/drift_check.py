@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from skipgs_plug.core import decision
+from skipgs_plug.core import decision, distributed
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.optimizers import has_pending_gradient
+
+Optimizers = Callable[[], Mapping[str, torch.optim.Optimizer] | Iterable[torch.optim.Optimizer]]
 
 CHECKED_SKIPS = 5  # skipped iterations that are checked, from the second on; a loop repeats what it does
 
@@ -19,31 +22,38 @@ class DriftCheck:
 
     A change there comes from the loop itself. It belongs to the gradient step, such as noise, and would go on alone.
     Sums and norms are compared. A checked iteration costs two passes over the parameters and one read of the device. A
-    NaN that stays a NaN has not moved.
+    NaN that stays a NaN has not moved. Several ranks are not checked: one that gave up alone would leave the others
+    waiting.
+
+    Args:
+        engine: The gate.
+        optimizers: Returns the optimizers of all parameters that must not move, by name if their groups have no names.
     """
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Engine, optimizers: Optimizers) -> None:
         self._engine = engine
+        self._optimizers = optimizers
         self._left = CHECKED_SKIPS
         # Number of events, names, and sums of the parameters when the iteration began.
         self._before: tuple[int, list[str], list[Tensor]] | None = None
 
-    def moved(self, optimizers: Iterable[torch.optim.Optimizer]) -> list[str]:
+    def moved(self) -> list[str]:
         """Return the names of the parameters that moved in the iteration before this call, if it was skipped.
 
-        Call it once at the beginning of each iteration, before `Hooks.iteration`.
+        Call it once at the beginning of each iteration, before the engine opens it.
         """
         stats = self._engine.stats
-        if self._left == 0 or not stats.skips:
+        if self._left == 0 or not stats.skips or distributed.group_size() > 1:
             return []
         before, self._before = self._before, None
         if self._engine.iteration.decision is decision.PAUSE:  # no iteration is skipped for a while
             return []
-        optimizers = list(optimizers)
-        if any(map(has_pending_gradient, optimizers)):
+        optimizers = self._optimizers()
+        named = dict(optimizers if isinstance(optimizers, Mapping) else enumerate(optimizers))
+        if any(map(has_pending_gradient, named.values())):
             return []
         events = sum(stats.events.values())
-        names, now = _like(optimizers)
+        names, now = _like(named)
         self._before = (events, names, now)
         if before is None or not self._engine.skipped or before[0] != events:
             return []
@@ -51,14 +61,14 @@ class DriftCheck:
         return _changed(before[1], before[2], now)
 
 
-def _like(optimizers: list[torch.optim.Optimizer]) -> tuple[list[str], list[Tensor]]:
-    """Return for each parameter the name of its group, and its sum and norm [2] on its device."""
+def _like(optimizers: dict[Any, torch.optim.Optimizer]) -> tuple[list[str], list[Tensor]]:
+    """Return for each parameter the name of its group or optimizer, and its sum and norm [2] on its device."""
     names, sums = [], []
-    for optimizer in optimizers:
-        for index, group in enumerate(optimizer.param_groups):
+    for name, optimizer in optimizers.items():
+        for group in optimizer.param_groups:
             for param in group["params"]:
                 values = param.detach()
-                names.append(str(group.get("name", index)))
+                names.append(str(group.get("name", name)))
                 sums.append(torch.stack([values.sum(), torch.linalg.vector_norm(values)]).double())
     return names, sums
 
