@@ -35,7 +35,7 @@ class MCMC(InriaFamily):
     stand_ins = "mcmc"
     mark = NOISE
     calls = ("add_new_gs", "relocate_gs", "add_", "randn_like", "randn")
-    densification = Densification(marks=("densification_interval",), needs="nothing")
+    densification = Densification(marks=("densification_interval",), needs="nothing", resets=False)
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)

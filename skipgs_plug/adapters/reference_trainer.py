@@ -74,4 +74,4 @@ def _densification(trainer: Any) -> Densification | None:
     mcmc = trainer.mcmc
     if mcmc is None:
         return strategy_events(trainer.strategy)
-    return Densification(numbers=lambda numbers: filter(mcmc.moves, numbers), needs="nothing")
+    return Densification(numbers=lambda numbers: filter(mcmc.moves, numbers), needs="nothing", resets=False)

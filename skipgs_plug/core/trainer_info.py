@@ -21,11 +21,14 @@ class Densification:
             needs more, at most as many as in the trainer's own schedule. "iterations": as many iterations ran as in the
             trainer's own schedule; this suits thresholds on counts of visits. "nothing": every event is kept; this
             suits growth by a budget or by a constant share per event.
+        resets: Whether opacities are reset now and then, so that few iterations run between two resets, or it is not
+            known. Without resets, longer steps are tolerated in schedules of any length (3DGS-MCMC).
     """
 
     marks: tuple[str, ...] = ()
     numbers: Callable[[range], Iterable[int]] | None = None
     needs: Literal["visits", "iterations", "nothing"] = "visits"
+    resets: bool = True
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
     per_refining = cost(grown)
     growing = growing_share(stop, pilot.views, longer=pilot.shown is not None) * stop
     left = max_steps - stop
-    refining = refining_share(left, pilot.views, grown_by_few=True) * left if left else 0.0
+    refining = refining_share(left, pilot.views, grown=stop) * left if left else 0.0
     more = grown - max(sample.gaussians for sample in pilot.samples)
     memory = None if pilot.peak_memory is None else round(pilot.peak_memory + BYTES_OF_A_GAUSSIAN * max(more, 0.0))
     return Forecast(

@@ -225,12 +225,13 @@ class Growing:
     @property
     def _factors(self) -> tuple[float, GrowingParts]:
         """Factor on learning rates until the last event, and the parts of opacities and positions."""
-        if self.share is None or self._visible is None or not self._config.compensates:
+        events = self.events
+        if self.share is None or self._visible is None or events is None or not self._config.compensates:
             return UNCHANGED
-        by_budget = self.events is not None and self.events.all_run
         share = max(self._share_now or self.share, self._must_share)
-        factor = growing_factor(self._length, share, self._visible, by_budget, self._times_grown)
-        return factor, GrowingParts(opacity_factor(share), positions_part(factor))
+        grown = self._times_grown
+        factor = growing_factor(self._length, share, self._visible, events.all_run, grown, events.resets)
+        return factor, GrowingParts(opacity_factor(share), positions_part(factor, events.resets))
 
     @property
     def _times_grown(self) -> float | None:

@@ -76,7 +76,7 @@ class Refining:
         views: list[str] | None,
         epoch: int | None,
         keeps_steps: bool,
-        grown_by_few: bool,
+        grown: int,
     ) -> None:
         """Begin refinement with iteration `first`.
 
@@ -87,14 +87,14 @@ class Refining:
             epoch: Number of iterations in which every view comes up once; None if unknown.
             keeps_steps: The trainer takes as many steps as in its own run, each with fewer gradients. Steps become
                 longer and shrink with its schedule then.
-            grown_by_few: Whether iterations are left out before refinement, too.
+            grown: Iterations of the schedule before refinement, if some of them are left out; else 0.
 
         Raises:
             SkipGSError: "auto" needs the views and they are unknown, or a loaded state had larger steps and they are
                 off now.
         """
         assert self.first is not None
-        self._begun, self._last, self.always, self._grown_by_few = True, last, always, grown_by_few
+        self._begun, self._last, self.always, self._grown_by_few = True, last, always, grown > 0
         self._must = frozenset().union(*always.values()) if always else frozenset()
         total = last + 1 - self.first
         if self._auto and self.share is None:
@@ -103,7 +103,7 @@ class Refining:
                     'refine_share="auto" must know the training views; give their names to gate.iterations() as views='
                     ", or a share."
                 )
-            self.share = refining_share(total, epoch, grown_by_few)
+            self.share = refining_share(total, epoch, grown)
         assert self.share is not None
         # Several processes train on different views at a time, so no view can be watched and kept out of training.
         if self._judges and views is not None and self.stopping is None and distributed.group_size() == 1:

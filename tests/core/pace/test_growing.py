@@ -356,17 +356,17 @@ def test_shares_that_auto_chooses():
     # Longer schedules run more iterations, and a smaller share.
     assert growing_share(3000, 46, longer=True) == pytest.approx(765 / 3000, abs=1e-3)
     assert growing_share(6000, 46, longer=True) == pytest.approx(975 / 6000, abs=1e-3)
-    assert refining_share(3000, 17, grown_by_few=True) == pytest.approx(701 / 3000, abs=1e-3)
+    assert refining_share(3000, 17, grown=3000) == pytest.approx(701 / 3000, abs=1e-3)
     # Where all events run, each needs 14 iterations, as far as all need more than that and no more than 1,200.
     assert growing_share(2500, 17, longer=True, events=10) == pytest.approx(717.5 / 2500, abs=1e-4)
     assert growing_share(2500, 17, longer=True, events=58) == 14 * 58 / 2500
     assert growing_share(2500, 17, longer=True, events=97) == growing_share(2500, 17, longer=False) == 1200 / 2500
     assert growing_share(500, 17, longer=True) == growing_share(0, 17, longer=True) == 1.0
-    assert refining_share(3500, 255) < refining_share(3500, 255, grown_by_few=True) == pytest.approx(0.2494, abs=1e-3)
-    assert refining_share(1000, 17) == 0.4 and refining_share(1000, 17, grown_by_few=True) == 0.55
-    assert refining_share(500, 17, grown_by_few=True) == 0.8
-    assert refining_share(15_000, 255, grown_by_few=True) == pytest.approx(0.1733, abs=1e-3)
-    assert refining_share(15_000, 17, grown_by_few=True) == 0.12 < refining_share(15_000, 17) == 0.2
+    assert refining_share(3500, 255) < refining_share(3500, 255, grown=3500) == pytest.approx(0.2494, abs=1e-3)
+    assert refining_share(1000, 17) == 0.4 and refining_share(1000, 17, grown=1000) == 0.55
+    assert refining_share(500, 17, grown=500) == 0.8
+    assert refining_share(15_000, 255, grown=15_000) == pytest.approx(0.1733, abs=1e-3)
+    assert refining_share(15_000, 17, grown=15_000) == 0.12 < refining_share(15_000, 17) == 0.2
 
 
 def test_factors_while_the_scene_grows():
