@@ -2,8 +2,11 @@
 
 import torch
 from cases import SkipAlways, run, script
-from lookalikes import mcmc
+from lookalikes import gsplat_runner, mcmc
 
+from skipgs_plug.adapters.gsplat_strategy import strategy_events
+from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.adapters.mcmc import MCMC
 from skipgs_plug.core import decision
 
 CASE = script("mcmc", mcmc)
@@ -28,3 +31,9 @@ def test_gate_started_early_runs_the_iterations_that_relocate():
     assert relocations == [5, 10, 15] and [s for s, *_ in gated.structure] == relocations
     assert gated.backwards == [*range(1, 8), 10, 15]
     assert [row.step for row in gate.trace if row.reason == "forced"] == [10, 15]
+
+
+def test_longer_steps_are_tolerated_where_opacities_are_never_reset():
+    assert not MCMC.densification.resets and InriaFamily.densification.resets
+    assert not strategy_events(gsplat_runner.MCMCStrategy()).resets
+    assert strategy_events(gsplat_runner.DefaultStrategy()).resets

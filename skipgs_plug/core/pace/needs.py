@@ -105,7 +105,7 @@ def refining_share(iterations: int, epoch: int, grown: int = 0) -> float:
     return min(MOST_SHARE_OF_STEPS, max(steps, visits) / iterations)
 
 
-def _longer(iterations: int) -> float:
+def _longer(iterations: float) -> float:
     """Return the factor on the least number of iterations of a phase, for a schedule of so many iterations."""
     return max(1.0, iterations / SHORT_PHASE) ** LONGER_PHASE
 

@@ -16,6 +16,7 @@ from skipgs_plug.core.pace.needs import (
     growing_share,
     hurry,
     opacity_factor,
+    positions_part,
     refining_share,
 )
 from skipgs_plug.core.trainer_info import Densification
@@ -367,6 +368,10 @@ def test_shares_that_auto_chooses():
     assert refining_share(500, 17, grown=500) == 0.8
     assert refining_share(15_000, 255, grown=15_000) == pytest.approx(0.1733, abs=1e-3)
     assert refining_share(15_000, 17, grown=15_000) == 0.12 < refining_share(15_000, 17) == 0.2
+    # Refinement of a sixth of the schedule runs as many iterations as that of a half, but not all of its own.
+    assert 5000 * refining_share(5000, 100, grown=25_000) == pytest.approx(15_000 * refining_share(15_000, 100, 15_000))
+    assert refining_share(5000, 100, grown=5000) < 0.2 < refining_share(5000, 100, grown=25_000)
+    assert refining_share(500, 17, grown=2500) == refining_share(300, 255, grown=2700) == 0.8
 
 
 def test_factors_while_the_scene_grows():
@@ -379,6 +384,14 @@ def test_factors_while_the_scene_grows():
     assert growing_factor(15_000, 0.2, 0.96, times_grown=math.e**1.5) == pytest.approx((1.5 * 2100 / 3000) ** 2)
     assert growing_factor(15_000, 0.2, 0.96, times_grown=12.0) == pytest.approx((2 * 2100 / 3000) ** 2)
     assert opacity_factor(0.25) == 2.0 and opacity_factor(1.0) == 1.0
+    assert positions_part(3.0) == pytest.approx(4 / 3) and positions_part(1.5) == 2.0 and positions_part(4.0) == 1.0
+
+
+def test_steps_conserve_the_path_in_any_schedule_if_opacities_are_never_reset():
+    assert growing_factor(25_000, 0.2, 1 / 3, by_budget=True, resets=False) == pytest.approx(5.0)
+    assert growing_factor(25_000, 0.1, 0.96, by_budget=True, resets=False) == 8.0  # the longest that pay
+    assert growing_factor(25_000, 0.9, 1 / 3, by_budget=True, resets=False) == pytest.approx(1 / 0.9)
+    assert positions_part(3.0, resets=False) == 2.0 and positions_part(8.0, resets=False) == 1.0
 
 
 LONG = range(100, 6001, 100)  # 60 events, with 20 iterations for each if every fifth runs
