@@ -49,17 +49,16 @@ MOST_FOR_NEW_GAUSSIANS = 2.0
 # Gaussians with a factor of 4, with 99 and 105 % with 3, and 0.1 to 0.25 dB lower with 2.5.
 LONGEST_STEPS = 3.0
 # The same if a budget or a share per event sets the number of Gaussians, which longer steps then do not raise. With 3,
-# the script of 3DGS-MCMC ended at 29.8 and 30.3 dB on fern, with 4 at 30.5 (own run 30.6).
+# the script of 3DGS-MCMC, which had this bound then, ended at 29.8 and 30.3 dB on fern, with 4 at 30.5 (own run 30.6).
 LONGEST_STEPS_BY_BUDGET = 4.0
 
 # The same, and the largest factor on the rate of positions, in any schedule without opacity resets. With 30,000
 # iterations, 3DGS-MCMC on Lego ends 0.02 dB below its own run with 8, 0.2 dB with 4 and 0.3 dB with 16. With 7,000 on
 # bonsai, positions at 8 instead of 4 times their rate gain 0.2 and 0.7 dB (two seeds).
 LONGEST_STEPS_WITHOUT_RESETS = 8.0
-
 # Largest factor on the rate of positions, which take twice the common factor elsewhere. With 6, fern that grows from
-# 4,000 to 74,000 Gaussians ended 4 dB below its own run, with 4 and 3 it ended 0.6 and 0.2 dB above. gsplat's MCMC on
-# bonsai lost 1 dB with 8, and 0.6 dB with 4. With 1.96 instead of 3.9 bonsai loses 0.1 dB.
+# 4,000 to 74,000 Gaussians ended 4 dB below its own run, with 4 and 3 it ended 0.6 and 0.2 dB above. With 1.96 instead
+# of 3.9 bonsai loses 0.1 dB.
 LONGEST_STEPS_OF_POSITIONS = 4.0
 
 # Refining (after densification ends).
