@@ -34,7 +34,7 @@ RENDERER, MODEL = "gaussian_renderer", "scene.gaussian_model"
 
 
 # Effect of `share` on trainers that accumulate gradients after densification; see `Phased`.
-GROWS_WHOLE = "If steps accumulate gradients after densification, it runs whole, since few steps follow it."
+GROWS_WHOLE = "If steps accumulate gradients after densification, it runs whole."
 
 
 class InriaFamily(AbstractAdapter):

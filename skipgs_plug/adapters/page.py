@@ -17,8 +17,8 @@ saving, prunes and optimizer calls continue in skipped iterations. An optimizer 
 are known by image name. A gate that would start while densification still reads gradients is refused.
 
 A fork may be taken for its parent. So each adapter names calls that change the model and that it does not know, and
-the gate begins after the last of them, if the loop's conditions tell their end. Where a loop moves the model in a
-skipped iteration all the same, the gate is released (scripts of Inria's family, gsplat, nerfstudio, `step_trainer`).
+the gate begins after the last of them, if the loop's conditions tell their end. If a loop moves the model in
+skipped iterations, the gate is released (Inria's family, gsplat, nerfstudio, `step_trainer`).
 
 With `share`, densification events are left out *by visits*, when the Gaussians were seen too seldom before them, or *by
 iterations*, when fewer iterations ran before them than their thresholds count. All events are kept where each one adds
