@@ -73,6 +73,7 @@ HOOKS = {
     "backward": "(self, loss: 'torch.Tensor', run: 'Callable[[], Any]', view: 'Any' = None) -> 'Any'",
     "before": "(self, owner: 'Any', name: 'str', call: 'Callable[..., Any]') -> 'None'",
     "catch_up": "(self, owner: 'Any', name: 'str', caller: 'str') -> 'None'",
+    "check_drift": "(self, optimizers: 'Optimizers') -> 'None'",
     "event": "(self, kind: 'str') -> 'None'",
     "events": "(self, owner: 'Any', *names: 'str') -> 'None'",
     "gate_tensor_backward": "(self, *callers: 'str') -> 'None'",

@@ -113,7 +113,7 @@ class GsplatRunner(AbstractAdapter):
             function_names(type(runner).train), "train", always=lambda numbers: opacity_resets(strategy, numbers)
         )
         catch_up_schedulers(hooks, "train")
-        hooks.unmoved(lambda: runner.optimizers)
+        hooks.check_drift(lambda: runner.optimizers)
         self._relocations = leave_out_noise(hooks, strategy, type(strategy))
         self.output_folder = runner.cfg.result_dir
         last = runner.cfg.max_steps - 1

@@ -226,7 +226,7 @@ class InriaFamily(AbstractAdapter):
                 self._refuse_fork(LoopCode.of_module(frame.f_globals))
                 self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
                 self._model = weakref.ref(model)
-                hooks.unmoved(self._optimizers_of_model)
+                hooks.check_drift(self._optimizers_of_model)
             else:
                 self._step = hooks.number(self._step + 1)
             hooks.iteration(self._step)

@@ -94,7 +94,7 @@ class Nerfstudio(AbstractAdapter):
         catch_up_schedulers(hooks, "scheduler_step_all")
         guard_scaler(hooks, trainer.grad_scaler)
         hooks.optimizer_names(lambda: trainer.optimizers.optimizers)
-        hooks.unmoved(lambda: trainer.optimizers.optimizers)
+        hooks.check_drift(lambda: trainer.optimizers.optimizers)
         self._relocations = leave_out_noise(hooks, strategy, strategy)
         self.output_folder = getattr(trainer, "base_dir", None)
         start, last = getattr(strategy, "refine_stop_iter", None), trainer.config.max_num_iterations - 1

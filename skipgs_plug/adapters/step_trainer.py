@@ -112,7 +112,7 @@ class StepTrainer(AbstractAdapter):
         hooks.wrap(trainer, "before_optim_hook", hooked)
         hooks.wrap(trainer, "optim_step", watched)
         hooks.gate_tensor_backward("step")
-        hooks.unmoved(lambda: [trainer.optimizer])
+        hooks.check_drift(lambda: [trainer.optimizer])
         hooks.ready(TrainerInfo(end, gradients_read_until=end))
 
     def always_run(self, numbers: range) -> Iterable[int]:

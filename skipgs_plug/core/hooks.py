@@ -298,7 +298,7 @@ class Hooks:
         """Gate the scalar `Tensor.backward` that functions of these names call themselves."""
         intercept_tensor_backward(self._patches, callers, self.backward)
 
-    def unmoved(self, optimizers: Optimizers) -> None:
+    def check_drift(self, optimizers: Optimizers) -> None:
         """Check that nothing moves the parameters of these optimizers in skipped iterations; see `DriftCheck`.
 
         A fork of a trainer can do that. The gate is then released, and training goes on without it.
