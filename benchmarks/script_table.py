@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 Run = dict[str, Any]
@@ -27,7 +28,7 @@ def table(runs: list[Run]) -> str:
     rows: dict[tuple[str, str, int], dict[int, Pair]] = {}
     for run in runs:
         draws = rows.setdefault((run["scene"], run["script"], run["iterations"]), {})
-        draws.setdefault(run.get("points_seed", 0), {})[run["mode"]] = run
+        draws.setdefault(run["points_seed"], {})[run["mode"]] = run
     lines: list[str] = []
     for scene in dict.fromkeys(key[0] for key in rows):
         lines += [f"{scene}:", "", HEAD, "|---" + "|---:" * 10 + "|"]
@@ -61,7 +62,7 @@ def row(script: str, iterations: int, pairs: list[Pair]) -> str:
 
 
 def mean(runs: list[Run], name: str) -> float:
-    return sum(run[name] for run in runs) / len(runs)
+    return fmean(run[name] for run in runs)
 
 
 def seconds(runs: list[Run]) -> str:
@@ -79,7 +80,7 @@ def quality(runs: list[Run]) -> str:
 
 def difference(each: list[float]) -> str:
     draws = f" ({', '.join(f'{one:+.2f}' for one in each)})" if len(each) > 1 else ""
-    return f"{sum(each) / len(each):+.2f}{draws}"
+    return f"{fmean(each):+.2f}{draws}"
 
 
 if __name__ == "__main__":

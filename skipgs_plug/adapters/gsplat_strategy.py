@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import Any
 
 from skipgs_plug.adapters.unknown_forks import Survey
 from skipgs_plug.core.hooks import Adapter, Hooks
@@ -58,8 +58,11 @@ def strategy_events(strategy: Any) -> Densification | None:
     def acts(n: int) -> bool:
         return n > first and n % every == 0 and (mcmc or n % reset >= pause)
 
-    needs: Literal["nothing", "visits"] = "nothing" if mcmc else "visits"
-    return Densification(numbers=lambda numbers: filter(acts, numbers), needs=needs, resets=not mcmc)
+    return Densification(
+        numbers=lambda numbers: filter(acts, numbers),
+        needs="nothing" if mcmc else "visits",
+        resets=not mcmc,
+    )
 
 
 def opacity_resets(strategy: Any, numbers: range) -> Iterable[int]:

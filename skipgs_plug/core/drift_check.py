@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from skipgs_plug.core import decision, distributed
 from skipgs_plug.core.engine import Engine
-from skipgs_plug.core.optimizers import has_pending_gradient
-
-Optimizers = Callable[[], Mapping[str, torch.optim.Optimizer] | Iterable[torch.optim.Optimizer]]
+from skipgs_plug.core.optimizers import Optimizers, has_pending_gradient, with_names
 
 CHECKED_SKIPS = 5  # skipped iterations that are checked, from the second on; a loop repeats what it does
 
@@ -48,9 +43,8 @@ class DriftCheck:
         before, self._before = self._before, None
         if self._engine.iteration.decision is decision.PAUSE:  # no iteration is skipped for a while
             return []
-        optimizers = self._optimizers()
-        named = dict(optimizers if isinstance(optimizers, Mapping) else enumerate(optimizers))
-        if any(map(has_pending_gradient, named.values())):
+        named = with_names(self._optimizers())
+        if any(has_pending_gradient(one) for _, one in named):
             return []
         events = sum(stats.events.values())
         names, now = _like(named)
@@ -61,14 +55,14 @@ class DriftCheck:
         return _changed(before[1], before[2], now)
 
 
-def _like(optimizers: dict[Any, torch.optim.Optimizer]) -> tuple[list[str], list[Tensor]]:
-    """Return for each parameter the name of its group or optimizer, and its sum and norm [2] on its device."""
+def _like(optimizers: list[tuple[str | None, torch.optim.Optimizer]]) -> tuple[list[str], list[Tensor]]:
+    """Return for each parameter the name of its group or optimizer, or a number, and its sum and norm [2]."""
     names, sums = [], []
-    for name, optimizer in optimizers.items():
-        for group in optimizer.param_groups:
+    for name, optimizer in optimizers:
+        for index, group in enumerate(optimizer.param_groups):
             for param in group["params"]:
                 values = param.detach()
-                names.append(str(group.get("name", name)))
+                names.append(str(group.get("name", index if name is None else name)))
                 sums.append(torch.stack([values.sum(), torch.linalg.vector_norm(values)]).double())
     return names, sums
 

@@ -10,14 +10,14 @@ from typing import Any, ClassVar, Protocol
 import torch
 
 from skipgs_plug.core.clock import Times
-from skipgs_plug.core.drift_check import DriftCheck, Optimizers
+from skipgs_plug.core.drift_check import DriftCheck
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.intercept import Around, Original, Patches, intercept_tensor_backward
+from skipgs_plug.core.optimizers import Named, Optimizers
 from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_known
 from skipgs_plug.core.pace.loop_range import LoopRange, replace_range
 from skipgs_plug.core.pace.phased import Phased
-from skipgs_plug.core.pace.rates import Named
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 from skipgs_plug.core.views import NOT_READ, view_key
 

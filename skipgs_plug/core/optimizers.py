@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
+
+Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
+Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 
 
 def has_pending_gradient(optimizer: torch.optim.Optimizer) -> bool:
@@ -20,3 +23,10 @@ def listed(optimizer: Any) -> list[torch.optim.Optimizer]:
     if isinstance(optimizer, (list, tuple)):
         return list(optimizer)
     return [optimizer]
+
+
+def with_names(
+    optimizers: Mapping[str, torch.optim.Optimizer] | Iterable[torch.optim.Optimizer],
+) -> list[tuple[str | None, torch.optim.Optimizer]]:
+    """Return each optimizer with its name; None without names."""
+    return list(optimizers.items()) if isinstance(optimizers, Mapping) else [(None, one) for one in optimizers]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import weakref
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from threading import get_ident
 from typing import Any
 
@@ -15,12 +15,10 @@ from torch.utils.hooks import RemovableHandle
 
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.optimizers import Optimizers, with_names
 from skipgs_plug.core.pace.parts import GrowingParts, OptimizerInfo
 from skipgs_plug.core.pace.step_reads import LiteralBetas, WatchedGroup, is_torchs, shorter_memory, unwatch, watch
 from skipgs_plug.core.pace.visibility import VISIBLE, Visibility
-
-Named = Callable[[], Mapping[str, torch.optim.Optimizer]]
-Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 
 # Least share of the iterations that steps are made longer for. With a smaller share, steps that conserve the whole path
 # are so long that they lose more than the path gains.
@@ -243,9 +241,7 @@ class ScaledRates:
         if self.only is not None:
             if key in self._foreign:
                 return None
-            own = self.only()
-            named = own.items() if isinstance(own, Mapping) else ((None, one) for one in own)
-            names = [name for name, one in named if one is optimizer]
+            names = [name for name, one in with_names(self.only()) if one is optimizer]
             if not names:
                 self._foreign.add(key)
                 return None
