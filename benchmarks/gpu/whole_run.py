@@ -32,7 +32,7 @@ class Script(NamedTuple):
 
     Attributes:
         folder: Name of its checkout in the folder of all checkouts.
-        train: Command line, with placeholders {scene}, {out} and {n}, the iterations.
+        train: Command line, with placeholders {scene}, {out}, {n} (iterations) and {scale} (iterations / 30,000).
         render: Command line that writes pictures of held-out views, if training does not.
         seconds: Pattern of the training seconds that the script prints or stores, evaluation and loading left out.
         gaussians: Pattern of the number of Gaussians that it prints or stores.
@@ -45,15 +45,21 @@ class Script(NamedTuple):
     gaussians: str
 
 
-SCRIPTS = {
-    "gsplat": Script(
+def gsplat(strategy: str) -> Script:
+    """Return gsplat's script, whose whole schedule is scaled to the iterations."""
+    return Script(
         "gsplat",
-        "examples/simple_trainer.py default --data_dir {scene} --data_factor 1 --result_dir {out} --max_steps {n} "
-        "--eval_steps {n} --save_steps {n} --disable_viewer --disable_video",
+        f"examples/simple_trainer.py {strategy} --data_dir {{scene}} --data_factor 1 --result_dir {{out}} "
+        "--max_steps 30000 --eval_steps 30000 --save_steps 30000 --steps_scaler {scale} --disable_viewer --disable_video",
         None,
         r'"ellipse_time": ([\d.]+)',
         r'"num_GS": (\d+)',
-    ),
+    )
+
+
+SCRIPTS = {
+    "gsplat": gsplat("default"),
+    "gsplat_mcmc": gsplat("mcmc"),
     # The settings of FastGS' own train_base.sh for this scene.
     "fastgs": Script(
         "FastGS",
@@ -123,7 +129,7 @@ def run(name: str, mode: str, folder: Path, asked: argparse.Namespace, seconds: 
     script = SCRIPTS[name]
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    filled = {"scene": asked.scene.resolve(), "out": folder, "n": asked.steps}
+    filled = {"scene": asked.scene.resolve(), "out": folder, "n": asked.steps, "scale": asked.steps / 30_000}
     peak = folder / "peak.json"
     record: dict[str, Any] = {"script": name, "mode": mode}
     command = ["-P", "-m", "benchmarks.gpu.peak", str(peak), "skipgs_plug", "run", "auto", *MODES[mode], "--"]

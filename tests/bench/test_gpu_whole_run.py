@@ -22,12 +22,12 @@ def gpu(monkeypatch):
     monkeypatch.setattr(whole_run, "measure_pictures", lambda folder, net, device: dict(PICTURES))
 
 
-def test_both_scripts_run_in_both_modes(gpu, tmp_path, capsys):
+def test_all_scripts_run_in_both_modes(gpu, tmp_path, capsys):
     out = tmp_path / "whole.json"
     assert whole_run.main(["scene", "checkouts", "--lpips", "alex", "--out", str(out)]) == 0
     stored = json.loads(out.read_text())["runs"]
     pairs = [(one["script"], one["mode"], one["psnr"]) for one in stored]
-    assert pairs == [(name, mode, 30.5) for name in ("gsplat", "fastgs") for mode in ("auto", "own")]
+    assert pairs == [(name, mode, 30.5) for name in whole_run.SCRIPTS for mode in ("auto", "own")]
     assert (
         "| gsplat | auto | 80.0 | 57.0 | 30,000 | 1,000 | 1.00 | 30.50 | 0.9000 | 0.0800 |" in capsys.readouterr().out
     )
