@@ -50,7 +50,8 @@ def gsplat(strategy: str) -> Script:
     return Script(
         "gsplat",
         f"examples/simple_trainer.py {strategy} --data_dir {{scene}} --data_factor 1 --result_dir {{out}} "
-        "--max_steps 30000 --eval_steps 30000 --save_steps 30000 --steps_scaler {scale} --disable_viewer --disable_video",
+        "--max_steps 30000 --eval_steps 30000 --save_steps 30000 --steps_scaler {scale} "
+        "--disable_viewer --disable_video",
         None,
         r'"ellipse_time": ([\d.]+)',
         r'"num_GS": (\d+)',
