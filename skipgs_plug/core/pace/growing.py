@@ -60,7 +60,7 @@ class Growing:
         self.events: Events | None = None
         self.always: dict[str, set[int]] = {}
         self._must: frozenset[int] = frozenset()
-        self._must_share = 0.0  # share of the iterations until the last event that must run
+        self._must_shares = 0.0, 0.0  # share of the iterations that must run: until the last event, and after it
         self._first_number: int | None = None
         self._length = 0
         self._epoch = 0
@@ -125,8 +125,10 @@ class Growing:
             self._first_number = numbers.start
         # Prunes and selections after the last event need no further iterations.
         self._length = min(numbers.stop, self.events.end or numbers.stop) - self._first_number
-        grows = range(self._first_number, self._first_number + self._length)
-        self._must_share = len(self._must.intersection(grows)) / max(self._length, 1)
+        end = self._first_number + self._length
+        parts = range(self._first_number, end), range(end, numbers.stop)
+        until, after = (len(self._must.intersection(part)) / max(len(part), 1) for part in parts)
+        self._must_shares = until, after
         self._epoch = epoch or self._epoch
         return True
 
@@ -138,7 +140,7 @@ class Growing:
     @property
     def leaves_out(self) -> bool:
         """Whether any iteration until the last event can be left out; False if all of them must run."""
-        return self._must_share < 1.0
+        return self._must_shares[0] < 1.0
 
     def require(self, number: int) -> None:
         """Make iteration `number` run. Call it for a need that shows only during the run."""
@@ -167,13 +169,12 @@ class Growing:
         runs = self.sampling.runs(must, barred)
         if runs:
             self.events.ran(number, needed)
-            if self._visible is not None and number in self.events:
+            if self._visible is not None and number in self.events and self.leaves_out:
                 self._measuring = True
                 self._rates.visibility.restart()
         else:
             self.events.skipped(number)
-        # After the last event iterations stand for themselves alone: prunes and terms of the loss wait for their own.
-        factor, parts = self._factors if number < self._first_number + self._length else UNCHANGED
+        factor, parts = self._factors(number)
         if parts.opacities > 1.0:
             self._rates.scale(factor, parts)
         elif self._measuring or self._config.max_gaussians is not None:
@@ -222,13 +223,14 @@ class Growing:
             events = len(self.events) if self.events.all_run else 0
             self.share = growing_share(self._length, self._epoch, longer, events)
 
-    @property
-    def _factors(self) -> tuple[float, GrowingParts]:
-        """Factor on learning rates until the last event, and the parts of opacities and positions."""
+    def _factors(self, number: int) -> tuple[float, GrowingParts]:
+        """Return the factor on learning rates in iteration `number`, and the parts of opacities and positions."""
         events = self.events
         if self.share is None or self._visible is None or events is None or not self._config.compensates:
             return UNCHANGED
-        share = max(self._share_now or self.share, self._must_share)
+        assert self._first_number is not None
+        ends = number >= self._first_number + self._length  # whether only prunes and terms of the loss follow
+        share = max(self._share_now or self.share, self._must_shares[ends])
         grown = self._times_grown
         factor = growing_factor(self._length, share, self._visible, events.all_run, grown, events.resets)
         return factor, GrowingParts(opacity_factor(share), positions_part(factor, events.resets))
@@ -252,7 +254,7 @@ class Growing:
         """
         events = self.events
         known = self.share is not None and self._config.compensates
-        factor, parts = self._factors if known else (None, None)
+        factor, parts = self._factors(self._first_number or 0) if known else (None, None)
         return {
             "share": self.share,
             "iterations_run": self.sampling.run,

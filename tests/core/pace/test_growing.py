@@ -121,15 +121,13 @@ class Opaque(Loop):
 
 
 @pytest.mark.parametrize(("share", "longer"), [(0.25, 4.0), (0.64, 4.0)])
-def test_opacities_take_the_root_of_the_path_until_the_last_event(share, longer):
+def test_opacities_take_the_root_of_the_path_until_refinement(share, longer):
     loop = Opaque()
     with SkipGate(start_iter=START + 100, share=share) as gate:
         loop.train(gate)
     assert gate.report()["growing"]["opacity_rate_factor"] == pytest.approx(share**-0.5)
-    # Once visibility is measured; the last event is in iteration 380, and another would follow in iteration 400.
-    assert loop.between(200, START) == {(round(longer, 3), round(share**-0.5, 3))}
-    # Until refinement begins, iterations stand for themselves alone.
-    assert loop.between(START, START + 100) == {(1.0, 1.0)}
+    # Once visibility is measured. The last event is in iteration 380, and refinement begins in iteration 500.
+    assert loop.between(200, START + 100) == {(round(longer, 3), round(share**-0.5, 3))}
 
 
 def test_opacities_alone_take_longer_steps_where_iterations_are_enough(monkeypatch):
@@ -153,6 +151,7 @@ def test_what_must_run_after_the_last_event_does_not_shorten_steps_before_it():
     with SkipGate(start_iter=START + 100, share=0.16) as gate:
         loop.train(gate, always=range(START, START + 100))
     assert loop.between(200, START) == {(4.0, 2.5)}
+    assert loop.between(START, START + 100) == {(1.0, 1.0)}
     assert set(range(START, START + 100)) <= set(loop.ran)
 
 
