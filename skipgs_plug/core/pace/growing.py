@@ -13,12 +13,13 @@ from skipgs_plug.core.pace.events import Events
 from skipgs_plug.core.pace.needs import (
     LEAST_GROWING_SHARE,
     MOST_RAISED_SHARE,
+    events_sooner,
     for_new_gaussians,
     growing_factor,
     growing_share,
-    hurry,
     opacity_factor,
     positions_part,
+    share_factor,
 )
 from skipgs_plug.core.pace.parts import GrowingParts
 from skipgs_plug.core.pace.rates import ScaledRates
@@ -155,7 +156,7 @@ class Growing:
             self.events.rows = distributed.largest(self._rates.rows)  # ranks leave out the same events
             self._rows_at_first = self._rows_at_first or self.events.rows
             if self._auto and self._visible is not None:
-                wanted = min(1.0, LEAST_GROWING_SHARE * self._hurry * self.stretch)
+                wanted = min(1.0, LEAST_GROWING_SHARE * share_factor(self.events.growth) * self.stretch)
                 self._share_now = max(self.share, wanted) if self._has_room(number) else self.share
         must, barred, needed = number in self._must, False, 0
         if number in self.events and not must:
@@ -194,17 +195,12 @@ class Growing:
         assert self.events is not None and self.share is not None
         # Events come sooner only in a scene with many new Gaussians. The ray-traced scene, which grows to e times as
         # many at most, ended with a tenth more Gaussians otherwise.
-        sooner = self._hurry if self._auto and self.stretch > 1.0 else None
+        sooner = events_sooner(self.events.growth) if self._auto and self.stretch > 1.0 else None
         return self.events.needed(number, self._visible_now, self.share, self._length, sooner)
 
     @property
     def _auto(self) -> bool:
         return self._config.growing == "auto"
-
-    @property
-    def _hurry(self) -> float:
-        """Factor on the share of the iterations after the last event, by the Gaussians that it added; at least 1."""
-        return 1.0 if self.events is None else hurry(self.events.growth)
 
     def _settle(self) -> None:
         """Use the present measurement; the share of the phase is fixed once enough steps are measured."""

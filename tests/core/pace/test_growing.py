@@ -11,13 +11,14 @@ from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.core.pace import needs
 from skipgs_plug.core.pace.events import LEAST_EVENTS, Events
 from skipgs_plug.core.pace.needs import (
+    events_sooner,
     for_new_gaussians,
     growing_factor,
     growing_share,
-    hurry,
     opacity_factor,
     positions_part,
     refining_share,
+    share_factor,
 )
 from skipgs_plug.core.trainer_info import Densification
 
@@ -301,7 +302,8 @@ def test_growth_is_that_of_the_last_event():
 
 
 def test_new_gaussians_ask_for_more_iterations():
-    assert hurry(0.0) == hurry(0.03) == 1.0 and hurry(0.09) == pytest.approx(3.0)
+    assert share_factor(0.0) == share_factor(0.03) == 1.0 and share_factor(0.09) == pytest.approx(3.0)
+    assert events_sooner(0.0) == events_sooner(0.025) == 1.0 and events_sooner(0.09) == pytest.approx(3.6)
     assert for_new_gaussians(None) == for_new_gaussians(0.2) == for_new_gaussians(2.718) == 1.0
     assert for_new_gaussians(97 / 3) == pytest.approx(1.82, abs=0.01)
 
