@@ -167,14 +167,13 @@ class Growing:
             self.sampling.share = self.share
         else:
             self.sampling.turn(self._share_now)
-        runs = self.sampling.runs(must, barred)
-        if runs:
-            self.events.ran(number, needed)
-            if self._visible is not None and number in self.events and self.leaves_out:
-                self._measuring = True
-                self._rates.visibility.restart()
-        else:
+        if not self.sampling.runs(must, barred):
             self.events.skipped(number)
+            return False
+        self.events.ran(number, needed)
+        if self._visible is not None and number in self.events and self.leaves_out:
+            self._measuring = True
+            self._rates.visibility.restart()
         factor, parts = self._factors(number)
         if parts.opacities > 1.0:
             self._rates.scale(factor, parts)
@@ -182,7 +181,7 @@ class Growing:
             self._rates.look()
         else:
             self._rates.pause()
-        return runs
+        return True
 
     def _has_room(self, number: int) -> bool:
         """Whether more iterations than `share` can run from `number` on, by `MOST_RAISED_SHARE` of the phase."""
