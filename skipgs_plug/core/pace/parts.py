@@ -119,8 +119,8 @@ class GroupInfo:
         return self.short
 
 
-class Share(NamedTuple):
-    """A group's share in the factor on learning rates. It holds while the number of Gaussians stays the same.
+class ScaledGroup(NamedTuple):
+    """How a group takes the factor on learning rates. It holds while the number of Gaussians stays the same.
 
     Attributes:
         group: One of an optimizer's `param_groups`.
@@ -159,11 +159,11 @@ class OptimizerInfo:
         name: The argument.
         positions: Parameters that may be positions [N, 3].
         known_positions: Positions [N, 3], if a name says so, which tell the number of Gaussians; else None.
-        shares: Shares of the groups that are scaled; see `divide`.
-        rows, growing: The arguments of `divide` that `shares` were found for.
+        scaled: The groups that are scaled; see `divide`.
+        rows, growing: The arguments of `divide` that `scaled` was found for.
     """
 
-    __slots__ = ("_only", "groups", "growing", "known_positions", "name", "positions", "rows", "shares")
+    __slots__ = ("_only", "groups", "growing", "known_positions", "name", "positions", "rows", "scaled")
 
     def __init__(self, optimizer: torch.optim.Optimizer, name: str | None) -> None:
         self.name = name
@@ -171,7 +171,7 @@ class OptimizerInfo:
         self.positions = [param for group in self.groups for param in group.positions]
         named = [param for group in self.groups if group.named_positions for param in group.positions]
         self.known_positions = named[0] if len(named) == 1 else None
-        self.shares: list[Share] = []
+        self.scaled: list[ScaledGroup] = []
         self.rows: int | None = None
         self.growing: GrowingParts | None = None
         self._only = self.groups[0] if len(self.groups) == 1 and self.groups[0].first is not None else None
@@ -185,7 +185,7 @@ class OptimizerInfo:
         return len(groups) == len(self.groups) and all(map(_is_about, self.groups, groups))
 
     def divide(self, rows: int, growing: GrowingParts | None) -> None:
-        """Find `shares`.
+        """Find `scaled`.
 
         Args:
             rows: Number of Gaussians; 0 if it is not known. Only parameters with as many rows take larger steps.
@@ -193,16 +193,16 @@ class OptimizerInfo:
                 Gaussian then keep their rates. None in refinement, in which opacities are never raised.
         """
         self.rows, self.growing = rows, growing
-        self.shares = [share for one in self.groups if (share := _share(one, rows, growing)) is not None]
+        self.scaled = [one for info in self.groups if (one := _scaled(info, rows, growing)) is not None]
 
 
-def _share(info: GroupInfo, rows: int, growing: GrowingParts | None) -> Share | None:
+def _scaled(info: GroupInfo, rows: int, growing: GrowingParts | None) -> ScaledGroup | None:
     if not info.of_gaussians(rows):
-        return Share(info.group, OTHERS_AT_MOST, 1.0, None) if growing is None else None
+        return ScaledGroup(info.group, OTHERS_AT_MOST, 1.0, None) if growing is None else None
     if info.part is None:
-        return Share(info.group, 1.0 if growing is None else growing.opacities, 1.0, info)
+        return ScaledGroup(info.group, 1.0 if growing is None else growing.opacities, 1.0, info)
     part = info.part if growing is None or not info.named_positions else growing.positions
-    return Share(info.group, part, math.inf, info)
+    return ScaledGroup(info.group, part, math.inf, info)
 
 
 def _is_about(info: GroupInfo, group: dict[str, Any]) -> bool:

@@ -202,7 +202,7 @@ class ScaledRates:
             info = step.info = OptimizerInfo(optimizer, info.name)
         self._unstepped = 0
         if not self.visibility.complete:
-            self.visibility.see(optimizer.param_groups, info.name)
+            self.visibility.see(info.positions)
         if info.known_positions is not None:
             rows = self._rows = self._rows_now = info.known_positions.shape[0]
         else:  # in groups without names, positions of cameras have the shape of positions of Gaussians, but fewer rows
@@ -212,15 +212,15 @@ class ScaledRates:
             rows = self._rows_now if self._rows_now > self._rows else self._rows
         if info.rows != rows or info.growing != self._growing:
             info.divide(rows, self._growing)
-        shares = [] if self._only_look else info.shares
+        scaled = [] if self._only_look else info.scaled
         if factor == 1.0 and self._growing is not None:  # only opacities, which have no part, are scaled
-            shares = [one for one in shares if one.longer is not None and one.longer.part is None]
+            scaled = [one for one in scaled if one.longer is not None and one.longer.part is None]
         if under_way:  # an optimizer can wrap another one that has the same groups
-            scaled = {id(group) for other in under_way for group, _, _ in other.before}
-            shares = [one for one in shares if id(one.group) not in scaled]
+            begun = {id(group) for other in under_way for group, _, _ in other.before}
+            scaled = [one for one in scaled if id(one.group) not in begun]
         under_way.append(step)
         before = step.before
-        for group, part, most, longer in shares:
+        for group, part, most, longer in scaled:
             times = part * (factor if factor < most else most)
             rate, betas = group.get("lr"), group.get("betas")
             before.append((group, rate, betas))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -56,19 +55,18 @@ class Visibility:
         """Measure no further steps until `restart`; on a device a measurement can wait for all work."""
         self.complete = True
 
-    def see(self, groups: list[dict[str, Any]], name: str | None) -> None:
-        """Measure a step that is about to run. Without names the first parameter [N, 3] counts as the positions.
+    def see(self, positions: Iterable[Tensor]) -> None:
+        """Measure a step that is about to run.
 
         Args:
-            groups: The optimizer's `param_groups`.
-            name: Name of groups without a `name`; None if it is unknown.
+            positions: Parameters of the optimizer that may be positions [N, 3]; the first with a gradient counts.
         """
         if self.complete:
             return
-        param = next((param for param in positions(groups, name) if param.grad is not None), None)
-        if param is None or param.grad is None:
+        gradient = next((param.grad for param in positions if param.grad is not None), None)
+        if gradient is None:
             return
-        share = reached_share(param.grad)
+        share = reached_share(gradient)
         if distributed.group_size() == 1 and share.device.type == "cpu":
             reached = share.item()
             if reached > 0.0:  # a step without gradients belongs to no view
@@ -93,15 +91,6 @@ class Visibility:
         self._looks = int(state[2])
         self.complete = self._looks >= STEPS
         self._unread = None if state[4] == 0.0 else torch.tensor(state[3:], dtype=torch.float64)
-
-
-def positions(groups: list[dict[str, Any]], name: str | None) -> Iterator[Tensor]:
-    """Yield the parameters that may be positions [N, 3]; arguments as for `Visibility.see`."""
-    for group in groups:
-        known = group.get("name", name)
-        for param in group["params"] if known is None or known in POSITIONS else ():
-            if param.ndim == 2 and param.shape[1] == 3:
-                yield param
 
 
 def reached_share(gradient: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from skipgs_plug.core.pace.parts import GroupInfo
 from skipgs_plug.core.pace.rates import ScaledRates, path_factor
 from skipgs_plug.core.pace.visibility import ROWS, STEPS, Visibility, reached_share
 
@@ -14,6 +15,10 @@ def positions(rows, reached, width=3):
     value.grad = torch.zeros(rows, width)
     value.grad[torch.randperm(rows)[:reached], torch.randint(width, (reached,))] = torch.randn(reached)
     return value
+
+
+def see(shown, groups, name=None):
+    shown.see([param for group in groups for param in GroupInfo(group, name).positions])
 
 
 @pytest.mark.parametrize("rows, reached", [(40, 10), (40, 40), (1, 1), (7, 3)])
@@ -39,8 +44,8 @@ def test_the_mean_over_the_first_steps_counts():
     assert shown.share is None
     for step in range(2 * STEPS):
         reached = 10 if step < STEPS else 40
-        shown.see([{"name": "rotation", "params": [positions(40, 20, 4)]}], None)
-        shown.see([{"name": "xyz", "params": [positions(40, reached)]}], None)
+        see(shown, [{"name": "rotation", "params": [positions(40, 20, 4)]}])
+        see(shown, [{"name": "xyz", "params": [positions(40, reached)]}])
     assert shown.share == 0.25
     again = Visibility()
     again.load_state_dict(shown.state_dict())
@@ -60,19 +65,19 @@ def test_the_mean_over_the_first_steps_counts():
 )
 def test_positions_are_known_by_name_or_by_shape(group, name, expected):
     shown = Visibility()
-    shown.see([{"params": [positions(40, 40, 1)]}, {"params": [positions(40, 20)], **group}], name)
+    see(shown, [{"params": [positions(40, 40, 1)]}, {"params": [positions(40, 20)], **group}], name)
     assert shown.share == expected
 
 
-def test_what_has_no_gradient_says_nothing():
+def test_parameters_without_a_gradient_do_not_count():
     shown = Visibility()
     empty = torch.nn.Parameter(torch.zeros(40, 3))
     for _ in range(3):
-        shown.see([{"params": [empty]}], "means")
-        shown.see([{"params": [positions(40, 0)]}], "means")
-        shown.see([{"params": [positions(0, 0)]}], "means")
+        shown.see([empty])
+        shown.see([positions(40, 0)])
+        shown.see([positions(0, 0)])
     assert shown.share is None
-    shown.see([{"params": [positions(40, 30)]}], "means")
+    shown.see([positions(40, 30)])
     assert shown.share == 0.75
 
 
