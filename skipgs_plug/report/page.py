@@ -137,9 +137,7 @@ def gate_blocks(name: str, data: dict[str, Any]) -> list[Block]:
         blocks.append(picture(plots.reasons(data), "Iterations since the gate became active, by reason of decision."))
         blocks.append(picture(plots.view_shares(views), "Share of skipped visits of each training view."))
         if any(row["mean_loss"] is not None for row in views):
-            blocks.append(
-                picture(plots.loss_against_skips(views), "Loss and share of skipped visits; a point per view.")
-            )
+            blocks.append(picture(plots.loss_against_skips(views), "Loss and skipped visits, one point per view."))
     if views:
         names = ("view", "visits", "backwards", "skips", "mean_loss", "last_loss")
         rows = [[rounded(row[name]) for name in names] for row in views]
