@@ -177,7 +177,7 @@ class CallReader:
                     return min(known, default=None)
                 return max(known) if len(known) == len(ends) else None
             case ast.Compare(option, [ast.Is() | ast.IsNot()], [ast.Constant(None)]):
-                # The user did not set the option, so the call is never made.
+                # Whether an option is set does not change during the run, so the call is never made.
                 return 0 if _is_plain_place(option) and _evaluated(test, scope) is (not holds) else None
             case ast.Compare(left, [operator], [right]) if not holds:
                 negated = _NEGATED.get(type(operator))
