@@ -1,6 +1,6 @@
-"""The calls that a training loop makes, and the iteration after which it no longer makes each of them.
+"""Find the calls of a training loop, and the iteration after which the loop no longer makes each call.
 
-Both are read from the source: of the loop, and of the functions of the same project that it calls.
+Both are read from the source of the loop and of the functions of the same project that it calls.
 """
 
 from __future__ import annotations
@@ -17,22 +17,23 @@ from pathlib import Path
 from types import CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
-NUMBER = "iteration"  # the loop's variable in the whole Inria family
-ASSIGNED = "data ="  # stands for an assignment to a tensor's `data` among the names of calls
-# Functions that may be evaluated in a condition: they change nothing.
+NUMBER = "iteration"  # variable that holds the iteration's number in every loop of the Inria family
+ASSIGNED = "data ="  # represents an assignment to a tensor's `data` among the names of calls
+# Functions that conditions may call while they are evaluated, because the functions change nothing.
 PURE = {name: getattr(builtins, name) for name in ("abs", "int", "float", "len", "max", "min", "round")}
-# Calls inside calls that are read. A trainer's loop reaches its strategy in three; more of them reach libraries.
+# Largest depth of nested calls that are read. A trainer's loop reaches its strategy in three; deeper calls reach
+# libraries.
 MAX_DEPTH = 5
 _NEGATED = {ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt}
 _MIRRORED = {ast.Lt: ast.Gt, ast.LtE: ast.GtE, ast.Gt: ast.Lt, ast.GtE: ast.LtE, ast.Eq: ast.Eq}
 
 
 class Scope(NamedTuple):
-    """Names of a function that is read.
+    """The names that a function can use.
 
     Attributes:
-        numbers: Expressions that hold the iteration's number, as they stand in the source.
-        values: Names and their values when the loop begins.
+        numbers: Expressions that hold the iteration's number, as spelled by `ast.unparse`.
+        values: Values of names when the loop begins.
         code: Code of the function; None for the loop of a script.
     """
 
@@ -42,37 +43,39 @@ class Scope(NamedTuple):
 
 
 class CallReader:
-    """Reads functions, and notes the end of every call in them.
+    """Reads functions and records the end of every call in them.
 
-    A call ends when an `if` around it bounds the number from above by something that is known when the loop begins, as
-    in `iteration < opt.prune_until_iter`, `iteration == 300` or `iteration in args.prune_iterations`. A guard before it
-    does the same: `if step >= self.stop: return`.
+    A call has an end if an `if` around it bounds the iteration's number from above by a value that is known when the
+    loop begins, as in `iteration < opt.prune_until_iter`, `iteration == 300` or `iteration in args.prune_iterations`. A
+    guard before the call has the same effect: `if step >= self.stop: return`.
 
     Args:
-        projects: Top-level packages whose functions are read where they are called; more may be added.
+        projects: Top-level packages whose functions are read if a function calls them. Callers may add more.
         stops: Names of functions that are not read.
-        windows: Names of functions `f(number, start, end, ...)` that tell whether a number lies between two others. A
-            negative start means that it never does, a negative end that there is no end.
+        windows: Names of functions `f(number, start, end, ...)` that return whether a number lies between two others.
+            With a negative start it never does; with a negative end there is no end.
 
     Attributes:
-        ends: For each name that is called, the first iteration that is too late for it. It is the latest of all places
-            with that name, and None if one of them has no end.
+        ends: By the name of each call, the first iteration in which the loop no longer makes the call. If a name is
+            called in several places, the latest end counts; None if one of the places has no end.
+        projects: The given packages, and those that callers added.
     """
 
     def __init__(self, projects: Iterable[str] = (), stops: Iterable[str] = (), windows: Iterable[str] = ()) -> None:
         self.ends: dict[str, int | None] = {}
         self.projects, self._stops = set(projects), frozenset(stops)
         self._windows = frozenset(windows)
-        self._open: list[CodeType] = []  # functions that are being read
+        self._open: list[CodeType] = []  # code of the functions that are being read, outermost first
 
     def read(self, function: Any, numbers: Collection[str], values: Mapping[str, Any], end: int | None = None) -> None:
-        """Read a function or a bound method, called until iteration `end` (None: to the end of the run).
+        """Read a function or a bound method.
 
         Args:
-            function: The function; one without a Python source is passed over.
-            numbers: Expressions that hold the iteration's number in it.
-            values: Values of its arguments, as far as they are known.
-            end: First iteration that is too late for the call of this function.
+            function: The function. It is ignored if it has no Python source.
+            numbers: Expressions that hold the iteration's number inside the function.
+            values: Known values of its arguments.
+            end: First iteration in which the loop no longer calls the function; None if it is called until the end
+                of the run.
         """
         plain = undecorated(function)
         syntax = None if plain is None else _syntax_of(plain)
@@ -87,18 +90,18 @@ class CallReader:
         self._open.pop()
 
     def read_body(self, syntax: ast.FunctionDef, scope: Scope, end: int | None = None) -> None:
-        """Read the body of a function whose names are known."""
+        """Read the body of a function; `end` has the same meaning as in `read`."""
         stores = Counter(
             node.id for node in ast.walk(syntax) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
         )
-        known: dict[str, Any] = {}  # names that are assigned once, from values that are known
+        known: dict[str, Any] = {}  # names that are assigned only once, from known values
         scope = scope._replace(values=ChainMap(known, *_maps(scope.values)))
         self._body(syntax.body, scope, end, stores, known)
 
     def _body(
         self, body: list[ast.stmt], scope: Scope, end: int | None, stores: Counter[str], known: dict[str, Any]
     ) -> None:
-        if end == 0:  # never reached
+        if end == 0:  # the body is never reached
             return
         for statement in body:
             if isinstance(statement, ast.If):
@@ -128,7 +131,7 @@ class CallReader:
                     known[name] = found
 
     def _calls(self, part: ast.AST, scope: Scope, end: int | None, but: Collection[int] = ()) -> None:
-        """Note the calls in a statement or an expression, but for these nodes, and read the functions called."""
+        """Record the calls in a statement or expression, except the nodes `but`, and read the called functions."""
         for node in ast.walk(part):
             if id(node) in but:
                 continue
@@ -141,7 +144,7 @@ class CallReader:
                     self._follow(name, node, scope, end)
 
     def note(self, name: str, end: int | None) -> None:
-        """Note a call that iteration `end` is too late for; None if it has no end."""
+        """Record a call that the loop no longer makes from iteration `end` on; None if the call has no end."""
         before = self.ends.get(name, 0)
         self.ends[name] = None if end is None or before is None else max(before, end)
 
@@ -157,13 +160,13 @@ class CallReader:
         parameters = [one.arg for one in syntax.args.args][owner is not None :]
         given = [*zip(parameters, call.args, strict=False), *((one.arg, one.value) for one in call.keywords if one.arg)]
         numbers = {parameter for parameter, value in given if ast.unparse(value) in scope.numbers}
-        # What hangs on the object has the same name in all of its methods.
+        # Attributes of the object have the same name in all of its methods.
         numbers |= {text for text in scope.numbers if text.startswith("self.") and owner is scope.values.get("self")}
         values = {parameter: _value(value, scope) for parameter, value in given if parameter not in numbers}
         self.read(function, numbers, {text: value for text, value in values.items() if value is not None}, end)
 
     def _end(self, test: ast.expr, scope: Scope, holds: bool = True) -> int | None:
-        """First iteration from which a condition is false for good (or true, unless `holds`); None if not known."""
+        """Return the first iteration from which a condition stays false (true, unless `holds`); None if unknown."""
         match test:
             case ast.UnaryOp(ast.Not(), operand):
                 return self._end(operand, scope, not holds)
@@ -174,7 +177,7 @@ class CallReader:
                     return min(known, default=None)
                 return max(known) if len(known) == len(ends) else None
             case ast.Compare(option, [ast.Is() | ast.IsNot()], [ast.Constant(None)]):
-                # An option that is not given: the whole run goes past the call.
+                # Whether an option is set does not change during the run, so the call is never made.
                 return 0 if _is_plain_place(option) and _evaluated(test, scope) is (not holds) else None
             case ast.Compare(left, [operator], [right]) if not holds:
                 negated = _NEGATED.get(type(operator))
@@ -192,14 +195,14 @@ class CallReader:
 
 
 def last_calls(function: ast.FunctionDef, names: Collection[str], values: Mapping[str, Any]) -> dict[str, int]:
-    """Return the first iteration that is too late for each of these calls, for calls that end at some iteration.
+    """Return the first iteration in which the loop no longer makes each of these calls, for calls that have an end.
 
-    Functions of the loop's own module are read too.
+    Functions of the loop's own package or script are read too.
 
     Args:
         function: The function that holds the loop.
         names: Names of the methods.
-        values: Names of the loop and their values when it begins.
+        values: Values of the loop's names when it begins.
     """
     reader = CallReader(projects={str(values.get("__name__", "__main__")).partition(".")[0]}, stops=names)
     reader.read_body(function, Scope(frozenset({NUMBER}), values))
@@ -207,7 +210,7 @@ def last_calls(function: ast.FunctionDef, names: Collection[str], values: Mappin
 
 
 def function_of(source: Path | Any, name: str) -> ast.FunctionDef | None:
-    """Return the function of this name in a script, or the syntax of a function; None where there is no source."""
+    """Return the syntax of a function, from a script or from the function itself; None if there is no source."""
     try:
         text = source.read_bytes() if isinstance(source, Path) else textwrap.dedent(inspect.getsource(source))
         tree = ast.parse(text)
@@ -217,7 +220,7 @@ def function_of(source: Path | Any, name: str) -> ast.FunctionDef | None:
 
 
 def undecorated(function: Any) -> FunctionType | None:
-    """Return the function under its decorators, also where a decorator does not tell; None if it is no function."""
+    """Return the function under its decorators, even without `functools.wraps`; None if it is not a Python function."""
     function = function.__func__ if isinstance(function, MethodType) else function
     if not isinstance(function, FunctionType):
         return None
@@ -235,7 +238,7 @@ def _syntax_of(function: FunctionType) -> ast.FunctionDef | None:
 
 
 def _called(node: ast.expr, scope: Scope) -> Any:
-    """The function that an expression names; None if that is not known. Properties are not run."""
+    """Return the function that an expression names; None if unknown. Properties are not evaluated."""
     match node:
         case ast.Name(name):
             return scope.values.get(name)
@@ -252,7 +255,7 @@ def _called(node: ast.expr, scope: Scope) -> Any:
 
 
 def _inherited(name: str, scope: Scope) -> Any:
-    """The method that `super().name` is, in the function that is read."""
+    """Return the method that `super().name` names in the function that is being read."""
     owner = scope.values.get("self")
     above = iter(type(owner).__mro__)
     for cls in above:
@@ -290,7 +293,7 @@ def _end_of_one(left: ast.expr, operator: ast.cmpop, right: ast.expr, scope: Sco
 
 
 def _value(node: ast.expr, scope: Scope) -> Any:
-    """Value of an expression of names, attributes, numbers and pure functions; None for anything else."""
+    """Return the value of an expression of names, attributes, constants, operators and `PURE` functions; else None."""
     if not all(_is_plain(part) for part in ast.walk(node)) or any(text in scope.numbers for text in _places(node)):
         return None
     return _evaluated(node, scope)

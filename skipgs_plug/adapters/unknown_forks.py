@@ -1,4 +1,4 @@
-"""Find what a trainer does beyond its adapter's knowledge, name it, and start the gate after it."""
+"""Find the calls of a trainer that its adapter does not know, name them, and start the gate after they end."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Adapter
 
+# Functions that draw random numbers.
 NOISE = frozenset({"randn", "randn_like", "normal"})
-# Methods of a tensor that change no values.
+# Methods of a tensor whose names end in "_" but that change no values.
 HARMLESS = frozenset({"requires_grad_", "share_memory_", "detach_", "rename_"})
-# Methods of the model that Inria's loops (classic and current) call, and arguments that they pass to `render` by name.
+# Methods of the model that Inria's loops (classic and current) call.
 CALLS = frozenset(
     {
         "add_densification_stats",
@@ -34,6 +35,7 @@ CALLS = frozenset(
         "update_learning_rate",
     }
 )
+# Arguments that these loops pass to `render` by name.
 ARGUMENTS = frozenset({"scaling_modifier", "override_color", "separate_sh", "use_trained_exp"})
 BY_HAND = "Gate it by hand with SkipGate(start_iter=...), or write an adapter (CONTRIBUTING.md)."
 
@@ -45,8 +47,8 @@ class Unrecognised(NamedTuple):
         calls: Methods of the model.
         arguments: Arguments of the renderer.
         noise: Functions that draw random numbers.
-        writes: Methods that change a tensor in place, and `data` if the loop assigns to it.
-        known: Names that the adapter did recognise.
+        writes: Methods that change a tensor in place, and "data" if the loop assigns to an attribute of that name.
+        known: Names that the adapter recognised.
     """
 
     calls: frozenset[str]
@@ -56,24 +58,24 @@ class Unrecognised(NamedTuple):
     known: frozenset[str]
 
     def refuse(self, who: str) -> None:
-        """Refuse a loop that changes tensors itself. Noise alone is accepted, since it may be input of a network.
+        """Raise an error if the loop itself changes tensors. Noise alone is accepted: it may be the input of a network.
 
         Args:
-            who: Beginning of the sentence.
+            who: Start of the message.
 
         Raises:
-            AdapterMismatchError: The loop writes into tensors.
+            AdapterMismatchError: The loop changes tensors in place.
         """
         if self.writes:
             names = ", ".join(sorted(self.writes | self.noise))
             raise AdapterMismatchError(
-                f"{who}: its loop changes values itself ({names}), which would go on alone in skipped iterations. "
+                f"{who}: its loop itself changes values ({names}), and would still do so in skipped iterations. "
                 f"{BY_HAND}"
             )
 
     @property
     def listed(self) -> list[str]:
-        """The unrecognised parts, spelled for a sentence."""
+        """The unrecognised parts, as messages show them."""
         return [
             *(f"render({name}=)" for name in sorted(self.arguments)),
             *(spelled(name) for name in sorted(self.calls | self.noise)),
@@ -87,15 +89,15 @@ def unrecognised(
     calls: Iterable[str],
     arguments: Iterable[str],
 ) -> Unrecognised:
-    """Compare a loop, and the functions that it calls, with the names that its adapter knows.
+    """Compare a loop and the functions that it calls with the names that its adapter knows.
 
     Args:
         code: The training script.
-        renderers: Its renderers.
-        model: Its GaussianModel.
-        calls: Names that the adapter knows beyond those of Inria's loop: methods of the model, functions that draw
-            noise, methods that change tensors in place.
-        arguments: Arguments of the renderers that the adapter knows beyond those of Inria's loop.
+        renderers: Renderers of the script.
+        model: GaussianModel of the script.
+        calls: Names that the adapter knows in addition to those of Inria's loop: methods of the model, functions that
+            draw noise, and methods that change tensors in place.
+        arguments: Arguments of the renderers that the adapter knows in addition to those of Inria's loop.
     """
     known = CALLS | set(calls)
     parameters = {name for one in renderers for name in inspect.signature(one).parameters}
@@ -110,18 +112,19 @@ def unrecognised(
 
 
 class Survey:
-    """Compares the calls of a trainer object with the ones that its adapter knows.
+    """Finds calls of a fork that its parent's adapter does not know, and delays the start of the gate until they end.
 
-    A fork that adds a method to the model, or calls a known one until later, has the same names as its parent
-    otherwise, so it is taken for its parent. The survey names what it adds, and puts the start of the gate off.
+    A fork may add a method to the model, or call a known method for longer than its parent. All its other names are
+    those of its parent, so the parent's adapter accepts it.
 
     Args:
-        adapter: The adapter, for sentences.
-        owners: Classes, and modules with functions, through which the model changes.
-        known: Their methods and functions that the trainer of the adapter calls.
-        changes: Further ones, which change the model until densification ends.
-        through: Further ones, which are read too: they call changes, in some iterations. No others are read.
-        windows: As for `CallReader`.
+        adapter: The adapter, which messages name.
+        owners: Classes and modules whose functions change the model.
+        known: Functions of the owners that the adapter's trainer calls.
+        changes: Functions of the owners that the adapter's trainer calls to change the model until densification ends.
+        through: Functions of the owners that call such changes in some iterations. They are read; no other functions
+            of the owners are.
+        windows: See `CallReader`.
     """
 
     def __init__(
@@ -147,9 +150,9 @@ class Survey:
 
         Args:
             function: The function.
-            *numbers: Expressions that hold the iteration's number in it, as they stand in its source.
-            values: Values of its names, as far as they are known.
-            end: First iteration that is too late for this function; None if it is called to the end.
+            *numbers: Expressions that hold the iteration's number inside the function, as spelled by `ast.unparse`.
+            values: Known values of its names.
+            end: First iteration in which the trainer no longer calls the function; None if it calls it until the end.
         """
         plain = undecorated(function)
         if plain is not None:
@@ -159,25 +162,25 @@ class Survey:
 
     @property
     def unknown(self) -> list[str]:
-        """The calls that the adapter does not know, but for getters."""
+        """The calls that the adapter does not know, except getters."""
         called = self._reader.ends.keys() & self._methods - self._known
         return sorted(name for name in called if not name.startswith("get_"))
 
     def start_after_changes(self, start: int, last: float = math.inf, unit: int = 1) -> int:
-        """Return `start`, or the end of the last known or unknown change of the model, if that is later.
+        """Return the later of `start` and the end of the last change of the model, known or unknown.
 
-        Says what was not recognised, and why the gate starts later.
+        Warns about unrecognised calls, and about a later start of the gate.
 
         Args:
-            start: First iteration after densification, by the trainer's options.
-            last: Last iteration of the run, if it is known.
-            unit: Iterations in one step of the numbers that are read, such as the views of an epoch.
+            start: First iteration after densification, according to the trainer's options.
+            last: Last iteration of the run; infinite if unknown.
+            unit: Number of iterations per step of the numbers in the source, for example the views of an epoch.
         """
         if self.unknown:
             name, checked = self._adapter.name, self._adapter.checked.partition(" (")[0]
             recognised = sorted(self._reader.ends.keys() & self._known) or ["no call of the model"]
             caution(
-                f"The trainer does more than {checked}, which adapter {name!r} is for. Recognised: "
+                f"The trainer does more than {checked}, for which adapter {name!r} was written. Recognised: "
                 f"{', '.join(recognised)}. {left_alone(map(spelled, self.unknown))}"
             )
         names = self._changes.union(self.unknown)
@@ -186,46 +189,46 @@ class Survey:
 
 
 def left_alone(names: Iterable[str]) -> str:
-    """Return the sentence about calls that were not recognised."""
-    return f"Not recognised, and left to go on in skipped iterations: {', '.join(names)}."
+    """Return a sentence about calls that were not recognised."""
+    return f"Not recognised, and still executed in skipped iterations: {', '.join(names)}."
 
 
 def spelled(name: str) -> str:
-    """Return a call as a sentence shows it."""
+    """Return the name of a call as messages show it."""
     return "an assignment to data" if name == ASSIGNED else f"{name}()"
 
 
 def begin_after(start: int, last: float, ends: Mapping[str, int]) -> int:
-    """Return the first iteration after `start` and after all of these ends; say so if it is later than `start`.
+    """Return the latest of `start` and the ends up to `last`; warn if it is later than `start`.
 
     Args:
-        start: First iteration that may be skipped as far as the adapter knows.
-        last: Last iteration of the run. What ends after it goes on to the end, and is not waited for.
-        ends: First iteration that is too late for each call.
+        start: First iteration that the adapter allows the gate to skip.
+        last: Last iteration of the run. The gate does not wait for calls that end after it.
+        ends: By the name of each call, the first iteration in which the loop no longer makes the call.
     """
     late = {name: end for name, end in ends.items() if start < end <= last}
     if late:
         listed = ", ".join(f"{spelled(name)} until iteration {end - 1}" for name, end in sorted(late.items()))
-        caution(f"The gate begins with iteration {max(late.values())} in place of {start}: the loop calls {listed}.")
+        caution(f"The gate starts at iteration {max(late.values())} instead of {start}: the loop calls {listed}.")
     return max([start, *late.values()])
 
 
 def _project(part: Any) -> str:
-    """Top-level package of a class, function or module."""
+    """Return the top-level package of a class, function or module."""
     return str(getattr(part, "__module__", None) or part.__name__).partition(".")[0]
 
 
 def _callables(owner: Any) -> set[str]:
-    """Names of the methods of a class, or of the functions of a module."""
+    """Return the names of the methods of a class, or of the functions of a module."""
     inherited = set(dir(torch.nn.Module)) if inspect.isclass(owner) else set()
     names = {name for name in dir(owner) if not name.startswith("__")} - inherited
     functions = {name: undecorated(inspect.getattr_static(owner, name, None)) for name in names}
-    own = owner.__name__ if inspect.ismodule(owner) else None  # a module has names of others, too
+    own = owner.__name__ if inspect.ismodule(owner) else None  # a module also holds functions that it imported
     return {name for name, one in functions.items() if one is not None and own in (None, one.__module__)}
 
 
 def writes_in_place(name: str) -> bool:
-    """Whether this is the name of a method that changes the values of a tensor in place."""
+    """Return whether a tensor method of this name changes the values of the tensor in place."""
     private = name.startswith("_") or not name.endswith("_")
     return not private and name not in HARMLESS and callable(getattr(torch.Tensor, name, None))
 

@@ -1,1 +1,1 @@
-"""Says, from half a minute of training, how long whole runs will take, how many Gaussians and how much memory."""
+"""Predict time, number of Gaussians and memory of whole runs from half a minute of training."""

@@ -1,4 +1,4 @@
-"""How far forecasts were from whole runs on the scenes of the bench; measured by `benchmarks/forecast.py`."""
+"""Errors of forecasts against whole runs on the scenes of the bench. `benchmarks/forecast.py` measures them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ QUANTITIES = ("seconds", "seconds_auto", "gaussians", "memory")
 
 
 def measured_errors() -> dict[str, Any]:
-    """Return what is stored: `provenance`, and `rows` with `scene max_steps quantity expected measured`."""
+    """Return `provenance`, and `rows` with the keys `scene`, `max_steps`, `quantity`, `expected` and `measured`."""
     return json.loads(FILE.read_text("utf-8"))  # type: ignore[no-any-return]
 
 
 def error(row: Mapping[str, Any]) -> float:
-    """Return by what share the expectation of a row was above the measurement."""
+    """Return the relative error of a row: 0.1 if the expected value was 10 % above the measured one."""
     return float(row["expected"] / row["measured"] - 1.0)
 
 
 def spread(rows: Iterable[Mapping[str, Any]], quantity: str) -> tuple[float, float, int] | None:
-    """Return the lowest and the highest error of a quantity and the number of its rows; None without any."""
+    """Return the lowest and the highest error of a quantity, and its number of rows; None if it has no rows."""
     errors = [error(row) for row in rows if row["quantity"] == quantity]
     return (min(errors), max(errors), len(errors)) if errors else None

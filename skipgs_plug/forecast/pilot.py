@@ -1,4 +1,4 @@
-"""The first iterations of a run that leaves out what it can, and what they cost: a forecast is made of them."""
+"""Run the first iterations of a short schedule and measure them, as the basis of a forecast."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from skipgs_plug.bench.memory import memory_meter
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.loop import Iteration
 
-PILOT_STEPS = 7000  # length of the schedule whose first iterations are run
+PILOT_STEPS = 7000  # iterations in the schedule of the pilot, which runs only the first of them
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One iteration that ran.
+    """Measurements of one iteration that ran.
 
     Attributes:
-        step: its number in the schedule of the pilot.
-        gaussians: how many there were after it.
-        seconds: of it.
+        step: Number of the iteration in the schedule of the pilot.
+        gaussians: Number of Gaussians after the iteration.
+        seconds: Duration of the iteration in seconds.
     """
 
     step: int
@@ -30,15 +30,15 @@ class Sample:
 
 @dataclass(frozen=True)
 class Pilot:
-    """What was seen.
+    """Measurements of a pilot run.
 
     Attributes:
-        samples: the iterations that ran, in order.
-        first_gaussians: how many there were before them.
-        views: number of training views.
-        shown: share of the Gaussians that a view shows; None if too few iterations ran to say.
-        stop: iteration of the pilot's schedule with which densification ends.
-        peak_memory: most bytes in use, of the process on the CPU, of PyTorch on a GPU; None where this is unknown.
+        samples: The iterations that ran, in order.
+        first_gaussians: Number of Gaussians before the first iteration.
+        views: Number of training views.
+        shown: Share of the Gaussians that a view shows; None if too few iterations ran to measure it.
+        stop: Iteration of the pilot's schedule at which densification ends.
+        peak_memory: Peak memory in bytes, of the process on the CPU and of PyTorch on a GPU; None if unknown.
     """
 
     samples: tuple[Sample, ...]
@@ -52,17 +52,17 @@ class Pilot:
 def run_pilot(
     config: TrainConfig, scene: Scene, seconds: float, by_processor: bool = False, progress: bool = False
 ) -> Pilot:
-    """Train for some seconds, or until a schedule of PILOT_STEPS ends, with `share="auto"`; keeps nothing.
+    """Train for some seconds, or until a schedule of `PILOT_STEPS` ends, and discard the model.
 
-    So many densification events are passed in a short time, and their number of Gaussians follows that of runs which
-    leave nothing out.
+    The pilot leaves out iterations (`share="auto"`), so it reaches many densification events in a short time. The
+    number of Gaussians at each event follows that of runs that leave out nothing.
 
     Args:
-        config: Settings of training; their length does not matter.
-        scene: What is trained.
-        seconds: Training time after which the pilot ends.
-        by_processor: Count seconds for which this process was running instead of those on the wall.
-        progress: Show a progress bar.
+        config: Settings of training. `PILOT_STEPS` replaces the length of its schedule.
+        scene: The scene to train.
+        seconds: Training time in seconds after which the pilot ends.
+        by_processor: Whether to count processor seconds of this process instead of wall-clock seconds.
+        progress: Whether to show a progress bar.
     """
     trainer = Trainer(dataclasses.replace(config, max_steps=PILOT_STEPS, schedule_steps=None), scene)
     meter = memory_meter(trainer.backend.device)

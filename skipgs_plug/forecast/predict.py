@@ -1,4 +1,4 @@
-"""From a pilot to whole runs: curves through what was seen, and sums over them."""
+"""Predict whole runs from a pilot: fit curves to its measurements, and add up their values."""
 
 from __future__ import annotations
 
@@ -13,29 +13,33 @@ from skipgs_plug.core.pace.needs import growing_share, refining_share
 from skipgs_plug.forecast.pilot import Pilot
 from skipgs_plug.trainer.config import TrainConfig
 
-# Seconds of an iteration go with a power of the number of Gaussians. Half is what whole runs on fern show; a pilot
-# moves it as far as its own numbers of Gaussians differ.
+# The duration of an iteration grows with a power of the number of Gaussians. Whole runs on fern show a power of one
+# half. A pilot corrects it, by more if its own numbers of Gaussians differ more.
 USUAL_POWER = 0.5
-POWER_WEIGHT = 1.0  # groups of iterations, one unit of logarithm apart, that outweigh the usual power
-GROUP = 20  # iterations whose mean time counts as one measurement
-# The number of Gaussians approaches its end as 1 - exp(-rate * x), x being the part of densification that is done.
+# Weight of the usual power. The pilot's own power counts as much if the weighted squared deviations of the logarithm
+# of its numbers of Gaussians add up to this value.
+POWER_WEIGHT = 1.0
+GROUP = 20  # number of iterations whose mean time counts as one measurement
+# The number of Gaussians approaches its final value as 1 - exp(-rate * x). x is the finished part of densification.
 USUAL_RATE = 2.2
-RATE_WEIGHT = 0.002  # of the squared logarithm of the rate against squared errors, as a share of the growth
-RATES = np.geomspace(0.3, 12.0, 80)
-BYTES_OF_A_GAUSSIAN = 2400  # of peak memory: parameters, gradients, moments, lists; measured on fern
+# Weight of log(rate / USUAL_RATE)**2 against the sum of squared errors, which are relative to the largest growth.
+RATE_WEIGHT = 0.002
+RATES = np.geomspace(0.3, 12.0, 80)  # rates that the fit tries
+# Peak memory of one Gaussian in bytes: parameters, gradients, moments and lists. Measured on fern.
+BYTES_OF_A_GAUSSIAN = 2400
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a run is expected to take.
+    """Predicted time, size and memory of a run.
 
     Attributes:
-        max_steps: its length.
-        seconds: of training, every iteration run.
-        seconds_auto: of training with `share="auto"`.
-        iterations_auto: iterations that run then.
-        gaussians: at the end.
-        memory: peak of bytes; None if it was not measured.
+        max_steps: Number of iterations in the schedule.
+        seconds: Training time in seconds if every iteration runs.
+        seconds_auto: Training time in seconds with `share="auto"`.
+        iterations_auto: Number of iterations that run with `share="auto"`.
+        gaussians: Number of Gaussians at the end.
+        memory: Peak memory in bytes; None if the pilot did not measure it.
     """
 
     max_steps: int
@@ -52,8 +56,9 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
     stop = min(schedule.scaled(schedule.recipe.refine_stop_iter), max_steps)
     growth = fit_growth(pilot, config)
     cost = fit_cost(pilot)
-    # Events are as far apart in short schedules as in long ones, so a shorter one ends where the pilot's curve is by
-    # then. Longer ones have more, and more that is pruned: Lego and bonsai end with about as many Gaussians.
+    # Densification events are as far apart in short schedules as in long ones, so a shorter schedule ends at the point
+    # that the pilot's curve reaches by then. A longer schedule has more events but also prunes more: Lego and bonsai
+    # end with about as many Gaussians.
     end = min(1.0, stop / pilot.stop)
     grown = growth(end)
     per_growing = float(np.mean([cost(growth(x)) for x in np.linspace(0.0, end, 101)]))
@@ -74,7 +79,7 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
 
 
 class Growth:
-    """Number of Gaussians by the part of densification that is done, in [0, 1]."""
+    """Number of Gaussians as a function of the finished part of densification, in [0, 1]."""
 
     def __init__(self, first: float, begin: float, added: float, rate: float, most: float) -> None:
         self._first, self._begin, self._added, self._rate, self._most = first, begin, added, rate, most
@@ -84,22 +89,22 @@ class Growth:
 
 
 def growth_shape(part: float, begin: float, rate: float) -> float:
-    """Share of the growth that is done after a part of densification; growth begins at `begin`."""
+    """Return the finished share of the growth when a part of densification is finished; growth starts at `begin`."""
     if part <= begin:
         return 0.0
     return math.expm1(-rate * (part - begin)) / math.expm1(-rate * (1.0 - begin))
 
 
 def fit_growth(pilot: Pilot, config: TrainConfig) -> Growth:
-    """Return the curve of the number of Gaussians that runs through those of the pilot.
+    """Fit a curve to the numbers of Gaussians in the pilot, and return it.
 
-    Where the pilot has passed the end of densification, its last number is met.
+    If the pilot passed the end of densification, the curve ends at the pilot's last number.
     """
     most = math.inf if config.strategy == "default" else float(max(config.cap_max, pilot.first_gaussians))
     begin = config.refine_start_iter / config.recipe.refine_stop_iter
     first = float(pilot.first_gaussians)
     grown = [sample for sample in pilot.samples if sample.step < pilot.stop]
-    # One point for each number of Gaussians: the events, not the iterations between them.
+    # One point for each change of the number of Gaussians, which the iterations between events do not change.
     events = [b for a, b in itertools.pairwise(grown) if b.gaussians != a.gaussians]
     parts = np.array([sample.step / pilot.stop for sample in events])
     counts = np.array([sample.gaussians for sample in events]) - first
@@ -122,7 +127,7 @@ def fit_growth(pilot: Pilot, config: TrainConfig) -> Growth:
 
 
 class Cost:
-    """Seconds of an iteration by the number of Gaussians."""
+    """Duration of an iteration in seconds as a function of the number of Gaussians."""
 
     def __init__(self, seconds: float, gaussians: float, power: float) -> None:
         self._seconds, self._gaussians, self._power = seconds, gaussians, power
@@ -132,7 +137,7 @@ class Cost:
 
 
 def fit_cost(pilot: Pilot) -> Cost:
-    """Return the curve through the seconds of groups of iterations; late groups, like those to come, weigh more."""
+    """Fit a curve to the durations of groups of iterations; late groups, like the iterations to come, weigh more."""
     groups = [pilot.samples[at : at + GROUP] for at in range(0, len(pilot.samples), GROUP)]
     groups = [group for group in groups if len(group) == GROUP] or [pilot.samples]
     times = np.log(np.array([mean(max(sample.seconds, 1e-9) for sample in group) for group in groups]))

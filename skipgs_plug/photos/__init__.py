@@ -1,1 +1,1 @@
-"""From photographs or a video to a COLMAP folder: gather, reconstruct, undistort, reduce."""
+"""Turn photographs or a video into a COLMAP folder: gather, reconstruct, undistort, and write reduced copies."""

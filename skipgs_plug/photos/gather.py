@@ -1,4 +1,4 @@
-"""Photographs as reconstruction wants them: upright, in formats that COLMAP reads, in one folder."""
+"""Prepare photographs for reconstruction: upright, in formats that COLMAP reads, in one folder."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.loaders import is_scene
 from skipgs_plug.trainer.loaders.images import ORIENTATION, decode
 
+# Suffixes of files that are linked, converted to JPEG, and refused.
 AS_THEY_ARE = (".jpg", ".jpeg", ".png")
 CONVERTED = (".webp", ".bmp", ".tif", ".tiff")
 UNREADABLE = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
 MODEL, FOCAL_LENGTH, EXIF_BLOCK = 0x0110, 0x920A, 0x8769  # EXIF tags
-QUALITY: dict[str, Any] = {"quality": 97, "subsampling": 0}
-OPAQUE = 128  # alpha (of 255), at least, of a pixel that counts, as in the loaders
-LEAST = 3  # photographs, at least: fewer cannot be reconstructed
+QUALITY: dict[str, Any] = {"quality": 97, "subsampling": 0}  # options of Pillow for JPEG files
+OPAQUE = 128  # least alpha, of 255, of a pixel that is not masked; the same as in the loaders
+LEAST = 3  # least number of photographs; fewer cannot be reconstructed
 
 
 @dataclass
@@ -31,10 +32,11 @@ class Gathered:
     """Photographs in a folder of their own.
 
     Attributes:
-        names: paths relative to the folder, sorted.
-        masks: folder with a mask for each photograph that is transparent somewhere, `photo.png.png` for
-            `photo.png`, black where alpha is below one half; None if no pixel is transparent.
-        one_camera: whether all have one size, camera model and focal length, so that they share intrinsics.
+        folder: The folder.
+        names: Paths of the photographs relative to the folder, sorted.
+        one_camera: Whether all photographs have the same size, camera model and focal length, and so share intrinsics.
+        masks: Folder with a mask for each photograph that has transparent pixels, `photo.png.png` for `photo.png`,
+            black where alpha is below one half; None if no pixel is transparent.
     """
 
     folder: Path
@@ -44,7 +46,7 @@ class Gathered:
 
 
 def are_photographs(source: Path) -> bool:
-    """Whether this is a video, or a folder with photographs and without cameras."""
+    """Return whether `source` is a video, or a folder that contains photographs but no cameras."""
     if source.is_file():
         return source.suffix.lower() in VIDEO_SUFFIXES
     if not source.is_dir() or is_scene(source):
@@ -54,13 +56,13 @@ def are_photographs(source: Path) -> bool:
 
 
 def walk(folder: Path) -> Iterator[Path]:
-    """Yield the files in a folder and its subfolders. Links are followed, and each real folder is visited once."""
+    """Yield the files in a folder and its subfolders. Follow links, but visit each real folder only once."""
     seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True):
-        # Names that start with a dot come from programs: .ipynb_checkpoints, .thumbnails, .Trash.
+        # Programs create folders with names that start with a dot: .ipynb_checkpoints, .thumbnails, .Trash.
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         real = os.path.realpath(root)
-        if real in seen:  # a link to a folder that holds it, or a second one
+        if real in seen:  # a link to a parent folder, or a second link to the same folder
             folders.clear()
             continue
         seen.add(real)
@@ -72,7 +74,7 @@ def check_source(source: Path) -> None:
 
     Raises:
         MissingFileError: `source` does not exist.
-        InputError: it is a file of another kind.
+        InputError: `source` is a file of another kind.
     """
     if not source.exists():
         raise MissingFileError(f"{source} does not exist; give a folder of photographs or a video.")
@@ -81,17 +83,19 @@ def check_source(source: Path) -> None:
 
 
 def gather(source: Path, folder: Path, frames: int, progress: Callable[[int], None]) -> Gathered:
-    """Put the photographs of `source` (a folder or a video) into `folder`.
+    """Put the photographs of `source` into `folder`.
 
-    Files are linked where they can stay as they are; photographs with an EXIF orientation are turned upright.
+    Files that need no change are linked. Photographs with an EXIF orientation are turned upright.
 
     Args:
-        frames: how many a video gives, each the sharpest of its group.
-        progress: called with 1 for every photograph.
+        source: A folder of photographs, or a video.
+        folder: Folder to create.
+        frames: Number of frames to take from a video, each the sharpest of its group.
+        progress: Called with 1 for each photograph.
 
     Raises:
         MissingFileError: `source` does not exist, or the target of a link among the photographs does not.
-        InputError: a photograph or the video cannot be decoded, or there are fewer than three photographs.
+        InputError: A photograph or the video cannot be decoded, or there are fewer than three photographs.
     """
     check_source(source)
     if source.is_file():
@@ -121,11 +125,11 @@ def gather_folder(source: Path, folder: Path, progress: Callable[[int], None]) -
     files = [path for path in found if not path.is_dir() and not path.name.startswith(".")]
     unreadable = [path for path in files if path.suffix.lower() in UNREADABLE]
     if unreadable:
-        others = f", like {len(unreadable) - 1} more" if len(unreadable) > 1 else ""
-        raise InputError(f"{unreadable[0]} has a format that cannot be read here{others}; export as JPEG.")
+        others = f" ({len(unreadable) - 1} more of this kind)" if len(unreadable) > 1 else ""
+        raise InputError(f"{unreadable[0]} has a format that this package cannot read{others}; export as JPEG.")
     for path in files:
         if not path.exists():
-            raise MissingFileError(f"{path} links to a file that does not exist; restore that or remove the link.")
+            raise MissingFileError(f"{path} links to a file that does not exist; restore the file or remove the link.")
     names, cameras = [], set()
     masks = folder.with_name("masks")
     for path in files:
@@ -135,17 +139,17 @@ def gather_folder(source: Path, folder: Path, progress: Callable[[int], None]) -
         progress(1)
     doubled = {name for name in names if names.count(name) > 1}
     if doubled:
-        raise InputError(f"{source}: two photographs would be called {min(doubled)}; rename one.")
+        raise InputError(f"{source} holds two photographs that would both be named {min(doubled)}; rename one.")
     return Gathered(folder, sorted(names), len(cameras) == 1, masks if masks.is_dir() else None)
 
 
 def add_photograph(path: Path, source: Path, folder: Path, masks: Path) -> tuple[str, tuple[object, ...]]:
-    """Link or convert one photograph, with its transparency in `masks`.
+    """Link or convert one photograph, and write a mask to `masks` if it has transparent pixels.
 
     Returns:
-        Its name, and the values that identify its camera.
+        The path of the photograph relative to `folder`, and the values that identify its camera.
     """
-    picture = decode(path, path)  # also so that a damaged file is named here, not by C++ code later
+    picture = decode(path, path)  # a damaged file raises here, with its name, and not in C++ code later
     exif = picture.getexif()
     target = folder / path.relative_to(source)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -168,7 +172,7 @@ def add_photograph(path: Path, source: Path, folder: Path, masks: Path) -> tuple
 
 
 def link(path: Path, target: Path) -> None:
-    """Link where the file system can, else copy."""
+    """Link a file, or copy it if the file system cannot link it."""
     try:
         os.link(path, target)
     except OSError:

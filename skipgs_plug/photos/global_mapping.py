@@ -1,7 +1,7 @@
-"""All photographs placed at once (global structure from motion, GLOMAP), in a process of its own.
+"""Place all photographs at once (global structure from motion, GLOMAP), in a separate process.
 
-pycolmap handles no signals during global mapping, and ends the process when it finds a defect. Run as a module, this
-file is the program of that process. It prints a line when one of its `STAGES` is done.
+pycolmap does not handle signals during global mapping, and it ends the process when it finds a defect. The separate
+process runs this file as a module. It prints a line after each stage.
 """
 
 from __future__ import annotations
@@ -16,21 +16,24 @@ from typing import Any
 
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 
-STAGES = 6  # steps of the progress bar: focal lengths, positions, up to three adjustments, points
-# Longest tracks of each photograph that place it. All tracks take longer for the same accuracy, see
-# benchmarks/notes/PHOTOS.md; points of the other tracks are added afterwards.
+# Number of steps of the progress bar: focal lengths, positions, up to three adjustments, points.
+STAGES = 6
+# Number of tracks per photograph that place it; the longest are taken. All tracks would take longer for the same
+# accuracy, see benchmarks/notes/PHOTOS.md. The points of the other tracks are added afterwards.
 TRACKS = 500
-LEAST_POINTS = 30  # points that a placed photograph shows, at least: COLMAP's bound for incremental mapping
-SEED = 0  # of COLMAP's random numbers
-GLANCE = 0.5  # seconds between two looks at COLMAP's progress
+LEAST_POINTS = 30  # least number of points in a placed photograph; COLMAP's bound for incremental mapping
+SEED = 0  # seed of COLMAP's random numbers
+GLANCE = 0.5  # seconds between two updates of the progress bar
 
 
 def map_globally(database: Path, photos: Path, output: Path, progress: Callable[[int], None]) -> list[Any]:
-    """Return the models, largest first; an empty list if the process failed.
+    """Place photographs in a separate process; return the models, largest first, or an empty list if it failed.
 
     Args:
-        output: folder to make, for the models and a copy of the database, whose focal lengths are corrected.
-        progress: called with the number of stages that were finished since the last call, twice a second.
+        database: COLMAP's database with features and verified matches. It is not changed.
+        photos: Folder of the photographs.
+        output: Folder to create. It receives the models and a copy of the database with corrected focal lengths.
+        progress: Called every `GLANCE` seconds with the number of stages that finished since the last call.
     """
     output.mkdir()
     copy = shutil.copyfile(database, output / "database.db")
@@ -49,7 +52,7 @@ def map_globally(database: Path, photos: Path, output: Path, progress: Callable[
             told = 0
             while reader.is_alive():
                 reader.join(GLANCE)
-                known = min(len(finished), STAGES)  # several models go through some stages each
+                known = min(len(finished), STAGES)  # each of several models repeats some stages
                 progress(known - told)
                 told = known
         except BaseException:
@@ -65,14 +68,14 @@ def map_globally(database: Path, photos: Path, output: Path, progress: Callable[
 
 
 def leave_out_unsupported(model: Any) -> None:
-    """Take the pose from photographs that hardly a point confirms: filters left them where they happened to be."""
+    """Remove the pose of photographs with fewer than LEAST_POINTS points: their position is arbitrary."""
     for image in list(model.images.values()):
         if image.has_pose and image.num_points3D < LEAST_POINTS:
             model.deregister_frame(image.frame_id)
 
 
 def main(database: Path, photos: Path, output: Path) -> None:
-    """Map, report progress, and write the models to numbered folders."""
+    """Map the photographs, print progress, and write the models to numbered folders in `output`."""
 
     def done() -> None:
         print("done", flush=True)
@@ -85,7 +88,7 @@ def main(database: Path, photos: Path, output: Path) -> None:
     done()
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = SEED
-    options.image_path = photos  # points get colours
+    options.image_path = photos  # gives the points their colours
     options.mapper.track_required_tracks_per_view = TRACKS
     models = pycolmap.ReconstructionManager()
     opened = pycolmap.Database.open(database)

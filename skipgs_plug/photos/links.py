@@ -1,4 +1,4 @@
-"""Features and matches of photographs, read from the database of a reconstruction."""
+"""Read the features and matches of photographs from the database of a reconstruction."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from pathlib import Path
 
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 
-LEAST_MATCHES = 15  # verified matches, at least, of two connected photographs: COLMAP's threshold for mapping
+LEAST_MATCHES = 15  # least number of verified matches of two neighbours; COLMAP's threshold for mapping
 
 
 @dataclass
 class Links:
-    """Features and verified pairs.
+    """Features and verified matches, by the name of the photograph.
 
     Attributes:
-        features: number of features, by photograph.
-        matched: photographs that share at least one verified match, by photograph.
-        neighbours: the same for matches enough to place one by the other.
+        features: Number of features.
+        matched: Photographs that share at least one verified match with the photograph.
+        neighbours: Photographs that share at least `LEAST_MATCHES` verified matches with the photograph.
     """
 
     features: dict[str, int]
@@ -26,6 +26,7 @@ class Links:
 
 
 def read_links(database: Path) -> Links:
+    """Read the links between all photographs of a COLMAP database."""
     pycolmap = import_pycolmap()
     connection = pycolmap.Database.open(database)
     try:
@@ -46,7 +47,7 @@ def read_links(database: Path) -> Links:
 
 
 def largest_group(neighbours: dict[str, set[str]]) -> set[str]:
-    """Return the largest set of photographs that hang together, from neighbour to neighbour."""
+    """Return the largest set of photographs that are connected, directly or through neighbours."""
     largest: set[str] = set()
     left = set(neighbours)
     while left:

@@ -1,4 +1,4 @@
-"""How far pycolmap has got with a database, while one of its calls is under way."""
+"""Count the finished rows of a pycolmap call while it runs."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-# Another process has to look: pycolmap brings its own SQLite, and when a second copy in one process closes a file, the
-# locks of the first are gone (its calls then end in bus errors). It ends with its reader, when it cannot print.
+# Program of a separate process that counts the rows. pycolmap contains its own copy of SQLite: when a second copy in
+# the same process closes the file, the locks of the first are lost, and its calls end in bus errors. The program ends
+# with its reader, because it can no longer print.
 WATCH = """
 import sqlite3, sys, time
 while True:
@@ -20,7 +21,7 @@ while True:
             print(*connection.execute(f"select count(*) from {sys.argv[2]}").fetchone(), flush=True)
         finally:
             connection.close()
-    except sqlite3.Error:  # not there yet: the next look will tell
+    except sqlite3.Error:  # the database or the table does not exist yet
         print(0, flush=True)
     time.sleep(0.3)
 """
@@ -28,7 +29,7 @@ while True:
 
 @contextlib.contextmanager
 def counted(database: Path, table: str, progress: Callable[[int], None]) -> Iterator[None]:
-    """Report the rows that are added to a table inside the block."""
+    """Call `progress` with the number of rows that were added to a table of the database inside the block."""
     command = [sys.executable, "-I", "-c", WATCH, f"{database.resolve().as_uri()}?mode=ro", table]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
 

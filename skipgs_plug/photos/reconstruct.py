@@ -1,4 +1,4 @@
-"""Structure from motion by pycolmap: features, matches, mapping, undistortion."""
+"""Structure from motion with pycolmap: features, matches, mapping, undistortion."""
 
 from __future__ import annotations
 
@@ -19,37 +19,38 @@ from skipgs_plug.photos.progress import counted
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.photograph import undistort
 
-EXHAUSTIVE_UP_TO = (
-    100  # photographs of which all pairs are compared; of more, that takes longer than neighbours in order
-)
-OVERLAP = 10  # neighbours on either side that a photograph is compared with; then those 16, 32, ... away
-KEY_PHOTOGRAPHS = 40  # photographs of a sequence that are compared with each other: walks return to where they were
-ALL_AT_ONCE_BEYOND = 100  # photographs; up to this number, incremental mapping is quick and keeps more points
-# Share of the matched photographs that global mapping must place. If it places fewer, incremental mapping is tried.
+# Largest number of photographs whose pairs are all compared. With more, this takes longer than comparing neighbours.
+EXHAUSTIVE_UP_TO = 100
+OVERLAP = 10  # neighbours on either side with which a photograph is compared; then those 16, 32, ... away
+# Number of photographs of a sequence that are all compared with each other, because a walk returns to earlier places.
+KEY_PHOTOGRAPHS = 40
+# Largest number of photographs that are placed one after another. Up to it, this is quick and keeps more points.
+ALL_AT_ONCE_BEYOND = 100
+# Share of the largest group of connected photographs that global mapping must place. If it places fewer, incremental
+# mapping is tried.
 ENOUGH = 0.9
 FEATURE_SIZE = 1600  # longer side in pixels for feature detection; larger photographs gain little
-SEED = 0  # of COLMAP's random numbers
+SEED = 0  # seed of COLMAP's random numbers
 
 Progress = Callable[[int], None]
 
 
 class Reconstruction:
-    """One reconstruction under way: its database and models lie in `work`.
+    """A reconstruction in progress. Its database and models are in the folder `work`.
 
-    Every step takes a function that is called with the number of finished photographs (of pairs, for matching).
+    Each step calls `progress` with the number of photographs (for matching: pairs) that finished since the last call.
     """
 
     def __init__(self, photos: Gathered, work: Path) -> None:
         self._colmap = import_pycolmap()
-        self._colmap.logging.minloglevel = int(
-            self._colmap.logging.FATAL
-        )  # errors that matter are raised or counted here
+        # COLMAP's messages are not needed: errors that matter are raised or counted here.
+        self._colmap.logging.minloglevel = int(self._colmap.logging.FATAL)
         self._photos = photos
         self._work = work
         self.database = work / "database.db"
 
     def extract(self, progress: Progress) -> None:
-        """Detect features."""
+        """Detect the features of all photographs and store them in the database."""
         options = self._colmap.FeatureExtractionOptions()
         options.max_image_size = FEATURE_SIZE
         reader = self._colmap.ImageReaderOptions()
@@ -67,7 +68,7 @@ class Reconstruction:
             )
 
     def match(self, matching: Matching, progress: Progress) -> str:
-        """Match features and verify them geometrically; return the kind of matching that was taken."""
+        """Match features and verify the matches geometrically; return the kind of matching that was used."""
         if matching == "auto":
             matching = "exhaustive" if len(self._photos.names) <= EXHAUSTIVE_UP_TO else "sequential"
         verification = self._colmap.TwoViewGeometryOptions()
@@ -92,7 +93,7 @@ class Reconstruction:
         return read_links(self.database)
 
     def resolve(self, mapping: Mapping) -> Mapping:
-        """Return "global" or "incremental", by the number of photographs where nothing was asked for."""
+        """Return "global" or "incremental"; for "auto", decide by the number of photographs."""
         if mapping != "auto":
             return mapping
         return "global" if len(self._photos.names) > ALL_AT_ONCE_BEYOND else "incremental"
@@ -105,7 +106,7 @@ class Reconstruction:
         return global_mapping.map_globally(self.database, self._photos.folder, self._work / "global", progress)
 
     def placed_enough(self, models: Sequence[Any]) -> bool:
-        """Whether the largest model holds about all photographs that matches tie together."""
+        """Return whether the largest model holds the share `ENOUGH` of the connected photographs or more."""
         return bool(models) and models[0].num_reg_images() >= ENOUGH * len(largest_group(self.links().neighbours))
 
     def map_incrementally(self, progress: Progress) -> list[Any]:
@@ -113,7 +114,7 @@ class Reconstruction:
         options = self._colmap.IncrementalPipelineOptions()
         options.random_seed = SEED
         options.min_model_size = 3
-        # Points that two photographs alone show start training well, and are half of all in small sets.
+        # Points that only two photographs show are good for the start of training, and are half of all in small sets.
         options.triangulation.ignore_two_view_tracks = False
         output = self._work / "models"
         output.mkdir()
@@ -138,7 +139,7 @@ class Reconstruction:
         return output
 
     def _undistort_masks(self, model: Any, masks: Path, output: Path) -> None:
-        """Write the masks of a model's photographs as `undistort` writes these."""
+        """Write the masks of a model's photographs without distortion, like the photographs."""
         for image in model.images.values():
             source = masks / f"{image.name}.png"
             if not source.is_file():
@@ -152,9 +153,9 @@ class Reconstruction:
 
 
 def key_pairs(names: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield all pairs among photographs that are evenly spread over the sequence: walks return to where they were.
+    """Yield all pairs among photographs that are evenly spread over the sequence. A walk returns to earlier places.
 
-    COLMAP's list of pairs is separated by spaces, so names that hold some are left out.
+    COLMAP separates the names of a pair by a space, so names that contain white space are left out.
     """
     spread = names[:: max(1, len(names) // KEY_PHOTOGRAPHS)]
     return itertools.combinations([name for name in spread if not any(map(str.isspace, name))], 2)

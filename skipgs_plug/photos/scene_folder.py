@@ -1,4 +1,4 @@
-"""The COLMAP folder that photographs become: images, images_2, images_4, images_8, sparse/0."""
+"""Write a scene as a COLMAP folder: images, images_2, images_4, images_8, sparse/0."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.scene import BLACK
 
-FACTORS = (2, 4, 8)
+FACTORS = (2, 4, 8)  # factors by which the sides of the reduced copies are shorter
 
 
 def check_target(scene: Path, source: Path) -> None:
-    """Refuse a scene folder that holds something already, or that lies around or in the photographs.
+    """Raise an error unless the scene can be written to this folder.
 
     Raises:
-        InputError: names the folder.
+        InputError: `scene` is a file, is not empty, or lies in the folder of the photographs.
     """
     if scene.exists() and (scene.is_file() or any(scene.iterdir())):
         raise InputError(f"{scene} exists and is not an empty folder; give another SCENE.")
     if source.is_dir() and scene.resolve().is_relative_to(source.resolve()):
-        raise InputError(f"{scene} lies in the folder of the photographs; give one outside of it.")
+        raise InputError(f"{scene} lies in the folder of the photographs; give a SCENE outside of it.")
 
 
 def write_scene(undistorted: Path, scene: Path, progress: Callable[[int], None]) -> int:
-    """Turn COLMAP's undistorted folder into `scene`, with reduced copies; returns the number of photographs.
-
-    `undistorted` must lie on the file system of `scene`: it is moved there as the last step.
+    """Turn COLMAP's undistorted folder into a scene with reduced copies; return the number of photographs.
 
     Args:
-        progress: called with 1 for every photograph.
+        undistorted: COLMAP's folder. It must be on the file system of `scene`, because the last step moves it there.
+        scene: Folder of the scene, which does not exist or is empty.
+        progress: Called with 1 for each photograph.
     """
     content = undistorted.with_name("scene")
     (content / "sparse").mkdir(parents=True)
@@ -54,6 +54,6 @@ def write_scene(undistorted: Path, scene: Path, progress: Callable[[int], None])
             Image.fromarray(pixels.numpy()).save(target, **options)
         progress(1)
     if scene.exists():
-        scene.rmdir()  # empty; Windows renames onto nothing that exists
+        scene.rmdir()  # the folder is empty, and Windows cannot rename onto an existing folder
     os.replace(content, scene)
     return len(images)

@@ -1,4 +1,4 @@
-"""Photographs that a reconstruction did not place, and the likeliest reason for each."""
+"""Find the most likely reason why a reconstruction did not place a photograph."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from skipgs_plug.photos.video import sharpness
 from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.scene import BLACK
 
-# A photograph that was not placed counts as poor in features, or as blurred, below these shares of the median of placed
-# photographs. They only choose the reason that is printed.
+# Shares of the median of the placed photographs, for the number of features and for sharpness. A photograph below them
+# counts as poor in features or as blurred. They only choose the reason that is printed.
 FEW_FEATURES = 0.25
 BLURRED = 0.25
-SAMPLE = 15  # placed photographs whose sharpness is measured for the median: each must be decoded
+# Number of placed photographs whose sharpness is measured for the median. It is small because each must be decoded.
+SAMPLE = 15
 
 
 def explain_unplaced(photos: Gathered, models: Sequence[Any], links: Links) -> dict[str, str]:
-    """Return, for each photograph that the first of `models` does not hold, the likeliest reason."""
+    """Return the most likely reason for each photograph that the first, largest of `models` does not hold."""
     placed = {image.name for image in models[0].images.values() if image.has_pose}
     missing = [name for name in photos.names if name not in placed]
     if not missing:
@@ -38,11 +39,9 @@ def explain_unplaced(photos: Gathered, models: Sequence[Any], links: Links) -> d
     reasons = {}
     for name in missing:
         if sharpness_of(photos, name) < BLURRED * usual_sharpness:
-            reasons[name] = "blurred, compared with the others"
+            reasons[name] = "is blurred, compared with the others"
         elif links.features[name] < FEW_FEATURES * usual_features:
-            reasons[name] = (
-                f"shows little to hold on to ({links.features[name]:,} features, usually {usual_features:,.0f})"
-            )
+            reasons[name] = f"shows too few details ({links.features[name]:,} features, usually {usual_features:,.0f})"
         elif name in elsewhere:
             size = models[elsewhere[name] - 1].num_reg_images()
             reasons[name] = f"belongs to a separate group of {size} that shares too little with the rest"
@@ -51,10 +50,11 @@ def explain_unplaced(photos: Gathered, models: Sequence[Any], links: Links) -> d
         elif not links.matched[name] & placed:
             reasons[name] = "overlaps only photographs that were not placed either"
         else:
-            reasons[name] = "matches others, but too few of their points in space"
+            reasons[name] = "matches placed photographs, but too few of their 3D points"
     return reasons
 
 
 def sharpness_of(photos: Gathered, name: str) -> float:
+    """Return the sharpness of a photograph; see `sharpness`."""
     pixels, _ = read_image(photos.folder / name, name, BLACK)
     return sharpness(pixels.numpy())

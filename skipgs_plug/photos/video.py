@@ -1,4 +1,4 @@
-"""Frames of a video: the sharpest of each of equally long groups."""
+"""Read the sharpest frames of a video, one from each of several groups of equal length."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from skipgs_plug.trainer.errors import InputError, reason
 log = logging.getLogger(__name__)
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp")
-JUDGED_SIZE = 640  # longer side in pixels of the frames whose sharpness is compared: sensor noise does not count there
+# Longer side in pixels to which frames are reduced before their sharpness is compared, to average out sensor noise.
+JUDGED_SIZE = 640
 
 
 def count_frames(path: Path) -> int:
-    """Return how many frames the video holds.
+    """Return the number of frames in a video.
 
     Raises:
-        InputError: it cannot be decoded.
+        InputError: The video cannot be decoded.
     """
     import imageio_ffmpeg
 
@@ -34,16 +35,16 @@ def count_frames(path: Path) -> int:
 def sharpest_frames(path: Path, wanted: int) -> Iterator[tuple[int, np.ndarray]]:
     """Yield (frame number, frame [H, W, 3] uint8) of the sharpest frame in each of `wanted` groups, in order.
 
-    A video with fewer frames yields all of them. Frames are turned upright by the decoder.
+    A video with fewer frames yields all of them. The decoder turns frames upright.
 
     Raises:
-        InputError: the video cannot be decoded.
+        InputError: The video cannot be decoded.
     """
     import imageio.v3 as iio
 
     total = count_frames(path)
     if total == 0:
-        raise InputError(f"Video {path} holds no frame; record it again.")
+        raise InputError(f"Video {path} contains no frames; record it again.")
     borders = np.linspace(0, total, min(wanted, total) + 1).round().astype(int)[1:]
     group, best, number = 0, (-1.0, 0, np.empty(0)), -1
     try:
@@ -58,7 +59,7 @@ def sharpest_frames(path: Path, wanted: int) -> Iterator[tuple[int, np.ndarray]]
         why = f"cannot be decoded to its end ({reason(error)})"
         raise InputError(f"Video {path} {why}; export it again as mp4 (H.264).") from error
     if number + 1 < total:
-        log.warning("%s: %d of %d frames can be decoded; record or export it again.", path, number + 1, total)
+        log.warning("%s: only %d of %d frames can be decoded; record or export it again.", path, number + 1, total)
     yield best[1], best[2]
 
 

@@ -1,1 +1,1 @@
-"""One HTML page from finished runs: read a folder (`source`), draw (`plots`), write (`page`)."""
+"""Make one HTML page from finished runs: read the folders (`source`), draw (`plots`), write the page (`page`)."""

@@ -1,4 +1,4 @@
-"""The parts of a page, and the page made of them. The template escapes everything from outside."""
+"""The parts of a page, and the function that writes the page. The template escapes all text from run folders."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 @dataclass
 class Table:
-    """A table whose first column heads its rows; `text` aligns the others left, else right."""
+    """A table whose first column holds row headers. `text` aligns the other columns left instead of right."""
 
     kind: ClassVar[str] = "table"
     caption: str
@@ -20,7 +20,7 @@ class Table:
 
 @dataclass
 class Picture:
-    """A picture as a data URI; the caption also describes it. A `wide` one is scrolled on small screens."""
+    """A picture as a data URI. Its caption is also its text alternative. A `wide` picture scrolls on small screens."""
 
     kind: ClassVar[str] = "picture"
     source: str
@@ -30,11 +30,11 @@ class Picture:
 
 @dataclass
 class Strip:
-    """Pictures side by side, each with a title, or below each other on small screens."""
+    """Pictures with titles, side by side; on small screens, one below the other."""
 
     kind: ClassVar[str] = "strip"
     caption: str
-    pictures: Sequence[tuple[str, str]]  # data URI, title
+    pictures: Sequence[tuple[str, str]]  # (data URI, title) of each picture
 
 
 @dataclass
@@ -47,7 +47,7 @@ class Text:
 
 @dataclass
 class Details:
-    """Blocks that are folded up."""
+    """Tables that the reader can unfold."""
 
     kind: ClassVar[str] = "details"
     summary: str
@@ -64,7 +64,7 @@ class Section:
 
 
 def write_page(title: str, lead: str, sections: Sequence[Section]) -> str:
-    """Return a whole page of HTML; it loads nothing and holds no script."""
+    """Return a complete HTML page that loads no other files and contains no scripts."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(

@@ -1,4 +1,4 @@
-"""The page: a comparison when there are several runs, then one section for each run or bench."""
+"""Build the page: a comparison if there are several runs, then one section for each run or bench."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ GATE_HEADING = (
 )
 REFINEMENT_HEADING = (
     "run",
-    "may run, %",
+    "iterations allowed, %",
     "iterations run",
     "left out",
-    "run in any case",
+    "always run",
     "ended early",
-    "rest foreseen to be worth, dB",
+    "remaining gain, upper bound, dB",
 )
-FITTED = "the same, colours fitted, dB"
+FITTED = "held-out PSNR, colours fitted, dB"
 RESULTS = (
     "held-out PSNR, dB",
     FITTED,
@@ -44,7 +44,7 @@ RESULTS = (
     "after densification, s",
     "backwards skipped, %",
 )
-PICTURED = 3  # worst held-out views of each run that the page shows
+PICTURED = 3  # number of held-out views of each run that the page shows, the worst ones
 
 
 def build_page(sources: Sequence[RunSource | BenchSource]) -> str:
@@ -54,32 +54,32 @@ def build_page(sources: Sequence[RunSource | BenchSource]) -> str:
     for source in sources:
         sections.append(bench_section(source) if isinstance(source, BenchSource) else run_section(source))
     title = "SkipGS: " + ", ".join(source.name for source in sources)
-    return write_page(title, "What training reached, what was left out of it, what that saved and cost.", sections)
+    return write_page(title, "Quality of the trained models, left-out work, and time saved.", sections)
 
 
 def comparison(runs: Sequence[RunSource]) -> Section:
-    """Runs side by side."""
+    """Return the section that shows several runs side by side."""
     blocks: list[Block] = [results("All runs", runs)]
     names = unique_names(runs)
     curves = {name: run.curve for name, run in names.items() if run.curve}
     if curves:
         blocks.append(picture(plots.loss_over_time(curves), "Training loss over iterations."))
-        blocks.append(picture(plots.gaussians_over_time(curves, {}), "Gaussians over the seconds of training."))
+        blocks.append(picture(plots.gaussians_over_time(curves, {}), "Number of Gaussians over training time."))
     views = {name: run.views for name, run in names.items() if run.views}
     if views:
-        blocks.append(picture(plots.quality_of_views(views), "PSNR of every held-out view; dashed: their means."))
+        blocks.append(picture(plots.quality_of_views(views), "PSNR of each held-out view; dashed: mean of each run."))
     return Section("Side by side", blocks)
 
 
 def unique_names(runs: Sequence[RunSource]) -> dict[str, RunSource]:
-    """Return the runs by name, by path where a name is not theirs alone."""
+    """Return the runs by name, or by path if several runs share a name."""
     names = [run.name for run in runs]
     return {run.name if names.count(run.name) == 1 else str(run.path): run for run in runs}
 
 
 def run_section(run: RunSource) -> Section:
     blocks: list[Block] = [results("Results", [run])]
-    # Reports from before iterations could be left out do not say.
+    # Older versions, which could not leave out iterations, did not write this field.
     if run.gate is not None and run.gate.get("refine_share") is not None:
         blocks += phase_blocks(run.gate, run.curve)
     if run.curve:
@@ -103,17 +103,17 @@ def run_section(run: RunSource) -> Section:
 
 
 def gaussians(run: RunSource) -> Picture:
-    """How many there were in the course of training, and where densification ended if that is known."""
-    caption = "Gaussians over the seconds of training."
+    """Plot the number of Gaussians during training, and the end of densification if it is known."""
+    caption = "Number of Gaussians over training time."
     ends = {}
     if run.t_total is not None and run.t_post:
         ends[run.name] = run.t_total - run.t_post
-        caption = "Gaussians over the seconds of training; dashed: the end of growing."
+        caption = "Number of Gaussians over training time; dashed: the end of growing."
     return picture(plots.gaussians_over_time({run.name: run.curve}, ends), caption)
 
 
 def pictured_views(run: RunSource) -> list[Block]:
-    """The worst held-out views; the first ones, when their quality is not known."""
+    """Return pictures of the worst held-out views, or of the first ones if their quality is unknown."""
     if len(run.views) != len(run.renders):
         return [Strip(path.name, plots.split_render(path)) for path in run.renders[:PICTURED]]
     worst = sorted(zip(run.views, run.renders, strict=True), key=lambda pair: pair[0]["psnr"])[:PICTURED]
@@ -127,17 +127,17 @@ def pictured_views(run: RunSource) -> list[Block]:
 
 
 def gate_blocks(name: str, data: dict[str, Any]) -> list[Block]:
-    blocks: list[Block] = [gate_table("What the gate did", name, data)]
-    if data.get("refine_share") is not None:  # reports from before iterations could be left out do not say
+    blocks: list[Block] = [gate_table("Decisions of the gate", name, data)]
+    if data.get("refine_share") is not None:  # older versions did not write this field
         blocks.append(refinement_table("Whole iterations left out", name, data))
     views = data["views"]
     if data["gated_iterations"] == 0:
         blocks.append(Text(["The gate was never active in this run, so there is nothing to draw."]))
     else:
-        blocks.append(picture(plots.reasons(data), "Iterations since the gate became active, by what decided."))
-        blocks.append(picture(plots.view_shares(views), "Share of visits skipped, by training view."))
+        blocks.append(picture(plots.reasons(data), "Iterations since the gate became active, by reason of decision."))
+        blocks.append(picture(plots.view_shares(views), "Share of skipped visits of each training view."))
         if any(row["mean_loss"] is not None for row in views):
-            blocks.append(picture(plots.loss_against_skips(views), "One point per view: its loss and skips."))
+            blocks.append(picture(plots.loss_against_skips(views), "Loss and skipped visits, one point per view."))
     if views:
         names = ("view", "visits", "backwards", "skips", "mean_loss", "last_loss")
         rows = [[rounded(row[name]) for name in names] for row in views]
@@ -153,7 +153,7 @@ def bench_section(bench: BenchSource) -> Section:
     blocks.append(Text(notes(rows, data)))
     blocks += [Picture(plots.inline_png(path), text, wide=True) for path, text in bench.pictures]
     if any(any(trace.skipped) for trace in bench.decisions.values()):
-        text = "Share of backwards skipped in the course of refinement, one curve per policy that skips."
+        text = "Share of backward passes skipped during refinement, one curve per policy that skips."
         blocks.append(picture(plots.skips_over_time(bench.decisions), text))
     blocks.append(Table("Policies", ("policy", "meaning"), legend(rows, is_whole(data)), text=True))
     facts = {"command": data["command"], "commits": ", ".join(data["commits"]), **data["versions"], **data["settings"]}
@@ -162,7 +162,7 @@ def bench_section(bench: BenchSource) -> Section:
 
 
 def results(caption: str, runs: Sequence[RunSource]) -> Table:
-    """Quality and time, one column per run; a dash where a folder lacks the value."""
+    """Return quality and time, one column per run, with a dash for each value that a folder lacks."""
     columns = []
     for run in runs:
         worst = min((row["psnr"] for row in run.views), default=None)
@@ -181,7 +181,7 @@ def results(caption: str, runs: Sequence[RunSource]) -> Table:
         )
         columns.append(["-" if value is None else format(value, form) for value, form in values])
     rows = [[name, *cells] for name, *cells in zip(RESULTS, *columns, strict=True)]
-    rows = [row for row in rows if row[0] != FITTED or set(row[1:]) != {"-"}]  # of runs with exposure alone
+    rows = [row for row in rows if row[0] != FITTED or set(row[1:]) != {"-"}]  # only runs with --exposure have it
     return Table(caption, ("", *unique_names(runs)), rows)
 
 

@@ -1,4 +1,4 @@
-"""The two phases of a run, growing and refining: iterations that ran or were left out, and estimated times."""
+"""Show the two phases of a run, growing and refining: iterations run and left out, and estimated times."""
 
 from __future__ import annotations
 
@@ -10,32 +10,35 @@ from skipgs_plug.report.blocks import Block, Table, Text
 
 ROWS = (
     "iterations of the schedule",
-    "run",
-    "left out",
-    "left out, %",
+    "iterations run",
+    "iterations left out",
+    "iterations left out, %",
     "densification events run",
     "densification events left out",
-    "steps longer by",
+    "factor on step lengths",
     "Gaussians at the end",
     "training, s",
-    "without leaving out, s (estimate)",
+    "training without left-out iterations, s (estimate)",
 )
 ESTIMATE = (
-    "The estimate takes an iteration that was left out to cost the mean of those of its phase that ran, which includes "
-    "densification. It was not measured: a run without may end with another number of Gaussians."
+    "The estimate assumes that each left-out iteration would have cost the mean of the iterations of its phase that "
+    "ran, densification included. It was not measured: without left-out iterations the run may end with another number "
+    "of Gaussians."
 )
 
 
 @dataclass(frozen=True)
 class Phase:
-    """One phase. A field is None if the run does not record it.
+    """One phase of a run. A field is None if the run did not record it.
 
     Attributes:
-        run: iterations that ran.
-        left_out: whole iterations that did not.
-        seconds: of training.
-        gaussians: at its end.
-        rate_factor: by which steps were longer.
+        run: Number of iterations that ran.
+        left_out: Number of iterations that were left out as a whole.
+        seconds: Training time of the phase in seconds.
+        gaussians: Number of Gaussians at the end of the phase.
+        events_run: Number of densification events that ran.
+        events_left_out: Number of densification events that were left out.
+        rate_factor: Factor by which optimizer steps were longer.
     """
 
     run: int
@@ -48,12 +51,12 @@ class Phase:
 
     @property
     def iterations(self) -> int:
-        """Of the schedule."""
+        """Number of iterations of the phase in the schedule."""
         return self.run + self.left_out
 
     @property
     def without(self) -> float | None:
-        """Estimated seconds that all its iterations would have taken; None if no iteration ran."""
+        """Estimated training time of the phase in seconds if all iterations had run; None if no iteration ran."""
         return self.seconds * self.iterations / self.run if self.run else None if self.left_out else 0.0
 
 
@@ -61,8 +64,8 @@ def phases(gate: Mapping[str, Any], curve: Mapping[str, Sequence[float]]) -> tup
     """Return the growing and the refining phase.
 
     Args:
-        gate: content of skipgs.json, of a gate that leaves out whole iterations.
-        curve: columns of the course of training; may be empty.
+        gate: Content of the skipgs.json of a gate that leaves out whole iterations.
+        curve: Columns of the training curve, see `RunSource`; may be empty.
     """
     growing = gate.get("growing") or {}
     end = gate["settings"].get("start_iter") or 0
@@ -87,7 +90,7 @@ def phases(gate: Mapping[str, Any], curve: Mapping[str, Sequence[float]]) -> tup
 
 
 def phase_blocks(gate: Mapping[str, Any], curve: Mapping[str, Sequence[float]]) -> list[Block]:
-    """Return the table of both phases and of the whole run, and how the estimate was made."""
+    """Return a table of both phases and the whole run, and a text that explains the estimate."""
     growing, refining = phases(gate, curve)
     whole = Phase(
         growing.run + refining.run,

@@ -1,4 +1,4 @@
-"""Plots of runs, drawn from their folders, and of a bench, drawn from its decisions."""
+"""Draw the plots of runs from their folders, and of a bench from its decisions."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from skipgs_plug.bench.record import Trace
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WIDTH = 5.2  # inches: letters stay readable when a phone shrinks the picture to its width
+WIDTH = 5.2  # width of a plot in inches; text stays readable when a phone shrinks the plot to its screen
 RUN_COLOUR = "#0072B2"
 SKIP_COLOUR = "#D55E00"
-ERROR_GAIN = 4
+ERROR_GAIN = 4  # factor that makes errors visible in the pictures of views
 REASON_COLOURS = {
     "warm-up": "#999999",
     "new view": "#56B4E9",
@@ -31,7 +31,7 @@ REASON_COLOURS = {
 
 
 def skips_over_time(traces: Mapping[tuple[int, str], Trace], parts: int = 25) -> Figure:
-    """Share of skipped backwards in equal parts of refinement, mean over seeds, for policies that skip."""
+    """Plot the share of skipped backward passes in equal parts of refinement, as a mean over seeds, by policy."""
     figure, axes = new_figure(WIDTH, 3.4)
     for i, policy in enumerate(dict.fromkeys(policy for _, policy in traces)):
         colour, _ = style(policy)
@@ -41,7 +41,7 @@ def skips_over_time(traces: Mapping[tuple[int, str], Trace], parts: int = 25) ->
         start = next(trace.start for (_, name), trace in traces.items() if name == policy)
         edges = np.linspace(0, len(runs[0]), min(parts, len(runs[0])) + 1).round().astype(int)
         shares = [[100 * part.mean() for part in np.split(run, edges[1:-1])] for run in runs]
-        width = max(1.0, 4.0 - 0.5 * i)  # policies may agree: then the earlier one shows behind the later
+        width = max(1.0, 4.0 - 0.5 * i)  # if two policies agree, the wider line of the earlier one stays visible
         axes.stairs(np.mean(shares, axis=0), start + edges, baseline=None, color=colour, linewidth=width, label=policy)
     axes.set_ylim(-2, 102)
     axes.set_xlabel("iteration")
@@ -51,7 +51,7 @@ def skips_over_time(traces: Mapping[tuple[int, str], Trace], parts: int = 25) ->
 
 
 def loss_over_time(curves: Mapping[str, Mapping[str, list[float]]]) -> Figure:
-    """Training loss of every run over iterations, each point a mean over a stretch of the run."""
+    """Plot the training loss of each run over iterations. Each point is a mean over a part of the run."""
     figure, axes = new_figure(WIDTH, 3.4)
     for i, (name, curve) in enumerate(curves.items()):
         axes.plot(curve["step"], curve["loss"], color=COLOURS[i % len(COLOURS)], linewidth=1.2, label=name)
@@ -63,7 +63,7 @@ def loss_over_time(curves: Mapping[str, Mapping[str, list[float]]]) -> Figure:
 
 
 def gaussians_over_time(curves: Mapping[str, Mapping[str, list[float]]], ends: Mapping[str, float]) -> Figure:
-    """Number of Gaussians of every run over the seconds of training; `ends`: seconds at which growing ended."""
+    """Plot the number of Gaussians of each run over training time; `ends` holds the end of growing in seconds."""
     figure, axes = new_figure(WIDTH, 3.4)
     for i, (name, curve) in enumerate(curves.items()):
         colour = COLOURS[i % len(COLOURS)]
@@ -80,7 +80,7 @@ def gaussians_over_time(curves: Mapping[str, Mapping[str, list[float]]], ends: M
 
 
 def quality_of_views(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
-    """Held-out PSNR of every view, in the order of their names; one mark per run."""
+    """Plot the PSNR of each held-out view, sorted by name, with one marker style per run."""
     figure, axes = new_figure(WIDTH, 3.4)
     for i, (name, views) in enumerate(runs.items()):
         values = [row["psnr"] for row in views]
@@ -96,7 +96,7 @@ def quality_of_views(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
 
 
 def view_shares(views: list[dict[str, Any]]) -> Figure:
-    """Share of skipped visits of every view, in the order of their names."""
+    """Plot the share of skipped visits of each view, sorted by name."""
     figure, axes = new_figure(WIDTH, 3.0)
     share = [100 * row["skips"] / row["visits"] for row in views]
     axes.bar(range(len(views)), share, width=1.0 if len(views) > 60 else 0.8, color=SKIP_COLOUR)
@@ -110,7 +110,7 @@ def view_shares(views: list[dict[str, Any]]) -> Figure:
 
 
 def loss_against_skips(views: list[dict[str, Any]]) -> Figure:
-    """Mean loss of every view against its share of skipped visits."""
+    """Plot the mean loss of each view against its share of skipped visits."""
     figure, axes = new_figure(WIDTH, 3.4)
     known = [row for row in views if row["mean_loss"] is not None]
     loss = np.array([row["mean_loss"] for row in known])
@@ -123,7 +123,7 @@ def loss_against_skips(views: list[dict[str, Any]]) -> Figure:
 
 
 def reasons(data: dict[str, Any]) -> Figure:
-    """Plot all gated iterations by reason: one bar of backward passes that ran, one of skipped ones."""
+    """Plot all gated iterations by reason, in one bar for backward passes that ran and one for skipped ones."""
     figure, axes = new_figure(WIDTH, 2.6)
     run = {k: v for k, v in data["reasons"].items() if k not in ("deviation", "non-finite")}
     lost = data["non_finite"]
@@ -156,7 +156,7 @@ def reasons(data: dict[str, Any]) -> Figure:
 
 
 def inline_svg(figure: Figure) -> str:
-    """Return the figure as a data URI."""
+    """Return a figure as the data URI of an SVG."""
     stream = io.BytesIO()
     figure.savefig(stream, format="svg", metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(stream.getvalue()).decode()
@@ -167,7 +167,7 @@ def inline_png(path: Path) -> str:
 
 
 def split_render(path: Path) -> list[tuple[str, str]]:
-    """Return truth, render and error of a picture that shows the first two side by side: data URI and title each."""
+    """Split a picture of photograph and render; return (data URI, title) of photograph, render and their error."""
     from PIL import Image
 
     with Image.open(path) as opened:
@@ -180,7 +180,7 @@ def split_render(path: Path) -> list[tuple[str, str]]:
 
 
 def inline_jpeg(picture: np.ndarray) -> str:
-    """Return a picture [H, W, 3] uint8 as a data URI, in a tenth of the bytes of a PNG."""
+    """Return a picture [H, W, 3] uint8 as the data URI of a JPEG, which needs a tenth of the bytes of a PNG."""
     from PIL import Image
 
     stream = io.BytesIO()

@@ -1,4 +1,4 @@
-"""The content of a folder: a gated run (ours or a script's), or a bench."""
+"""Read the content of a folder: a run of this package's trainer or of a script, or a bench."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ BENCH_PICTURES = {
     "psnr_over_time.png": "Held-out PSNR against seconds of refinement, one curve per policy.",
     "time_against_error.png": "Refinement time against final held-out PSNR, with spread over seeds.",
     "phases.png": "Seconds of refinement in forward, loss, backward and optimizer, one bar per policy.",
-    "skipped_views.png": "Which visits of which training view were skipped, over iterations.",
+    "skipped_views.png": "Skipped visits of each training view over iterations.",
     "loss_and_mean.png": "Loss of single views against their running mean; skipped visits are hollow.",
 }
 EVALUATIONS = "stats/val_step*.json"
@@ -45,14 +45,16 @@ CURVE_FIELDS = ("step", "seconds", "loss", "num_GS")
 
 @dataclass
 class RunSource:
-    """A run, gated or not.
+    """A run, with or without a gate.
 
     Attributes:
+        name: Name of the run's folder.
+        path: The folder.
         gate: Content of skipgs.json; None if the run has no gate.
-        metrics: of the last evaluation that the run folder holds in gsplat's layout; empty without.
+        metrics: Metrics of the last evaluation in gsplat's file layout; empty if there is none.
         views: Metrics of each evaluated view, in the order of `renders`; empty if the trainer wrote none.
         renders: Pictures of that evaluation, each with the photograph and the render.
-        curve: columns `step seconds loss num_GS` of the course of training; empty without.
+        curve: Columns `step`, `seconds`, `loss`, `num_GS` of the training curve; empty if the trainer wrote none.
         settings: Settings of the training; empty if unknown.
     """
 
@@ -67,20 +69,20 @@ class RunSource:
 
     @property
     def t_total(self) -> float | None:
-        """Seconds of training, if they are known."""
+        """Training time in seconds; None if unknown."""
         if self.gate is not None:
             return float(self.gate["t_total"])
         return self.curve["seconds"][-1] if self.curve.get("seconds") else None
 
     @property
     def t_post(self) -> float | None:
-        """Seconds after densification, if they are known."""
+        """Training time after densification in seconds; None if unknown."""
         return float(self.gate["t_post"]) if self.gate is not None else None
 
 
 @dataclass
 class BenchSource:
-    """A bench: content of bench.json, its plots with captions, and its decisions if there are any."""
+    """A bench: the content of bench.json, its plots with captions, and the decisions of its policies if stored."""
 
     name: str
     path: Path
@@ -90,10 +92,10 @@ class BenchSource:
 
 
 def read_source(path: str | Path) -> RunSource | BenchSource:
-    """Read a run folder, a bench folder, or the JSON file of either.
+    """Read the folder of a run or of a bench, or the JSON file of either.
 
     Raises:
-        SkipGSError: The file is missing, damaged or of another version; the message names it.
+        SkipGSError: The file is missing, damaged or of another version. The message names the file.
     """
     path = Path(path).expanduser()
     if not path.exists():
@@ -106,12 +108,12 @@ def read_source(path: str | Path) -> RunSource | BenchSource:
     name = printable(folder.resolve().name)
     if not file.is_file():
         if (folder / "settings.json").is_file() and (folder / "runs").is_dir():
-            raise SkipGSError(f"{folder} holds a bench that has not finished; give its command again to continue it.")
+            raise SkipGSError(f"{folder} holds a bench that has not finished; repeat its command to continue it.")
         run = read_run(name, folder, None)
         if not run.metrics and not run.curve:
             raise SkipGSError(
-                f"{folder} holds neither skipgs.json, bench.json nor {EVALUATIONS}; give the folder of a run "
-                "(skipgs-plug train or run) that has finished, or of a bench."
+                f"{folder} holds neither skipgs.json, bench.json nor {EVALUATIONS}; give the folder of a "
+                "finished run (skipgs-plug train or run), or of a bench."
             )
         return run
     data = read_object(file)
@@ -125,7 +127,7 @@ def read_source(path: str | Path) -> RunSource | BenchSource:
 
 
 def read_run(name: str, folder: Path, gate: dict[str, Any] | None) -> RunSource:
-    """Read the files of a folder besides skipgs.json."""
+    """Read all files of a run folder except skipgs.json, whose content is `gate`."""
     metrics, renders = last_evaluation(folder)
     views = metrics.pop("per_view", [])
     curve = folder / "stats" / CURVE
@@ -136,7 +138,7 @@ def read_run(name: str, folder: Path, gate: dict[str, Any] | None) -> RunSource:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """Return the settings of training in cfg.yml; empty if the trainer writes no such file, or Python objects."""
+    """Return the training settings in cfg.yml; empty if the file is missing or contains Python objects."""
     import yaml
 
     file = folder / "cfg.yml"
@@ -151,25 +153,25 @@ def read_object(file: Path) -> dict[str, Any]:
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:
-        raise SkipGSError(f"{file} is damaged ({error}); run it again, or leave it out.") from error
+        raise SkipGSError(f"{file} is damaged ({error}); repeat the run, or leave the file out.") from error
     if not isinstance(data, dict):
-        raise SkipGSError(f"{file} holds no JSON object; it was not written by this package.")
+        raise SkipGSError(f"{file} holds no JSON object; this package did not write it.")
     return data
 
 
 def require(file: Path, data: dict[str, Any], fields: tuple[str, ...], version: int) -> None:
     if data.get("schema_version") != version:
         raise SkipGSError(
-            f"{file} has schema version {data.get('schema_version')!r}, this package reads {version}; "
-            "use the version that wrote it."
+            f"{file} has schema version {data.get('schema_version')!r}, but this package reads {version}; "
+            "use the version of the package that wrote the file."
         )
     missing = [name for name in fields if name not in data]
     if missing:
-        raise SkipGSError(f"{file} is damaged (no {missing[0]!r} in it); run it again, or leave it out.")
+        raise SkipGSError(f"{file} is damaged (no {missing[0]!r} in it); repeat the run, or leave the file out.")
 
 
 def last_evaluation(folder: Path) -> tuple[dict[str, Any], list[Path]]:
-    """Return metrics and pictures of the last evaluation in gsplat's layout, if the folder has that."""
+    """Return metrics and pictures of the last evaluation in gsplat's file layout; empty if there is none."""
     found = [(step_of(path), path) for path in folder.glob(EVALUATIONS)]
     if not found:
         return {}, []

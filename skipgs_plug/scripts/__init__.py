@@ -1,1 +1,1 @@
-"""Training scripts of others, run in this process: the launcher, their checkpoints, CUDA redirected to the CPU."""
+"""Run the training scripts of other projects in this process: launcher, gate states, and CUDA on the CPU."""

@@ -1,4 +1,4 @@
-"""The gate's state beside the checkpoints that a script saves itself, found again when it loads one."""
+"""Save the gate's state beside the checkpoints of a script, and restore it when the script loads one."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.files import write_aside
 from skipgs_plug.gate import SkipGate
 
-REPLACED = ("torch.save", "torch.load")  # by `watch`; `torch.load` by `run_script` too
-SUFFIX = ".skipgs.json"  # behind the name of the checkpoint
+# Functions that `watch` replaces. `run_script` replaces `torch.load` too.
+REPLACED = ("torch.save", "torch.load")
+SUFFIX = ".skipgs.json"  # appended to the name of the checkpoint
 
 
 class Checkpoints:
-    """For each file that the script gives to `torch.save` while it trains, a second one with the gate's state.
+    """Writes the gate's state next to every file that the script saves with `torch.save`.
 
-    When the script loads such a file with `torch.load` and goes on in the iteration after it, the gate goes on
-    too. A state of another script or iteration is left alone, and that is said.
+    When the script loads such a file with `torch.load` and continues with the next iteration, the gate continues
+    too. If a state belongs to another script or iteration, the gate ignores it and prints a message.
 
     Args:
         adapter: Name of the adapter.
-        script: What is run, without its arguments and folder.
-        resume: "auto"; "off" for a gate that starts afresh; or the path of a state to go on from.
+        script: Name of the script or module, without its folder and arguments.
+        resume: "auto" to look for a state, "off" to start afresh, or the path of the state to continue from.
 
     Raises:
-        SkipGSError: The given path holds no state.
+        SkipGSError: The file at the given path does not hold a state.
     """
 
     def __init__(self, adapter: str, script: str, resume: str = "auto") -> None:
@@ -42,13 +43,13 @@ class Checkpoints:
         self._search = resume == "auto"
         self._given = None if resume in ("auto", "off") else Path(resume)
         self._found: list[Path] = []
-        self._without: list[Path] = []  # checkpoints that were loaded and have no state beside them
+        self._without: list[Path] = []  # missing state files of loaded checkpoints
         if self._given is not None:
             _read(self._given)
 
     @contextmanager
     def watch(self) -> Iterator[None]:
-        """See what is saved and loaded inside the block."""
+        """Follow the calls of `torch.save` and `torch.load` inside the block."""
         save, load = torch.save, torch.load
 
         @functools.wraps(save)
@@ -71,17 +72,18 @@ class Checkpoints:
             torch.save, torch.load = save, load
 
     def state_for(self, first: int) -> dict[str, Any] | None:
-        """Return the state of the gate for a script whose first iteration this is, if there is one.
+        """Return the gate's state for a script that starts with iteration `first`; None if there is no such state.
 
         Raises:
-            SkipGSError: The state that the user gave is of another iteration, or one is damaged.
+            SkipGSError: The state that the user gave belongs to another iteration, or a state is damaged.
         """
         if self._given is not None:
             content = _read(self._given)
             if content["gate"]["step"] != first - 1:
                 raise SkipGSError(
-                    f"The gate state {self._given} is of iteration {content['gate']['step']}, but the script goes on "
-                    f"with {first}: give the one beside the checkpoint that it loads, or --resume-gate off."
+                    f"The gate state {self._given} belongs to iteration {content['gate']['step']}, but the script "
+                    f"continues with iteration {first}: give the state beside the checkpoint that the script loads, "
+                    "or --resume-gate off."
                 )
             _say(f"The gate takes its state from {self._given}.")
             return content["gate"]
@@ -92,11 +94,11 @@ class Checkpoints:
                 _say(f"The gate takes its state from {path}.")
                 return content["gate"]
             refused = (
-                f"The gate starts afresh: {path} is of {content['script']} and iteration {content['gate']['step']}, "
-                f"while {self._run['script']} begins with {first}."
+                f"The gate starts afresh: {path} belongs to iteration {content['gate']['step']} of "
+                f"{content['script']}, but {self._run['script']} starts with iteration {first}."
             )
         if not refused and self._without and first > 1:
-            refused = f"The gate starts afresh in iteration {first}: there is no {self._without[-1]}."
+            refused = f"The gate starts afresh in iteration {first}: {self._without[-1]} does not exist."
         if refused:
             _say(refused)
         return None
@@ -105,15 +107,15 @@ class Checkpoints:
         gate = self.gate
         if gate is None or not gate.config.enabled or gate.stats()["iterations"] == 0:
             return
-        for state in checkpoint.parent.glob(f"*{SUFFIX}"):  # some scripts keep the last few checkpoints only
+        for state in checkpoint.parent.glob(f"*{SUFFIX}"):  # some scripts delete their older checkpoints
             if not state.with_name(state.name.removesuffix(SUFFIX)).exists():
                 state.unlink(missing_ok=True)
         try:
             with write_aside(_beside(checkpoint)) as temporary:
                 temporary.write_text(json.dumps({**self._run, "gate": gate.state_dict()}) + "\n")
-        except Exception as error:  # the script's checkpoint is written, and its training goes on
+        except Exception as error:  # the script has its checkpoint and can continue to train
             why = f"{type(error).__name__}: {error}"
-            _say(f"{_beside(checkpoint)} could not be written ({why}): a run that is resumed here gates afresh.")
+            _say(f"{_beside(checkpoint)} could not be written ({why}): if a run resumes here, its gate starts afresh.")
 
 
 def _beside(checkpoint: Path) -> Path:
@@ -128,7 +130,7 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, AttributeError, KeyError, TypeError, RecursionError):
         pass
     raise SkipGSError(
-        f"{path} holds no gate state: give a file that ends in {SUFFIX}, as it lies beside the checkpoints of a gated "
+        f"{path} does not hold a gate state: give a file that ends in {SUFFIX}, from beside the checkpoints of a gated "
         "run, or --resume-gate off."
     )
 

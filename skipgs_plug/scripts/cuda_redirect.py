@@ -1,8 +1,7 @@
-"""Run code written for CUDA on the CPU: every request for a CUDA tensor gives a CPU tensor.
+"""Run code for CUDA on the CPU: every request for a CUDA tensor gives a CPU tensor.
 
-The counterpart of `compat`: together they let an unmodified training script run where
-there is no GPU. Nothing is emulated beyond placement and clocks, and whatever is not listed here (streams,
-graphs, CUDA generators) fails as it does in any PyTorch without CUDA.
+Together with `compat`, this module runs an unmodified training script on a machine without a GPU. It emulates only
+placement and clocks. Everything else (streams, graphs, CUDA generators) fails as in any PyTorch without CUDA.
 """
 
 from __future__ import annotations
@@ -20,54 +19,54 @@ from skipgs_plug.compat.stand_ins import stand_ins
 
 
 class HostEvent:
-    """`torch.cuda.Event` on the host's clock: the CPU has finished whatever was called before."""
+    """A `torch.cuda.Event` that reads the host's clock: on the CPU, all earlier calls have finished."""
 
     def __init__(self, enable_timing: bool = False, blocking: bool = False, interprocess: bool = False) -> None:
         self._time: float | None = None
 
     def record(self, stream: Any = None) -> None:
-        """Remember the present moment."""
+        """Store the current time."""
         self._time = time.perf_counter()
 
     def elapsed_time(self, end_event: HostEvent) -> float:
-        """Milliseconds from this event to `end_event`.
+        """Return the milliseconds from this event to `end_event`.
 
         Raises:
-            RuntimeError: One of the two was never recorded.
+            RuntimeError: One of the two events was never recorded.
         """
         if self._time is None or end_event._time is None:
             raise RuntimeError("Both events must be recorded before elapsed_time.")
         return 1000.0 * (end_event._time - self._time)
 
     def query(self) -> bool:
-        """Whether the work before the event is done: always, here."""
+        """Return True: on the CPU, the work before the event is always done."""
         return True
 
     def synchronize(self) -> None:
-        """Wait for the event: there is nothing to wait for."""
+        """Return at once: on the CPU, the work before the event is always done."""
 
 
 def _nothing(*args: Any, **kwargs: Any) -> None:
-    """Stands for a call that only matters where a device runs beside the host."""
+    """Do nothing. Replaces calls that matter only on a GPU."""
 
 
-# Every name that is replaced; all come back on exit.
+# Names that `cuda_on_cpu` replaces, and restores on exit.
 REPLACED: dict[str, Any] = {
     "torch.cuda.Event": HostEvent,
     "torch.cuda.synchronize": _nothing,
     "torch.cuda.set_device": _nothing,
     "torch.cuda.reset_peak_memory_stats": _nothing,
     "torch.cuda.current_device": lambda: 0,
-    # Scripts assert that there is a device, and count them to decide on one process per device.
+    # Scripts assert that a device is available, and count devices to start one process for each.
     "torch.cuda.is_available": lambda: True,
     "torch.cuda.device_count": lambda: 1,
-    # torch's own optimizers ask it once a device is there; without a driver, a build with CUDA raises.
+    # Torch's optimizers call this when a device is available. A build with CUDA raises an error without a driver.
     "torch.cuda.is_current_stream_capturing": lambda: False,
     "torch.cuda.FloatTensor": torch.FloatTensor,
     "torch.cuda.IntTensor": torch.IntTensor,
     "torch.cuda.LongTensor": torch.LongTensor,
     "torch.cuda.BoolTensor": torch.BoolTensor,
-    # torch's own optimizers ask here, and what they would do with a device goes beyond placement.
+    # Torch's optimizers call this; None keeps them on their CPU path.
     "torch.accelerator.current_accelerator": _nothing,
 }
 
@@ -75,25 +74,25 @@ REPLACED: dict[str, Any] = {
 @contextmanager
 def cuda_on_cpu() -> Iterator[None]:
     """Redirect CUDA to the CPU inside the block, in this thread."""
-    # Optimizers load dynamo, which lists the functions of torch.cuda once and trips over replaced ones.
+    # Optimizers import dynamo, which lists the functions of torch.cuda once and fails if they are replaced by then.
     dynamo = importlib.import_module("torch._dynamo")
     replaced = [*_places(), (torch, "load", _load_on_cpu(torch.load))]
-    # A compiler that believes in CUDA asks for its random state; uncompiled functions give the same.
+    # The compiler would ask CUDA for its random state. Uncompiled functions give the same results.
     with stand_ins(replaced), _CpuPlacement(), dynamo.config.patch(disable=True):
         yield
 
 
 def _places() -> list[tuple[Any, str, Any]]:
-    """Module, name and stand-in of what is replaced, where this torch has the module (`accelerator`: from 2.6 on)."""
+    """Return module, name and stand-in of each replaced function. Torch before 2.6 has no module `accelerator`."""
     split = ((*name.split(".")[1:], stand_in) for name, stand_in in REPLACED.items())
     return [(getattr(torch, module), name, stand_in) for module, name, stand_in in split if hasattr(torch, module)]
 
 
 @contextmanager
 def exclusive_cores() -> Iterator[None]:
-    """Keep torch to one thread inside the block: the CPU rasterizer, which stands in for the GPU, has its own.
+    """Limit torch to one thread inside the block: the CPU rasterizer, which replaces the GPU, has its own threads.
 
-    torch's idle OpenMP threads spin for a while after each operation, and take the cores from the rasterizer.
+    Torch's idle OpenMP threads spin for a while after each operation and keep the cores from the rasterizer.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""What to do about a module that a script asks for and that is not there."""
+"""Explain how to install a module that a script imports and that is missing."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
-# Parts of every checkout of the Inria family, CUDA extensions, packages not called as their module.
+# Modules that every checkout of the Inria family contains.
 OF_CHECKOUTS = frozenset({"arguments", "gaussian_renderer", "scene", "utils"})
 EXTENSIONS = ("diff_", "simple_knn", "fused_ssim")
-# What the stand-ins take arguments with.
+# Functions of the stand-ins, as messages of a `TypeError` name them.
 RASTERIZER = re.compile(r"GaussianRaster\w+|\bsplats\(\)")
+# Packages by the name of their module, where the two differ.
 PACKAGES = {
     "cv2": "opencv-python",
     "PIL": "pillow",
@@ -20,27 +21,35 @@ PACKAGES = {
     "yaml": "pyyaml",
 }
 REQUIREMENTS = ("*requirements*.txt", "environment*.yml", "environment*.yaml", "pyproject.toml", "setup.*")
-FOLDERS = 2  # gsplat's scripts lie one below the folder of its checkout
+# Number of folders that are searched for requirements, from the script's folder upwards. gsplat keeps its scripts one
+# folder below its checkout.
+FOLDERS = 2
 
 
-def what_brings(module: str, script: Path, on_cpu: bool = False) -> str:
-    """A sentence for a module that a script asks for and that is not there.
+def install_hint(module: str, script: Path, on_cpu: bool = False) -> str:
+    """Return a sentence that explains how to install a missing module.
 
-    It names a package only where the checkout's requirements do, or the name of the module is known to differ from
-    that of its package: modules are also files that a checkout lacks, and indices hold packages of any name.
+    The sentence names a package only if the requirements of the checkout list it or if `PACKAGES` holds the module.
+    Any other module may be a file that the checkout lacks, and the package index may hold an unrelated package of
+    that name.
+
+    Args:
+        module: Name of the missing module.
+        script: File of the script that imports the module.
+        on_cpu: Whether CPU stand-ins replace CUDA modules.
     """
     top = module.partition(".")[0]
     if top in OF_CHECKOUTS:
-        return f"{script.name} is not in its checkout: there is no {top} beside it; run the one in a whole checkout."
+        return f"{script.name} is not in its checkout: its folder has no {top}. Run the script in a complete checkout."
     if top.startswith(EXTENSIONS) and on_cpu:
         return (
-            f"{top} is a CUDA extension that has no CPU stand-in under this adapter: name the adapter of the "
-            "trainer that it belongs to, or run with CUDA, without --cpu."
+            f"{top} is a CUDA extension for which this adapter has no CPU stand-in: name the adapter of the trainer "
+            "that uses it, or run on a GPU, without --cpu."
         )
     if top.startswith(EXTENSIONS):
         return (
-            f"{top} is a CUDA extension that comes with the trainer: build it as the trainer's README says, or run on "
-            "the CPU with --cpu before '--'."
+            f"{top} is a CUDA extension of the trainer: build it as the trainer's README says, or run on the CPU with "
+            "--cpu before '--'."
         )
     package = PACKAGES.get(top, top)
     for listing in requirements(script):
@@ -49,16 +58,16 @@ def what_brings(module: str, script: Path, on_cpu: bool = False) -> str:
     if top in PACKAGES:
         return f"{script.name} needs the module {top}; run: pip install {package}"
     return (
-        f"{script.name} needs the module {module}, which is neither installed nor beside it: if it is a file of the "
-        "script's checkout, take a whole checkout; else install the package that the trainer's README names."
+        f"{script.name} needs the module {module}, which is not installed and not in its folder. If {module} is part "
+        "of the checkout, fetch the whole checkout; otherwise install the package that the trainer's README names."
     )
 
 
 def foreign_rasterizer(error: BaseException) -> str | None:
-    """Return a sentence for a script that calls its rasterizer in a way that the CPU stand-in does not know.
+    """Return a sentence that explains an error from a rasterizer call that the CPU stand-in does not support.
 
     Returns:
-        None for any other error.
+        The sentence; None for any other error.
     """
     text, last = str(error), traceback.extract_tb(error.__traceback__)[-1:]
     found = None
@@ -69,23 +78,23 @@ def foreign_rasterizer(error: BaseException) -> str | None:
     elif isinstance(error, TypeError) and RASTERIZER.search(text):
         found = text
     elif isinstance(error, ValueError) and "to unpack" in text and "gaussian_renderer" in last[0].filename:
-        found = f"{text} where the renderer takes its results"
+        found = f"{text} where the renderer unpacks the results"
     if found is None:
         return None
     return (
-        f"The script has a rasterizer of its own, which --cpu has no stand-in for ({found}): run it with CUDA, without "
+        f"The script uses its own rasterizer, for which --cpu has no stand-in ({found}): run it on a GPU, without "
         "--cpu."
     )
 
 
 def requirements(script: Path) -> Iterator[Path]:
-    """Yield the files near a script that list what it needs."""
+    """Yield the requirement files in the folder of a script and above it, `FOLDERS` folders in all."""
     for folder in (script.parent, *script.parents[1:FOLDERS]):
         for pattern in REQUIREMENTS:
             yield from sorted(path for path in folder.glob(pattern) if path.is_file())
 
 
 def names(listing: Path, package: str) -> bool:
-    """Whether a list of requirements names a package; to indices "-" and "_" are one."""
+    """Return whether a requirements file names a package. Package indices treat "-" and "_" alike."""
     name = re.sub("[-_]+", "[-_]", re.escape(package).replace(r"\-", "-"))
     return re.search(rf"(?<![\w-]){name}(?![\w-])", listing.read_text(errors="replace"), re.IGNORECASE) is not None

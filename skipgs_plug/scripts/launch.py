@@ -1,4 +1,4 @@
-"""Run a training script as Python itself would, in this process, so that adapters can reach into it."""
+"""Run a training script in this process, as Python would run it, so that adapters can change it."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from typing import Any, NamedTuple
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.scripts.import_hints import foreign_rasterizer, what_brings
+from skipgs_plug.scripts.import_hints import foreign_rasterizer, install_hint
 
 Attach = Callable[[], dict[str, Any]]  # see `run_script`
 
 
 def run_script(command: Sequence[str], attach: Attach | None = None, on_cpu: bool = False) -> int:
-    """Execute an unmodified script in its own checkout and give its exit code.
+    """Run an unmodified script in its own checkout and return its exit code.
 
-    The script sees its own folder first on `sys.path`, its own `sys.argv`, and `__name__ == "__main__"`.
-    Output, files and traceback are its own. The working folder stays as it is.
+    The script finds its own folder first on `sys.path`, its own `sys.argv`, and `__name__ == "__main__"`. Its output,
+    files and traceback look as if Python ran it. The working folder does not change.
 
     Args:
-        command: What would follow `python`: a script and its arguments, or `-m`, a module and its arguments.
-            Or the name of a command that an installed package brings, such as `ns-train`, and its arguments.
-        attach: Called where the script would be: its folder is on `sys.path`, nothing of it is imported. Gives
-            names that the script is to find among its globals.
-        on_cpu: CUDA modules are served by CPU stand-ins, which an error may be about.
+        command: The arguments of `python`: a script and its arguments, or `-m`, a module and its arguments. Also a
+            command that an installed package provides, such as `ns-train`, and its arguments.
+        attach: Called immediately before the script runs, when its folder is on `sys.path` and none of its modules is
+            imported. Returns names to add to the script's globals.
+        on_cpu: Whether CPU stand-ins replace CUDA modules. Error messages depend on it.
 
     Raises:
-        SkipGSError: There is no such script or module, or a module of the script's checkout was imported
-            before from somewhere else.
+        SkipGSError: The script or module does not exist, or a module of the script's checkout was already imported
+            from another folder.
     """
     return _run(_resolve(command), attach, None, on_cpu)
 
@@ -45,7 +45,7 @@ def run_script(command: Sequence[str], attach: Attach | None = None, on_cpu: boo
 def run_in_script(
     command: Sequence[str], attach: Attach, run: Callable[[str, dict[str, Any]], None], on_cpu: bool = False
 ) -> int:
-    """As `run_script`, with `run(file of the script, names for its globals)` in place of running it."""
+    """Like `run_script`, but call `run(file, names)` instead of running the script."""
     return _run(_resolve(command), attach, run, on_cpu)
 
 
@@ -69,16 +69,17 @@ def _run(
                 return 1
             _print_traceback(error, program)
             if isinstance(error, ModuleNotFoundError) and error.name:
-                print(f"skipgs-plug: {what_brings(error.name, program.source, on_cpu)}", file=sys.stderr)
+                print(f"skipgs-plug: {install_hint(error.name, program.source, on_cpu)}", file=sys.stderr)
             return 130 if isinstance(error, KeyboardInterrupt) else 1
     return 0
 
 
 def source_of(command: Sequence[str]) -> Path:
-    """The file that `run_script` would run for this command.
+    """Return the file that `run_script` would run for this command.
 
     Raises:
-        SkipGSError: There is none.
+        SkipGSError: The script or module does not exist, or a module of the script's checkout was already imported
+            from another folder.
     """
     return _resolve(command).source
 
@@ -86,8 +87,8 @@ def source_of(command: Sequence[str]) -> Path:
 class _Program(NamedTuple):
     argv: list[str]
     folder: Path  # first on sys.path
-    source: Path  # whose frames the traceback begins with
-    run: Callable[[dict[str, Any]], Any]  # takes global names of the script
+    source: Path  # file of the script; the traceback begins with its frames
+    run: Callable[[dict[str, Any]], Any]  # called with names to add to the script's globals
 
 
 def _resolve(command: Sequence[str]) -> _Program:
@@ -126,10 +127,10 @@ def _call(installed: importlib.metadata.EntryPoint, names: dict[str, Any]) -> No
 
 
 def _source_of(module: str) -> Path | None:
-    """File of a module that is not imported for it, though its packages are."""
+    """Return the file of a module without importing the module; its packages are imported."""
     try:
         found = importlib.util.find_spec(module)
-    except ModuleNotFoundError:  # its package is not there either
+    except ModuleNotFoundError:  # the package of the module does not exist either
         return None
     return None if found is None or found.origin is None else Path(found.origin).resolve()
 
@@ -142,7 +143,7 @@ def _exit_code(code: Any) -> int:
 
 
 def _print_traceback(error: BaseException, program: _Program) -> None:
-    """As the interpreter prints it: from the first frame on that is the script's or lies in its checkout."""
+    """Print the traceback from the first frame of the script or its checkout on."""
 
     def is_ours(trace: types.TracebackType) -> bool:
         file = trace.tb_frame.f_code.co_filename
@@ -179,7 +180,7 @@ def _as_main_program(program: _Program) -> Iterator[None]:
 def _whole_checkpoints() -> Iterator[None]:
     """Let `torch.load` read checkpoints as it did before PyTorch 2.6.
 
-    The trainers save NumPy scalars beside their tensors, which the newer default refuses to load.
+    The trainers save NumPy scalars with their tensors. Newer versions of PyTorch refuse to load them by default.
     """
     load = torch.load
 

@@ -1,4 +1,4 @@
-"""Processes that a script spawns itself, one for each device: the launcher's work is done again in each of them."""
+"""Attach a gate in each process that a script spawns, usually one per GPU."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ Enter = Callable[[int, bytes], None]
 
 @contextmanager
 def gated_when_spawned(enter: Enter) -> Iterator[list[int]]:
-    """Let `torch.multiprocessing.spawn` begin each process with `enter(rank, call)`, which ends in `run_call`.
+    """Let `torch.multiprocessing.spawn` start each process with `enter(rank, call)`, which must call `run_call`.
 
-    A new process imports the main module of its parent before anything else. Here it imports none, so that `enter`
-    comes first, and can put stand-ins and wrappers in place before the script is imported.
+    A new process imports its parent's main module first. Here that module is empty, so `enter` runs first. It can
+    install stand-ins and wrappers before the script is imported.
 
     Args:
-        enter: Of a module that a new process can import; pickled, as its arguments are.
+        enter: A function of a module that a new process can import. It is pickled with its arguments.
 
     Yields:
-        How often processes were spawned is the length of this list, later.
+        A list that gets one entry per spawn.
     """
     spawn = torch.multiprocessing.spawn
     spawned: list[int] = []
 
     def spawn_gated(fn: Callable[..., Any], args: tuple[Any, ...] = (), *more: Any, **options: Any) -> Any:
-        call = bytes(ForkingPickler.dumps((fn, args)))  # while the script is the main module
+        call = bytes(ForkingPickler.dumps((fn, args)))  # pickled while the script is still the main module
         spawned.append(1)
         main = sys.modules["__main__"]
         sys.modules["__main__"] = types.ModuleType("__main__")
@@ -54,14 +54,17 @@ def gated_when_spawned(enter: Enter) -> Iterator[list[int]]:
 
 
 def run_call(command: Sequence[str], attach: Attach, rank: int, call: bytes, on_cpu: bool = False) -> int:
-    """In a spawned process: import the script as Python would there, and call what the script had spawned.
+    """Import the script in a spawned process, as Python would, and call the function that the script spawned.
 
     Args:
-        command: As for `run_script`.
-        attach: As for `run_script`.
-        rank: Number of the process.
-        call: What `gated_when_spawned` gave to `enter`.
-        on_cpu: As for `run_script`.
+        command: See `run_script`.
+        attach: See `run_script`.
+        rank: Number of the process, from 0.
+        call: The pickled call that `gated_when_spawned` passed to `enter`.
+        on_cpu: See `run_script`.
+
+    Returns:
+        The exit code.
     """
 
     def run(script: str, names: dict[str, Any]) -> None:

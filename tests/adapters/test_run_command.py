@@ -196,7 +196,7 @@ def test_script_that_never_trains_keeps_its_code(checkout, tmp_path, capfd):
         ),
         (["inria"], "no script to run"),
         (["inria", "--", "absent.py"], "absent.py: name the training script after '--'"),
-        (["inria", "--resume-gate", __file__, "--", __file__], "holds no gate state: give a file that ends in"),
+        (["inria", "--resume-gate", __file__, "--", __file__], "does not hold a gate state: give a file that ends in"),
         (["inria", "--ema-decay", "2", "--", __file__], "ema_decay must be in [0, 1)"),
     ],
 )
@@ -277,10 +277,16 @@ def test_gate_state_of_another_run_is_left_alone(train, capfd):
     state = whole / "chkpnt40.pth.skipgs.json"
     state.write_text(state.read_text().replace("train.py", "prune.py"))
     code, folder = train("other", "--start", str(whole / "chkpnt40.pth"))
-    assert code == 0 and "is of prune.py and iteration 40, while train.py begins with 41" in capfd.readouterr().err
+    assert (
+        code == 0
+        and "belongs to iteration 40 of prune.py, but train.py starts with iteration 41" in capfd.readouterr().err
+    )
     assert counted(folder)["iterations"] == 20
     code, _ = train("wrong", gate=["--resume-gate", str(state)])
-    assert code == cli.BAD_INPUT and "is of iteration 40, but the script goes on with 1" in capfd.readouterr().err
+    assert (
+        code == cli.BAD_INPUT
+        and "belongs to iteration 40, but the script continues with iteration 1" in capfd.readouterr().err
+    )
 
 
 def test_gate_states_go_with_their_checkpoints(train):
@@ -316,7 +322,7 @@ def test_missing_extension_is_the_scripts_own_error(checkout, tmp_path, capfd):
     assert cli.main(["run", "inria", "--", checkout, str(tmp_path)]) == 1  # without --cpu there are no stand-ins
     error = capfd.readouterr().err
     assert "Traceback" in error and "gaussian_renderer/__init__.py" in error and "launch.py" not in error
-    assert "diff_gaussian_rasterization is a CUDA extension that comes with the trainer" in error
+    assert "diff_gaussian_rasterization is a CUDA extension of the trainer" in error
     assert "skipgs_plug[full]" not in error
 
 
@@ -325,7 +331,7 @@ def test_script_outside_its_checkout_is_said(checkout, tmp_path, capfd):
     lonely.parent.mkdir()
     lonely.write_text(Path(checkout).read_text())
     assert cli.main(["run", "inria", "--cpu", "--", str(lonely), str(tmp_path)]) == 1
-    assert "train.py is not in its checkout: there is no gaussian_renderer beside it" in capfd.readouterr().err
+    assert "train.py is not in its checkout: its folder has no gaussian_renderer" in capfd.readouterr().err
 
 
 def test_torch_keeps_to_one_thread_on_the_cpu(checkout, tmp_path, capfd):
@@ -360,7 +366,7 @@ def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
     forget()
     script = Path(checkout)
     script.write_text(script.read_text().replace("loss.backward()", "loss.mul_(1); loss.backward()"))
-    with pytest.warns(RuntimeWarning, match=r"goes on without it.* changes values itself \(mul_\)"):
+    with pytest.warns(RuntimeWarning, match=r"goes on without it.* itself changes values \(mul_\)"):
         assert cli.main(["run", "auto", "--no-gate", "--cpu", "--", checkout, str(tmp_path)]) == 0
     forget()
     assert cli.main(["run", "auto", "--cpu", "--", checkout, str(tmp_path)]) == cli.BAD_INPUT
@@ -385,7 +391,7 @@ def test_rasterizer_of_a_forks_own_is_one_sentence(checkout, tmp_path, capfd, ol
     renderer.write_text(renderer.read_text().replace(old, new))
     assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
     error = capfd.readouterr().err
-    assert "has a rasterizer of its own, which --cpu has no stand-in for" in error and found in error
+    assert "uses its own rasterizer, for which --cpu has no stand-in" in error and found in error
     assert "Traceback" not in error
 
 
@@ -394,7 +400,7 @@ def test_no_advice_to_give_what_is_given(checkout, tmp_path, capfd):
     renderer.write_text("import diff_plane_rasterization\n" + renderer.read_text())
     assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
     error = capfd.readouterr().err
-    assert "diff_plane_rasterization is a CUDA extension that has no CPU stand-in" in error
+    assert "diff_plane_rasterization is a CUDA extension for which this adapter has no CPU stand-in" in error
     assert "with --cpu before" not in error
 
 
@@ -402,4 +408,4 @@ def test_a_resumed_run_without_a_state_says_so(train, capfd):
     _, off = train("off", "--save", gate=["--no-gate"])
     code, _ = train("on", "--start", str(off / "chkpnt40.pth"))
     state = off / "chkpnt40.pth.skipgs.json"
-    assert code == 0 and f"The gate starts afresh in iteration 41: there is no {state}." in capfd.readouterr().err
+    assert code == 0 and f"The gate starts afresh in iteration 41: {state} does not exist." in capfd.readouterr().err

@@ -140,8 +140,8 @@ def test_unknown_change_is_named_and_the_gate_begins_after_it(name, tmp_path):
     assert gate.adapter.name == name and gate.config.start_iter == 30
     assert len(sentences) == 2
     assert gate.adapter.checked.partition(" (")[0] in sentences[0]
-    assert sentences[0].endswith("Not recognised, and left to go on in skipped iterations: trim().")
-    assert sentences[1] == "The gate begins with iteration 30 in place of 20: the loop calls trim() until iteration 29."
+    assert sentences[0].endswith("Not recognised, and still executed in skipped iterations: trim().")
+    assert sentences[1] == "The gate starts at iteration 30 instead of 20: the loop calls trim() until iteration 29."
 
 
 @each

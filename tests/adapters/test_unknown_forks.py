@@ -81,10 +81,10 @@ def test_loop_of_inrias_own_is_no_stranger():
 @pytest.mark.parametrize(
     ("extra", "sentence"),
     [
-        ("gaussians.values['xyz'].add_(torch.randn(30, 3))", r"changes values itself \(add_, randn\)"),
-        ("gaussians.values['xyz'].data += 0.1", r"changes values itself \(data\)"),
-        ("gaussians.values['xyz'].add_(0.1)", r"changes values itself \(add_\)"),
-        ("[v.mul_(0.9) for v in gaussians.values.values()]", r"changes values itself \(mul_\)"),
+        ("gaussians.values['xyz'].add_(torch.randn(30, 3))", r"itself changes values \(add_, randn\)"),
+        ("gaussians.values['xyz'].data += 0.1", r"itself changes values \(data\)"),
+        ("gaussians.values['xyz'].add_(0.1)", r"itself changes values \(add_\)"),
+        ("[v.mul_(0.9) for v in gaussians.values.values()]", r"itself changes values \(mul_\)"),
     ],
 )
 def test_loop_that_changes_values_itself_is_refused(extra, sentence):
@@ -103,7 +103,7 @@ def test_further_calls_and_arguments_are_listed():
         gate = SkipGate(unknown_fork(", kernel_size=0.1", "gaussians.count()"), policy=SkipAlways())
     sentence = str(warnings[0].message)
     assert "Recognised: render, backward, training_setup, update_learning_rate." in sentence
-    assert sentence.endswith("left to go on in skipped iterations: render(kernel_size=), count().")
+    assert sentence.endswith("still executed in skipped iterations: render(kernel_size=), count().")
     with gate:
         train(gate.adapter.trainer)  # nothing moves, so it is gated to the end
     assert gate.report()["backwards_skipped"] == 21
@@ -136,7 +136,7 @@ def test_what_moves_beside_a_nan_is_still_found():
 
 
 def test_noise_for_a_network_is_listed_and_not_refused():
-    with pytest.warns(RuntimeWarning, match=r"left to go on in skipped iterations: randn\(\)"):
+    with pytest.warns(RuntimeWarning, match=r"still executed in skipped iterations: randn\(\)"):
         gate = SkipGate(unknown_fork(extra="noise = torch.randn(3)"), policy=SkipAlways())
     with gate:
         train(gate.adapter.trainer)
@@ -163,7 +163,7 @@ def test_functions_that_the_loop_calls_are_read_too():
     with pytest.warns(RuntimeWarning, match=r"in skipped iterations: count\(\)"):
         SkipGate(unknown_fork(extra="nudge(gaussians)", helper=helper)).detach()
     writes = helper.replace("gaussians.count()", "gaussians.values['xyz'].add_(1.0)")
-    with pytest.raises(AdapterMismatchError, match=r"changes values itself \(add_\)"):
+    with pytest.raises(AdapterMismatchError, match=r"itself changes values \(add_\)"):
         SkipGate(unknown_fork(extra="nudge(gaussians)", helper=writes))
 
 
@@ -184,7 +184,7 @@ def test_gate_begins_after_the_last_call_that_is_not_recognised(extra, start, fr
         gate = SkipGate(from_file(extra=extra), policy=SkipAlways())
     with gate:
         if start > 20:
-            with pytest.warns(RuntimeWarning, match=rf"begins with iteration {start} in place of 20: .* count\(\)"):
+            with pytest.warns(RuntimeWarning, match=rf"starts at iteration {start} instead of 20: .* count\(\)"):
                 train(gate.adapter.trainer)
         else:
             train(gate.adapter.trainer)

@@ -78,8 +78,11 @@ def test_a_link_to_nothing_is_named(pattern, tmp_path):
         ((), "gives no photograph;"),
         (("a.png",), "gives only 1 photograph;"),
         (("a.png", "b.png"), "gives only 2 photographs;"),
-        (("a.heic",), "a.heic has a format that cannot be read here; export as JPEG."),
-        (("a.heic", "b.NEF"), "a.heic has a format that cannot be read here, like 1 more; export as JPEG."),
+        (("a.heic",), "a.heic has a format that this package cannot read; export as JPEG."),
+        (
+            ("a.heic", "b.NEF"),
+            "a.heic has a format that this package cannot read (1 more of this kind); export as JPEG.",
+        ),
     ],
 )
 def test_too_few_or_unreadable_photographs_are_counted(pattern, tmp_path, names, sentence):

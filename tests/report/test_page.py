@@ -31,7 +31,7 @@ def rows_of(dom: str, caption: str) -> list[list[str]]:
 def test_browser_shows_a_training_run(train_folder, tmp_path, dump_dom):
     dom = dump_dom(make_page(tmp_path, train_folder))
     data = json.loads((train_folder / "skipgs.json").read_text())
-    (row,) = rows_of(dom, "What the gate did")
+    (row,) = rows_of(dom, "Decisions of the gate")
     assert row[:5] == ["gated", "40", "20", str(data["backwards_run"]), str(data["backwards_skipped"])]
     assert len(rows_of(dom, "Training views")) == 6
     assert dict(rows_of(dom, "Last evaluation"))["num_GS"].isdigit()
@@ -55,7 +55,7 @@ def test_a_run_without_a_gate_is_shown_with_its_worst_view_first(ungated_folder,
     )
     assert captions[first].startswith(f"{worst['view']}: {worst['psnr']:.2f} dB, worst of 2")
     assert captions[second].startswith(best["view"])
-    assert "What the gate did" not in dom
+    assert "Decisions of the gate" not in dom
     assert body_count(dom, "images") == body_count(dom, "decoded") == 3 + 6
 
 
@@ -98,13 +98,13 @@ def test_browser_shows_a_bench(bench_folder, tmp_path, dump_dom):
     assert all(len(row) == len(rows[0]) > 8 for row in rows)
     assert [row[0] for row in rows_of(dom, "Share of refinement time")] == ["own", "gate", "random"]
     assert "A perfect gate at this skip rate could save" in dom
-    assert "Share of backwards skipped in the course of refinement" in dom
+    assert "Share of backward passes skipped during refinement" in dom
     assert body_count(dom, "images") == body_count(dom, "decoded") == 6
 
 
 def test_browser_shows_the_run_of_an_upstream_script(script_folder, tmp_path, dump_dom):
     dom = dump_dom(make_page(tmp_path, script_folder))
-    (row,) = rows_of(dom, "What the gate did")
+    (row,) = rows_of(dom, "Decisions of the gate")
     assert row[:3] == ["output &amp; &lt;model&gt;", "60", "55"]
     assert [row[0] for row in rows_of(dom, "Training views")] == [f"cam/{i}&lt;b&gt;.png" for i in range(3)]
     assert body_count(dom, "images") == body_count(dom, "decoded") == 3
@@ -188,7 +188,7 @@ def test_unusable_input_is_one_sentence(tmp_path, capsys, content, sentence):
 def test_a_bench_without_decisions_is_shown_and_damaged_ones_are_named(bench_folder, tmp_path, capsys):
     folder = tmp_path / "copy"
     shutil.copytree(bench_folder, folder, ignore=shutil.ignore_patterns("decisions.json", "snapshots"))
-    assert "in the course of refinement" not in make_page(tmp_path, folder).read_text()
+    assert "skipped during refinement" not in make_page(tmp_path, folder).read_text()
     (folder / "decisions.json").write_text("{}")
     assert main(["report", str(folder)]) == 2
     assert "decisions.json holds no decisions" in capsys.readouterr().err
@@ -232,13 +232,13 @@ def test_the_phases_of_a_run_are_told_and_the_whole_is_estimated(shared_folder, 
     ran, skipped = data["iterations_run"], data["iterations_skipped"]
     assert ran + skipped == 200 and skipped > 0
     assert rows["iterations of the schedule"] == ["200", "200", "400"]
-    assert rows["left out"] == [f"{left_out}", f"{skipped}", f"{left_out + skipped}"]
+    assert rows["iterations left out"] == [f"{left_out}", f"{skipped}", f"{left_out + skipped}"]
     events = str(growing["events_skipped"])
     assert rows["densification events left out"] == [events, "-", events]
     gaussians = json.loads((shared_folder / "stats/train_curve.json").read_text())["num_GS"]
     assert rows["Gaussians at the end"][2] == f"{gaussians[-1]:,}"
     whole = (data["t_total"] - data["t_post"]) * 200 / run + data["t_post"] * 200 / ran
-    assert rows["without leaving out, s (estimate)"][2] == f"{whole:.0f}"
+    assert rows["training without left-out iterations, s (estimate)"][2] == f"{whole:.0f}"
     assert "It was not measured" in page and "dashed: the end of growing" in page
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.scripts.import_hints import what_brings
+from skipgs_plug.scripts.import_hints import install_hint
 from skipgs_plug.scripts.launch import run_script
 
 
@@ -159,7 +159,7 @@ def test_a_module_imported_from_elsewhere_is_refused(checkout, tmp_path, monkeyp
 def test_missing_module_is_named(checkout, capfd):
     assert run_script([write(checkout, "import absent_module_of_script.part\n")]) == 1
     error = capfd.readouterr().err
-    assert "Traceback" in error and "train.py needs the module absent_module_of_script, which is neither" in error
+    assert "Traceback" in error and "train.py needs the module absent_module_of_script, which is not" in error
     assert "pip install" not in error  # it may be a file that the checkout lacks, and an index may hold that name
 
 
@@ -168,7 +168,7 @@ def test_missing_module_is_named(checkout, capfd):
     [
         ("absent_module", "requirements.txt", "numpy\nAbsent-Module>=2\n", "lists; run: pip install absent_module"),
         ("absent_module", "../environment.yml", "  - absent_module=1.0\n", "environment.yml lists; run: pip install"),
-        ("absent", "requirements.txt", "absent-module\n", "if it is a file of the script's checkout"),
+        ("absent", "requirements.txt", "absent-module\n", "If absent is part of the checkout"),
         ("skimage", None, "", "run: pip install scikit-image"),
         (
             "skimage",
@@ -183,7 +183,7 @@ def test_only_packages_are_said_to_be_installed(tmp_path, module, listing, text,
     script.parent.mkdir()
     if listing is not None:
         (script.parent / listing).write_text(text)
-    assert advice in what_brings(module, script)
+    assert advice in install_hint(module, script)
 
 
 def test_error_while_attaching_is_the_scripts(checkout, capfd):
