@@ -1,4 +1,4 @@
-"""Densification events: which of them a thinned growing phase keeps."""
+"""Densification events: which of them run when iterations of the growing phase are left out."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from skipgs_plug.core.pace.visibility import VISIBLE
 from skipgs_plug.core.trainer_info import Densification
 
 # Iterations that a densification event needs if a view shows almost none of the Gaussians. With more of them shown, an
-# event needs fewer: times (1 - share shown) to the power `NARROW_VIEWS`. A thinned run is less far at each event than
-# the trainer's own, so more gradients exceed the threshold. With every event kept, a tenth of 15,000 iterations ends
+# event needs fewer: times (1 - share shown) to the power `NARROW_VIEWS`. A run of fewer iterations is less far at each
+# event than the trainer's own, so more gradients exceed the threshold. With every event kept, a tenth of 15,000 iterations ends
 # with 170 % of the Gaussians on bonsai, where a view shows a third of them, and with 190 % on a ray-traced scene, where
 # it shows three quarters. Where it shows nearly all, as on Lego and fern, the number of events limits growth: with
 # every second event they end with half to three quarters. The two numbers are fitted: for as many Gaussians as in the

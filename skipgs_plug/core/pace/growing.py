@@ -28,8 +28,8 @@ from skipgs_plug.core.trainer_info import Densification
 
 # Number of steps over which the share of the Gaussians that a view shows is averaged before it decides on shares.
 MEASURED = 20
-# The same after each event that was kept. The share falls as the scene grows, on bonsai from 46 % to 30 %. A few steps
-# are precise enough to count visits, and each measured step can cost a read of the GPU.
+# Number of these steps after each event that ran. The share falls as the scene grows, on bonsai from 46 % to 30 %. A few
+# steps are precise enough to count visits, and each measured step can cost a read of the GPU.
 MEASURED_AGAIN = 8
 UNCHANGED = 1.0, GrowingParts(1.0, 1.0)  # factor and parts of the trainer's own steps
 
@@ -66,7 +66,7 @@ class Growing:
         self._length = 0
         self._epoch = 0
         self._visible: float | None = None  # share that a view shows, in the first measurement; it settles `share`
-        self._visible_now: float | None = None  # the same in the latest measurement
+        self._visible_now: float | None = None  # that share in the latest measurement
         self._share_now: float | None = None  # share of the present iterations; None for `share`
         self._rows_at_first = 0  # number of Gaussians at the first event
         self._measuring = True

@@ -29,7 +29,8 @@ STEPS_PER_EVENT = 14
 # make the following ones come sooner, with more iterations: bonsai that grows from 3,000 points to 97,000 in 30,000
 # iterations lost 2.5 dB with a tenth of them. From all its points bonsai adds 0 to 3 % per event.
 GROWTH_PER_EVENT = 0.03
-# The same for the number of iterations that an event needs, which decides on the number of Gaussians. With 0.03 bonsai
+# Largest growth per event, as a share of the Gaussians, at which the following event needs as many iterations as ever.
+# These decide on the number of Gaussians. With 0.03 bonsai
 # that grows from 3,000 points ended with 95 % of its Gaussians, 0.20 dB and 0.007 SSIM below its own run, with 0.025 it
 # ends with 105 %, level. From 8,000 points it was 91 %, and is 101 % and 0.1 dB more. With 0.02 it was 116 %.
 GROWTH_BEFORE_EVENTS_COME_SOONER = 0.025
@@ -52,11 +53,11 @@ MOST_FOR_NEW_GAUSSIANS = 2.0
 # Largest factor on rates while the scene grows. On two seeds of 6,000 iterations Lego ends with 108 and 118 % of its
 # Gaussians with a factor of 4, with 99 and 105 % with 3, and 0.1 to 0.25 dB lower with 2.5.
 LONGEST_STEPS = 3.0
-# The same if a budget or a share per event sets the number of Gaussians, which longer steps then do not raise. With 3,
+# Largest factor on rates where a budget or a share per event sets the number of Gaussians, which longer steps do not
+# raise. With 3,
 # the script of 3DGS-MCMC, which had this bound then, ended at 29.8 and 30.3 dB on fern, with 4 at 30.5 (own run 30.6).
 LONGEST_STEPS_BY_BUDGET = 4.0
-
-# The same, and the largest factor on the rate of positions, in any schedule without opacity resets. With 30,000
+# Largest factor on rates, those of positions included, in any schedule without opacity resets. With 30,000
 # iterations, 3DGS-MCMC on Lego ends 0.02 dB below its own run with 8, 0.2 dB with 4 and 0.3 dB with 16. With 7,000 on
 # bonsai, positions at 8 instead of 4 times their rate gain 0.2 and 0.7 dB (two seeds).
 LONGEST_STEPS_WITHOUT_RESETS = 8.0
@@ -67,20 +68,20 @@ LONGEST_STEPS_OF_POSITIONS = 4.0
 
 # Refining (after densification ends).
 LEAST_SHARE = 0.2  # least share of the iterations that run, in any schedule
-# The same if iterations were left out before refinement too. Steps then shrink once, and no view is watched.
+# Least share if iterations were left out before refinement too. Steps then shrink once, and no view is watched.
 LEAST_SHARE_AFTER_FEW = 0.12
 LEAST_STEPS = 400  # least number of iterations, so that steps can shrink
-# The same if iterations were left out before refinement too. With 400 scripts of 3,000 iterations end 0.1 to 0.2 dB
+# Least number if iterations were left out before refinement too. With 400 scripts of 3,000 iterations end 0.1 to 0.2 dB
 # lower on bonsai than with 600, and up to 0.2 dB below their own runs. 600 would take over 40 % of the time on fern.
 # Longer schedules need more, as while the scene grows: of 3,000 iterations, 550 lost 0.1 dB on a ray-traced scene.
 LEAST_STEPS_AFTER_FEW = 550
-# Largest share that this number asks for. Where all iterations run, steps are not longer and do not shrink: 500 such
+# Largest share that the least number of iterations can ask for. Where all iterations run, steps are not longer and do not shrink: 500 such
 # iterations after its last prune ended 0.3 dB lower than 400 for LightGaussian.
 MOST_SHARE_OF_STEPS = 0.8
 # Share of the iterations that run if refinement shows each view once. The share falls with the fourth root of the
 # number of visits. On bonsai, shares of 0.35, 0.3 and 0.25 lose nothing at 2, 6 and 12 visits.
 RARE_SHARE = 0.46
-# The same share if iterations were left out before refinement too. On bonsai at 59 visits (30,000 iterations) a share
+# This share if iterations were left out before refinement too. On bonsai at 59 visits (30,000 iterations) a share
 # of 0.18 loses nothing, and 0.15 loses 0.2 dB.
 RARE_SHARE_AFTER_FEW = 0.48
 

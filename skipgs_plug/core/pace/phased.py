@@ -244,8 +244,8 @@ class Phased(Pace):
                 marks = ", ".join(self._densification.marks)
                 self._grow_whole(f"No condition of the loop that names {marks} holds before iteration {self._start}")
         held = {reason: hits for reason, hits in found[1].items() if hits}
-        thinned = self.growing is not None and bool(grown) and self.growing.leaves_out
-        before = self.refining.first - begun if thinned else 0
+        leaves_out = self.growing is not None and bool(grown) and self.growing.leaves_out
+        before = self.refining.first - begun if leaves_out else 0
         self.refining.begin(self._last, held, self._views, epoch, self._keeps_steps, before)
 
     def _require_events(self) -> None:
