@@ -11,13 +11,14 @@ from skipgs_plug.core.pace.needs import LEAST_GROWING_SHARE
 from skipgs_plug.core.pace.visibility import VISIBLE
 from skipgs_plug.core.trainer_info import Densification
 
-# Iterations that a densification event needs if a view shows almost none of the Gaussians. With more of them shown, an
-# event needs fewer: times (1 - share shown) to the power `NARROW_VIEWS`. A run of fewer iterations is less far at each
-# event than the trainer's own, so more gradients exceed the threshold. With every event kept, a tenth of 15,000 iterations ends
-# with 170 % of the Gaussians on bonsai, where a view shows a third of them, and with 190 % on a ray-traced scene, where
-# it shows three quarters. Where it shows nearly all, as on Lego and fern, the number of events limits growth: with
-# every second event they end with half to three quarters. The two numbers are fitted: for as many Gaussians as in the
-# own run, bonsai needs about 47 iterations per event, the ray-traced scene 32, fern at most 40 and Lego at most 10.
+# Iterations that a densification event needs if a view shows almost none of the Gaussians. With more of them shown,
+# an event needs fewer: times (1 - share shown) to the power `NARROW_VIEWS`. A run of fewer iterations is less far at
+# each event than the trainer's own, so more gradients exceed the threshold. With every event kept, a tenth of 15,000
+# iterations ends with 170 % of the Gaussians on bonsai, where a view shows a third of them, and with 190 % on a
+# ray-traced scene, where it shows three quarters. Where it shows nearly all, as on Lego and fern, the number of
+# events limits growth: with every second event they end with half to three quarters. The two numbers are fitted: for
+# as many Gaussians as in the own run, bonsai needs about 47 iterations per event, the ray-traced scene 32, fern at
+# most 40 and Lego at most 10.
 STEPS_BEHIND = 55.0
 NARROW_VIEWS = 0.4
 # A larger share than a tenth has more iterations between two events, which would all run otherwise: on the ray-traced

@@ -28,8 +28,8 @@ from skipgs_plug.core.trainer_info import Densification
 
 # Number of steps over which the share of the Gaussians that a view shows is averaged before it decides on shares.
 MEASURED = 20
-# Number of these steps after each event that ran. The share falls as the scene grows, on bonsai from 46 % to 30 %. A few
-# steps are precise enough to count visits, and each measured step can cost a read of the GPU.
+# Number of these steps after each event that ran. The share falls as the scene grows, on bonsai from 46 % to 30 %. A
+# few steps are precise enough to count visits, and each measured step can cost a read of the GPU.
 MEASURED_AGAIN = 8
 UNCHANGED = 1.0, GrowingParts(1.0, 1.0)  # factor and parts of the trainer's own steps
 

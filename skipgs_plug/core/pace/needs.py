@@ -29,10 +29,10 @@ STEPS_PER_EVENT = 14
 # make the following ones come sooner, with more iterations: bonsai that grows from 3,000 points to 97,000 in 30,000
 # iterations lost 2.5 dB with a tenth of them. From all its points bonsai adds 0 to 3 % per event.
 GROWTH_PER_EVENT = 0.03
-# Largest growth per event, as a share of the Gaussians, at which the following event needs as many iterations as ever.
-# These decide on the number of Gaussians. With 0.03 bonsai
-# that grows from 3,000 points ended with 95 % of its Gaussians, 0.20 dB and 0.007 SSIM below its own run, with 0.025 it
-# ends with 105 %, level. From 8,000 points it was 91 %, and is 101 % and 0.1 dB more. With 0.02 it was 116 %.
+# Largest growth per event, as a share of the Gaussians, at which the following event needs as many iterations as
+# ever. These decide on the number of Gaussians. With 0.03 bonsai that grows from 3,000 points ended with 95 % of its
+# Gaussians, 0.20 dB and 0.007 SSIM below its own run, with 0.025 it ends with 105 %, level. From 8,000 points it was
+# 91 %, and is 101 % and 0.1 dB more. With 0.02 it was 116 %.
 GROWTH_BEFORE_EVENTS_COME_SOONER = 0.025
 # How much a share is raised for Gaussians that are new: by a part of the logarithm of their number, as a multiple of
 # the number at the beginning. Up to e times as many need nothing more.
@@ -54,8 +54,8 @@ MOST_FOR_NEW_GAUSSIANS = 2.0
 # Gaussians with a factor of 4, with 99 and 105 % with 3, and 0.1 to 0.25 dB lower with 2.5.
 LONGEST_STEPS = 3.0
 # Largest factor on rates where a budget or a share per event sets the number of Gaussians, which longer steps do not
-# raise. With 3,
-# the script of 3DGS-MCMC, which had this bound then, ended at 29.8 and 30.3 dB on fern, with 4 at 30.5 (own run 30.6).
+# raise. With 3, the script of 3DGS-MCMC, which had this bound then, ended at 29.8 and 30.3 dB on fern, with 4 at 30.5
+# (own run 30.6).
 LONGEST_STEPS_BY_BUDGET = 4.0
 # Largest factor on rates, those of positions included, in any schedule without opacity resets. With 30,000
 # iterations, 3DGS-MCMC on Lego ends 0.02 dB below its own run with 8, 0.2 dB with 4 and 0.3 dB with 16. With 7,000 on
@@ -75,8 +75,8 @@ LEAST_STEPS = 400  # least number of iterations, so that steps can shrink
 # lower on bonsai than with 600, and up to 0.2 dB below their own runs. 600 would take over 40 % of the time on fern.
 # Longer schedules need more, as while the scene grows: of 3,000 iterations, 550 lost 0.1 dB on a ray-traced scene.
 LEAST_STEPS_AFTER_FEW = 550
-# Largest share that the least number of iterations can ask for. Where all iterations run, steps are not longer and do not shrink: 500 such
-# iterations after its last prune ended 0.3 dB lower than 400 for LightGaussian.
+# Largest share that the least number of iterations can ask for. Where all iterations run, steps are not longer and do
+# not shrink: 500 such iterations after its last prune ended 0.3 dB lower than 400 for LightGaussian.
 MOST_SHARE_OF_STEPS = 0.8
 # Share of the iterations that run if refinement shows each view once. The share falls with the fourth root of the
 # number of visits. On bonsai, shares of 0.35, 0.3 and 0.25 lose nothing at 2, 6 and 12 visits.
