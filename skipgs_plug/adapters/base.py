@@ -10,7 +10,7 @@ import torch
 
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.clock import Times
-from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.hooks import Hooks
 
 
@@ -98,6 +98,10 @@ class AbstractAdapter(ABC):
             return original(trainer, *args, **kwargs)
 
         hooks.wrap(owner, method, begins)
+
+    def mismatch(self, expected: str) -> AdapterMismatchError:
+        """Return the error for a trainer that is not as `expected`, which completes "Adapter ... expects"."""
+        return AdapterMismatchError(f"Adapter {self.name!r} expects {expected}, as in {self.checked}.")
 
     def must_run(self, step: int) -> bool:
         """Return whether this iteration must not be skipped. Its loss is not recorded either."""

@@ -12,7 +12,6 @@ from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import ASSIGNED
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.unknown_forks import CALLS, Survey
-from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.core.views import view_key
@@ -51,9 +50,7 @@ class EDGS(AbstractAdapter):
     def attach(self, hooks: Hooks) -> None:
         trainer = self.trainer
         if not self.matches(trainer):
-            raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects an EDGSTrainer with {', '.join(EXPECTED)}, as in {self.checked}."
-            )
+            raise self.mismatch(f"an EDGSTrainer with {', '.join(EXPECTED)}")
         gate_backwards_only(hooks, self)
 
         def stepped(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

@@ -11,7 +11,6 @@ from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.unknown_forks import Survey
-from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 
@@ -72,9 +71,7 @@ class FasterGS(AbstractAdapter):
     def attach(self, hooks: Hooks) -> None:
         trainer = self.trainer
         if not self.matches(trainer):
-            raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects a FasterGSTrainer with {', '.join(EXPECTED)}, as in {self.checked}."
-            )
+            raise self.mismatch(f"a FasterGSTrainer with {', '.join(EXPECTED)}")
         gate_backwards_only(hooks, self)
 
         def rendered(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

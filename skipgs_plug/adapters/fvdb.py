@@ -12,7 +12,7 @@ from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.unknown_forks import Survey
-from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
+from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 
@@ -57,10 +57,7 @@ class FVDB(AbstractAdapter):
     def attach(self, hooks: Hooks) -> None:
         runner = self.trainer
         if not self.matches(runner):
-            raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects a SceneOptimizationRunner with {', '.join(EXPECTED)}, "
-                f"as in {self.checked}."
-            )
+            raise self.mismatch(f"a SceneOptimizationRunner with {', '.join(EXPECTED)}")
         gate_backwards_only(hooks, self)
         config, dataset = runner.config, runner.training_dataset
         if config.crops_per_image != 1:

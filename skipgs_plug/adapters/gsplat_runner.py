@@ -18,7 +18,7 @@ from skipgs_plug.adapters.gsplat_strategy import (
 )
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
-from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
+from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.host_copy import HostCopy
@@ -78,9 +78,7 @@ class GsplatRunner(AbstractAdapter):
         runner = self.trainer
         missing = [name for name in EXPECTED if not hasattr(runner, name)]
         if missing:
-            raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects a Runner with {', '.join(missing)}, as in {self.checked}."
-            )
+            raise self.mismatch(f"a Runner with {', '.join(missing)}")
         strategy = runner.cfg.strategy
         refuse_frozen(runner.cfg, hooks)
         survey = survey_of(self, strategy)

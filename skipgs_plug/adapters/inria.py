@@ -146,10 +146,7 @@ class InriaFamily(AbstractAdapter):
     def attach(self, hooks: Hooks) -> None:
         names = namespace_of(self.trainer)
         if names is None or LOOP not in names or "GaussianModel" not in names:
-            raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects a train module with {LOOP}() and GaussianModel, or its "
-                f"{LOOP} function, as in {self.checked}."
-            )
+            raise self.mismatch(f"a train module with {LOOP}() and GaussianModel, or its {LOOP} function")
         code = LoopCode.of_module(names)
         self._refuse_fork(code)
         self.examine(code, self._renderers(names), names["GaussianModel"])
@@ -279,9 +276,7 @@ class InriaFamily(AbstractAdapter):
         missing = [name for name in ("opt", "iteration") if name not in loop]
         if scene is None or missing:
             wanted = ", ".join(missing or self.scenes)
-            raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects {wanted} among the variables of {LOOP}(), as in {self.checked}."
-            )
+            raise self.mismatch(f"{wanted} among the variables of {LOOP}()")
         opt, self._step = loop["opt"], int(loop["iteration"])
         self.output_folder = getattr(scene, "model_path", None)
         cameras = scene.getTrainCameras()

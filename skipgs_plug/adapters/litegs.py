@@ -14,7 +14,6 @@ from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import ASSIGNED
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.unknown_forks import Survey
-from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 
@@ -65,9 +64,7 @@ class LiteGS(AbstractAdapter):
     def attach(self, hooks: Hooks) -> None:
         names = _namespace(self.trainer)
         if names is None or not all(name in names for name in EXPECTED):
-            raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects the module {MODULE} or its function {LOOP}, as in {self.checked}."
-            )
+            raise self.mismatch(f"the module {MODULE} or its function {LOOP}")
         gate_backwards_only(hooks, self)
         self._attach_to(hooks, names)
 

@@ -19,7 +19,6 @@ from skipgs_plug.adapters.gsplat_strategy import (
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.loss_scaler import guard_scaler
 from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
-from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 
@@ -64,9 +63,7 @@ class Nerfstudio(AbstractAdapter):
         trainer = self.trainer
         pipeline = getattr(trainer, "pipeline", None)
         if pipeline is None or not hasattr(trainer, LOOP):
-            raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects a Trainer with {LOOP}() whose setup() was called, as in {self.checked}."
-            )
+            raise self.mismatch(f"a Trainer with {LOOP}() whose setup() was called")
         names = view_names(pipeline.datamanager.train_dataset.image_filenames)
 
         def forwarded(original: Callable[..., Any], step: int) -> Any:

@@ -12,7 +12,6 @@ import torch
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.caution import caution
-from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 
@@ -74,9 +73,7 @@ class StepTrainer(AbstractAdapter):
         trainer = self.trainer
         missing = [name for name in EXPECTED if not hasattr(trainer, name)]
         if missing:
-            raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects a trainer with {', '.join(missing)}, as in {self.checked}."
-            )
+            raise self.mismatch(f"a trainer with {', '.join(missing)}")
 
         bounds = {name: getattr(part, name) for part in layers(trainer) for name in dir(part) if name.endswith(BOUND)}
         end = max(bounds.values()) + 1 if bounds else None

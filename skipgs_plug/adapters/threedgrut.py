@@ -9,7 +9,6 @@ from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.adapters.unknown_forks import Survey
-from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 
@@ -86,9 +85,7 @@ class ThreeDGRUT(AbstractAdapter):
     def attach(self, hooks: Hooks) -> None:
         trainer = self.trainer
         if not self.matches(trainer):
-            raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects a Trainer3DGRUT with {', '.join(EXPECTED)}, as in {self.checked}."
-            )
+            raise self.mismatch(f"a Trainer3DGRUT with {', '.join(EXPECTED)}")
         gate_backwards_only(hooks, self)
         paths = getattr(trainer.train_dataset, "image_paths", None)
         names = None if paths is None else [str(path) for path in paths]

@@ -21,8 +21,8 @@ from scipy.spatial.transform import Rotation
 from skipgs_plug.commands.view import Draw
 from skipgs_plug.fallback_raster.oracle.torch_reference_projection import spherical_harmonics
 from skipgs_plug.view.model import open_model
+from skipgs_plug.view.web.rotate_model import turn, turned_harmonics, upright
 from skipgs_plug.view.web.server import WebPage
-from skipgs_plug.view.web.turn import turn, turned_harmonics, upright
 
 pytestmark = pytest.mark.timeout(600)
 

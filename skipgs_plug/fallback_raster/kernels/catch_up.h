@@ -1,7 +1,7 @@
 // Applies to each listed row the steps with zero gradient that it missed, and then one step with a gradient if there is
 // one.
 //
-// The result equals to the bit that of `adam.h` for the same steps. A step of `adam.h` has two divisions and a square
+// The result is bit-identical to that of `adam.h` for the same steps. A step of `adam.h` has two divisions and a square
 // root, which take 35 cycles for 16 floats. Where no number comes near underflow, multiply-adds give the same correctly
 // rounded results (Markstein, IBM J. Res. Dev. 34, 1990) in 15 cycles.
 //

@@ -21,7 +21,7 @@ from typing import Annotated, NamedTuple
 from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, FloatOutput, IntArray, IntOutput
 from .binning import TileLists
-from .structs import Channels, Grid, PairSums, SplatGradients
+from .structs import BLOCKS, Channels, Grid, PairSums, SplatGradients
 
 
 class Pixels(NamedTuple):
@@ -152,7 +152,7 @@ def compiled_width(channels: int) -> int:
     return min(width for width in _WIDTHS if width >= channels)
 
 
-@worker(file="reduce_pairs.h", items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS", grain="1")
+@worker(file="reduce_pairs.h", items=BLOCKS, grain="1")
 def reduce_pairs(
     *,
     sums: PairSums,

@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 
 from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, FloatOutput, IntArray, IntOutput
-from .structs import BlockRows, Camera, GaussianGradients, Gaussians, ProjectedGradients, RowList
+from .structs import BLOCKS, BlockRows, Camera, GaussianGradients, Gaussians, ProjectedGradients, RowList
 
 
 class Limits(NamedTuple):
@@ -31,7 +31,7 @@ class Projected(NamedTuple):
     opacities: Annotated[FloatOutput, "n if raw else 0"]  # activated, and compensated where antialiased
 
 
-@worker(file="project_forward.h", items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS", grain="1")
+@worker(file="project_forward.h", items=BLOCKS, grain="1")
 def project_forward(
     *,
     gaussians: Gaussians,
@@ -60,7 +60,7 @@ def list_visible(
 ) -> None: ...
 
 
-@worker(file="project_adjoint.h", items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS", grain="1")
+@worker(file="project_adjoint.h", items=BLOCKS, grain="1")
 def project_adjoint(
     *,
     gaussians: Gaussians,

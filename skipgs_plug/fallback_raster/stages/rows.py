@@ -11,7 +11,7 @@ from ..runtime.constants import BLOCK_ROWS, blocks
 from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, FloatOutput, IntArray
 from .project import list_visible
-from .structs import BlockRows, RowList
+from .structs import BLOCKS, BlockRows, RowList
 
 
 @worker(file="take_rows.h", items="n", grain="4096")
@@ -25,7 +25,7 @@ def _take_rows(
 ) -> None: ...
 
 
-@worker(file="put_rows.h", items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS", grain="1")
+@worker(file="put_rows.h", items=BLOCKS, grain="1")
 def _put_rows(
     *,
     visible: RowList,

@@ -7,10 +7,10 @@ from typing import Annotated
 
 from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, FloatOutput
-from .structs import FactorOutput, Harmonics, HarmonicsGradients, RowList
+from .structs import BLOCKS, FactorOutput, Harmonics, HarmonicsGradients, RowList
 
 
-@worker(file="sh_forward.h", items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS", grain="1")
+@worker(file="sh_forward.h", items=BLOCKS, grain="1")
 def sh_forward(
     *,
     means: Annotated[FloatArray, "n, 3"],
@@ -22,7 +22,7 @@ def sh_forward(
 ) -> None: ...
 
 
-@worker(file="sh_adjoint.h", items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS", grain="1", structs=(FactorOutput,))
+@worker(file="sh_adjoint.h", items=BLOCKS, grain="1", structs=(FactorOutput,))
 def sh_adjoint(
     *,
     means: Annotated[FloatArray, "n, 3"],

@@ -9,6 +9,7 @@ from typing import Annotated, NamedTuple
 from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, FloatOutput
 from .structs import (
+    BLOCKS,
     Camera,
     Channels,
     FactorOutput,
@@ -41,7 +42,7 @@ class CenterGradients(NamedTuple):
 
 @worker(
     file="splat_adjoint.h",
-    items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS",
+    items=BLOCKS,
     grain="1",
     structs=(Channels, ProjectedGradients, RowList, SplatGradients),
 )

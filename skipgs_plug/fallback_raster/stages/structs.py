@@ -9,6 +9,9 @@ from typing import Annotated, NamedTuple
 from ..runtime.constants import tiles
 from ..runtime.parameters import FloatArray, FloatOutput, IntArray, IntOutput
 
+# C++ expression for the number of blocks, for workers whose items are blocks of the `n` Gaussians.
+BLOCKS = "(n + BLOCK_ROWS - 1) / BLOCK_ROWS"
+
 
 class Gaussians(NamedTuple):
     """Parameters of Gaussians. With `raw`, scales are logarithms."""

@@ -17,7 +17,7 @@ from ..runtime.optimizations import OPTIMIZATIONS, active_optimizations
 from ..runtime.parameters import FloatOutput, IntArray, IntOutput
 from .binning import Bins, bin_gaussians
 from .rows import visible_rows
-from .structs import BlockRows, Grid, RowList, Splats, grid
+from .structs import BLOCKS, BlockRows, Grid, RowList, Splats, grid
 
 # Visible Gaussians per tile of the image below which everything is listed in one pass: sampling would cost more time
 # than it saves.
@@ -59,7 +59,7 @@ def _near_ranges(
 ) -> None: ...
 
 
-@worker(file="list_open.h", items="(n + BLOCK_ROWS - 1) / BLOCK_ROWS", grain="1")
+@worker(file="list_open.h", items=BLOCKS, grain="1")
 def _list_open(
     *,
     visible: RowList,

@@ -26,7 +26,7 @@ from skipgs_plug.view.model import Model
 from skipgs_plug.view.page import ERROR_GAIN, RADIUS, Splats, field_of_view, require_address
 from skipgs_plug.view.sog import to_sog
 from skipgs_plug.view.upright import up_direction
-from skipgs_plug.view.web.turn import turn, upright
+from skipgs_plug.view.web.rotate_model import turn, upright
 
 log = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""Turn and scale a model, with its rotations and spherical harmonics."""
+"""Rotate and scale a model, with its quaternions and spherical harmonics."""
 
 from __future__ import annotations
 
