@@ -62,6 +62,7 @@ ADAPTER = {
     "attach_on_call": "(self, hooks: 'Hooks', owner: 'Any', method: 'str') -> 'None'",
     "attach_script": "(self, hooks: 'Hooks') -> 'None'",
     "matches": "(trainer: 'Any') -> 'bool'",
+    "mismatch": "(self, expected: 'str') -> 'AdapterMismatchError'",
     "must_run": "(self, step: 'int') -> 'bool'",
     "optimizers": "(self) -> 'Iterable[torch.optim.Optimizer]'",
     "recognises_script": "(code: 'LoopCode') -> 'bool'",
