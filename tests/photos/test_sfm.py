@@ -45,7 +45,7 @@ def test_photographs_become_a_scene(photos, tmp_path, capsys, monkeypatch, mappi
     assert main(["sfm", str(photos), str(scene), "--mapping", mapping]) == 0
     captured = capsys.readouterr()
     assert f"8 of 10 photographs placed (exhaustive matching, {mapping} mapping)" in captured.out
-    assert re.search(r"blurred\.png: blurred", captured.out)
+    assert re.search(r"blurred\.png: is blurred", captured.out)
     assert re.search(r"elsewhere\.png: overlaps no other photograph", captured.out)
     placing = "Placing photographs" + (" all at once" if mapping == "global" else "")
     assert f"{placing}: " in captured.err
