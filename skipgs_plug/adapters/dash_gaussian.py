@@ -13,7 +13,10 @@ class DashGaussian(InriaFamily):
     checked = "YouyuChen0207/DashGaussian 4e3b5606 (train_dash.py, run on the CPU)"
     project = "[DashGaussian, `train_dash.py`](https://github.com/YouyuChen0207/DashGaussian)"
     gated = "From `densify_until_iter` on: resolution and number of Gaussians are constant."
-    left_alone = "Both optimizers, sparse Adam too. Its `train.py` is Inria's; use adapter `inria` for it."
+    left_alone = (
+        "In skipped iterations neither the optimizer of the Gaussians (sparse Adam too) nor that of the exposure has "
+        "gradients. Its `train.py` is Inria's; use adapter `inria` for it."
+    )
     stand_ins = "dash_gaussian"
     mark = "TrainingScheduler"
     calls = ("prune_and_densify",)

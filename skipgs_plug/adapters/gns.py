@@ -7,15 +7,14 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from skipgs_plug.adapters.inria import GROWS_WHOLE, InriaFamily
+from skipgs_plug.adapters.improved_gs import ImprovedGS
+from skipgs_plug.adapters.inria import GROWS_WHOLE
 from skipgs_plug.core.hooks import Hooks
-from skipgs_plug.core.trainer_info import Densification
 
-ACCUMULATES_FROM = 20_000  # train.py has this number in it
 PRUNED = "prune_iter"  # the loop's variable for the iteration of the final prune
 
 
-class GNS(InriaFamily):
+class GNS(ImprovedGS):
     """Gated after the selection, in which a term of the loss pushes opacities of Gaussians to zero.
 
     The final prune comes early if few enough Gaussians are left. Both optimizers step every 5th and later every 20th
@@ -35,16 +34,10 @@ class GNS(InriaFamily):
         "All events are kept. All iterations of the selection run: its term would act alone if iterations between "
         f"were left out. {GROWS_WHOLE}"
     )
-    left_alone = (
-        "Both optimizers step every 5th and later every 20th iteration with the gradients gathered since, even in a "
-        "skipped iteration."
-    )
-    stand_ins = "improved_gs"
+    left_alone = ImprovedGS.left_alone
     mark = "update_opacity_lr"
-    densification = Densification(marks=("densification_interval",), needs="nothing")
-    structural = (*InriaFamily.structural, "only_prune")
-    calls = ("add_densification_stats_abs", "final_prune", "densify_and_prune_Improved", "update_opacity_lr")
-    arguments = ("pixel_weights",)
+    calls = (*ImprovedGS.calls, "final_prune", "update_opacity_lr")
+    accumulates_from = 20_000
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
@@ -81,7 +74,7 @@ class GNS(InriaFamily):
         return int(opt.s2) if self._fast else int(opt.densify_until_iter)
 
     def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
-        return opt.optimizer_type == "default" and (self._fast or self.start_iter(opt, loop) >= ACCUMULATES_FROM)
+        return super().accumulates(opt, loop) or (self._fast and opt.optimizer_type == "default")
 
     @property
     def _fast(self) -> bool:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 from skipgs_plug.adapters.inria import GROWS_WHOLE, InriaFamily
 from skipgs_plug.core.trainer_info import Densification
-
-ACCUMULATES_FROM = 15_000  # iteration; a constant of the loop
 
 
 class ImprovedGS(InriaFamily):
@@ -30,10 +28,11 @@ class ImprovedGS(InriaFamily):
     with_share = f"All events are kept. {GROWS_WHOLE}"
     stand_ins = "improved_gs"
     mark = "compute_edge_score"
-    calls = ("add_densification_stats_abs", "densify_and_prune_Improved")
+    calls: ClassVar[tuple[str, ...]] = ("add_densification_stats_abs", "densify_and_prune_Improved")
     arguments = ("pixel_weights",)
     densification = Densification(marks=("densification_interval",), needs="nothing")
     structural = (*InriaFamily.structural, "only_prune")
+    accumulates_from: ClassVar[int] = 15_000  # iteration; a constant of the loop
 
     def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
-        return opt.optimizer_type == "default" and self.start_iter(opt, loop) >= ACCUMULATES_FROM
+        return opt.optimizer_type == "default" and self.start_iter(opt, loop) >= self.accumulates_from

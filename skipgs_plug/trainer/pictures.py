@@ -13,6 +13,7 @@ from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.scene import View
 
 ERROR_GAIN = 4.0  # factor on absolute errors: at 1, an error of 0.05 would look black
+ROWS = 3  # views to show, at most
 ZOOM = 2  # side of one pixel of the render in the picture, in pixels
 SMOOTH = 0.95  # decay of the running mean of losses per iteration: about the mean of the last 20
 
@@ -32,18 +33,17 @@ class Curve:
         self.skipped.append(skipped)
 
 
-def save_comparison(path: Path, views: list[View], renders: Mapping[str, Sequence[Tensor]], rows: int = 3) -> None:
-    """Write a PNG with columns truth, each run, error of each run, for up to `rows` views.
+def save_comparison(path: Path, views: list[View], renders: Mapping[str, Sequence[Tensor]]) -> None:
+    """Write a PNG with columns truth, each run, error of each run, for up to `ROWS` views.
 
     Args:
         path: PNG file to write.
         views: Held-out views with their photographs.
         renders: Renders of these views by name of the run, each [H, W, 3] in [0, 1].
-        rows: Number of views to show, at most.
     """
     from PIL import Image, ImageDraw
 
-    picked = np.linspace(0, len(views) - 1, min(rows, len(views))).round().astype(int)
+    picked = np.linspace(0, len(views) - 1, min(ROWS, len(views))).round().astype(int)
     lines = []
     for i in picked:
         truth = views[i].image.numpy().astype(np.float32) / 255.0

@@ -16,8 +16,8 @@ class SelectiveAdam(torch.optim.Adam):
     gsplat's class of that name runs on CUDA only. This class does the same on the CPU too.
     """
 
-    def __init__(self, params: Any, eps: float, betas: tuple[float, float] = (0.9, 0.999)) -> None:
-        super().__init__(params, eps=eps, betas=betas)
+    def __init__(self, params: Any, eps: float) -> None:
+        super().__init__(params, eps=eps)
 
     @torch.no_grad()
     def step(self, visibility: Tensor) -> None:  # type: ignore[override]

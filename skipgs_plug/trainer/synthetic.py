@@ -35,7 +35,6 @@ def make_scene(
     height: int = 120,
     n_points: int = 4000,
     test_every: int = 8,
-    seed: int = 0,
 ) -> Scene:
     """Ray-trace a small scene with 2x2 samples per pixel. The same arguments give the same scene.
 
@@ -45,7 +44,6 @@ def make_scene(
         height: Image height in pixels.
         n_points: Number of surface points, with the colour of their texture under the light.
         test_every: Hold out every n-th view by name.
-        seed: Seed of the surface points.
 
     Examples:
         >>> from skipgs_plug.trainer.synthetic import make_scene
@@ -67,7 +65,7 @@ def make_scene(
             torch.from_numpy(viewmat),
         )
         (test if test_every and i % test_every == 0 else train).append(view)
-    points, colours = sample_surfaces(n_points, np.random.default_rng(seed))
+    points, colours = sample_surfaces(n_points, np.random.default_rng(0))
     rgb = np.rint(colours * 255).astype(np.uint8)
     return assemble_scene(Path("demo"), "demo", train, test, points, rgb, background=SKY)
 

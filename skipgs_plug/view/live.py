@@ -19,9 +19,9 @@ class LiveView:
     waits until updates take less than 2 % of the training time. Without visitors, there is no update.
     """
 
-    def __init__(self, trainer: Trainer, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(self, trainer: Trainer, port: int = 8080) -> None:
         self._trainer = trainer
-        self.page = Page(trainer.scene, lambda _, view: trainer.render(view).clamp(0, 1), host=host, port=port)
+        self.page = Page(trainer.scene, lambda _, view: trainer.render(view).clamp(0, 1), port=port)
         self._next = 0.0
 
     def iteration(self, iteration: Iteration) -> None:
