@@ -97,7 +97,8 @@ def _resolve(command: Sequence[str]) -> _Program:
     name, arguments = command[0], list(command[1:])
     if name == "-m":
         name, *arguments = arguments
-        source = _source_of(name)
+        with _first_on_path(Path.cwd()):
+            source = _source_of(name)
         if source is None:
             raise SkipGSError(f"There is no module {name}: install it, or name a training script after '--'.")
         run = functools.partial(_run_module, name)
@@ -115,7 +116,8 @@ def _resolve(command: Sequence[str]) -> _Program:
 
 
 def _run_module(name: str, names: dict[str, Any]) -> None:
-    runpy.run_module(name, init_globals=names, run_name="__main__")
+    # As `__main__` in sys.modules, too: type hints and pickles of the script's classes are looked up there.
+    runpy.run_module(name, init_globals=names, run_name="__main__", alter_sys=True)
 
 
 def _run_path(script: str, names: dict[str, Any]) -> None:
@@ -167,13 +169,23 @@ def _refuse_shadowed_modules(checkout: Path) -> None:
 
 @contextmanager
 def _as_main_program(program: _Program) -> Iterator[None]:
-    argv, path, stdout = sys.argv, list(sys.path), sys.stdout
+    argv, stdout = sys.argv, sys.stdout
     sys.argv = program.argv
-    sys.path.insert(0, str(program.folder))
+    try:
+        with _first_on_path(program.folder):
+            yield
+    finally:
+        sys.argv, sys.stdout = argv, stdout
+
+
+@contextmanager
+def _first_on_path(folder: Path) -> Iterator[None]:
+    path = list(sys.path)
+    sys.path.insert(0, str(folder))
     try:
         yield
     finally:
-        sys.argv, sys.path[:], sys.stdout = argv, path, stdout
+        sys.path[:] = path
 
 
 @contextmanager

@@ -95,9 +95,21 @@ def test_a_module_is_run_as_python_does_with_m(checkout, monkeypatch, capfd):
     (checkout / "neighbour_of_script" / "train.py").write_text(
         "import sys\nfrom neighbour_of_script import VALUE\nprint(VALUE, __name__, sys.argv[1:])\n"
     )
-    monkeypatch.syspath_prepend(checkout)
+    monkeypatch.chdir(checkout)  # which is not on the path of the installed command `skipgs-plug`
     assert run_script(["-m", "neighbour_of_script.train", "-i", "3"]) == 0
     assert capfd.readouterr().out == "own __main__ ['-i', '3']\n"
+
+
+def test_a_module_that_asks_for_type_hints_of_its_own_classes_is_run(checkout, monkeypatch):
+    (checkout / "neighbour_of_script" / "train.py").write_text(
+        "from __future__ import annotations\nimport dataclasses, typing\nfrom pathlib import Path\n"
+        "@dataclasses.dataclass\nclass Arguments:\n    folder: Path\n"
+        "assert typing.get_type_hints(Arguments) == {'folder': Path}\n"
+    )
+    monkeypatch.chdir(checkout)
+    before = sys.modules["__main__"]
+    assert run_script(["-m", "neighbour_of_script.train"]) == 0
+    assert sys.modules["__main__"] is before
 
 
 @pytest.fixture
