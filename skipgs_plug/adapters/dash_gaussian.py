@@ -14,8 +14,8 @@ class DashGaussian(InriaFamily):
     project = "[DashGaussian, `train_dash.py`](https://github.com/YouyuChen0207/DashGaussian)"
     gated = "From `densify_until_iter` on: resolution and number of Gaussians are constant."
     left_alone = (
-        "In skipped iterations neither the optimizer of the Gaussians (sparse Adam too) nor that of the exposure has "
-        "gradients. Its `train.py` is Inria's; use adapter `inria` for it."
+        "The optimizers of Gaussians (sparse Adam too) and exposure have no gradients in skipped iterations. Its "
+        "`train.py` is Inria's; use adapter `inria` for it."
     )
     stand_ins = "dash_gaussian"
     mark = "TrainingScheduler"

@@ -323,9 +323,9 @@ class Inria(InriaFamily):
     project = "[Inria 3DGS](https://github.com/graphdeco-inria/gaussian-splatting)"
     gated = "From `densify_until_iter` on: that iteration does not densify any more."
     left_alone = (
-        "In skipped iterations neither the optimizer of the Gaussians (sparse Adam too) nor that of the exposure has "
-        "gradients. Renders of the viewer and of evaluations do not count as training. If two images have the same "
-        "name in different folders (older versions keep the name only), the gate warns and tells views apart by their "
+        "The optimizers of Gaussians (sparse Adam too) and exposure have no gradients in skipped iterations. "
+        "Renders of the viewer and of evaluations do not count as training. If two images have the same name in "
+        "different folders (older versions keep the name only), the gate warns and tells views apart by their "
         "position. A fork that no adapter knows is refused if its loop changes tensors in place."
     )
     stand_ins = "inria"
