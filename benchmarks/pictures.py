@@ -20,14 +20,15 @@ def find_pictures(out: Path) -> Path:
 def measure_pictures(folder: Path, lpips_net: str | None = None, device: str = "cpu") -> dict[str, Any]:
     """Return means of PSNR, SSIM and, for a backbone, LPIPS over pictures, and their number.
 
-    Renders and photographs lie in folders `renders` and `gt` (Inria's family), or side by side in one file (gsplat).
+    Renders and photographs lie in folders `renders` and `gt` (Inria's family), or side by side in one file (gsplat,
+    nerfstudio).
     """
     if (folder / "gt").is_dir():
         names = sorted(path.name for path in (folder / "gt").iterdir())
         pairs = [(pixels(folder / "renders" / name, device), pixels(folder / "gt" / name, device)) for name in names]
     else:
         pairs = []
-        for path in sorted(folder.glob("val_step*.png")):
+        for path in sorted([*folder.glob("val_step*.png"), *folder.glob("eval_img_*.png")]):
             photograph, render = pixels(path, device).chunk(2, dim=1)
             pairs.append((render.contiguous(), photograph.contiguous()))
     return means([measure(chosen(lpips_net), render, photograph) for render, photograph in pairs])

@@ -10,9 +10,12 @@ class Row(NamedTuple):
         label: Name in the table.
         project: Owner and name of the repository on GitHub.
         folder: Name of its checkout in the folder of all checkouts.
-        command: Command line of the script, with placeholders {scene}, {factor}, {out} and those of `schedule`.
-        pictures: Whether the script's own renders are measured, because no PLY contains its model in the scene's
+        command: Command line of the script, with placeholders {scene}, {factor}, {out}, {sized} (the folder that
+            `sized_scene` writes) and those of `schedule`.
+        pictures: Whether the project's own renders are measured, because no PLY contains the model in the scene's
             coordinates.
+        render: Command line that renders these pictures after training, if the script does not. Its seconds are not
+            counted.
     """
 
     label: str
@@ -20,6 +23,7 @@ class Row(NamedTuple):
     folder: str
     command: str
     pictures: bool = False
+    render: str = ""
 
 
 # Densification thresholds for images of 126x94 pixels. With the projects' own, which are for large photographs, scenes
@@ -34,6 +38,15 @@ _GSPLAT = (
     "--ply_steps {n} --save_ply --strategy.refine-start-iter 150 --disable_viewer --disable_video "
 )
 _ANCHORS = f"train.py {_SAVED}--images images_{{factor}} --update_until {{half}} --start_stat 100 --update_from 200 "
+# Without evaluations in between and at constant resolution, as the other scripts. Opacities are reset after every 3,000
+# iterations, nerfstudio's own interval, as in gsplat's script. The lists in {sized} go before the interval.
+_NERFSTUDIO = (
+    "--output-dir {out} --experiment-name run --timestamp model --vis tensorboard --max-num-iterations {n} "
+    "--steps-per-save {n} --steps-per-eval-image 0 --steps-per-eval-all-images 0 --pipeline.model.num-downscales 0 "
+    "--pipeline.model.warmup-length 150 --pipeline.model.refine-every 100 --pipeline.model.stop-split-at {half} "
+    "--pipeline.model.densify-grad-thresh 0.001 --optimizers.means.scheduler.max-steps {n} "
+    "colmap --data {sized} --downscale-factor 1 --colmap-path sparse/0 --eval-mode interval --eval-interval 8"
+)
 
 ROWS = {
     "inria": Row(
@@ -136,6 +149,15 @@ ROWS = {
         f"examples/simple_trainer.py mcmc {_GSPLAT}--strategy.refine-stop-iter {{late}} --strategy.refine-every 40 "
         "--strategy.cap-max 12000",
         pictures=True,
+    ),
+    "nerfstudio": Row(
+        "nerfstudio `ns-train splatfacto`",
+        "nerfstudio-project/nerfstudio",
+        "nerfstudio",
+        f"-m nerfstudio.scripts.train splatfacto {_NERFSTUDIO}",
+        pictures=True,
+        render="-m nerfstudio.scripts.eval --load-config {out}/run/splatfacto/model/config.yml "
+        "--output-path {out}/eval.json --render-output-path {out}/renders",
     ),
 }
 

@@ -9,7 +9,7 @@
 These scripts fix their seeds. A second run starts from another draw of the scene's points (`scene --seed 1`).
 All scripts are measured alike: this package renders their PLY from the held-out cameras. A PLY of Mip-Splatting
 contains a 3D filter, which is applied together with its 2D filter of 0.1 square pixels. For scripts without a PLY in
-the scene's coordinates (Scaffold-GS, gsplat) the pictures that the script wrote are measured, in 8 bits.
+the scene's coordinates (Scaffold-GS, gsplat, nerfstudio) the pictures that the project wrote are measured, in 8 bits.
 """
 
 import json
@@ -30,6 +30,7 @@ from torch import Tensor
 
 from benchmarks.pictures import find_pictures, means, measure_pictures
 from benchmarks.script_rows import ROWS, Row, schedule
+from benchmarks.sized_scene import sized_scene
 from skipgs_plug.fallback_raster import rasterization
 from skipgs_plug.files import write_aside
 from skipgs_plug.trainer.loaders import load_scene
@@ -124,23 +125,20 @@ def run(
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     filled = {"scene": scene.resolve(), "factor": data_factor, "out": folder, **schedule(iterations)}
+    filled["sized"] = folder / "scene"
+    if "{sized}" in one.command:
+        sized_scene(scene, data_factor, folder / "scene")
     gate = ["run", "auto", "--cpu", *MODES[mode], "--"]
     script = [*shlex.split(one.command.format(**filled)), *shlex.split(more)]
-    settings = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     begun = time.perf_counter()
-    with (folder / "log.txt").open("w") as log:
-        child = subprocess.Popen(
-            [sys.executable, "-P", "-m", "skipgs_plug", *gate, *script],
-            cwd=checkouts / one.folder,
-            env=settings,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-        )
-        _, status, used = os.wait4(child.pid, 0)
+    child = start([*gate, *script], checkouts / one.folder, folder / "log.txt")
+    _, status, used = os.wait4(child.pid, 0)
     code = child.returncode = os.waitstatus_to_exitcode(status)  # Popen did not wait itself
     if code:  # said first: there may be no model to judge
         print(f"The script ended with {code}; its log is {folder / 'log.txt'}.", file=sys.stderr)
+    wall = time.perf_counter() - begun
+    if one.render:
+        render(one.render.format(**filled), checkouts / one.folder, folder / "render.txt")
     judged = judge(one, folder, scene, data_factor)
     record = {
         "scene": named(scene, data_factor),
@@ -149,7 +147,7 @@ def run(
         "mode": mode,
         "iterations": iterations,
         "seconds": round(used.ru_utime + used.ru_stime, 1),
-        "wall_seconds": round(time.perf_counter() - begun, 1),
+        "wall_seconds": round(wall, 1),
         "peak_rss_gib": round(used.ru_maxrss / 2**20, 2),
         "exit_code": code,
         **facts(folder, iterations),
@@ -165,15 +163,48 @@ def run(
     print(json.dumps(record, indent=1))
 
 
+def start(arguments: list[str], checkout: Path, log: Path) -> subprocess.Popen[bytes]:
+    """Start `skipgs-plug` in a checkout, with its output in a file."""
+    with log.open("w") as output:
+        return subprocess.Popen(
+            [sys.executable, "-P", "-m", "skipgs_plug", *arguments],
+            cwd=checkout,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"},
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
+
+
+def render(command: str, checkout: Path, log: Path) -> None:
+    """Run the project's command that renders the held-out views of a trained model, in both modes without a gate."""
+    code = start(["run", "auto", "--cpu", "--no-gate", "--", *shlex.split(command)], checkout, log).wait()
+    if code:
+        print(f"Rendering ended with {code}; its log is {log}.", file=sys.stderr)
+
+
 def judge(row: Row, folder: Path, scene: Path, factor: int) -> dict[str, Any]:
-    """Return PSNR, SSIM, and the numbers of held-out views and of Gaussians (None if there is no PLY)."""
-    plys = sorted(folder.rglob("point_cloud*.ply"), key=lambda path: path.stat().st_mtime)
+    """Return PSNR, SSIM, and the numbers of held-out views and of Gaussians (None if no file of the model is known)."""
     if not row.pictures:
-        return measure_ply(plys[-1], scene, factor)
+        return measure_ply(newest(folder, "point_cloud*.ply"), scene, factor)
+    return {**measure_pictures(find_pictures(folder)), "gaussians": count_gaussians(folder)}
+
+
+def count_gaussians(folder: Path) -> int | None:
+    """Return the number of Gaussians in a script's last PLY, or else in nerfstudio's last checkpoint."""
     from plyfile import PlyData
 
-    count = PlyData.read(str(plys[-1]))["vertex"].count if plys else None
-    return {**measure_pictures(find_pictures(folder)), "gaussians": count}
+    if any(folder.rglob("point_cloud*.ply")):
+        return PlyData.read(str(newest(folder, "point_cloud*.ply")))["vertex"].count
+    if any(folder.rglob("step-*.ckpt")):
+        state = torch.load(newest(folder, "step-*.ckpt"), "cpu", weights_only=False)  # with NumPy scalars
+        return len(state["pipeline"]["_model.gauss_params.means"])
+    return None
+
+
+def newest(folder: Path, pattern: str) -> Path:
+    """Return the newest of the files in a folder, and in folders inside it, that have such a name."""
+    return max(folder.rglob(pattern), key=lambda path: path.stat().st_mtime)
 
 
 def facts(folder: Path, iterations: int) -> dict[str, Any]:

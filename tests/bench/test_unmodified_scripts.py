@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from benchmarks import unmodified_scripts
+from benchmarks.pictures import measure_pictures
 from benchmarks.script_rows import Row
 from benchmarks.script_table import table
+from benchmarks.sized_scene import sized_scene
 
 # In place of Python: logs its arguments, and leaves a report and the pictures that a gsplat run would have written.
 STAND_IN = """#!/bin/sh
@@ -36,13 +39,14 @@ def checkouts(tmp_path: Path) -> Path:
     return tmp_path / "checkouts"
 
 
-def run(checkouts: Path, monkeypatch: pytest.MonkeyPatch, mode: str = "auto", code: int = 0) -> dict:
+def run(checkouts: Path, monkeypatch: pytest.MonkeyPatch, mode: str = "auto", code: int = 0, render: str = "") -> dict:
     """Run the row once, and return its record."""
     folder = checkouts.parent
     stand_in = folder / "python"
     stand_in.write_text(STAND_IN.format(ready=folder / "ready", code=code))
     stand_in.chmod(0o755)
-    row = Row("Tiny", "nobody/tiny", "project", "train.py -s {scene} -n {n} --half {half} -m {out}", pictures=True)
+    command = "train.py -s {scene} -n {n} --half {half} -m {out}"
+    row = Row("Tiny", "nobody/tiny", "project", command, pictures=True, render=render)
     monkeypatch.setattr(sys, "executable", str(stand_in))
     monkeypatch.setitem(unmodified_scripts.ROWS, "tiny", row)
     monkeypatch.setattr(unmodified_scripts, "named", lambda scene, factor: f"{scene.name} at 1/{factor}")
@@ -76,6 +80,46 @@ def test_second_run_replaces_the_record_of_the_same_mode_alone(checkouts, monkey
 def test_script_that_fails_is_named_with_its_log(checkouts, monkeypatch, capsys):
     assert run(checkouts, monkeypatch, code=3)["exit_code"] == 3
     assert "The script ended with 3; its log is " in capsys.readouterr().err
+
+
+def test_pictures_that_another_command_renders_and_gaussians_of_a_checkpoint_are_recorded(checkouts, monkeypatch):
+    model = checkouts.parent / "ready/run/model/step-000000099.ckpt"
+    model.parent.mkdir(parents=True)
+    torch.save({"pipeline": {"_model.gauss_params.means": torch.zeros(7, 3)}}, model)
+    record = run(checkouts, monkeypatch, render="-m eval {out}")
+    assert record["gaussians"] == 7 and record["views"] == 1 and "eval" not in record["command"]
+    log = checkouts.parent / "out/tiny.fern.4.100.auto/render.txt"
+    assert log.read_text().startswith("-P -m skipgs_plug run auto --cpu --no-gate -- -m eval ")
+
+
+def test_pictures_of_nerfstudio_have_the_photograph_on_the_left(tmp_path):
+    pair = np.zeros((16, 48, 3), np.uint8)
+    pair[:, 24:] = 51
+    for number in (0, 1):
+        Image.fromarray(pair).save(tmp_path / f"eval_img_000{number}.png")
+    measured = measure_pictures(tmp_path)
+    assert measured["views"] == 2 and measured["psnr"] == pytest.approx(20 * np.log10(5), abs=1e-3)
+
+
+def test_sized_scene_has_cameras_of_the_photographs_and_lists_every_eighth_by_name(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    names = [f"{number:02}.png" for number in range(9)]
+    (tmp_path / "scene/sparse/0").mkdir(parents=True)
+    (tmp_path / "scene/images_4").mkdir()
+    for name in names:
+        Image.new("RGB", (10, 7)).save(tmp_path / "scene/images_4" / name)
+    model = tmp_path / "scene/sparse/0"
+    (model / "cameras.txt").write_text("1 SIMPLE_PINHOLE 40 26 50 20 13\n")
+    images = [f"{number + 1} 1 0 0 0 0 0 0 1 {name}\n\n" for number, name in enumerate(reversed(names))]
+    (model / "images.txt").write_text("".join(images))
+    (model / "points3D.txt").write_text("")
+    sized_scene(tmp_path / "scene", 4, tmp_path / "sized")
+    camera = pycolmap.Reconstruction(str(tmp_path / "sized/sparse/0")).cameras[1]
+    assert (camera.width, camera.height) == (10, 7)
+    assert list(camera.params) == pytest.approx([50 / 4, 50 * 7 / 26, 5, 3.5])
+    lists = {split: (tmp_path / f"sized/{split}_list.txt").read_text().split() for split in ("train", "val", "test")}
+    assert lists == {"train": names[1:8], "val": [names[0], names[8]], "test": [names[0], names[8]]}
+    assert sorted(path.name for path in (tmp_path / "sized/images").iterdir()) == names
 
 
 def test_table_has_means_over_draws_of_the_points_and_each_difference():
