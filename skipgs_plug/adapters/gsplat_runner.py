@@ -11,8 +11,8 @@ import torch
 from skipgs_plug.adapters.base import GATES_SPAWNED, AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import (
     gradients_read_until,
+    iterations_that_run,
     leave_out_noise,
-    opacity_resets,
     strategy_events,
     survey_of,
 )
@@ -108,7 +108,7 @@ class GsplatRunner(AbstractAdapter):
         hooks.before(type(strategy), "step_pre_backward", forwarded)
         hooks.gate_tensor_backward("train")
         hooks.loop(
-            function_names(type(runner).train), "train", always=lambda numbers: opacity_resets(strategy, numbers)
+            function_names(type(runner).train), "train", always=lambda numbers: iterations_that_run(strategy, numbers)
         )
         catch_up_schedulers(hooks, "train")
         hooks.check_drift(lambda: runner.optimizers)

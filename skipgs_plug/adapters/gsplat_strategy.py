@@ -65,11 +65,17 @@ def strategy_events(strategy: Any) -> Densification | None:
     )
 
 
-def opacity_resets(strategy: Any, numbers: range) -> Iterable[int]:
-    """Return the iterations in which a strategy resets opacities, which must all run."""
+def iterations_that_run(strategy: Any, numbers: range) -> Iterable[int]:
+    """Return the iterations until densification ends that must all run.
+
+    They reset opacities, or Gaussians are split in them by the largest size that they had on the screen in any step
+    (`refine_scale2d_stop_iter`, nerfstudio's default). With fewer, longer steps sizes overshoot: splatfacto ended with
+    172 % of its Gaussians on fern, and 0.2 dB below its own run.
+    """
     every = getattr(strategy, "reset_every", 0)
     stop = getattr(strategy, "refine_stop_iter", 0)
-    return (n for n in numbers if every and n > 0 and n % every == 0 and n < stop)
+    by_size = getattr(strategy, "refine_scale2d_stop_iter", 0)
+    return (n for n in numbers if n < stop and (n < by_size or (every and n > 0 and n % every == 0)))
 
 
 def leave_out_noise(hooks: Hooks, strategy: Any, owner: Any) -> range:

@@ -11,8 +11,8 @@ from typing import Any
 from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import (
     gradients_read_until,
+    iterations_that_run,
     leave_out_noise,
-    opacity_resets,
     strategy_events,
     survey_of,
 )
@@ -36,7 +36,10 @@ class Nerfstudio(AbstractAdapter):
     checked = "nerfstudio-project/nerfstudio 1.1.5 50e0e3c7 (ns-train, run on the CPU)"
     project = "[nerfstudio, splatfacto and splatfacto-mcmc](https://github.com/nerfstudio-project/nerfstudio)"
     gated = "Like gsplat; decided on `main_loss`, since other terms appear in every tenth iteration only."
-    with_share = "Like gsplat. Evaluations, and the first and last iteration of accumulated gradients, always run."
+    with_share = (
+        "Like gsplat. All iterations until `stop_screen_size_at`, evaluations, and the first and last iteration of "
+        "accumulated gradients always run."
+    )
     left_alone = (
         "An enabled loss scaler does not update without a gradient. The command: `skipgs-plug run nerfstudio "
         "-- ns-train splatfacto ...` (or `-m nerfstudio.scripts.train`). `skipgs.json` lies beside its `config.yml`."
@@ -114,7 +117,7 @@ class Nerfstudio(AbstractAdapter):
         config = self.trainer.config
         every = (config.steps_per_eval_batch, config.steps_per_eval_image, config.steps_per_eval_all_images)
         gathered = [steps for steps in config.gradient_accumulation_steps.values() if steps > 1]
-        yield from opacity_resets(getattr(self.trainer.pipeline.model, "strategy", None), numbers)
+        yield from iterations_that_run(getattr(self.trainer.pipeline.model, "strategy", None), numbers)
         for n in numbers:
             evaluates = any(interval and n % interval == 0 for interval in every)
             if evaluates or any(n % steps in (0, steps - 1) for steps in gathered):

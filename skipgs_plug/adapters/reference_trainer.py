@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from skipgs_plug.adapters.base import AbstractAdapter
-from skipgs_plug.adapters.gsplat_strategy import opacity_resets, strategy_events
+from skipgs_plug.adapters.gsplat_strategy import iterations_that_run, strategy_events
 from skipgs_plug.core.clock import Times
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
@@ -43,7 +43,7 @@ class ReferenceTrainer(AbstractAdapter):
             hooks.backward(loss, lambda: original(loss, view, step), view)
 
         hooks.wrap(trainer, "backward", gated)
-        hooks.own_loop(trainer, "iterations", always=lambda numbers: opacity_resets(trainer.strategy, numbers))
+        hooks.own_loop(trainer, "iterations", always=lambda numbers: iterations_that_run(trainer.strategy, numbers))
         n_views = len(trainer.view_names)
         scale = trainer.config.schedule / FULL_SCHEDULE
         hooks.ready(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from skipgs_plug import SkipGate
-from skipgs_plug.adapters.gsplat_strategy import opacity_resets, strategy_events
+from skipgs_plug.adapters.gsplat_strategy import iterations_that_run, strategy_events
 from skipgs_plug.bench.policies import REFERENCE, Earlier
 from skipgs_plug.bench.record import RunRecord, Trace
 from skipgs_plug.bench.refine import NotRunError, finite_losses, logged, measured, peak_memory, point, recorded
@@ -155,7 +155,7 @@ def events(trainer: Trainer) -> set[int]:
         return set(filter(trainer.mcmc.moves, numbers))
     known = strategy_events(trainer.strategy)
     assert known is not None and known.numbers is not None
-    return {*known.numbers(numbers), *opacity_resets(trainer.strategy, numbers)}
+    return {*known.numbers(numbers), *iterations_that_run(trainer.strategy, numbers)}
 
 
 def shortened(
