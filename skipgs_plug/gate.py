@@ -409,7 +409,7 @@ class SkipGate:
         return None if self.policy is None else self.policy.floor
 
     def _attach(self, trainer: Any, adapter: Adapter, given: frozenset[str]) -> None:
-        self._hooks = Hooks(self._engine, adapter, given)
+        self._hooks = Hooks(self._engine, adapter, given, in_script=trainer is None)
         try:
             if trainer is None:
                 adapter.attach_script(self._hooks)

@@ -57,8 +57,15 @@ class Hooks:
     The first training backward pass of an iteration is gated. Any further one runs and counts as a mismatch.
     """
 
-    def __init__(self, engine: Engine, adapter: Adapter, given: frozenset[str]) -> None:
-        """Create hooks for an adapter; `given` has the names of the settings that the user gave."""
+    def __init__(self, engine: Engine, adapter: Adapter, given: frozenset[str], in_script: bool = False) -> None:
+        """Create hooks for an adapter.
+
+        Args:
+            engine: Engine of the gate.
+            adapter: The adapter.
+            given: Names of the settings that the user gave.
+            in_script: Whether the trainer is a script, whose user cannot attach a new gate for a second run in it.
+        """
         self._engine = engine
         self._adapter = adapter
         self._given = given
@@ -70,6 +77,7 @@ class Hooks:
         self._guarded = self._giving_up.guarded(lambda: self._iteration.step)
         self._patches = Patches(self._expectation, self._failed)
         self._ready = False
+        self._in_script = in_script
         self.script_globals: dict[str, Any] = {}
         self._iteration = engine.iteration
         self._drift: DriftCheck | None = None
@@ -105,6 +113,13 @@ class Hooks:
                 self._require_one_backward_each()
             if self._drift is not None and (moved := self._drift.moved()):
                 self._release_moved(moved)
+                return
+            before = self._iteration.step
+            if before is not None and step < before and (self._in_script or not self._engine.config.enabled):
+                self._giving_up.let_go(
+                    f"The gate is released: iterations went back from {before} to {step}, as in a second training run "
+                    "of one process. Training goes on without it, in all its iterations"
+                )
                 return
             self._iterations += 1
             self._odd_iterations += 1  # until its backward is seen

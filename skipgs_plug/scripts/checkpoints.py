@@ -105,12 +105,12 @@ class Checkpoints:
 
     def _save_beside(self, checkpoint: Path) -> None:
         gate = self.gate
-        if gate is None or not gate.config.enabled or gate.stats()["iterations"] == 0:
-            return
-        for state in checkpoint.parent.glob(f"*{SUFFIX}"):  # some scripts delete their older checkpoints
-            if not state.with_name(state.name.removesuffix(SUFFIX)).exists():
-                state.unlink(missing_ok=True)
         try:
+            if gate is None or not gate.config.enabled or gate.stats()["iterations"] == 0:
+                return
+            for state in checkpoint.parent.glob(f"*{SUFFIX}"):  # some scripts delete their older checkpoints
+                if state.is_file() and not state.with_name(state.name.removesuffix(SUFFIX)).exists():
+                    state.unlink(missing_ok=True)
             with write_aside(_beside(checkpoint)) as temporary:
                 temporary.write_text(json.dumps({**self._run, "gate": gate.state_dict()}) + "\n")
         except Exception as error:  # the script has its checkpoint and can continue to train

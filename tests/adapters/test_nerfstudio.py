@@ -46,6 +46,16 @@ def test_accumulated_gradients_are_stepped_in_a_skipped_iteration():
     assert [step for step in log.steps if step >= 20] == list(range(21, 60, 2))
 
 
+def test_all_iterations_run_while_sizes_on_the_screen_split_gaussians():
+    new_log()
+    trainer = nerfstudio.Trainer().setup()
+    trainer.pipeline.model.strategy.refine_scale2d_stop_iter = 12
+    with SkipGate(trainer, share=0.4):
+        trainer.train()
+    assert set(range(12)) <= set(log.backwards)
+    assert len(set(range(12, 20)) & set(log.backwards)) < 8
+
+
 def test_parameters_are_known_by_the_names_of_their_optimizers():
     new_log()
     trainer = nerfstudio.Trainer().setup()

@@ -241,6 +241,13 @@ def test_gate_goes_on_with_the_scripts_own_checkpoint(train, capfd):
     assert counted(given) == counted(whole)
 
 
+def test_a_folder_named_like_a_gate_state_ends_no_training(train, tmp_path):
+    (tmp_path / "beside").mkdir()
+    (tmp_path / "beside" / "old.pth.skipgs.json").mkdir()
+    code, folder = train("beside", "--save")
+    assert code == 0 and (folder / "chkpnt40.pth.skipgs.json").is_file()
+
+
 def test_what_cannot_be_written_beside_the_scripts_files_is_said_and_no_more(train, capfd, monkeypatch):
     def fails(*args, **kwargs):
         raise OSError(28, "No space left on device")

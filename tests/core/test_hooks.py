@@ -312,6 +312,30 @@ def test_training_anew_with_one_gate_is_refused() -> None:
             trainer.train()
 
 
+def test_a_gate_that_is_off_ends_no_second_training() -> None:
+    trainer = ToyTrainer()
+    with SkipGate(trainer, adapter=Toy(trainer), enabled=False):
+        trainer.train()
+        with pytest.warns(RuntimeWarning, match="went back from 99 to 0, as in a second training run"):
+            trainer.train()
+    assert trainer.noise == 200
+
+
+def test_a_second_training_in_a_script_releases_the_gate() -> None:
+    trainer = ToyTrainer()
+
+    class InScript(Toy):
+        def attach_script(self, hooks) -> None:
+            self.trainer = trainer
+            self.attach(hooks)
+
+    with SkipGate(adapter=InScript()) as gate:
+        trainer.train()
+        with pytest.warns(RuntimeWarning, match="The gate is released: iterations went back from 99 to 0"):
+            trainer.train()
+    assert trainer.noise == 200 - gate.stats()["backwards_skipped"]  # none was left out of the second training
+
+
 def test_what_the_adapter_knows_of_numbers_holds_beside_what_the_user_chose() -> None:
     class Knowing(Toy):
         def attach(self, hooks) -> None:
