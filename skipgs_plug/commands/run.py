@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug import SkipGate, SkipGSError, UnknownTrainerError
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
 from skipgs_plug.commands.options.run import Args
@@ -35,7 +35,10 @@ def run(args: Args) -> int:
     """
     command = list(args.command)
     if args.adapter == "auto":
-        args = dataclasses.replace(args, adapter=find_script_adapter(source_of(command)).name)
+        adapter = find_adapter(args, command)
+        if adapter is None:
+            return run_script(command, dict)
+        args = dataclasses.replace(args, adapter=adapter)
         say(f"{script_name(command)} is run as {args.adapter}.")
     with spawned.gated_when_spawned(functools.partial(run_spawned, args, command)) as processes:
         code, gate = run_gated(args, command, functools.partial(run_script, command, on_cpu=args.cpu))
@@ -43,6 +46,21 @@ def run(args: Args) -> int:
     if code == 0 and not processes and not (args.no_gate if gate is None else gate.trained):
         say(f"{script_name(command)} ended without a training iteration; nothing was gated.")
     return code
+
+
+def find_adapter(args: Args, command: list[str]) -> str | None:
+    """Return the name of the adapter that knows the script; None if none does and the script can run without.
+
+    Raises:
+        UnknownTrainerError: No adapter knows the script, and it should be gated, or needs stand-ins for CUDA modules.
+    """
+    try:
+        return find_script_adapter(source_of(command)).name
+    except UnknownTrainerError as error:
+        if not args.no_gate or args.cpu:
+            raise
+        say(f"{script_name(command)} runs without a gate, and so without skipgs.json: {error}")
+        return None
 
 
 def run_spawned(args: Args, command: list[str], rank: int, call: bytes) -> None:

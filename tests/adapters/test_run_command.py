@@ -241,6 +241,15 @@ def test_gate_goes_on_with_the_scripts_own_checkpoint(train, capfd):
     assert counted(given) == counted(whole)
 
 
+def test_no_gate_runs_a_script_that_no_adapter_knows(tmp_path, capfd):
+    script = tmp_path / "train.py"
+    script.write_text("import pathlib, sys\npathlib.Path(sys.argv[1]).write_text('trained')\nsys.exit(3)\n")
+    assert cli.main(["run", "auto", "--no-gate", "--", str(script), str(tmp_path / "model")]) == 3
+    assert (tmp_path / "model").read_text() == "trained"
+    assert "train.py runs without a gate, and so without skipgs.json: No adapter knows" in capfd.readouterr().err
+    assert cli.main(["run", "auto", "--no-gate", "--cpu", "--", str(script), "x"]) == cli.BAD_INPUT
+
+
 def test_a_folder_named_like_a_gate_state_ends_no_training(train, tmp_path):
     (tmp_path / "beside").mkdir()
     (tmp_path / "beside" / "old.pth.skipgs.json").mkdir()

@@ -144,3 +144,10 @@ def test_a_loop_that_cannot_be_shortened_is_refused_before_anything_runs(case, s
     with pytest.raises(SkipGSError, match="cannot leave out whole iterations"):
         SkipGate(trainer, share=share)
     assert begun == []
+
+
+def test_numbers_given_as_always_leave_densification_whole_and_the_warning_says_so():
+    case = next(case for case in LOOPS if case.name == "inria")
+    with pytest.warns(RuntimeWarning, match="The numbers given as always replace the loop's conditions, also those"):
+        gated = run(case, share=SHARE, always=[30], pause_iters=0)[0]
+    assert set(range(1, 20)) <= set(gated.values)

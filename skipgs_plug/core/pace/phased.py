@@ -242,7 +242,11 @@ class Phased(Pace):
                 hidden = {n for n in (*self._hidden(grown), *self._chosen, *self._required) if n in grown}
             if not self.growing.begin(grown, found[0], hidden, self._densification, epoch):
                 marks = ", ".join(self._densification.marks)
-                self._grow_whole(f"No condition of the loop that names {marks} holds before iteration {self._start}")
+                if self._config.always is None:
+                    why = f"No condition of the loop that names {marks} holds before iteration {self._start}"
+                else:
+                    why = f"The numbers given as always replace the loop's conditions, also those that name {marks}"
+                self._grow_whole(why)
         held = {reason: hits for reason, hits in found[1].items() if hits}
         leaves_out = self.growing is not None and bool(grown) and self.growing.leaves_out
         before = self.refining.first - begun if leaves_out else 0
