@@ -124,10 +124,10 @@ def run(
     folder = (out / f"{row}.{scene.name}.{data_factor}.{iterations}.{mode}").resolve()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    filled = {"scene": scene.resolve(), "factor": data_factor, "out": folder, **schedule(iterations)}
-    filled["sized"] = folder / "scene"
+    sized = folder / "scene"
+    filled = {"scene": scene.resolve(), "factor": data_factor, "out": folder, "sized": sized, **schedule(iterations)}
     if "{sized}" in one.command:
-        sized_scene(scene, data_factor, folder / "scene")
+        sized_scene(scene, data_factor, sized)
     gate = ["run", "auto", "--cpu", *MODES[mode], "--"]
     script = [*shlex.split(one.command.format(**filled)), *shlex.split(more)]
     begun = time.perf_counter()

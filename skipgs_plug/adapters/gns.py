@@ -34,7 +34,6 @@ class GNS(ImprovedGS):
         "All events are kept. All iterations of the selection run: its term would act alone if iterations between "
         f"were left out. {GROWS_WHOLE}"
     )
-    left_alone = ImprovedGS.left_alone
     mark = "update_opacity_lr"
     calls = (*ImprovedGS.calls, "final_prune", "update_opacity_lr")
     accumulates_from = 20_000

@@ -59,7 +59,7 @@ def find_adapter(args: Args, command: list[str]) -> str | None:
     except UnknownTrainerError as error:
         if not args.no_gate or args.cpu:
             raise
-        say(f"{script_name(command)} runs without a gate, and so without skipgs.json: {error}")
+        say_ungated(command, error)
         return None
 
 
@@ -102,7 +102,7 @@ def run_gated(
         except SkipGSError as error:
             if not args.no_gate:
                 raise
-            say(f"{script_name(command)} runs without a gate, and so without skipgs.json: {error}")
+            say_ungated(command, error)
             return {}
         checkpoints.gate = gates[0]
         return gates[0].script_globals
@@ -121,6 +121,10 @@ def run_gated(
 
 def say(sentence: str) -> None:
     print(f"skipgs-plug: {sentence}", file=sys.stderr)
+
+
+def say_ungated(command: Sequence[str], error: SkipGSError) -> None:
+    say(f"{script_name(command)} runs without a gate, and so without skipgs.json: {error}")
 
 
 def script_name(command: Sequence[str]) -> str:
