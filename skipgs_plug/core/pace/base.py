@@ -14,7 +14,6 @@ from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 Source = tuple[CodeType, Mapping[str, Any]]  # code of the function that holds a loop, and the names that it had
 Always = Callable[[range], Iterable[int]]
 Known = Callable[[Mapping[str, Any]], Mapping[str, Any]]
-NAMED = "named for this trainer"  # reason of iterations that must run and that no condition of the loop names
 
 
 def nothing_always(numbers: range) -> Iterable[int]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.pace.base import NAMED
 from skipgs_plug.core.pace.events import Events
 from skipgs_plug.core.pace.needs import (
     LEAST_GROWING_SHARE,
@@ -22,9 +20,9 @@ from skipgs_plug.core.pace.needs import (
     share_factor,
 )
 from skipgs_plug.core.pace.parts import GrowingParts
+from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.sampling import Sampling
-from skipgs_plug.core.trainer_info import Densification
 
 # Number of steps over which the share of the Gaussians that a view shows is averaged before it decides on shares.
 MEASURED = 20
@@ -34,7 +32,7 @@ MEASURED_AGAIN = 8
 UNCHANGED = 1.0, GrowingParts(1.0, 1.0)  # factor and parts of the trainer's own steps
 
 
-class Growing:
+class Growing(Phase):
     """Decides which iterations run while the scene grows, and scales learning rates if that replaces iterations.
 
     The iterations that run are spread evenly. With "auto", more of them run after an event that added many Gaussians.
@@ -47,21 +45,22 @@ class Growing:
         rates: Scales learning rates, and measures the share of the Gaussians that a view shows.
 
     Attributes:
-        share: Share of the iterations that runs; None before the phase begins.
         sampling: Counts the iterations that ran and that were left out.
         events: Densification events; None before the phase begins.
         always: Iterations that must run, by reason.
     """
 
+    leaves_out = True
+
     def __init__(self, config: SkipConfig, rates: ScaledRates) -> None:
         self._config = config
         self._rates = rates
-        self.share: float | None = None if config.growing == "auto" else config.growing  # type: ignore[assignment]
+        self.share = None if config.growing == "auto" else config.growing  # type: ignore[assignment]
         self.sampling = Sampling(1.0)
         self.events: Events | None = None
         self.always: dict[str, set[int]] = {}
         self._must: frozenset[int] = frozenset()
-        self._must_shares = 0.0, 0.0  # share of the iterations that must run: until the last event, and after it
+        self._must_shares = 1.0, 1.0  # share of the iterations that must run: until the last event, and after it
         self._first_number: int | None = None
         self._length = 0
         self._epoch = 0
@@ -72,36 +71,26 @@ class Growing:
         self._measuring = True
         self._saved_events: dict[str, Any] | None = None
 
-    @property
-    def first(self) -> int | None:
-        """First iteration that could be left out; None before the phase begins."""
-        return self._first_number
+    def numbers(self, number: int, end: int) -> range:
+        return range(number if self._first_number is None else self._first_number, end)
 
-    def begin(
-        self,
-        numbers: range,
-        found: Mapping[str, set[int]],
-        hidden: set[int],
-        densification: Densification,
-        epoch: int | None,
-    ) -> bool:
+    def begin(self, plan: PhasePlan) -> bool:
         """Receive the facts that are known when the loop begins; return False if no densification event is found.
-
-        Args:
-            numbers: Iterations from the first that can be left out to the end of densification.
-            found: Iterations that conditions of the loop name, by condition.
-            hidden: Further iterations of `numbers` that must run.
-            densification: How to recognise the trainer's events.
-            epoch: Number of iterations in which every view comes up once; None if unknown.
 
         Raises:
             SkipGSError: "auto" needs the number of views, and it is unknown.
         """
-        if self.share is None and epoch is None:
+        if self.share is None and plan.epoch is None:
             raise SkipGSError(
                 'share="auto" must know the training views; give their names to gate.iterations() as views=, '
                 "or a share."
             )
+        numbers, found, densification, hidden = plan.numbers, plan.conditions, plan.densification, plan.named
+        assert densification is not None
+        if plan.accumulates and self._config.grow_share is None:
+            # Refinement on accumulated gradients has few steps: 312 of 15,000 iterations in FastGS. Densification is
+            # nearly all of the training then, so all of it runs.
+            hidden = set(numbers)
         marks = densification.marks
         events = set() if densification.numbers is None else set(densification.numbers(numbers))
         others: dict[str, set[int]] = {}
@@ -112,7 +101,7 @@ class Growing:
                 others[reason] = hits
         if marks and not any(mark in reason for reason in found for mark in marks):
             return False
-        self.always = {**others, NAMED: hidden} if hidden else others
+        self.always = {**others, NAMED_FOR_TRAINER: hidden} if hidden else others
         self.events = Events(events, densification)
         if self._saved_events is not None:
             self.events.load_state_dict(self._saved_events)
@@ -130,25 +119,29 @@ class Growing:
         parts = range(self._first_number, end), range(end, numbers.stop)
         until, after = (len(self._must.intersection(part)) / max(len(part), 1) for part in parts)
         self._must_shares = until, after
-        self._epoch = epoch or self._epoch
+        self._epoch = plan.epoch or self._epoch
         return True
 
     @property
     def stretch(self) -> float:
         """Factor on the share of the iterations for Gaussians that were added, also in refinement; at least 1."""
-        return for_new_gaussians(self._times_grown) if self.leaves_out else 1.0
+        return 1.0 if self._all_must else for_new_gaussians(self._times_grown)
 
     @property
-    def leaves_out(self) -> bool:
-        """Whether any iteration until the last event can be left out; False if all of them must run."""
-        return self._must_shares[0] < 1.0
+    def _all_must(self) -> bool:
+        """Whether all iterations until the last event must run."""
+        return self._must_shares[0] >= 1.0
+
+    def shortened(self, end: int) -> int:
+        return 0 if self._first_number is None or self._all_must else end - self._first_number
 
     def require(self, number: int) -> None:
-        """Make iteration `number` run. Call it for a need that shows only during the run."""
         self._must |= {number}
 
+    def end(self) -> None:
+        self._rates.visibility.restart()  # the grown scene decides how long steps are in refinement
+
     def runs(self, number: int) -> bool:
-        """Whether iteration `number` runs; called once for each number, in order."""
         assert self.events is not None and self._first_number is not None
         self._settle()
         assert self.share is not None
@@ -171,7 +164,7 @@ class Growing:
             self.events.skipped(number)
             return False
         self.events.ran(number, needed)
-        if self._visible is not None and number in self.events and self.leaves_out:
+        if self._visible is not None and number in self.events and not self._all_must:
             self._measuring = True
             self._rates.visibility.restart()
         factor, parts = self._factors(number)
@@ -277,8 +270,8 @@ class Growing:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict()`; `begin` follows."""
         self.share, self._first_number = state["share"], state["first"]
+        self._must_shares = 1.0, 1.0
         self._epoch = state["views"]
         self._measuring = state["measuring"]
         self._share_now, self._rows_at_first = state.get("share_now"), state.get("gaussians_at_first", 0)

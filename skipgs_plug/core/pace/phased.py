@@ -8,12 +8,13 @@ from typing import Any
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.pace.base import NAMED, Always, Known, Pace, Source, nothing_always, nothing_known
+from skipgs_plug.core.pace.base import Always, Known, Pace, Source, nothing_always, nothing_known
 from skipgs_plug.core.pace.display import Bars
 from skipgs_plug.core.pace.growing import Growing
 from skipgs_plug.core.pace.loop_finder import LoopFinder
 from skipgs_plug.core.pace.loop_range import LoopRange, line_of, require_planned
 from skipgs_plug.core.pace.milestones import read_loop
+from skipgs_plug.core.pace.phase import Phase, PhasePlan
 from skipgs_plug.core.pace.policy import RefinementPolicy
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refining import Refining
@@ -33,7 +34,7 @@ class Phased(Pace):
 
     Attributes:
         refining: The phase after densification.
-        growing: The phase before the end of densification; None if that phase runs whole.
+        growing: The phase before the end of densification.
     """
 
     def __init__(
@@ -44,10 +45,10 @@ class Phased(Pace):
         self._go_on = go_on
         self._giving_up = giving_up
         self.refining = Refining(config, rates)
-        self.growing: Growing | None = None if config.growing is None else Growing(config, rates)
+        self.growing: Phase = Phase() if config.growing is None else Growing(config, rates)
         self._finder = LoopFinder()
         self._densification: Densification | None = None
-        self._keeps_steps = False
+        self._accumulates = False
         self._views: list[str] | None = None
         self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
         self._start = 0
@@ -58,7 +59,7 @@ class Phased(Pace):
         self._known: Known = nothing_known
         self._required: set[int] = set()
         # Iterations that the loop's conditions name, by condition: of the growing phase, and of the refining phase.
-        self._conditions: tuple[dict[str, set[int]], dict[str, set[int]]] | None = None
+        self._conditions: list[dict[str, set[int]]] | None = None
         self._left_out = 0
         self._bars = Bars([])
         self._attached = False  # by an adapter
@@ -70,7 +71,7 @@ class Phased(Pace):
 
     def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
         self._start, self._last, self._views = start, info.max_steps, views
-        self._keeps_steps, self._epoch = info.accumulates, info.epoch
+        self._accumulates, self._epoch = info.accumulates, info.epoch
         self._densification = info.densification or self._densification
         self._configured = True
 
@@ -90,8 +91,7 @@ class Phased(Pace):
     def require(self, number: int) -> None:
         self._required.add(number)
         self.refining.require(number)
-        if self.growing is not None:
-            self.growing.require(number)
+        self.growing.require(number)
 
     def follow(
         self,
@@ -129,13 +129,12 @@ class Phased(Pace):
 
     def begin(self, step: int, policy: Policy | None) -> None:
         # An adapter's loop is searched for from the first iteration on, so that a refusal comes before any training.
-        needed = self._attached or self.growing is not None or step >= self._start
+        needed = self._attached or self.growing.leaves_out or step >= self._start
         if not self._attached and self.number is None and not self._removed:
             self._ask_for_loop(needed)
         self._asked = True
-        if self._finder.begins(step, needed) and step >= self._start and self.refining.first is None:
-            self.refining.first = step  # this iteration began before its loop was known
-            self.refining.counts()
+        if self._finder.begins(step, needed) and step >= self._start:
+            self.refining.count_first(step)
 
     # Questions of loops.
 
@@ -168,8 +167,8 @@ class Phased(Pace):
             self._planned = False
             self._read(loop, number)
             self._planned = True
-        grows = number < self._start
-        runs = (self.growing is None or self.growing.runs(number)) if grows else self._refine(number)
+        phase = self.growing if number < self._start else self.refining
+        runs = phase.runs(number)
         if runs:
             self.gap, self._left_out = self._left_out, 0
             if self.gap:
@@ -185,8 +184,8 @@ class Phased(Pace):
         if self._removed:
             return len(numbers)
         before = len(range(numbers.start, min(max(self._start, numbers.start), numbers.stop)))
-        grown = 1.0 if self.growing is None else self.growing.share or 1.0
-        return round(before * grown) + round((len(numbers) - before) * (self.refining.share or 1.0))
+        grown, refined = self.growing.share or 1.0, self.refining.share or 1.0
+        return round(before * grown) + round((len(numbers) - before) * refined)
 
     def ended(self, loop: LoopRange) -> None:
         """Leave rates alone once the loop is over, or was left early: later optimizer steps are not part of it."""
@@ -210,47 +209,45 @@ class Phased(Pace):
         self._require_events()
         if self._last is None:
             self._last = loop.numbers[-1]
-        if self.refining.first is None:
-            self.refining.first = max(self._start, number)
         # On resume, include iterations that are done already, because conditions are judged by how often they hold.
         # A trainer that is trained in parts, such as train(until=1000), has more numbers than its first loop.
         end = loop.numbers.stop if loop.source is not None else max(loop.numbers.stop, self._last + 1)
-        refined = range(self.refining.first, end)
-        begun = number if self.growing is None or self.growing.first is None else self.growing.first
-        grown = range(0) if self.growing is None else range(begun, min(self._start, end))
-        found: list[dict[str, set[int]]] = [{}, {}]
+        grown = self.growing.numbers(number, min(self._start, end))
+        refined = self.refining.numbers(max(self._start, number), end)
         if loop.source is not None and self._config.always is None:
             code, names = loop.source
             read = read_loop(code, line_of(code), names, self._pure, self._known(names))
-            found = [read.milestones(numbers) if numbers else {} for numbers in (grown, refined)]
+            self._conditions = [read.milestones(numbers) if numbers else {} for numbers in (grown, refined)]
             self._bars = Bars(read.bar_moves(loop.numbers))
-        elif self._conditions is not None:
-            found = list(self._conditions)  # a state is loaded inside this loop
+        elif self._conditions is None:  # they are known if a state is loaded inside this loop
+            self._conditions = [{}, {}]
         loop.source = None
-        hidden = {n for n in (*self._hidden(refined), *self._chosen, *self._required) if n in refined}
-        if hidden:
-            found[1][NAMED] = hidden
-        self._conditions = found[0], found[1]
+        if grown and not self.growing.begin(self._plan(grown, self._conditions[0], Phase())):
+            self._grow_whole(self._why_no_event())
+        self.refining.begin(self._plan(refined, self._conditions[1], self.growing))
+
+    def _plan(self, numbers: range, conditions: dict[str, set[int]], before: Phase) -> PhasePlan:
+        assert self._last is not None
+        named = {n for n in (*self._hidden(numbers), *self._chosen, *self._required) if n in numbers}
         epoch = self._epoch or (None if self._views is None else len(self._views))
-        if self.growing is not None and grown:
-            assert self._densification is not None
-            if self._keeps_steps and self._config.grow_share is None:
-                # Refinement on accumulated gradients has few steps: 312 of 15,000 iterations in FastGS. Densification
-                # is nearly all of the training then, so all of it runs.
-                hidden = set(grown)
-            else:
-                hidden = {n for n in (*self._hidden(grown), *self._chosen, *self._required) if n in grown}
-            if not self.growing.begin(grown, found[0], hidden, self._densification, epoch):
-                marks = ", ".join(self._densification.marks)
-                if self._config.always is None:
-                    why = f"No condition of the loop that names {marks} holds before iteration {self._start}"
-                else:
-                    why = f"The numbers given as always replace the loop's conditions, also those that name {marks}"
-                self._grow_whole(why)
-        held = {reason: hits for reason, hits in found[1].items() if hits}
-        leaves_out = self.growing is not None and bool(grown) and self.growing.leaves_out
-        before = self.refining.first - begun if leaves_out else 0
-        self.refining.begin(self._last, held, self._views, epoch, self._keeps_steps, before)
+        return PhasePlan(
+            numbers,
+            conditions,
+            named,
+            self._last,
+            before,
+            self._views,
+            epoch,
+            self._densification,
+            self._accumulates,
+        )
+
+    def _why_no_event(self) -> str:
+        assert self._densification is not None
+        marks = ", ".join(self._densification.marks)
+        if self._config.always is None:
+            return f"No condition of the loop that names {marks} holds before iteration {self._start}"
+        return f"The numbers given as always replace the loop's conditions, also those that name {marks}"
 
     def _require_events(self) -> None:
         """Let the growing phase run whole if its densification events are not known.
@@ -258,7 +255,7 @@ class Phased(Pace):
         Raises:
             SkipGSError: `grow_share` was given, which needs them.
         """
-        if self.growing is None or self._densification is not None or self._start == 0:
+        if not self.growing.leaves_out or self._densification is not None or self._start == 0:
             return
         if self._config.share is None:
             raise SkipGSError(
@@ -272,13 +269,7 @@ class Phased(Pace):
             "The densification events of this trainer are not known, so its densification runs whole, and iterations "
             f"are left out after it. {reason}."
         )
-        self.growing = None
-
-    def _refine(self, number: int) -> bool:
-        if self.growing is not None and self.refining.sampling.asked == 0:
-            self._rates.visibility.restart()  # the grown scene decides how long steps are
-            self.refining.stretch(self.growing.stretch)
-        return self.refining.runs(number)
+        self.growing = Phase()
 
     # State and report.
 
@@ -286,19 +277,19 @@ class Phased(Pace):
         return {
             **self.refining.report(),
             "gaussians_shown": self._rates.visibility.share,
-            "growing": None if self.growing is None else self.growing.report(),
+            "growing": self.growing.report(),
         }
 
     def state_dict(self) -> dict[str, Any]:
         return {
             "start": self._start,
             "last": self._last,
-            "keeps_rates": self._keeps_steps,
+            "keeps_rates": self._accumulates,
             "next": self._finder.expected,
             "required": sorted(self._required),
             "refining": self.refining.state_dict(),
             "grow_asked": self._config.growing,
-            "growing": None if self.growing is None else self.growing.state_dict(),  # None, too, if it runs whole
+            "growing": self.growing.state_dict(),  # None, too, if the phase runs whole
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -313,13 +304,13 @@ class Phased(Pace):
         self._required = set(state["required"])
         self.refining.load_state_dict(state["refining"])
         if growing is None:
-            self.growing = None
-        elif self.growing is not None:
+            self.growing = Phase()
+        else:
             self.growing.load_state_dict(growing)
         self._finder.expected = state["next"]
         # The loop asks about its first number before the trainer reports its facts.
         if not self._configured:
-            self._start, self._last, self._keeps_steps = state["start"], state["last"], state["keeps_rates"]
+            self._start, self._last, self._accumulates = state["start"], state["last"], state["keeps_rates"]
             self._configured = True
         if self._finder.found is not None and self._conditions is not None:
             self._read(self._finder.found, max(self._start, state["next"] or 0))

@@ -11,6 +11,7 @@ from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, ONE_CYCLE, EarlyStopping, watched_views
 from skipgs_plug.core.pace.needs import MOST_RAISED_SHARE, refining_share
+from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates, path_factor
 from skipgs_plug.core.pace.sampling import Sampling
 
@@ -23,7 +24,7 @@ RECOVERY = 500
 OF_SHARE, OF_LOOP, OF_CHANGES = "share", "conditions", "changes"
 
 
-class Refining:
+class Refining(Phase):
     """Decides which iterations of refinement run, and the factor on their learning rates.
 
     If steps are larger and shrink to zero, the iterations that run come first: trainers lower the rate of positions by
@@ -34,25 +35,25 @@ class Refining:
         rates: Scales learning rates.
 
     Attributes:
-        share: Share of the iterations that run, or that may run with "auto"; None before refinement.
         sampling: Counts the iterations that ran and that were left out.
         stopping: Follows the cycles of shrinking steps, of which a given share has one; None if rates stay as they are.
         always: Iterations that must run, by reason.
         ran_for: Number of iterations that ran, by reason: the share, conditions of the loop after the share was used
             up, or structural changes after that.
         watched: Views that are watched and not trained on while `watching` is True.
-        first: First iteration of the phase; None before it is known.
     """
+
+    leaves_out = True
 
     def __init__(self, config: SkipConfig, rates: ScaledRates) -> None:
         self._config = config
         self._rates = rates
-        self.share: float | None = None if self._auto else config.refining  # type: ignore[assignment]
+        self.share = None if self._auto else config.refining  # type: ignore[assignment]
         self.sampling = Sampling(1.0)
         self.stopping: EarlyStopping | None = None
         self.always: dict[str, set[int]] = {}
         self.watched: frozenset[str] = frozenset()
-        self.first: int | None = None
+        self._first: int | None = None
         self._last: int | None = None
         self._must: frozenset[int] = frozenset()
         self.ran_for = {OF_SHARE: 0, OF_LOOP: 0, OF_CHANGES: 0}
@@ -61,57 +62,51 @@ class Refining:
         self._expected: int | None = None  # iteration in which another change is expected; None if no change is
         self._over = False  # whether refinement has ended, for the present iteration
         self._shrinks = False  # whether the steps, as many as in the trainer's own run, shrink with its schedule
+        self._before = Phase()
         self._grown_by_few = False
-        self._begun = self._removed = False
+        self._begun = self._entered = self._removed = False
 
     @property
     def begun(self) -> bool:
-        """Whether an iteration of the phase was asked about."""
+        """Whether the training loop has begun, so that the last iteration is settled."""
         return self._begun
 
-    def begin(
-        self,
-        last: int,
-        always: dict[str, set[int]],
-        views: list[str] | None,
-        epoch: int | None,
-        keeps_steps: bool,
-        grown: int,
-    ) -> None:
-        """Begin refinement with iteration `first`.
+    def numbers(self, number: int, end: int) -> range:
+        return range(number if self._first is None else self._first, end)
 
-        Args:
-            last: Last iteration of the run.
-            always: Iterations that must run, by reason.
-            views: Keys of all training views; None if unknown.
-            epoch: Number of iterations in which every view comes up once; None if unknown.
-            keeps_steps: The trainer takes as many steps as in its own run, each with fewer gradients. Steps become
-                longer and shrink with its schedule then.
-            grown: Iterations of the schedule before refinement, if some of them are left out; else 0.
+    def begin(self, plan: PhasePlan) -> bool:
+        """Receive the facts that are known when the loop begins.
+
+        If gradients accumulate, the trainer takes as many steps as in its own run, each with fewer gradients. Steps
+        become longer and shrink with its schedule then.
 
         Raises:
             SkipGSError: "auto" needs the views and they are unknown, or a loaded state had larger steps and they are
                 off now.
         """
-        assert self.first is not None
-        self._begun, self._last, self.always, self._grown_by_few = True, last, always, grown > 0
-        self._must = frozenset().union(*always.values()) if always else frozenset()
-        total = last + 1 - self.first
+        if self._first is None:
+            self._first = plan.numbers.start
+        grown = plan.before.shortened(self._first)
+        self._begun, self._last, self._before, self._grown_by_few = True, plan.last, plan.before, grown > 0
+        reasons = {**plan.conditions, NAMED_FOR_TRAINER: plan.named}
+        self.always = {reason: hits for reason, hits in reasons.items() if hits}
+        self._must = frozenset().union(*self.always.values())
+        total = plan.last + 1 - self._first
         if self._auto and self.share is None:
-            if epoch is None:
+            if plan.epoch is None:
                 raise SkipGSError(
                     'refine_share="auto" must know the training views; give their names to gate.iterations() as views='
                     ", or a share."
                 )
-            self.share = refining_share(total, epoch, grown)
+            self.share = refining_share(total, plan.epoch, grown)
         assert self.share is not None
         # Several processes train on different views at a time, so no view can be watched and kept out of training.
-        if self._judges and views is not None and self.stopping is None and distributed.group_size() == 1:
-            self.watched = watched_views(views, self.share * total)
+        if self._judges and plan.views is not None and self.stopping is None and distributed.group_size() == 1:
+            self.watched = watched_views(plan.views, self.share * total)
         # Iterations are spread evenly if gradients accumulate, so that each step gets some.
         scales = self._scales
-        self._shrinks = scales and keeps_steps
-        if not scales or keeps_steps:
+        self._shrinks = scales and plan.accumulates
+        if not scales or plan.accumulates:
             if self.stopping is not None:
                 raise SkipGSError(
                     "The gate state was saved with larger, shrinking steps, which are off now; continue with the same "
@@ -123,21 +118,27 @@ class Refining:
         log.info(
             "Refinement: at most %.0f %% of iterations %d to %d run, %d of them in any case.",
             100 * self.share,
-            self.first,
-            last,
+            self._first,
+            plan.last,
             len(self._must),
         )
+        return True
 
-    def stretch(self, factor: float) -> None:
-        """Raise the share of "auto" for Gaussians that densification added. Call it before the first iteration."""
+    def _enter(self) -> None:
+        """Begin with the first iteration of the phase: raise the share of "auto" for Gaussians that were added."""
+        self._entered = True
+        if self.sampling.asked > 0:
+            return  # the run was resumed inside the phase
+        self._before.end()
         assert self.share is not None
         if self._auto:
-            self.share = max(self.share, min(self.share * factor, MOST_RAISED_SHARE))
+            self.share = max(self.share, min(self.share * self._before.stretch, MOST_RAISED_SHARE))
             if self.stopping is None:
                 self.sampling.share = self.share
 
     def runs(self, number: int) -> bool:
-        """Whether iteration `number` runs; called once for each number, in order."""
+        if not self._entered:
+            self._enter()
         if self._expected is not None and number > self._expected:
             assert self._last is not None
             self._recover(min(RECOVERY, self._last - self._expected))
@@ -154,11 +155,13 @@ class Refining:
         return runs
 
     def require(self, number: int) -> None:
-        """Make iteration `number` run. Call it for a need that shows only during the run."""
         self._must |= {number}
 
-    def counts(self) -> None:
-        """Count the present iteration, which began before the training loop was known, as one that ran."""
+    def count_first(self, number: int) -> None:
+        """Count iteration `number`, the first of the phase, if it began before the training loop was known."""
+        if self._first is not None:
+            return
+        self._first = number
         self.sampling.runs(must=True)
         self.ran_for[OF_SHARE] += 1
 
@@ -227,20 +230,20 @@ class Refining:
 
     def _set_pace(self, number: int) -> None:
         """Set the share and the factor for iteration `number`; without larger steps both stay."""
-        assert self.first is not None and self._last is not None and self.share is not None
+        assert self._first is not None and self._last is not None and self.share is not None
         if self.stopping is None:
             if self._shrinks:
                 self._rates.visibility.finish()  # gradients of several views come together
                 # With a share of its gradients a step is noisier by 1 / sqrt(share). Adam shortens the part that views
                 # agree on by as much.
-                progress = (number - self.first) / (self._last + 1 - self.first)
+                progress = (number - self._first) / (self._last + 1 - self._first)
                 self._rates.scale(path_factor(math.sqrt(self.share), progress, self._config.rate_peak))
             return
         if self._recovered < self._recovery:
             factor = 1.0 - self._recovered / self._recovery
             self._over = False
         else:
-            progress = self.stopping.progress(self.sampling.run / (self.share * (self._last + 1 - self.first)))
+            progress = self.stopping.progress(self.sampling.run / (self.share * (self._last + 1 - self._first)))
             factor = path_factor(self.share, progress, self._config.rate_peak, self._rates.visibility.share)
             self._over = self.stopping.ended
         self.sampling.share = 0.0 if self._over else 1.0
@@ -274,7 +277,7 @@ class Refining:
         return {
             "asked": self._config.refining,
             "share": self.share,
-            "first": self.first,
+            "first": self._first,
             "sampling": self.sampling.state_dict(),
             "watched": sorted(self.watched),
             "recovery": [self._recovery, self._recovered],
@@ -285,15 +288,10 @@ class Refining:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict()`; `begin` follows.
-
-        Raises:
-            SkipGSError: No run has such a state.
-        """
         share = state["share"]
         if not (self._auto and state["first"] is None if share is None else 0.0 < share <= 1.0):
             raise SkipGSError(f"The gate state has share={share!r}, expected one in (0, 1]; start the gate afresh.")
-        self.share, self.first = share, state["first"]
+        self.share, self._first = share, state["first"]
         self.sampling.load_state_dict(state["sampling"])
         self.watched = frozenset(state["watched"])
         self._recovery, self._recovered = state["recovery"]
@@ -303,4 +301,4 @@ class Refining:
         if state["stopping"] is not None:
             self.stopping = EarlyStopping(self._config.tolerance)
             self.stopping.load_state_dict(state["stopping"])
-        self._begun = False
+        self._begun = self._entered = False
