@@ -13,7 +13,7 @@ class HostCopy:
     """Starts a copy of a tensor with one value to the host, behind the work that is queued on the device so far.
 
     `value` waits for the copy only, and not for work that is queued later, such as a backward pass. On the CPU, and on
-    devices without events, no copy is started and `value` reads the tensor.
+    devices that cannot copy beside other work, no copy is started and `value` reads the tensor.
 
     Args:
         tensor: One value, of any shape.
@@ -25,7 +25,7 @@ class HostCopy:
         self._event: Any = None
         self._value: float | None = None
         self._copy = tensor.detach()
-        if has_events(tensor.device):
+        if copies_in_background(tensor.device):
             # PyTorch puts a non-blocking copy in pinned memory.
             self._copy = self._copy.to("cpu", non_blocking=True)
             self._event = getattr(torch, tensor.device.type).Event()
@@ -47,7 +47,7 @@ class HostCopy:
 
 
 @functools.cache
-def has_events(device: torch.device) -> bool:
-    """Whether this device has events, so that each copy can be waited for."""
-    # On MPS, events are not in order with non-blocking copies.
+def copies_in_background(device: torch.device) -> bool:
+    """Whether a copy from this device can run beside its other work, and be waited for alone."""
+    # It is waited for by an event of PyTorch. On MPS, events are not in order with non-blocking copies.
     return device.type not in ("cpu", "mps") and hasattr(getattr(torch, device.type, None), "Event")

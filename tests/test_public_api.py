@@ -107,7 +107,7 @@ FACTS = (
 )
 POLICY = {
     "decide": "(self, view: 'Hashable', loss: 'float', step: 'int') -> 'Decision'",
-    "foreseen": "(self, view: 'Hashable', step: 'int') -> 'bool | None'",
+    "known_ahead": "(self, view: 'Hashable', step: 'int') -> 'bool | None'",
     "load_state_dict": "(self, state: 'dict[str, Any]') -> 'None'",
     "mean": "(self, view: 'Hashable') -> 'float | None'",
     "notify_event": "(self, step: 'int', n_views: 'int') -> 'None'",

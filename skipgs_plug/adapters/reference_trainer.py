@@ -12,8 +12,8 @@ from skipgs_plug.adapters.gsplat_strategy import iterations_that_run, strategy_e
 from skipgs_plug.core.clock import Times
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.events import MIN_PAUSE_ITERS
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.pause import MIN_PAUSE_ITERS
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
 FULL_SCHEDULE = 30_000  # iterations of the schedule that the default settings of gate and trainer suit

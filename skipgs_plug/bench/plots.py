@@ -161,8 +161,8 @@ def skipped_views(runs: Sequence[RunRecord], n_views: int) -> Figure:
         panel.yaxis.get_major_locator().set_params(integer=True)
         if run.warm_up:
             panel.axvline(run.trace.start + run.warm_up, color="0.25", linewidth=1, linestyle=(0, (4, 3)))
-        share = 100 * run.skips / run.iterations_run
-        panel.set_title(f"{run.policy}, seed {run.seed}: {share:.0f} % skipped", loc="left", fontsize=11)
+        percent = 100 * run.skips / run.iterations_run
+        panel.set_title(f"{run.policy}, seed {run.seed}: {percent:.0f} % skipped", loc="left", fontsize=11)
         panel.set_xlabel("iteration (dashed: end of warm-up)")
         panel.grid(visible=False)
     axes[0].set_ylabel("training view")
@@ -208,8 +208,8 @@ def loss_and_mean(run: RunRecord, view_names: Sequence[str]) -> Figure:
                    label="loss, backward run")  # fmt: skip
         panel.plot(steps[out], loss[out], linestyle="none", marker="o", markersize=3.6, color="#D55E00",
                    markerfacecolor="white", label="loss, backward skipped")  # fmt: skip
-        share = f"{out.sum()} of {len(out)} visits skipped"
-        panel.set_title(f"{view_names[view]}: {share}", loc="left", fontsize=SMALL + 1, parse_math=False)
+        count = f"{out.sum()} of {len(out)} visits skipped"
+        panel.set_title(f"{view_names[view]}: {count}", loc="left", fontsize=SMALL + 1, parse_math=False)
         panel.set_ylabel("loss")
     panels[-1].set_xlabel("iteration")
     handles, labels = panels[0].get_legend_handles_labels()
@@ -222,12 +222,12 @@ def seeds_text(rows: Sequence[Row]) -> str:
     return "one seed" if len(seeds) == 1 else f"mean of {len(seeds)} seeds"
 
 
-def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **share: Any) -> Any:
+def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **shared: Any) -> Any:
     """Return a figure and its axes, without frame clutter."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, **share).ravel()
+    grid = figure.subplots(rows, columns, squeeze=False, **shared).ravel()
     for axes in grid:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(color="0.92", linewidth=0.8)

@@ -88,7 +88,7 @@ def all_iterations(trainer: Trainer, earlier: Earlier) -> int:
 
 
 @dataclass(frozen=True)
-class Policy:
+class BenchPolicy:
     """One row of a comparison.
 
     Attributes:
@@ -103,7 +103,7 @@ class Policy:
 
 
 @dataclass(frozen=True)
-class PolicySpec(Policy):
+class RefineBenchPolicy(BenchPolicy):
     """One row of the comparison of refinements.
 
     Attributes:
@@ -116,10 +116,10 @@ class PolicySpec(Policy):
     iterations: Callable[[Trainer, Earlier], int] = all_iterations
 
 
-AnyPolicy = TypeVar("AnyPolicy", bound=Policy)
+AnyBenchPolicy = TypeVar("AnyBenchPolicy", bound=BenchPolicy)
 
 
-def table_of(*specs: AnyPolicy) -> dict[str, AnyPolicy]:
+def table_of(*specs: AnyBenchPolicy) -> dict[str, AnyBenchPolicy]:
     return {spec.name: spec for spec in specs}
 
 
@@ -128,58 +128,62 @@ def _periodic(first: int, end: int, n_skips: int, seed: int) -> PlannedSkipping:
 
 
 POLICIES = table_of(
-    PolicySpec(REFERENCE, "the trainer's own refinement: every iteration runs as it is"),
-    PolicySpec("gate", "the paper's gate, default settings", gate=gate_with()),
-    PolicySpec("gate,min_bwd_ratio=0", "the gate without a floor", gate=gate_with(min_bwd_ratio=0.0)),
-    PolicySpec(
+    RefineBenchPolicy(REFERENCE, "the trainer's own refinement: every iteration runs as it is"),
+    RefineBenchPolicy("gate", "the paper's gate, default settings", gate=gate_with()),
+    RefineBenchPolicy("gate,min_bwd_ratio=0", "the gate without a floor", gate=gate_with(min_bwd_ratio=0.0)),
+    RefineBenchPolicy(
         "random",
         "control: as many backwards skipped as by the gate, drawn by chance",
         ("gate",),
         planned_as("gate", random_skipping),
     ),
-    PolicySpec(
+    RefineBenchPolicy(
         "periodic",
         "control: as many backwards skipped as by the gate, evenly spread",
         ("gate",),
         planned_as("gate", _periodic),
     ),
-    PolicySpec(
+    RefineBenchPolicy(
         "shortened",
         "control: no skips, fewer iterations, schedule compressed to the gate's time",
         (REFERENCE, "gate"),
         iterations=as_long_as("gate"),
     ),
-    PolicySpec(
+    RefineBenchPolicy(
         "own,compensate",
         f"every iteration runs, with the larger, shrinking steps of {COPIED}",
         (COPIED,),
         stepping_as(COPIED),
     ),
-    PolicySpec(COPIED, "40 % of the iterations run, with larger, shrinking steps", gate=gate_with(refine_share=0.4)),
-    PolicySpec(
+    RefineBenchPolicy(
+        COPIED, "40 % of the iterations run, with larger, shrinking steps", gate=gate_with(refine_share=0.4)
+    ),
+    RefineBenchPolicy(
         "refine_share=auto",
         "as many iterations as the scene needs, with larger, shrinking steps",
         gate=gate_with(refine_share="auto"),
     ),
-    PolicySpec(
+    RefineBenchPolicy(
         f"{COPIED},no-compensate",
         "control: 40 % of the iterations run, steps as they are",
         gate=gate_with(refine_share=0.4, compensate=False),
     ),
-    PolicySpec("gate,compensate", "the paper's gate, with larger, shrinking steps", gate=gate_with(compensate=True)),
-    PolicySpec(
+    RefineBenchPolicy(
+        "gate,compensate", "the paper's gate, with larger, shrinking steps", gate=gate_with(compensate=True)
+    ),
+    RefineBenchPolicy(
         "random,compensate",
         "control: random, with larger, shrinking steps",
         ("gate",),
         planned_as("gate", random_skipping, compensate=True),
     ),
-    PolicySpec(
+    RefineBenchPolicy(
         "periodic,compensate",
         "control: periodic, with larger, shrinking steps",
         ("gate",),
         planned_as("gate", _periodic, compensate=True),
     ),
-    PolicySpec(
+    RefineBenchPolicy(
         "shortened,compensate",
         "control: iterations left out down to the gate's time, with larger, shrinking steps",
         (REFERENCE, "gate"),
@@ -188,7 +192,7 @@ POLICIES = table_of(
 )
 
 
-def refinement_policy(name: str) -> PolicySpec | None:
+def refinement_policy(name: str) -> RefineBenchPolicy | None:
     """Return the policy with this name; None if it does not exist. `refine_share=` takes any number in (0, 1]."""
     if name in POLICIES:
         return POLICIES[name]
@@ -196,7 +200,7 @@ def refinement_policy(name: str) -> PolicySpec | None:
     if share is None:
         return None
     meaning = f"{100 * share:g} % of the iterations run, with larger, shrinking steps"
-    return PolicySpec(name, meaning, gate=gate_with(refine_share=share))
+    return RefineBenchPolicy(name, meaning, gate=gate_with(refine_share=share))
 
 
 def number_after(setting: str, name: str) -> float | None:
@@ -205,7 +209,9 @@ def number_after(setting: str, name: str) -> float | None:
     return float(found[1]) if found is not None and 0.0 < float(found[1]) <= 1.0 else None
 
 
-def check_policies(names: Sequence[str], find: Callable[[str], Policy | None], known: Mapping[str, Policy]) -> None:
+def check_policies(
+    names: Sequence[str], find: Callable[[str], BenchPolicy | None], known: Mapping[str, BenchPolicy]
+) -> None:
     """Raise InputError if no policy is given, or if one is unknown, given twice, or lacks a policy that it needs.
 
     Args:
@@ -226,7 +232,7 @@ def check_policies(names: Sequence[str], find: Callable[[str], Policy | None], k
             raise InputError(f"Policy {name!r} copies rate or time of {missing[0]!r}; add {missing[0]} to --policies.")
 
 
-def rounds(specs: Sequence[AnyPolicy], position: int) -> list[list[AnyPolicy]]:
+def rounds(specs: Sequence[AnyBenchPolicy], position: int) -> list[list[AnyBenchPolicy]]:
     """Return groups that run in turns: policies that copy nothing, then policies that copy from them, and so on.
 
     The order within a group is rotated by `position`, the place of the seed among all seeds.

@@ -13,7 +13,7 @@ import torch
 
 from skipgs_plug import SkipGate
 from skipgs_plug.bench.memory import memory_meter
-from skipgs_plug.bench.policies import REFERENCE, Earlier, PolicySpec
+from skipgs_plug.bench.policies import REFERENCE, Earlier, RefineBenchPolicy
 from skipgs_plug.bench.record import Point, RunRecord, Trace
 from skipgs_plug.trainer import Trainer
 from skipgs_plug.trainer.loop import Iteration
@@ -48,7 +48,7 @@ def densify(trainer: Trainer, progress: bool = True, scalars: Path | None = None
 
 def refine(
     trainer: Trainer,
-    spec: PolicySpec,
+    spec: RefineBenchPolicy,
     earlier: Earlier,
     lpips_net: str | None = None,
     scalars: Path | None = None,

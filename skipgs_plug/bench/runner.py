@@ -12,7 +12,7 @@ from typing import Any
 from skipgs_plug.bench import provenance
 from skipgs_plug.bench.choices import Clock
 from skipgs_plug.bench.find import find_policy, known_policies
-from skipgs_plug.bench.policies import Earlier, Policy, check_policies, refinement_policy, rounds
+from skipgs_plug.bench.policies import BenchPolicy, Earlier, check_policies, refinement_policy, rounds
 from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.bench.refine import DivergedError, NotRunError, densify, refine
 from skipgs_plug.bench.store import BenchFolder
@@ -107,7 +107,7 @@ class Bench:
             records += [found[name] for name in self.policies]
         return records
 
-    def _run_seed(self, seed: int, order: list[list[Policy]]) -> dict[str, RunRecord]:
+    def _run_seed(self, seed: int, order: list[list[BenchPolicy]]) -> dict[str, RunRecord]:
         found: dict[str, RunRecord] = {}
         for spec in itertools.chain(*order):
             stored = self.folder.load(seed, spec.name)
@@ -129,7 +129,7 @@ class Bench:
         return found
 
     def _in_turns(
-        self, seed: int, specs: list[Policy], begin: Begin, earlier: dict[str, RunRecord]
+        self, seed: int, specs: list[BenchPolicy], begin: Begin, earlier: dict[str, RunRecord]
     ) -> Iterator[RunRecord]:
         """Train under each policy, taking turns by part; yield each finished run.
 
@@ -206,11 +206,11 @@ class Bench:
         record.commit = self.commit
         self.folder.store(record)
         if record.status == "done":
-            share = 100 * record.backwards / record.iterations
+            percent = 100 * record.backwards / record.iterations
             time = f"T_total {record.t_total:7.1f} s" if self.whole else f"T_post {record.t_post:7.1f} s"
             self.say(
                 f"seed {record.seed}: {record.policy:24} {time}, "
-                f"{record.backwards:,} of {record.iterations:,} backwards ({share:.0f} %), "
+                f"{record.backwards:,} of {record.iterations:,} backwards ({percent:.0f} %), "
                 f"{record.metrics['num_GS']:,} Gaussians, PSNR {record.metrics['psnr']:.2f} dB"
             )
         else:

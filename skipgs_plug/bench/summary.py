@@ -111,8 +111,8 @@ def time_to_reach(points: Sequence[Point], target: float) -> float | None:
     for after in points:
         if after.metrics[HEADLINE] >= target:
             rise = after.metrics[HEADLINE] - before.metrics[HEADLINE]
-            share = (target - before.metrics[HEADLINE]) / rise if rise > 0 else 1.0
-            return before.seconds + share * (after.seconds - before.seconds)
+            part = (target - before.metrics[HEADLINE]) / rise if rise > 0 else 1.0
+            return before.seconds + part * (after.seconds - before.seconds)
         before = after
     return None
 
@@ -136,12 +136,12 @@ def ceiling(rows: Sequence[Row]) -> dict[str, float] | None:
     by_name = {row.policy: row.values for row in rows if row.seeds}
     if "gate" not in by_name or REFERENCE not in by_name or "t_post_saved" not in by_name["gate"]:
         return None
-    share = by_name[REFERENCE]["share_backward"].mean + by_name[REFERENCE]["share_optimizer"].mean
+    percent = by_name[REFERENCE]["share_backward"].mean + by_name[REFERENCE]["share_optimizer"].mean
     skipped = 100 - by_name["gate"]["backwards_share"].mean
     return {
-        "share": share,
+        "share": percent,
         "skipped": skipped,
-        "most": share * skipped / 100,
+        "most": percent * skipped / 100,
         "measured": by_name["gate"]["t_post_saved"].mean,
     }
 

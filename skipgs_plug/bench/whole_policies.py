@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
 from skipgs_plug import SkipGate
-from skipgs_plug.bench.policies import REFERENCE, Earlier, Policy, gate_with, number_after, table_of
+from skipgs_plug.bench.policies import REFERENCE, BenchPolicy, Earlier, gate_with, number_after, table_of
 from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.bench.sampling import periodic_numbers, random_numbers
 from skipgs_plug.bench.whole import Maker, as_many_gaussians, planned, shortened, whole_run
@@ -22,7 +22,7 @@ Run = Callable[[Maker, Earlier, RunRecord], Generator[None, None, None]]
 
 
 @dataclass(frozen=True)
-class WholePolicy(Policy):
+class WholeBenchPolicy(BenchPolicy):
     """One row of the comparison of whole runs.
 
     Attributes:
@@ -57,45 +57,45 @@ def larger_steps(trainer: Trainer, earlier: Earlier) -> SkipGate:
 
 
 WHOLE_POLICIES = table_of(
-    WholePolicy(REFERENCE, "the trainer's own run: every iteration runs as it is", run=own),
-    WholePolicy("gate", "the paper's gate, default settings, after densification", run=gated()),
-    WholePolicy(
+    WholeBenchPolicy(REFERENCE, "the trainer's own run: every iteration runs as it is", run=own),
+    WholeBenchPolicy("gate", "the paper's gate, default settings, after densification", run=gated()),
+    WholeBenchPolicy(
         "refine_share=auto",
         "densification as it is, then as many iterations as the scene needs, with larger, shrinking steps",
         run=gated(refine_share="auto"),
     ),
-    WholePolicy(COPIED, "as many iterations as the scene needs in the whole run", run=gated(share="auto")),
-    WholePolicy("share=0.4", "40 % of the iterations of the whole run", run=gated(share=0.4)),
-    WholePolicy(
+    WholeBenchPolicy(COPIED, "as many iterations as the scene needs in the whole run", run=gated(share="auto")),
+    WholeBenchPolicy("share=0.4", "40 % of the iterations of the whole run", run=gated(share=0.4)),
+    WholeBenchPolicy(
         f"{COPIED},no-compensate",
         f"control: {COPIED} with steps as they are",
         run=gated(share="auto", compensate=False),
     ),
-    WholePolicy(
+    WholeBenchPolicy(
         "shortened",
         f"control: a schedule with all its milestones compressed to the time of {COPIED}",
         (REFERENCE, COPIED),
         shortened(COPIED),
     ),
-    WholePolicy(
+    WholeBenchPolicy(
         "shortened,compensate",
         "control: the same with larger, shrinking steps in refinement",
         (REFERENCE, COPIED),
         shortened(COPIED, larger_steps),
     ),
-    WholePolicy(
+    WholeBenchPolicy(
         "random",
         f"control: as many iterations as {COPIED} in each phase, drawn by chance, with all events, steps as they are",
         (COPIED,),
         planned(COPIED, random_numbers),
     ),
-    WholePolicy(
+    WholeBenchPolicy(
         "periodic",
         f"control: as many iterations as {COPIED} in each phase, evenly spread, with all events, steps as they are",
         (COPIED,),
         planned(COPIED, periodic_numbers),
     ),
-    WholePolicy(
+    WholeBenchPolicy(
         "own,grow_grad2d",
         f"control: the own run with grow_grad2d set so that it ends with as many Gaussians as {COPIED}",
         (REFERENCE, COPIED),
@@ -104,14 +104,14 @@ WHOLE_POLICIES = table_of(
 )
 
 
-def whole_policy(name: str) -> WholePolicy | None:
+def whole_policy(name: str) -> WholeBenchPolicy | None:
     """Return the policy with this name; None if it does not exist. Shares are numbers in (0, 1]."""
     if name in WHOLE_POLICIES:
         return WHOLE_POLICIES[name]
     share, refined = number_after("share", name), number_after("refine_share", name)
     if share is not None:
-        return WholePolicy(name, f"{100 * share:g} % of the iterations of the whole run", run=gated(share=share))
+        return WholeBenchPolicy(name, f"{100 * share:g} % of the iterations of the whole run", run=gated(share=share))
     if refined is not None:
         meaning = f"densification as it is, then {100 * refined:g} % of the iterations, with larger, shrinking steps"
-        return WholePolicy(name, meaning, run=gated(refine_share=refined))
+        return WholeBenchPolicy(name, meaning, run=gated(refine_share=refined))
     return None

@@ -13,7 +13,7 @@ CHECKED_SKIPS = 5  # skipped iterations that are checked, from the second on; a 
 
 
 class DriftCheck:
-    """Compares the parameters before and after skipped iterations without pending gradients or events.
+    """Compares the parameters before and after skipped iterations without pending gradients or structural changes.
 
     A change there comes from the loop itself. It belongs to the gradient step, such as noise, and would go on alone.
     Sums and norms are compared. A checked iteration costs two passes over the parameters and one read of the device. A
@@ -29,7 +29,7 @@ class DriftCheck:
         self._engine = engine
         self._optimizers = optimizers
         self._left = CHECKED_SKIPS
-        # Number of events, names, and sums of the parameters when the iteration began.
+        # Number of structural changes, names, and sums of the parameters when the iteration began.
         self._before: tuple[int, list[str], list[Tensor]] | None = None
 
     def moved(self) -> list[str]:
@@ -46,10 +46,10 @@ class DriftCheck:
         named = with_names(self._optimizers())
         if any(has_pending_gradient(one) for _, one in named):
             return []
-        events = sum(stats.events.values())
+        changes = sum(stats.changes.values())
         names, now = _like(named)
-        self._before = (events, names, now)
-        if before is None or not self._engine.skipped or before[0] != events:
+        self._before = (changes, names, now)
+        if before is None or not self._engine.skipped or before[0] != changes:
             return []
         self._left -= 1
         return _changed(before[1], before[2], now)

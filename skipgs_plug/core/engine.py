@@ -31,7 +31,7 @@ from skipgs_plug.core.stats import GateStats
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.core.views import require_unique, warn_unless_recurring
-from skipgs_plug.host_copy import HostCopy, has_events
+from skipgs_plug.host_copy import HostCopy, copies_in_background
 
 log = logging.getLogger(__name__)
 
@@ -201,12 +201,12 @@ class Engine:
             alone: Whether the iteration has no other backward pass, so that a skipped graph can be freed at once.
         """
         back_from = loss if loss is not None else signal if isinstance(signal, Tensor) else None
-        foreseen = self._foreseen(view, signal, back_from) if self.iteration.gated else None
-        if foreseen is False:
+        ahead = self._known_ahead(view, signal, back_from) if self.iteration.gated else None
+        if ahead is False:
             skip = self._run_first(view, signal, run, back_from)
         else:
             # The loss is not read in iterations that train nothing.
-            skip = self.decide(view, None if foreseen else signal).skip
+            skip = self.decide(view, None if ahead else signal).skip
             if not skip:
                 run()
                 self.iteration.ran = True
@@ -227,10 +227,10 @@ class Engine:
                 free_graph(loss)
         self._skipped.clear()
 
-    def _foreseen(self, view: str, signal: float | Tensor, loss: Tensor | None) -> bool | None:
+    def _known_ahead(self, view: str, signal: float | Tensor, loss: Tensor | None) -> bool | None:
         """Whether the backward of a gated iteration is skipped, if that is known without waiting for the loss."""
         now = self.iteration
-        if not (loss is not None and isinstance(signal, Tensor) and has_events(signal.device)):
+        if not (loss is not None and isinstance(signal, Tensor) and copies_in_background(signal.device)):
             return None
         # Other processes must be asked. With accumulation, a non-finite loss would drop earlier gradients too.
         if self._accumulates or self._scene_check.running or distributed.group_size() > 1:
@@ -238,7 +238,7 @@ class Engine:
         assert self.policy is not None and now.step is not None
         if self._must_run is not None and self._must_run(now.step):
             return False
-        return self.policy.foreseen(view, now.step)
+        return self.policy.known_ahead(view, now.step)
 
     def _run_first(self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor | None) -> bool:
         """Launch the backward pass, then decide; return True if its gradients were dropped."""
@@ -289,7 +289,7 @@ class Engine:
         assert self.policy is not None
         if not self.config.enabled or step < self.start - 1:
             return
-        self.stats.events[kind] = self.stats.events.get(kind, 0) + 1
+        self.stats.changes[kind] = self.stats.changes.get(kind, 0) + 1
         self._scene_check.stop()
         self.policy.notify_event(step, self.n_views)
 
@@ -335,7 +335,7 @@ class Engine:
             self.clock.load_state_dict(state["clock"])
             step = state["step"]
         # A pace that leaves out iterations does not pause, so means are far off for a long time after a change.
-        if not self.pace.leaves_out or not self.stats.events:
+        if not self.pace.leaves_out or not self.stats.changes:
             self._scene_check.start()
         self.iteration.begin(step, gated=step is not None and step >= self.start and self.config.enabled)
 

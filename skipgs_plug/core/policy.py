@@ -12,7 +12,7 @@ from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.ema import ViewMeans
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.events import Pause
+from skipgs_plug.core.pause import Pause
 from skipgs_plug.core.state import POLICY_VERSION, policy_state
 
 # Added to a mean (unit of the loss) before the loss is divided by it, so that a mean of 0 is no division by zero. The
@@ -52,7 +52,7 @@ class Policy(ABC):
         """Return the running mean of a view's loss; None if the view or the policy has no mean."""
         return None
 
-    def foreseen(self, view: Hashable, step: int) -> bool | None:
+    def known_ahead(self, view: Hashable, step: int) -> bool | None:
         """Return whether `decide` will skip, if that is known without the loss; None if it is unknown.
 
         The call changes nothing. It returns True only in iterations that train nothing; `decide` is then not called
@@ -86,9 +86,9 @@ class SkipPolicy(Policy):
 
     From `start_iter` on, the deviation score of a view is loss / (mean + 1e-8). Its backward pass is skipped when the
     score is at most 1 + threshold, unless the floor on the share of backward passes forbids it. The arguments are
-    those of `SkipConfig`. Without events and with finite losses, the decisions are those of the authors' released
-    controller, one for one, with one exception: warm-up counts from the first iteration that the policy sees, so
-    that a run that is resumed late still sets its floor.
+    those of `SkipConfig`. Without structural changes and with finite losses, the decisions are those of the authors'
+    released controller, one for one, with one exception: warm-up counts from the first iteration that the policy sees,
+    so that a run that is resumed late still sets its floor.
 
     Examples:
         >>> from skipgs_plug.core.policy import SkipPolicy
@@ -194,7 +194,7 @@ class SkipPolicy(Policy):
             budget.calibrate()
         return answer
 
-    def foreseen(self, view: Hashable, step: int) -> bool | None:
+    def known_ahead(self, view: Hashable, step: int) -> bool | None:
         """Return False in a pause, in warm-up, for a new view, and while the floor forbids skipping."""
         if step < self._start_iter or not self.enabled or step < self.pause.until:
             return False
@@ -244,7 +244,7 @@ class SkipPolicy(Policy):
             "budget": self.budget.state_dict(),
             "warmup_end": self._warmup_end,
             "pause_until": self.pause.until,
-            "events": self.pause.events,
+            "events": self.pause.changes,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -258,4 +258,4 @@ class SkipPolicy(Policy):
         self.budget.load_state_dict(state["budget"])
         self._warmup_end = state["warmup_end"]
         self.pause.until = state["pause_until"]
-        self.pause.events = state["events"]
+        self.pause.changes = state["events"]

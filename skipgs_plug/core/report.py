@@ -56,7 +56,7 @@ def counters(
         "paused": stats.reasons.get("pause", 0),
         "non_finite": stats.reasons.get("non-finite", 0),
         "reasons": dict(stats.reasons),
-        "events": dict(stats.events),
+        "events": dict(stats.changes),
         **times._asdict(),
         **(left_out or {**NO_REFINEMENT, "iterations_run": stats.gated}),
     }
@@ -75,9 +75,9 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
         return _summarise_refinement(config, counted)
     gated, skipped, reasons = counted["gated_iterations"], counted["backwards_skipped"], counted["reasons"]
     floor = counted["min_bwd_ratio_effective"]
-    share = 100 * skipped / gated if gated else 0.0
+    percent = 100 * skipped / gated if gated else 0.0
     return (
-        f"SkipGS: {skipped:,} of {gated:,} backwards skipped ({share:.1f} %) since iteration "
+        f"SkipGS: {skipped:,} of {gated:,} backwards skipped ({percent:.1f} %) since iteration "
         f"{config.start_iter or 0:,}, {counted['iterations']:,} iterations in all.\n"
         f"  floor {'none' if floor is None else format(floor, '.3f')}, warm-up {reasons.get('warm-up', 0):,}, "
         f"held back by the floor {reasons.get('budget', 0):,}, paused {counted['paused']:,} "
@@ -87,10 +87,10 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
 
 def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
     run, skipped = counted["iterations_run"], counted["iterations_skipped"]
-    share = 100 * run / (run + skipped) if run + skipped else 0.0
+    percent = 100 * run / (run + skipped) if run + skipped else 0.0
     lines = [] if counted["growing"] is None else [_summarise_growing(counted["growing"])]
     lines += [
-        f"SkipGS: {run:,} of {run + skipped:,} iterations run ({share:.1f} %) since iteration "
+        f"SkipGS: {run:,} of {run + skipped:,} iterations run ({percent:.1f} %) since iteration "
         f"{config.start_iter or 0:,}, {skipped:,} left out whole."
     ]
     if counted["gaussians_shown"] is not None:
@@ -126,11 +126,11 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
 
 def _summarise_growing(growing: dict[str, Any]) -> str:
     run, skipped = growing["iterations_run"], growing["iterations_skipped"]
-    share = 100 * run / (run + skipped) if run + skipped else 100.0
+    percent = 100 * run / (run + skipped) if run + skipped else 100.0
     factor = growing["rate_factor"]
     longer = "" if factor is None or factor == 1.0 else f", steps {factor:.1f} times as long"
     return (
-        f"SkipGS: {run:,} of {run + skipped:,} iterations run ({share:.1f} %) until densification ends, with "
+        f"SkipGS: {run:,} of {run + skipped:,} iterations run ({percent:.1f} %) until densification ends, with "
         f"{growing['events_run']:,} of {growing['events_run'] + growing['events_skipped']:,} densification "
         f"events{longer}.{_why_more(growing)}"
     )

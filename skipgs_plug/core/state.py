@@ -116,7 +116,7 @@ class NewerEventsState(TypedDict, total=False):
 
 
 class EventsState(NewerEventsState):
-    """Content of `Events.state_dict()`."""
+    """Content of `DensificationEvents.state_dict()`."""
 
     kept: int
     left_out: int

@@ -17,7 +17,7 @@ class GateStats:
         backwards: Number of real backward passes from `start_iter` on, including those in warm-up and in pauses.
         skips: Number of skipped backward passes.
         reasons: Number of gated decisions, by reason.
-        events: Number of structural changes that the policy was notified of, by kind.
+        changes: Number of structural changes that the policy was notified of, by kind.
     """
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class GateStats:
         self.backwards = 0
         self.skips = 0
         self.reasons: dict[str, int] = {}
-        self.events: dict[str, int] = {}
+        self.changes: dict[str, int] = {}
         self._views: dict[str, list[Any]] = {}  # visits, backwards, skips, last loss
 
     def record(self, decision: Decision, view: str, loss: float | None) -> bool:
@@ -97,7 +97,7 @@ class GateStats:
             "backwards": self.backwards,
             "skips": self.skips,
             "reasons": dict(self.reasons),
-            "events": dict(self.events),
+            "events": dict(self.changes),
             "views": {view: list(row) for view, row in self._views.items()},
         }
 
@@ -106,5 +106,5 @@ class GateStats:
         self.backwards = state["backwards"]
         self.skips = state["skips"]
         self.reasons = dict(state["reasons"])
-        self.events = dict(state["events"])
+        self.changes = dict(state["events"])
         self._views = {view: list(row) for view, row in state["views"].items()}

@@ -36,7 +36,7 @@ class Pilot:
         samples: The iterations that ran, in order.
         first_gaussians: Number of Gaussians before the first iteration.
         views: Number of training views.
-        shown: Share of the Gaussians that a view shows; None if too few iterations ran to measure it.
+        visible: Share of the Gaussians that a view shows; None if too few iterations ran to measure it.
         stop: Iteration of the pilot's schedule at which densification ends.
         peak_memory: Peak memory in bytes, of the process on the CPU and of PyTorch on a GPU; None if unknown.
     """
@@ -44,7 +44,7 @@ class Pilot:
     samples: tuple[Sample, ...]
     first_gaussians: int
     views: int
-    shown: float | None
+    visible: float | None
     stop: int
     peak_memory: int | None
 
@@ -82,6 +82,6 @@ def run_pilot(
         meter.reset()
     with SkipGate(trainer, share="auto") as gate:
         trainer.train(progress=progress)
-        shown = gate.report()["gaussians_shown"]
+        visible = gate.report()["gaussians_shown"]
     peak = None if meter is None else meter.peak()
-    return Pilot(tuple(samples), first, len(scene.train), shown, trainer.refine_stop_iter, peak)
+    return Pilot(tuple(samples), first, len(scene.train), visible, trainer.refine_stop_iter, peak)

@@ -63,7 +63,7 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
     grown = growth(end)
     per_growing = float(np.mean([cost(growth(x)) for x in np.linspace(0.0, end, 101)]))
     per_refining = cost(grown)
-    growing = growing_share(stop, pilot.views, longer=pilot.shown is not None) * stop
+    growing = growing_share(stop, pilot.views, longer=pilot.visible is not None) * stop
     left = max_steps - stop
     refining = refining_share(left, pilot.views, grown=stop) * left if left else 0.0
     more = grown - max(sample.gaussians for sample in pilot.samples)

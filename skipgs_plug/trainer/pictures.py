@@ -72,8 +72,8 @@ def plot_refinement(path: Path, curves: list[Curve]) -> None:
         if any(curve.skipped):
             steps, skipped = np.array(curve.steps), np.array(curve.skipped)
             skips.vlines(steps[skipped], 0, 1, color="0.75", linewidth=0.5)
-            share = np.cumsum(skipped) / np.arange(1, len(skipped) + 1)
-            skips.plot(steps, share, color=line.get_color(), label=f"{curve.name}: share skipped so far")
+            skipped_so_far = np.cumsum(skipped) / np.arange(1, len(skipped) + 1)
+            skips.plot(steps, skipped_so_far, color=line.get_color(), label=f"{curve.name}: share skipped so far")
             skips.legend(loc="upper left", fontsize="small")
     losses.set_ylabel("training loss (running mean)")
     losses.legend()

@@ -92,15 +92,15 @@ def look_at(position: Array, target: Array) -> Array:
 
 def sample_surfaces(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Return points [n, 3] and colours [n, 3]: half of them on the floor, the others on the objects."""
-    shares = [n // 8] * (len(SPHERES) + len(BOXES))
+    counts = [n // 8] * (len(SPHERES) + len(BOXES))
     points, items, normals = [], [], []
-    for k, (sphere, count) in enumerate(zip(SPHERES, shares, strict=False)):
+    for k, (sphere, count) in enumerate(zip(SPHERES, counts, strict=False)):
         direction = rng.normal(size=(count, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         points.append(np.array(sphere.centre) + sphere.radius * direction)
         normals.append(direction)
         items.append(np.full(count, k))
-    for k, (box, count) in enumerate(zip(BOXES, shares[FIRST_BOX:], strict=False)):
+    for k, (box, count) in enumerate(zip(BOXES, counts[FIRST_BOX:], strict=False)):
         low, high = np.array(box.low), np.array(box.high)
         face = rng.integers(0, 5, count)  # four sides and the top
         axis, side = np.array([0, 0, 1, 1, 2])[face], np.array([0, 1, 0, 1, 1])[face]
@@ -110,7 +110,7 @@ def sample_surfaces(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
         points.append(p)
         normals.append(np.eye(3)[axis] * (2 * side - 1)[:, None])
         items.append(np.full(count, FIRST_BOX + k))
-    rest = n - sum(shares)
+    rest = n - sum(counts)
     floor = rng.uniform(-FLOOR_HALF, FLOOR_HALF, (rest, 3)) * (1, 1, 0)
     points.append(floor)
     normals.append(np.tile((0.0, 0.0, 1.0), (rest, 1)))

@@ -8,8 +8,7 @@ from lookalikes.splats import log, new_log
 
 from skipgs_plug import SkipGate
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.pace import events as growing_events
-from skipgs_plug.core.pace import needs
+from skipgs_plug.core.pace import densification_events, needs
 
 LOOPS = [case for case in CASES if case.leaves_out]
 each = pytest.mark.parametrize("case", LOOPS, ids=lambda case: case.name)
@@ -43,7 +42,7 @@ def thinned():
 @pytest.fixture
 def short(monkeypatch):
     """Let "auto" find a share below 1 in runs as short as these, and leave out some of their few events."""
-    monkeypatch.setattr(growing_events, "LEAST_EVENTS", 1)
+    monkeypatch.setattr(densification_events, "LEAST_EVENTS", 1)
     monkeypatch.setattr(needs, "LEAST_GROWING_STEPS", 6)
     monkeypatch.setattr(needs, "LEAST_GROWING_STEPS_LONGER", 6)
     monkeypatch.setattr(needs, "STEPS_PER_EVENT", 1)

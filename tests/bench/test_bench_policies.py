@@ -47,11 +47,11 @@ def test_shortened_takes_the_time_of_the_gate(scene):
     assert shortened(0.001) == 1
 
 
-@pytest.mark.parametrize(("shown", "peak"), [(None, 5.0), (1 / 3, 5.0), (0.75, 7.5)])
-def test_own_compensate_has_the_factors_of_refine_share(scene, shown, peak):
+@pytest.mark.parametrize(("visible", "peak"), [(None, 5.0), (1 / 3, 5.0), (0.75, 7.5)])
+def test_own_compensate_has_the_factors_of_refine_share(scene, visible, peak):
     trainer = Trainer(TrainConfig(max_steps=2000), scene)
     gate = POLICIES["own,compensate"].gate(
-        trainer, {"refine_share=0.4": RunRecord(0, "refine_share=0.4", gaussians_shown=shown)}
+        trainer, {"refine_share=0.4": RunRecord(0, "refine_share=0.4", gaussians_shown=visible)}
     )
     with gate:
         assert gate.config.rate_peak == pytest.approx(peak)

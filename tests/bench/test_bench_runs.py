@@ -9,7 +9,7 @@ import torch
 from bench_fixtures import MAX_STEPS, SEEDS, early_floor, make_bench
 
 from skipgs_plug.bench import provenance, runner
-from skipgs_plug.bench.policies import POLICIES, PolicySpec
+from skipgs_plug.bench.policies import POLICIES, RefineBenchPolicy
 from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.bench.refine import PARTS, compressed, densify, peak_memory
 from skipgs_plug.bench.store import BenchFolder
@@ -147,7 +147,7 @@ def test_a_policy_that_leaves_out_whole_iterations_is_one_entry(scene, tmp_path,
     def every_second(trainer, earlier):
         trainer.iterations = lambda until: [n for n in range(trainer.step, until) if n % 2 == 0]
 
-    monkeypatch.setitem(POLICIES, "halved", PolicySpec("halved", "every second iteration", gate=every_second))
+    monkeypatch.setitem(POLICIES, "halved", RefineBenchPolicy("halved", "every second iteration", gate=every_second))
     full, record = make_bench(scene, tmp_path, seeds=(0,), policies=("own", "halved")).run()
     assert (record.iterations, record.iterations_run, record.backwards, record.skips) == (40, 20, 20, 0)
     assert record.trace.codes == "-." * 20

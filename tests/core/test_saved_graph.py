@@ -209,7 +209,7 @@ def losses(gate, steps, poison=()):
 def test_a_backward_that_does_not_wait_is_decided_on_the_same(settings, monkeypatch):
     traces = []
     for device in (False, True):
-        monkeypatch.setattr(engine, "has_events", lambda _, device=device: device)
+        monkeypatch.setattr(engine, "copies_in_background", lambda _, device=device: device)
         gate = SkipGate(start_iter=50, record_trace=True, **settings)
         losses(gate, 2000)
         gate.notify_event("prune", 1999)
@@ -219,7 +219,7 @@ def test_a_backward_that_does_not_wait_is_decided_on_the_same(settings, monkeypa
 
 @pytest.mark.parametrize("mode, left", [("skip", (False, None)), ("pass", (True, False))])
 def test_a_loss_that_is_not_finite_is_seen_behind_its_backward_and_before_the_step(mode, left, monkeypatch):
-    monkeypatch.setattr(engine, "has_events", lambda _: True)
+    monkeypatch.setattr(engine, "copies_in_background", lambda _: True)
     gate = SkipGate(start_iter=0, warmup=100, on_nonfinite=mode)
     with pytest.warns(RuntimeWarning, match="Loss is nan in iteration 20"):
         seen = losses(gate, 30, poison=(20,))
@@ -227,7 +227,7 @@ def test_a_loss_that_is_not_finite_is_seen_behind_its_backward_and_before_the_st
 
 
 def test_a_loss_that_stops_training_leaves_no_gradient(monkeypatch):
-    monkeypatch.setattr(engine, "has_events", lambda _: True)
+    monkeypatch.setattr(engine, "copies_in_background", lambda _: True)
     value = torch.nn.Parameter(torch.ones(4))
     gate = SkipGate(start_iter=0, on_nonfinite="raise")
     with pytest.raises(SkipGSError, match="Loss is nan"):

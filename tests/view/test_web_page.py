@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from skipgs_plug.commands.view import Draw
 from skipgs_plug.fallback_raster.oracle.torch_reference_projection import spherical_harmonics
 from skipgs_plug.view.model import open_model
-from skipgs_plug.view.web.rotate_model import turn, turned_harmonics, upright
+from skipgs_plug.view.web.rotate_model import rotated, rotated_harmonics, upright
 from skipgs_plug.view.web.server import WebPage
 
 pytestmark = pytest.mark.timeout(600)
@@ -131,7 +131,7 @@ def test_a_turned_model_is_seen_from_a_turned_direction_as_before() -> None:
         "sh0": torch.randn(n, 1, 3, generator=generator),
         "shN": torch.randn(n, 15, 3, generator=generator),
     }
-    turned = turn(splats, rotation, 2.0)
+    turned = rotated(splats, rotation, 2.0)
     matrix = torch.from_numpy(rotation).float()
     torch.testing.assert_close(turned["means"], 2 * splats["means"] @ matrix.T)
     directions = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=1)
@@ -150,8 +150,8 @@ def test_a_turned_model_is_seen_from_a_turned_direction_as_before() -> None:
 
 
 @pytest.mark.parametrize("k", [3, 8, 15])
-def test_turned_harmonics_keep_lengths(k: int) -> None:
-    matrix = turned_harmonics(torch.from_numpy(Rotation.random(random_state=k).as_matrix()), k)
+def test_rotated_harmonics_keep_lengths(k: int) -> None:
+    matrix = rotated_harmonics(torch.from_numpy(Rotation.random(random_state=k).as_matrix()), k)
     torch.testing.assert_close(matrix @ matrix.T, torch.eye(k, dtype=torch.float64))
 
 

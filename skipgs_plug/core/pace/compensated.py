@@ -56,7 +56,7 @@ class Compensated(Pace):
         # A trainer may go on after the last iteration that it announced. Its steps then have length 0.
         progress = min((step - self._start) / max(self._last + 1 - self._start, 1), 1.0)
         floor = (policy.floor if policy is not None else None) or 1.0
-        self._rates.scale(path_factor(floor, progress, self._config.rate_peak, self._rates.visibility.share))
+        self._rates.scale(path_factor(floor, progress, self._config.rate_peak, self._rates.visibility.visible))
 
     def _plan(self, numbers: range) -> None:
         if not numbers:

@@ -24,7 +24,7 @@ from skipgs_plug.core.errors import SkipGSError
 CYCLE_ENDS = (0.125, 0.25, 1.0)  # ends of the cycles, as shares of the iterations that may run
 ONE_CYCLE = (1.0,)  # the same if nothing is estimated: the share is given, or no view is watched
 LEAST_LOSS = 1e-5  # mean absolute difference below which losses count as equal; 8-bit images have steps of 4e-3
-WATCHED_SHARE = 1 / 12  # share of the views that is watched
+WATCHED_FRACTION = 1 / 12  # fraction of the views that is watched
 # Bounds on the number of watched views. Fewer than three cannot resolve 0.05 dB; more than twelve cost quality.
 LEAST_WATCHED, MOST_WATCHED = 3, 12
 
@@ -38,7 +38,7 @@ def watched_views(names: Iterable[str], iterations: float, seed: int = 0) -> fro
         seed: Seed of the draw.
     """
     names = sorted(names)
-    count = min(MOST_WATCHED, round(len(names) * WATCHED_SHARE))
+    count = min(MOST_WATCHED, round(len(names) * WATCHED_FRACTION))
     if count < LEAST_WATCHED or CYCLE_ENDS[0] * iterations < len(names):
         return frozenset()
     return frozenset(random.Random(seed).sample(names, count))
@@ -55,7 +55,7 @@ class EarlyStopping:
         cycle: Index of the present cycle.
         ended: Whether refinement is over.
         gains: Gain of the watched views in each judged cycle, in decibels: (mean, standard error).
-        foreseen: Bound on the gain of the rest at the last check, in decibels, two standard errors included.
+        gain_left: Bound on the gain of the rest at the last check, in decibels, two standard errors included.
     """
 
     def __init__(self, tolerance: float, ends: tuple[float, ...] = CYCLE_ENDS) -> None:
@@ -63,7 +63,7 @@ class EarlyStopping:
         self.cycle = 0
         self.ended = False
         self.gains: list[tuple[float, float]] = []
-        self.foreseen: float | None = None
+        self.gain_left: float | None = None
         self._now: dict[str, float] = {}
         self._before: dict[str, float] = {}
 
@@ -106,8 +106,8 @@ class EarlyStopping:
             if gain is not None:
                 self.gains.append(gain)
                 mean, error = gain
-                self.foreseen = (abs(mean) + 2.0 * error) * math.log2(1.0 / end)
-                self.ended = self.foreseen < self._tolerance
+                self.gain_left = (abs(mean) + 2.0 * error) * math.log2(1.0 / end)
+                self.ended = self.gain_left < self._tolerance
                 if self.ended:
                     return
         self._before = {**self._before, **self._now}
@@ -120,7 +120,7 @@ class EarlyStopping:
             "cycle": self.cycle,
             "ended": self.ended,
             "gains": [list(gain) for gain in self.gains],
-            "foreseen": self.foreseen,
+            "foreseen": self.gain_left,
             "now": dict(self._now),
             "before": dict(self._before),
         }
@@ -137,7 +137,7 @@ class EarlyStopping:
                 "start the gate afresh."
             )
         self._ends = tuple(state["ends"])
-        self.cycle, self.ended, self.foreseen = int(state["cycle"]), bool(state["ended"]), state["foreseen"]
+        self.cycle, self.ended, self.gain_left = int(state["cycle"]), bool(state["ended"]), state["foreseen"]
         self.gains = [(float(mean), float(error)) for mean, error in state["gains"]]
         self._now, self._before = dict(state["now"]), dict(state["before"])
 

@@ -7,7 +7,7 @@ from typing import Any
 from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.pace.events import Events
+from skipgs_plug.core.pace.densification_events import DensificationEvents
 from skipgs_plug.core.pace.needs import (
     LEAST_GROWING_SHARE,
     MOST_RAISED_SHARE,
@@ -57,7 +57,7 @@ class Growing(Phase):
         self._rates = rates
         self.share = None if config.growing == "auto" else config.growing  # type: ignore[assignment]
         self.sampling = Sampling(1.0)
-        self.events: Events | None = None
+        self.events: DensificationEvents | None = None
         self.always: dict[str, set[int]] = {}
         self._must: frozenset[int] = frozenset()
         self._must_shares = 1.0, 1.0  # share of the iterations that must run: until the last event, and after it
@@ -102,7 +102,7 @@ class Growing(Phase):
         if marks and not any(mark in reason for reason in found for mark in marks):
             return False
         self.always = {**others, NAMED_FOR_TRAINER: hidden} if hidden else others
-        self.events = Events(events, densification)
+        self.events = DensificationEvents(events, densification)
         if self._saved_events is not None:
             self.events.load_state_dict(self._saved_events)
         # A condition can name the iteration of an event that is left out. The iteration runs all the same if the
@@ -159,7 +159,7 @@ class Growing(Phase):
         if self._share_now is None:
             self.sampling.share = self.share
         else:
-            self.sampling.turn(self._share_now)
+            self.sampling.set_share(self._share_now)
         if not self.sampling.runs(must, barred):
             self.events.skipped(number)
             return False
@@ -200,7 +200,7 @@ class Growing(Phase):
         visibility = self._rates.visibility
         settled = self._visible is not None
         if self._measuring and visibility.steps >= (MEASURED_AGAIN if settled else MEASURED):
-            self._visible_now, self._measuring = visibility.share, False
+            self._visible_now, self._measuring = visibility.visible, False
         if not self._measuring:
             visibility.finish()
         if settled:

@@ -12,7 +12,7 @@ from skipgs_plug.core.pace.visibility import POSITIONS
 
 # Multiples of the common factor that groups of parameters take, by kind. In refinement opacities are never raised.
 HIGHER_BANDS, GEOMETRY, OTHERS, CONSTANT_BAND = 4.0, 2.0, 1.0, 0.5
-NAMED = {
+PART_BY_NAME = {
     **dict.fromkeys(("f_rest", "shN", "features_rest"), HIGHER_BANDS),
     **dict.fromkeys(("f_dc", "sh0", "features_dc"), CONSTANT_BAND),
     **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
@@ -37,7 +37,7 @@ def group_part(group: dict[str, Any], name: str | None = None) -> float | None:
     """
     name = group.get("name", name)
     if name is not None:
-        return None if name in OPACITIES else NAMED.get(name, OTHERS)
+        return None if name in OPACITIES else PART_BY_NAME.get(name, OTHERS)
     shapes = [tuple(param.shape[1:]) for param in group["params"]]
     if all(shape == (1,) for shape in shapes):
         return None

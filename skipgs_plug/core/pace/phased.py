@@ -15,8 +15,8 @@ from skipgs_plug.core.pace.loop_finder import LoopFinder
 from skipgs_plug.core.pace.loop_range import LoopRange, line_of, require_planned
 from skipgs_plug.core.pace.milestones import read_loop
 from skipgs_plug.core.pace.phase import Phase, PhasePlan
-from skipgs_plug.core.pace.policy import RefinementPolicy
 from skipgs_plug.core.pace.rates import ScaledRates
+from skipgs_plug.core.pace.refinement_policy import RefinementPolicy
 from skipgs_plug.core.pace.refining import Refining
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.release import Release
@@ -276,7 +276,7 @@ class Phased(Pace):
     def report(self) -> dict[str, Any]:
         return {
             **self.refining.report(),
-            "gaussians_shown": self._rates.visibility.share,
+            "gaussians_shown": self._rates.visibility.visible,
             "growing": self.growing.report(),
         }
 

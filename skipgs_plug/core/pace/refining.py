@@ -18,7 +18,7 @@ from skipgs_plug.core.pace.sampling import Sampling
 log = logging.getLogger(__name__)
 
 # Largest number of iterations that run after a structural change that comes when refinement has ended. It is as long
-# as the gate's pause (`events.MIN_PAUSE_ITERS`).
+# as the gate's pause (`pause.MIN_PAUSE_ITERS`).
 RECOVERY = 500
 # Reasons for which iterations run.
 OF_SHARE, OF_LOOP, OF_CHANGES = "share", "conditions", "changes"
@@ -244,7 +244,7 @@ class Refining(Phase):
             self._over = False
         else:
             progress = self.stopping.progress(self.sampling.run / (self.share * (self._last + 1 - self._first)))
-            factor = path_factor(self.share, progress, self._config.rate_peak, self._rates.visibility.share)
+            factor = path_factor(self.share, progress, self._config.rate_peak, self._rates.visibility.visible)
             self._over = self.stopping.ended
         self.sampling.share = 0.0 if self._over else 1.0
         self._rates.scale(factor)
@@ -268,7 +268,7 @@ class Refining(Phase):
                 "ended_early": stopping.early,
                 "cycle": stopping.cycle,
                 "gains_db": [list(gain) for gain in stopping.gains],
-                "rest_worth_db": stopping.foreseen,
+                "rest_worth_db": stopping.gain_left,
                 "watched": sorted(self.watched),
             },
         }

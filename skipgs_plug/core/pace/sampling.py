@@ -9,8 +9,8 @@ class Sampling:
     """Runs one iteration in each slot of 1 / share iterations, at a position in the slot that looks random.
 
     With strictly even gaps, a loop that trains on view `step % n` would show the same few views again and again. An
-    iteration that must run takes the turn of a later one. So the share is met as long as fewer iterations must run than
-    the share allows.
+    iteration that must run takes the place of a later one. So the share is met as long as fewer iterations must run
+    than the share allows.
 
     Args:
         share: Share of the iterations that run, in [0, 1].
@@ -26,7 +26,7 @@ class Sampling:
         self._due = 0  # number of iterations that should have run by now
         self._since = (0, 0)  # numbers of iterations, and of those due, before the present share
 
-    def turn(self, share: float) -> None:
+    def set_share(self, share: float) -> None:
         """Run another share from now on, and keep no account of the iterations before."""
         if share != self.share:
             self.share, self._due, self._since = share, self.run, (self.asked, self.run)
@@ -46,7 +46,7 @@ class Sampling:
 
         Args:
             must: The iteration runs in any case.
-            barred: The iteration is left out, and a later one takes its turn.
+            barred: The iteration is left out, and a later one takes its place.
         """
         if barred:
             self.left_out += 1

@@ -35,7 +35,7 @@ class Visibility:
         self.restart()
 
     @property
-    def share(self) -> float | None:
+    def visible(self) -> float | None:
         """The mean, in (0, 1]; None before the first step, and for a model without a group of positions."""
         return self._sum / self._steps if self._steps else None
 
@@ -66,16 +66,16 @@ class Visibility:
         gradient = next((param.grad for param in positions if param.grad is not None), None)
         if gradient is None:
             return
-        share = reached_share(gradient)
-        if distributed.group_size() == 1 and share.device.type == "cpu":
-            reached = share.item()
-            if reached > 0.0:  # a step without gradients belongs to no view
-                self._sum, self._steps, self._looks = self._sum + reached, self._steps + 1, self._looks + 1
+        visible = visible_share(gradient)
+        if distributed.group_size() == 1 and visible.device.type == "cpu":
+            seen = visible.item()
+            if seen > 0.0:  # a step without gradients belongs to no view
+                self._sum, self._steps, self._looks = self._sum + seen, self._steps + 1, self._looks + 1
                 self.complete = self._looks >= STEPS
             return
         self._looks += 1
         self.complete = self._looks >= STEPS
-        now = torch.stack([share, (share > 0.0).to(share.dtype)])
+        now = torch.stack([visible, (visible > 0.0).to(visible.dtype)])
         self._unread = now if self._unread is None else self._unread.to(now) + now
         if self._looks in READ_AT:
             total, steps = distributed.mean(self._unread)
@@ -93,7 +93,7 @@ class Visibility:
         self._unread = None if state[4] == 0.0 else torch.tensor(state[3:], dtype=torch.float64)
 
 
-def reached_share(gradient: Tensor) -> Tensor:
+def visible_share(gradient: Tensor) -> Tensor:
     """Return the share of the rows of a gradient [N, K], dense or sparse, that are not all 0, on its device."""
     count = max(len(gradient), 1)
     exact = torch.float64 if gradient.device.type == "cpu" else torch.float32  # some devices have no float64

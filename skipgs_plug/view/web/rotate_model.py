@@ -24,8 +24,8 @@ def upright(up: np.ndarray, ahead: np.ndarray) -> np.ndarray:
 
 
 @torch.no_grad()
-def turn(splats: Mapping[str, Tensor], rotation: np.ndarray, unit: float) -> dict[str, Tensor]:
-    """Return the raw parameters of the model, turned by `rotation` [3, 3] and with lengths multiplied by `unit`."""
+def rotated(splats: Mapping[str, Tensor], rotation: np.ndarray, unit: float) -> dict[str, Tensor]:
+    """Return the raw parameters of the model, rotated by `rotation` [3, 3] and with lengths multiplied by `unit`."""
     from scipy.spatial.transform import Rotation
 
     matrix = torch.from_numpy(rotation).double()
@@ -33,7 +33,7 @@ def turn(splats: Mapping[str, Tensor], rotation: np.ndarray, unit: float) -> dic
     left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float32)
     rest = splats["shN"].float()
     if rest.shape[1]:
-        rest = torch.einsum("ij,njc->nic", turned_harmonics(matrix, rest.shape[1]).float(), rest)
+        rest = torch.einsum("ij,njc->nic", rotated_harmonics(matrix, rest.shape[1]).float(), rest)
     return {
         "means": (splats["means"].double() @ matrix.T * unit).float(),
         "scales": splats["scales"].float() + float(np.log(unit)),
@@ -44,7 +44,7 @@ def turn(splats: Mapping[str, Tensor], rotation: np.ndarray, unit: float) -> dic
     }
 
 
-def turned_harmonics(rotation: Tensor, k: int) -> Tensor:
+def rotated_harmonics(rotation: Tensor, k: int) -> Tensor:
     """Return the matrix [K, K] that turns K coefficients beyond the constant one, by a rotation [3, 3], float64."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(DIRECTIONS, 3, generator=generator, dtype=torch.float64)

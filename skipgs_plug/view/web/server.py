@@ -26,7 +26,7 @@ from skipgs_plug.view.model import Model
 from skipgs_plug.view.page import ERROR_GAIN, RADIUS, Splats, field_of_view, require_address
 from skipgs_plug.view.sog import to_sog
 from skipgs_plug.view.upright import up_direction
-from skipgs_plug.view.web.rotate_model import turn, upright
+from skipgs_plug.view.web.rotate_model import rotated, upright
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +84,7 @@ class WebPage:
 
     def prepare(self) -> None:
         """Compress the model."""
-        turned = turn(self._splats, self._rotation, self._unit)
+        turned = rotated(self._splats, self._rotation, self._unit)
         self._compressed.set_result(to_sog(turned, self._model.antialiased, PAIRS))
 
     def stop(self) -> None:

@@ -28,7 +28,7 @@ def follow(losses, tolerance=0.05, iterations=800):
 def test_a_scene_that_needs_nothing_ends_after_the_second_cycle():
     early_stopping, done = follow(lambda view, done: 0.1)
     assert early_stopping.early and done == CYCLE_ENDS[1]
-    assert early_stopping.gains == [(0.0, 0.0)] and early_stopping.foreseen == 0.0
+    assert early_stopping.gains == [(0.0, 0.0)] and early_stopping.gain_left == 0.0
 
 
 def test_a_scene_that_gains_to_the_end_gets_all():
@@ -60,7 +60,7 @@ def test_without_two_watched_views_nothing_is_judged():
     early_stopping = EarlyStopping(0.05)
     for i in range(100):
         early_stopping.progress(i / 100)
-    assert early_stopping.gains == [] and early_stopping.foreseen is None and not early_stopping.ended
+    assert early_stopping.gains == [] and early_stopping.gain_left is None and not early_stopping.ended
 
 
 def test_a_saved_state_goes_on():

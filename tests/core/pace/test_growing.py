@@ -9,7 +9,7 @@ import torch
 
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.core.pace import needs
-from skipgs_plug.core.pace.events import LEAST_EVENTS, Events
+from skipgs_plug.core.pace.densification_events import LEAST_EVENTS, DensificationEvents
 from skipgs_plug.core.pace.needs import (
     events_sooner,
     for_new_gaussians,
@@ -27,7 +27,7 @@ INTERVAL, START, LAST = 20, 400, 600
 
 
 class Loop:
-    """A loop that densifies every 20 iterations until 400, saves every 60 and has six Gaussians, all of them shown."""
+    """A loop that densifies every 20 iterations until 400, saves every 60 and has six Gaussians, all visible."""
 
     def __init__(self, begin=0, means=None, moments=None):
         self.begin = begin
@@ -247,13 +247,13 @@ def test_what_shares_its_number_with_events_keeps_it_if_it_is_rarer():
     assert len(set(range(20, 800, 20)) & set(ran)) < 25
 
 
-def kept(needs, shown, every, numbers=range(100, 2001, 100), share=0.1, length=100_000):
+def kept(needs, visible, every, numbers=range(100, 2001, 100), share=0.1, length=100_000):
     """Return the events that run if every `every`-th iteration runs, and each event that has enough before it."""
-    events = Events(numbers, Densification(needs=needs))
+    events = DensificationEvents(numbers, Densification(needs=needs))
     found = []
     for number in range(numbers[-1] + 1):
         if number in events:
-            needed = events.needed(number, shown, share, length)
+            needed = events.needed(number, visible, share, length)
             if events.behind >= needed:
                 found.append(number)
                 events.ran(number, needed)
@@ -278,7 +278,7 @@ def test_needs_of_an_event():
 
 
 def test_an_event_can_come_sooner():
-    events = Events(range(100, 1001, 100), Densification())
+    events = DensificationEvents(range(100, 1001, 100), Densification())
     for sooner, needed in ((None, 47), (1.0, 47), (2.0, 23), (10.0, 4)):
         found = []
         for behind in range(1, 60):
@@ -289,7 +289,7 @@ def test_an_event_can_come_sooner():
 
 
 def test_growth_is_that_of_the_last_event():
-    events = Events(range(100, 1001, 100), Densification())
+    events = DensificationEvents(range(100, 1001, 100), Densification())
     events.rows = 1000
     assert events.growth == 0.0  # no event yet
     events.ran(100)
@@ -419,13 +419,13 @@ def test_events_need_more_iterations_if_a_larger_share_of_them_runs():
 def test_surplus_iterations_count_for_the_following_event_alone():
     gaps = {after - before for before, after in itertools.pairwise(kept("visits", 0.75, 5, LONG))}
     assert gaps == {100, 200}  # without the surplus, every second event
-    events = Events(range(100, 1001, 100), Densification())
+    events = DensificationEvents(range(100, 1001, 100), Densification())
     for number in range(1, 400):
         events.ran(number) if number % 100 else events.skipped(number)
     needed = events.needed(400, 0.75, 0.1, 1_000_000)
     assert needed == 31 and events.behind > 10 * needed
     events.ran(400, needed)
     assert events.state_dict()["behind"] <= 32  # hundreds of iterations do not pay for several events
-    resumed = Events(range(100, 1001, 100), Densification())
+    resumed = DensificationEvents(range(100, 1001, 100), Densification())
     resumed.load_state_dict(events.state_dict())
     assert resumed.state_dict() == events.state_dict()

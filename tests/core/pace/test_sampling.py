@@ -53,7 +53,7 @@ def test_no_view_starves_in_a_loop_that_takes_them_in_turn(share: float, n_views
 def test_a_share_that_turns_is_kept_from_then_on(parts: list[tuple[float, int]]) -> None:
     sampling = Sampling(1.0)
     for share, count in parts:
-        sampling.turn(share)
+        sampling.set_share(share)
         before = sampling.run
         for _ in range(count):
             sampling.runs(False)

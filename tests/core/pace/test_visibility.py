@@ -7,7 +7,7 @@ import torch
 
 from skipgs_plug.core.pace.parts import GroupInfo
 from skipgs_plug.core.pace.rates import ScaledRates, path_factor
-from skipgs_plug.core.pace.visibility import ROWS, STEPS, Visibility, reached_share
+from skipgs_plug.core.pace.visibility import ROWS, STEPS, Visibility, visible_share
 
 
 def positions(rows, reached, width=3):
@@ -17,39 +17,39 @@ def positions(rows, reached, width=3):
     return value
 
 
-def see(shown, groups, name=None):
-    shown.see([param for group in groups for param in GroupInfo(group, name).positions])
+def see(visibility, groups, name=None):
+    visibility.see([param for group in groups for param in GroupInfo(group, name).positions])
 
 
 @pytest.mark.parametrize("rows, reached", [(40, 10), (40, 40), (1, 1), (7, 3)])
 def test_rows_with_a_gradient_count(rows, reached):
     gradient = positions(rows, reached).grad
-    assert reached_share(gradient) == reached / rows
-    assert reached_share(gradient.to_sparse(1)) == reached / rows
-    assert reached_share(gradient.to_sparse(2)) == reached / rows
+    assert visible_share(gradient) == reached / rows
+    assert visible_share(gradient.to_sparse(1)) == reached / rows
+    assert visible_share(gradient.to_sparse(2)) == reached / rows
 
 
 def test_rows_listed_with_zeros_do_not_count():
     values = torch.tensor([[0.0, 0.0], [0.0, 2.0], [1.0, 0.0]])
     listed = torch.sparse_coo_tensor(torch.tensor([[1, 4, 4]]), values, (10, 2), check_invariants=True)
-    assert reached_share(listed) == 0.1
+    assert visible_share(listed) == 0.1
 
 
 def test_of_many_rows_some_are_looked_at():
-    assert reached_share(positions(20 * ROWS, 6 * ROWS).grad) == pytest.approx(0.3, abs=0.03)
+    assert visible_share(positions(20 * ROWS, 6 * ROWS).grad) == pytest.approx(0.3, abs=0.03)
 
 
 def test_the_mean_over_the_first_steps_counts():
-    shown = Visibility()
-    assert shown.share is None
+    visibility = Visibility()
+    assert visibility.visible is None
     for step in range(2 * STEPS):
         reached = 10 if step < STEPS else 40
-        see(shown, [{"name": "rotation", "params": [positions(40, 20, 4)]}])
-        see(shown, [{"name": "xyz", "params": [positions(40, reached)]}])
-    assert shown.share == 0.25
+        see(visibility, [{"name": "rotation", "params": [positions(40, 20, 4)]}])
+        see(visibility, [{"name": "xyz", "params": [positions(40, reached)]}])
+    assert visibility.visible == 0.25
     again = Visibility()
-    again.load_state_dict(shown.state_dict())
-    assert again.share == shown.share
+    again.load_state_dict(visibility.state_dict())
+    assert again.visible == visibility.visible
 
 
 @pytest.mark.parametrize(
@@ -64,21 +64,21 @@ def test_the_mean_over_the_first_steps_counts():
     ],
 )
 def test_positions_are_known_by_name_or_by_shape(group, name, expected):
-    shown = Visibility()
-    see(shown, [{"params": [positions(40, 40, 1)]}, {"params": [positions(40, 20)], **group}], name)
-    assert shown.share == expected
+    visibility = Visibility()
+    see(visibility, [{"params": [positions(40, 40, 1)]}, {"params": [positions(40, 20)], **group}], name)
+    assert visibility.visible == expected
 
 
 def test_parameters_without_a_gradient_do_not_count():
-    shown = Visibility()
+    visibility = Visibility()
     empty = torch.nn.Parameter(torch.zeros(40, 3))
     for _ in range(3):
-        shown.see([empty])
-        shown.see([positions(40, 0)])
-        shown.see([positions(0, 0)])
-    assert shown.share is None
-    shown.see([positions(40, 30)])
-    assert shown.share == 0.75
+        visibility.see([empty])
+        visibility.see([positions(40, 0)])
+        visibility.see([positions(0, 0)])
+    assert visibility.visible is None
+    visibility.see([positions(40, 30)])
+    assert visibility.visible == 0.75
 
 
 def test_steps_are_longer_where_a_view_shows_more():
@@ -88,7 +88,7 @@ def test_steps_are_longer_where_a_view_shows_more():
     rates.scale(1.0)
     optimizer.step()
     rates.remove()
-    assert path_factor(0.4, 0.25, visible=rates.visibility.share) == pytest.approx(3.75 * math.sqrt(2.7))
+    assert path_factor(0.4, 0.25, visible=rates.visibility.visible) == pytest.approx(3.75 * math.sqrt(2.7))
     assert path_factor(0.4, 0.25) == pytest.approx(3.75)
     assert path_factor(0.4, 0.25, peak=3.0, visible=0.9) == 2.25
 

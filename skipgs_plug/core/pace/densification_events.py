@@ -11,8 +11,8 @@ from skipgs_plug.core.pace.needs import LEAST_GROWING_SHARE
 from skipgs_plug.core.pace.visibility import VISIBLE
 from skipgs_plug.core.trainer_info import Densification
 
-# Iterations that a densification event needs if a view shows almost none of the Gaussians. With more of them shown,
-# an event needs fewer: times (1 - share shown) to the power `NARROW_VIEWS`. A run of fewer iterations is less far at
+# Iterations that a densification event needs if a view shows almost none of the Gaussians. With more of them visible,
+# an event needs fewer: times (1 - visible) to the power `POWER_OF_HIDDEN`. A run of fewer iterations is less far at
 # each event than the trainer's own, so more gradients exceed the threshold. With every event kept, a tenth of 15,000
 # iterations ends with 170 % of the Gaussians on bonsai, where a view shows a third of them, and with 190 % on a
 # ray-traced scene, where it shows three quarters. Where it shows nearly all, as on Lego and fern, the number of
@@ -20,20 +20,20 @@ from skipgs_plug.core.trainer_info import Densification
 # as many Gaussians as in the own run, bonsai needs about 47 iterations per event, the ray-traced scene 32, fern at
 # most 40 and Lego at most 10.
 STEPS_BEHIND = 55.0
-NARROW_VIEWS = 0.4
+POWER_OF_HIDDEN = 0.4
 # A larger share than a tenth has more iterations between two events, which would all run otherwise: on the ray-traced
 # scene they end with 106 % of the Gaussians with a tenth of 15,000 iterations, but with 118 % with a quarter of 3,000.
 # So an event needs more, by a power of the share: this number times the square of the share that a view shows. Where a
 # view shows a third, as on bonsai, the number of Gaussians is right without, and with a power of 1/3 images of 798x531
 # pixels end 0.2 dB lower.
-LARGER_SHARE = 0.5
+POWER_OF_SHARE = 0.5
 # Least number of events that a shortened phase keeps, whatever they need; a schedule with fewer keeps all. An event
 # at most doubles the Gaussians. With 7 or 8 of 13 events, scripts on bonsai at 100x67 ended with half of their
 # Gaussians and 0.011 less SSIM.
 LEAST_EVENTS = 16
 
 
-class Events:
+class DensificationEvents:
     """Decides for each event whether enough iterations ran before it.
 
     If an event is left out, its statistics go on to the following event.
@@ -124,8 +124,8 @@ class Events:
         if self._needs == "iterations":
             return distance
         visible = visible or VISIBLE
-        larger = (share / LEAST_GROWING_SHARE) ** (LARGER_SHARE * visible**2)
-        needed = STEPS_BEHIND * (1.0 - visible) ** NARROW_VIEWS * (larger if sooner is None else 1.0 / sooner)
+        larger = (share / LEAST_GROWING_SHARE) ** (POWER_OF_SHARE * visible**2)
+        needed = STEPS_BEHIND * (1.0 - visible) ** POWER_OF_HIDDEN * (larger if sooner is None else 1.0 / sooner)
         return min(int(needed), math.ceil(share * length / LEAST_EVENTS), distance)
 
     def _distance(self, number: int) -> int:

@@ -15,15 +15,15 @@ class Pause:
 
     Attributes:
         until: First iteration after the pause.
-        events: Number of changes that caused or extended a pause.
+        changes: Number of changes that caused or extended a pause.
     """
 
-    __slots__ = ("_iters", "events", "until")
+    __slots__ = ("_iters", "changes", "until")
 
     def __init__(self, pause_iters: int | None = None) -> None:
         self._iters = pause_iters
         self.until = 0
-        self.events = 0
+        self.changes = 0
 
     def extend(self, step: int, n_views: int) -> int:
         """Pause the iterations after `step`; return the number of iterations that this adds to the pause."""
@@ -33,5 +33,5 @@ class Pause:
         if end <= begin:
             return 0
         self.until = end
-        self.events += 1
+        self.changes += 1
         return end - begin

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from skipgs_plug.core.events import Pause
+from skipgs_plug.core.pause import Pause
 
 
 def test_lasts_an_epoch_or_500_iterations() -> None:
@@ -18,10 +18,10 @@ def test_overlapping_changes_extend_once() -> None:
     assert pause.extend(0, 1) == 0
     assert pause.extend(4, 1) == 4
     assert pause.until == 15
-    assert pause.events == 2
+    assert pause.changes == 2
 
 
 def test_can_be_switched_off() -> None:
     pause = Pause(0)
     assert pause.extend(7, 100) == 0
-    assert pause.events == 0
+    assert pause.changes == 0

@@ -38,7 +38,7 @@ class RefinementPolicy(Policy):
         """Return the running mean of a view's loss; None for a new view."""
         return self._means.get(view)
 
-    def foreseen(self, view: Hashable, step: int) -> bool | None:
+    def known_ahead(self, view: Hashable, step: int) -> bool | None:
         """Return True when refinement is over, and False if the view is not watched."""
         if self._refining.over:
             return True
