@@ -46,6 +46,13 @@ class HostCopy:
         return self._value
 
 
+def on_host(number: float | Tensor | HostCopy) -> float:
+    """Return the value of a number; this waits for the device that holds it."""
+    if isinstance(number, Tensor):
+        return float(number.item())
+    return number.value() if isinstance(number, HostCopy) else float(number)
+
+
 @functools.cache
 def copies_in_background(device: torch.device) -> bool:
     """Whether a copy from this device can run beside its other work, and be waited for alone."""

@@ -6,7 +6,7 @@ import dataclasses
 import logging
 import math
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 from torch import Tensor
@@ -18,20 +18,18 @@ from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
 from skipgs_plug.core.gated_iteration import GatedIteration
 from skipgs_plug.core.nonfinite import NonFiniteGuard
-from skipgs_plug.core.pace.base import Pace
-from skipgs_plug.core.pace.compensated import Compensated
-from skipgs_plug.core.pace.phased import Phased
+from skipgs_plug.core.pace.choose import pace_of
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.release import Release
 from skipgs_plug.core.saved_graph import drop_gradients, free_graph
-from skipgs_plug.core.scene_check import SceneCheck
+from skipgs_plug.core.scene_check import SceneCheck, require_same_scene
 from skipgs_plug.core.state import GATE_VERSION, gate_state, is_release_state, require_state
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.core.views import require_unique, warn_unless_recurring
-from skipgs_plug.host_copy import HostCopy, copies_in_background
+from skipgs_plug.host_copy import HostCopy, copies_in_background, on_host
 
 log = logging.getLogger(__name__)
 
@@ -85,11 +83,7 @@ class Engine:
         self.rates = ScaledRates()
         giving_up = self.giving_up
         self.rates.on_error = lambda error: giving_up.on_error(error, iteration.step)
-        self.pace: Pace
-        if config.leaves_out:
-            self.pace = Phased(config, self.rates, self._go_on_from_saved, self.giving_up)
-        else:
-            self.pace = Compensated(config, self.rates) if config.compensates else Pace()
+        self.pace = pace_of(config, self.rates, self._go_on_from_saved, giving_up)
         self.trace: list[TraceRow] | None = [] if record_trace else None
         self._skipped: list[weakref.ref[Tensor]] = []  # losses of this iteration whose backwards were skipped
         self._accumulates = False
@@ -275,7 +269,7 @@ class Engine:
         if signal is None:
             loss, answer = math.nan, decision.OVER
         else:
-            loss = _on_host(signal)
+            loss = on_host(signal)
             answer = self._agreed(view, loss, now.step, signal)
         now.decision = answer
         if self.stats.record(answer, view, None if signal is None else loss) and self._view_names is None:
@@ -321,12 +315,12 @@ class Engine:
         state = gate_state(state)
         if is_release_state(state):
             self._load_pace(state)
-            self._refuse_other_scene(state["view_loss_ema"])
+            require_same_scene(state["view_loss_ema"], self._view_names)
             self.policy.load_state_dict(state)
             self.stats.load_release_state(state)
             step = None
         else:
-            self._refuse_other_scene(state["stats"]["views"])
+            require_same_scene(state["stats"]["views"], self._view_names)
             if not pending:
                 self._load_pace(state)
             self.policy.load_state_dict(state["policy"])
@@ -393,20 +387,3 @@ class Engine:
             self._scene_check.stop()  # means are from before the change
         self._scene_check.see(loss, mean, step)
         return answer
-
-    def _refuse_other_scene(self, views: Iterable[Any]) -> None:
-        if self._view_names is None:
-            return
-        unknown = sorted({str(view) for view in views} - set(self._view_names))
-        if unknown:
-            raise SkipGSError(
-                f"The gate state belongs to another scene: it knows view {unknown[0]!r}, which is not among "
-                f"the {len(self._view_names)} training views; start the gate afresh."
-            )
-
-
-def _on_host(signal: float | Tensor | HostCopy) -> float:
-    """Return the value to decide by; this waits for the device that holds it."""
-    if isinstance(signal, Tensor):
-        return float(signal.item())
-    return signal.value() if isinstance(signal, HostCopy) else float(signal)

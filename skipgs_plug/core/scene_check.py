@@ -1,6 +1,9 @@
-"""Check by the first losses after a resume whether the loaded state belongs to the scene that is trained."""
+"""Check whether a loaded state belongs to the scene that is trained: by its views, then by the first losses."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
 
 from skipgs_plug.core.errors import SkipGSError
 
@@ -10,6 +13,26 @@ CHECKED_LOSSES = 10
 # Factor between a loss and the mean of its view from which the loss counts as far off. A mean lags behind the losses,
 # but by less than this factor while training continues.
 FAR = 2.0
+
+
+def require_same_scene(saved: Iterable[Any], names: list[str] | None) -> None:
+    """Refuse a state that knows other views than the training views.
+
+    Args:
+        saved: Keys of the views in the state.
+        names: Keys of all training views; None if they are unknown, and nothing is refused.
+
+    Raises:
+        SkipGSError: A view of the state is not a training view.
+    """
+    if names is None:
+        return
+    unknown = sorted({str(view) for view in saved} - set(names))
+    if unknown:
+        raise SkipGSError(
+            f"The gate state belongs to another scene: it knows view {unknown[0]!r}, which is not among "
+            f"the {len(names)} training views; start the gate afresh."
+        )
 
 
 class SceneCheck:

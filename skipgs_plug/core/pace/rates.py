@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import weakref
 from collections.abc import Callable
@@ -16,16 +15,14 @@ from torch.utils.hooks import RemovableHandle
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.optimizers import Optimizers, with_names
+from skipgs_plug.core.pace.optimizer_steps import SQUARES_KEPT, OptimizerSteps
 from skipgs_plug.core.pace.parts import GrowingParts, OptimizerInfo
-from skipgs_plug.core.pace.step_reads import LiteralBetas, WatchedGroup, is_torchs, shorter_memory, unwatch, watch
+from skipgs_plug.core.pace.step_reads import shorter_memory
 from skipgs_plug.core.pace.visibility import VISIBLE, Visibility
 
 # Least share of the iterations that steps are made longer for. With a smaller share, steps that conserve the whole path
 # are so long that they lose more than the path gains.
 LEAST_PATH_SHARE = 0.25
-# Largest beta2 of Adam during a longer step. The gradient of a single view can move a parameter by its rate divided by
-# the root of 1 - beta2: 32 times the rate at the usual 0.999, which is too far with larger rates, 7 times at 0.98.
-SQUARES_KEPT = 0.98
 # Number of iterations in a row that ran with larger steps while no optimizer of PyTorch stepped. After the first number
 # the user is warned, after the second an error is raised.
 UNSTEPPED_WARNS, UNSTEPPED_RAISES = 50, 200
@@ -87,9 +84,9 @@ class ScaledRates:
         self._only_look = False
         self._rows = self._rows_now = 0  # number of Gaussians in the previous and in this iteration; 0 if unknown
         self._thread = get_ident()
-        self._under_way: list[_Steps] = []  # each was called by the step before it in the list
+        self._under_way: list[OptimizerSteps] = []  # each was called by the step before it in the list
         self._handles: list[RemovableHandle] = []
-        self._steps: dict[int, _Steps] = {}  # by id of the optimizer
+        self._steps: dict[int, OptimizerSteps] = {}  # by id of the optimizer
         self._foreign: set[int] = set()  # ids of optimizers that stepped in this iteration and are not scaled
         self._unstepped = 0  # number of iterations in a row that ran without a step
         self._removed = False
@@ -193,7 +190,7 @@ class ScaledRates:
             raise error
         self.on_error(error)
 
-    def _scale(self, optimizer: torch.optim.Optimizer, step: _Steps, factor: float) -> None:
+    def _scale(self, optimizer: torch.optim.Optimizer, step: OptimizerSteps, factor: float) -> None:
         under_way = self._under_way
         if under_way:
             self._pass_on(optimizer)
@@ -235,8 +232,8 @@ class ScaledRates:
         if step.longer or step.literal is not None:
             step.prepare(optimizer)
 
-    def _begin_with(self, optimizer: torch.optim.Optimizer) -> _Steps | None:
-        """Create `_Steps` for an optimizer that steps for the first time; None if it is not scaled."""
+    def _begin_with(self, optimizer: torch.optim.Optimizer) -> OptimizerSteps | None:
+        """Create `OptimizerSteps` for an optimizer that steps for the first time; None if it is not scaled."""
         key, name = id(optimizer), None
         if self.only is not None:
             if key in self._foreign:
@@ -246,7 +243,7 @@ class ScaledRates:
                 self._foreign.add(key)
                 return None
             name = names[0]
-        step = _Steps(optimizer, name, self._under_way, self._failed)
+        step = OptimizerSteps(optimizer, name, self._under_way, self._failed)
         step.handles = self._watch(optimizer, step)
         self._steps[key] = step
         # Python can give the id of a deleted optimizer to a new one.
@@ -260,7 +257,7 @@ class ScaledRates:
             if other.watched is not None and any(id(one) in own or id(one.group) in own for one in other.watched):
                 other.stop_watching()
 
-    def _watch(self, optimizer: torch.optim.Optimizer, step: _Steps) -> list[RemovableHandle]:
+    def _watch(self, optimizer: torch.optim.Optimizer, step: OptimizerSteps) -> list[RemovableHandle]:
         """Add the hooks that restore the trainer's settings before other code reads them."""
         ends = optimizer.register_step_post_hook(step.after_step)
         # The trainer's own hooks after a step, such as a scheduler's, must find the trainer's rates.
@@ -271,132 +268,3 @@ class ScaledRates:
     def _put_back_all(self, _: torch.optim.Optimizer) -> None:
         for step in self._under_way:
             step.put_back()
-
-
-class _Steps:
-    """The steps of one optimizer: facts about its groups, and the trainer's settings while a step is under way.
-
-    Args:
-        optimizer: The optimizer.
-        name: Name of the optimizer, if its groups have no names; None if unknown.
-        under_way: Steps of all optimizers that have begun and not ended, outermost first.
-        failed: Receives errors at the end of a step, and raises them or releases the gate.
-
-    Attributes:
-        info: Facts about the groups.
-        handles: Handles of the hooks on the optimizer.
-        gone: Weak reference that removes this object together with the optimizer.
-        depth: Number of nested calls of the optimizer's `step`.
-        before: Groups with changed settings, each with the trainer's rate and betas; None for a setting that the group
-            does not have.
-        longer: Groups with a gradient and a changed rate; filled until the optimizer is judged.
-        watched: Copies that replace all groups during the first longer step of an optimizer that is not PyTorch's.
-        judged: Whether it is known which settings a step reads.
-        literal: Replaces betas that a step passes as literal numbers; None if it passes none.
-        memory_stays: Whether a step has a beta2 that cannot be changed from outside.
-    """
-
-    __slots__ = (
-        *("_failed", "_under_way", "_until_end", "before", "depth", "info", "gone", "handles", "judged"),
-        *("literal", "longer", "memory_stays", "watched"),
-    )
-
-    def __init__(
-        self,
-        optimizer: torch.optim.Optimizer,
-        name: str | None,
-        under_way: list[_Steps],
-        failed: Callable[[Exception], None],
-    ) -> None:
-        self.info = OptimizerInfo(optimizer, name)
-        self.handles: list[RemovableHandle] = []
-        self.gone: Any = None
-        self._under_way, self._failed = under_way, failed
-        self.depth = 0
-        self.before: list[tuple[dict[str, Any], Any, Any]] = []
-        self.longer: list[dict[str, Any]] = []
-        self.watched: list[WatchedGroup] | None = None
-        self.judged = is_torchs(optimizer)
-        self.literal: LiteralBetas | None = None
-        self.memory_stays = False
-        self._until_end: contextlib.ExitStack | None = None
-
-    def after_step(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        """Hook of PyTorch: a step has ended."""
-        if self.depth:
-            self.depth -= 1
-            if self.depth == 0:
-                try:
-                    self.end(optimizer)
-                except Exception as error:
-                    self._failed(error)
-
-    def end(self, optimizer: torch.optim.Optimizer) -> None:
-        """Restore the trainer's settings before other code reads them, and judge a watched step."""
-        self._under_way.remove(self)
-        self.put_back()
-        if self.watched is not None:
-            self.judge(optimizer)
-
-    def drop(self) -> None:
-        """Forget a step that raised, and restore the trainer's settings."""
-        self.depth = 0
-        self.put_back()
-        self.watched = None
-        self.longer.clear()
-
-    def prepare(self, optimizer: torch.optim.Optimizer) -> None:
-        """Watch which settings the first longer step reads, and replace literal betas that it passes on."""
-        self._until_end = contextlib.ExitStack()
-        if not self.judged:
-            betas = next((betas for _, _, betas in self.before if betas is not None), None)
-            self.literal = None if betas is None else LiteralBetas(optimizer, betas, SQUARES_KEPT)
-            self.watched = watch(optimizer.param_groups)
-            self._until_end.callback(unwatch, optimizer.param_groups)
-        if self.literal is not None:
-            self._until_end.enter_context(self.literal.in_place())
-
-    def stop_watching(self) -> None:
-        """Do not judge this step: another optimizer uses its groups inside it."""
-        if self._until_end is not None:
-            self._until_end.close()
-        self.watched = self.literal = None
-
-    def put_back(self) -> None:
-        """Restore the trainer's settings, once: values that the trainer sets later stay."""
-        for group, rate, betas in self.before:
-            if rate is not None:
-                group["lr"] = rate
-            if betas is not None:
-                group["betas"] = betas
-        self.before.clear()
-        if self._until_end is not None:
-            self._until_end.close()
-            self._until_end = None
-
-    def judge(self, optimizer: torch.optim.Optimizer) -> None:
-        """Judge the watched step, which has ended, by the settings that it read.
-
-        Raises:
-            SkipGSError: It did not read the learning rates, so larger steps have no effect.
-        """
-        watched, self.watched = self.watched or [], None
-        longer = [group for group in watched if any(group.group is one for one in self.longer)]
-        self.judged = True
-        self.longer.clear()
-        kind = type(optimizer).__name__
-        if any("lr" not in group.read or "lr" not in group for group in longer):
-            raise SkipGSError(
-                f"Steps of {kind} do not read the lr of its param_groups, so they are not larger; let them read it, or "
-                "give compensate=False."
-            )
-        fixed = [group for group in longer if "betas" in group and "betas" not in group.read]
-        if fixed and self.literal is not None and self.literal.replaced:
-            return
-        self.literal, self.memory_stays = None, bool(fixed)
-        if fixed:
-            bound = shorter_memory(fixed[0].group["betas"], SQUARES_KEPT)
-            caution(
-                f"Steps of {kind} do not read the betas of its param_groups, so its beta2 cannot be lowered; "
-                f"its learning rates are raised {bound:.2f} times as far instead."
-            )

@@ -1,0 +1,26 @@
+"""Choose the pace that the settings of a gate ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.pace.base import Pace
+from skipgs_plug.core.pace.compensated import Compensated
+from skipgs_plug.core.pace.phased import Phased
+from skipgs_plug.core.pace.rates import ScaledRates
+from skipgs_plug.core.release import Release
+
+
+def pace_of(config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None], giving_up: Release) -> Pace:
+    """Return the pace for these settings.
+
+    Args:
+        config: Settings that the user gave.
+        rates: Scales learning rates.
+        go_on: Receives the first iteration of a resumed run, and loads the state of its checkpoint, if there is one.
+        giving_up: Receives errors, and raises them or releases the gate.
+    """
+    if config.leaves_out:
+        return Phased(config, rates, go_on, giving_up)
+    return Compensated(config, rates) if config.compensates else Pace()
