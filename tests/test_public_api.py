@@ -148,12 +148,12 @@ def test_errors_are_one_family() -> None:
 
 def signatures(cls: type) -> dict[str, str]:
     """Of everything public that can be called."""
-    names = [name for name in vars(cls) if not name.startswith("_") and callable(getattr(cls, name))]
+    names = [name for name in dir(cls) if not name.startswith("_") and callable(getattr(cls, name))]
     return {name: str(inspect.signature(getattr(cls, name))) for name in names}
 
 
 def properties(cls: type) -> set[str]:
-    return {name for name, member in vars(cls).items() if isinstance(member, property) and not name.startswith("_")}
+    return {name for name in dir(cls) if isinstance(getattr(cls, name), property) and not name.startswith("_")}
 
 
 def test_gate_verbs_and_their_signatures() -> None:

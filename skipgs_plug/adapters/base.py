@@ -61,21 +61,36 @@ class AbstractAdapter(ABC):
     @classmethod
     @abstractmethod
     def matches(cls, trainer: Any) -> bool:
-        """Return whether this is the trainer that the adapter knows, without importing the trainer."""
+        """Return whether this is the trainer that the adapter knows, without importing the trainer.
+
+        Args:
+            trainer: An object, a module or a function.
+        """
 
     @classmethod
     def recognises_script(cls, code: LoopCode) -> bool:
-        """Return whether a training script with these names belongs to the trainer that the adapter knows."""
+        """Return whether a training script belongs to the trainer that the adapter knows.
+
+        Args:
+            code: Names that the script has and that its loop uses.
+        """
         return False
 
     @classmethod
     def stand_ins_for(cls, command: Sequence[str]) -> str:
-        """Return the family of stand-ins for a script with this command line; see `stand_ins`."""
+        """Return the family of stand-ins for a script; see `stand_ins`.
+
+        Args:
+            command: Command line of the script, which begins with its file.
+        """
         return cls.stand_ins
 
     @abstractmethod
     def attach(self, hooks: Hooks) -> None:
         """Attach to `self.trainer`, which has not begun training.
+
+        Args:
+            hooks: Reports to the gate, and replaces names in the trainer.
 
         Raises:
             AdapterMismatchError: An expected name is missing.
@@ -85,11 +100,26 @@ class AbstractAdapter(ABC):
         """Attach to a training script that is about to run in this process.
 
         Its file is `sys.argv[0]`, its folder is first on `sys.path`, and none of its modules is imported yet.
+
+        Args:
+            hooks: Reports to the gate, and replaces names in the trainer.
+
+        Raises:
+            SkipGSError: The trainer has no script, or its script cannot be gated.
         """
         raise SkipGSError(f"Adapter {self.name!r} needs a trainer object; it has no script to run.")
 
     def attach_on_call(self, hooks: Hooks, owner: Any, method: str) -> None:
-        """Attach to the object that `owner.method` is called on, before it runs."""
+        """Attach to the object that a method is called on, before the method runs.
+
+        Args:
+            hooks: Reports to the gate, and replaces names in the trainer.
+            owner: The class of the object.
+            method: Name of the method.
+
+        Raises:
+            AdapterMismatchError: The class has no such method.
+        """
 
         def begins(original: Callable[..., Any], trainer: Any, *args: Any, **kwargs: Any) -> Any:
             self.trainer = trainer
@@ -100,11 +130,19 @@ class AbstractAdapter(ABC):
         hooks.wrap(owner, method, begins)
 
     def mismatch(self, expected: str) -> AdapterMismatchError:
-        """Return the error for a trainer that is not as `expected`, which completes "Adapter ... expects"."""
+        """Return the error for a trainer that differs from the one that the adapter knows.
+
+        Args:
+            expected: What the adapter expects. It completes the sentence "Adapter ... expects".
+        """
         return AdapterMismatchError(f"Adapter {self.name!r} expects {expected}, as in {self.checked}.")
 
     def must_run(self, step: int) -> bool:
-        """Return whether this iteration must not be skipped. Its loss is not recorded either."""
+        """Return whether the backward pass of an iteration must not be skipped. Its loss is not recorded either.
+
+        Args:
+            step: Number of the iteration, counted as the trainer counts.
+        """
         return False
 
     def optimizers(self) -> Iterable[torch.optim.Optimizer]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, ClassVar, Protocol
@@ -14,11 +13,9 @@ from skipgs_plug.core.drift_check import DriftCheck
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.intercept import Around, Original, Patches, intercept_tensor_backward
-from skipgs_plug.core.optimizers import Named, Optimizers
-from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_known
-from skipgs_plug.core.pace.loop_range import LoopRange, replace_range
-from skipgs_plug.core.pace.phased import Phased
-from skipgs_plug.core.trainer_info import Densification, TrainerInfo
+from skipgs_plug.core.loop_hooks import LoopHooks
+from skipgs_plug.core.optimizers import Optimizers
+from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.core.views import NOT_READ, view_key
 
 # First iterations in which training backward passes are counted. Any number but one in each is a wrong attachment, and
@@ -51,7 +48,7 @@ class Adapter(Protocol):
         """Return the times that the trainer measures itself, or None."""
 
 
-class Hooks:
+class Hooks(LoopHooks):
     """Reports to a gate what a trainer does: iterations, views, backward passes, structural changes.
 
     The first training backward pass of an iteration is gated. Any further one runs and counts as a mismatch.
@@ -66,16 +63,15 @@ class Hooks:
             given: Names of the settings that the user gave.
             in_script: Whether the trainer is a script, whose user cannot attach a new gate for a second run in it.
         """
-        self._engine = engine
+        self._expectation = f"Adapter {adapter.name!r} was checked with {adapter.checked}."
+        super().__init__(engine, adapter.optimizers, Patches(self._expectation, self._failed))
         self._adapter = adapter
         self._given = given
-        self._expectation = f"Adapter {adapter.name!r} was checked with {adapter.checked}."
         self._giving_up = engine.giving_up
         self._giving_up.undoes(self.restore)
         # Refusals come with the first iteration, when nothing is lost yet.
         self._giving_up.refuses = lambda: max(self._iterations, self._backwards) <= 1
         self._guarded = self._giving_up.guarded(lambda: self._iteration.step)
-        self._patches = Patches(self._expectation, self._failed)
         self._ready = False
         self._in_script = in_script
         self.script_globals: dict[str, Any] = {}
@@ -90,6 +86,9 @@ class Hooks:
     def ready(self, info: TrainerInfo) -> None:
         """Pass on the facts that must be known before the first iteration.
 
+        Args:
+            info: Facts about the trainer.
+
         Raises:
             SkipGSError: The settings do not fit the trainer; see `Engine.configure`.
         """
@@ -102,7 +101,16 @@ class Hooks:
     # Reports during training.
 
     def iteration(self, step: int) -> None:
-        """Begin iteration `step`: its first training backward pass will be gated."""
+        """Begin an iteration, whose first training backward pass will be gated.
+
+        Args:
+            step: Number of the iteration, counted as the trainer counts. It may not decrease.
+
+        Raises:
+            AdapterMismatchError: This is the first iteration, and it came before `ready`. Later errors release the
+                gate.
+            SkipGSError: This is the first iteration, and the gate refuses the run.
+        """
         if self.released:
             return
         step = int(step)  # a NumPy number would get into saved states
@@ -135,17 +143,38 @@ class Hooks:
         self._iteration.view = key
 
     def signal(self, value: float | torch.Tensor) -> None:
-        """Decide by this value in the present iteration, instead of by the loss."""
+        """Decide by this value in the present iteration, instead of by the loss.
+
+        Args:
+            value: The number to decide by, such as the image term of the loss; a tensor has one element.
+        """
         self._iteration.signal = value
 
     def event(self, kind: str) -> None:
-        """Report a structural change (prune, opacity reset, new optimizer). Changes before training do not count."""
+        """Report a structural change (prune, opacity reset, new optimizer). Changes before training do not count.
+
+        Args:
+            kind: Name of the change for the report, such as the name of the method.
+        """
         step = self._iteration.step
         if self._engine.policy is not None and step is not None:
             self._engine.notify_event(kind, step)
 
     def backward(self, loss: torch.Tensor, run: Callable[[], Any], view: Any = None) -> Any:
-        """Gate a training backward pass: call `run()`, which runs it, unless it is skipped."""
+        """Gate a training backward pass: run it, unless it is skipped.
+
+        Args:
+            loss: The tensor whose backward pass runs.
+            run: Runs the backward pass.
+            view: Key of the view; None for the key that `view` reported.
+
+        Returns:
+            The result of `run()` if the gate does not handle this backward pass, else None.
+
+        Raises:
+            AdapterMismatchError: This is the first iteration, and no view was reported.
+            SkipGSError: This is the first iteration, and the gate refuses the run.
+        """
         if self.released:
             return run()
         call = Original(run)
@@ -187,11 +216,28 @@ class Hooks:
     # Ways to attach to the trainer.
 
     def wrap(self, owner: Any, name: str, around: Around) -> None:
-        """Call `around(original, *args, **kwargs)` in place of `owner.name`; see `Patches.wrap`."""
+        """Call `around(original, *args, **kwargs)` in place of each `owner.name(*args, **kwargs)`.
+
+        Args:
+            owner: A class (`args` then begin with the instance), an instance, a module, or the namespace dict of a
+                module.
+            name: Attribute to replace.
+            around: The replacement.
+
+        Raises:
+            AdapterMismatchError: The owner has no function of this name.
+            SkipGSError: A gate has replaced the name already.
+        """
         self._patches.wrap(owner, name, around)
 
     def before(self, owner: Any, name: str, call: Callable[..., Any]) -> None:
-        """Call `call(*args, **kwargs)` before each `owner.name(*args, **kwargs)`."""
+        """Call `call(*args, **kwargs)` before each `owner.name(*args, **kwargs)`.
+
+        Args:
+            owner: The object that holds the function; see `wrap`, also for errors.
+            name: Attribute of the function.
+            call: The function to call first.
+        """
 
         def around(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             call(*args, **kwargs)
@@ -200,7 +246,12 @@ class Hooks:
         self.wrap(owner, name, around)
 
     def events(self, owner: Any, *names: str) -> None:
-        """Report each call of these methods as a structural change with the method's name."""
+        """Report each call of these methods as a structural change with the method's name.
+
+        Args:
+            owner: The object that holds the methods; see `wrap`, also for errors.
+            *names: Attributes of the methods.
+        """
         for name in names:
             self.before(owner, name, lambda *args, _kind=name, **kwargs: self.event(_kind))
 
@@ -208,6 +259,10 @@ class Hooks:
         """Suppress calls of these methods in iterations whose backward pass was skipped.
 
         For side effects that belong to a gradient step but need no gradient, such as position noise.
+
+        Args:
+            owner: The object that holds the methods; see `wrap`, also for errors.
+            *names: Attributes of the methods. A suppressed call returns None.
         """
 
         def around(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -216,107 +271,21 @@ class Hooks:
         for name in names:
             self.wrap(owner, name, around)
 
-    def loop(
-        self,
-        names: dict[str, Any],
-        *functions: str,
-        always: Always | None = None,
-        pure: Iterable[str] = (),
-        densification: Densification | None = None,
-        known: Known | None = None,
-    ) -> None:
-        """Name the functions whose loop over `range` may be the training loop, so that iterations can be left out.
-
-        Iterations that the loop's own conditions name (`if iteration % 1000 == 0`) always run.
-
-        Args:
-            names: Global names of the functions' module; `script_globals` for a script that is about to run.
-            functions: Names of the functions.
-            always: Returns further iterations out of a range that must run, because functions that the loop calls
-                depend on their numbers.
-            pure: Functions that only read numbers, and may occur in the loop's conditions.
-            densification: How to recognise densification events, if `ready` comes after the loop has begun.
-            known: Receives all names of the loop's function right before its conditions are read, and returns values
-                of names that the loop assigns, if they are known before.
-        """
-        pace = self._engine.pace
-        if isinstance(pace, Phased):
-            pace.describe(always or nothing_always, pure, densification, known or nothing_known)
-            replace_range(self._patches, names, functions, pace)
-
-    def always(self, always: Always) -> None:
-        """Name iterations that must run, as for `loop`, if the loop is the user's own."""
-        self._engine.pace.describe(always)
-
-    def require(self, number: int) -> None:
-        """Make iteration `number` run, because a condition of the loop depends on an event that just happened.
-
-        Give the name in such a condition a value for which it never holds; see `known` of `loop`.
-        """
-        self._engine.pace.require(number)
-
-    def optimizer_names(self, named: Named) -> None:
-        """Set the function that returns the trainer's optimizers by name. Names identify groups that have none.
-
-        Only the learning rates of these optimizers are scaled.
-        """
-        self._engine.rates.only = named
-
-    def own_loop(self, owner: Any, name: str, always: Always | None = None) -> None:
-        """Use the range that `owner.name(...)` returns as that of the training loop; `always` as for `loop`.
-
-        Only the learning rates of the adapter's `optimizers` are scaled.
-        """
-        self._engine.rates.only = self._adapter.optimizers
-        pace = self._engine.pace
-        if not pace.leaves_out:
-            return
-        pace.describe(always or nothing_always)
-
-        def counted(original: Callable[..., range], *args: Any, **kwargs: Any) -> LoopRange:
-            return pace.follow(original(*args, **kwargs), None)
-
-        self.wrap(owner, name, counted)
-
-    def number(self, counted: int) -> int:
-        """Return the number of the present iteration in the training loop; `counted` while that loop is not known."""
-        number = self._engine.pace.number
-        return counted if number is None else number
-
-    @property
-    def gap(self) -> int:
-        """Number of iterations that were left out right before the present one."""
-        return self._engine.pace.gap
-
-    def catch_up(self, owner: Any, name: str, caller: str) -> None:
-        """Call `owner.name` once more for every iteration that was left out before the present one.
-
-        For what advances per call instead of by the iteration's number.
-
-        Args:
-            owner: The object or class that holds the function, as for `wrap`.
-            name: Attribute of the function.
-            caller: Name of the function whose calls count.
-        """
-        if not self._engine.pace.leaves_out:
-            return
-
-        def repeated(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            if sys._getframe(2).f_code.co_name == caller:  # 0 is this function, 1 the wrapper
-                for _ in range(self.gap):
-                    original(*args, **kwargs)
-            return original(*args, **kwargs)
-
-        self.wrap(owner, name, repeated)
-
     def gate_tensor_backward(self, *callers: str) -> None:
-        """Gate the scalar `Tensor.backward` that functions of these names call themselves."""
+        """Gate the scalar `Tensor.backward` that certain functions call themselves.
+
+        Args:
+            *callers: Names of these functions.
+        """
         intercept_tensor_backward(self._patches, callers, self.backward)
 
     def check_drift(self, optimizers: Optimizers) -> None:
         """Check that nothing moves the parameters of these optimizers in skipped iterations; see `DriftCheck`.
 
         A fork of a trainer can do that. The gate is then released, and training goes on without it.
+
+        Args:
+            optimizers: Returns the optimizers.
         """
         self._drift = DriftCheck(self._engine, optimizers)
 
@@ -328,7 +297,12 @@ class Hooks:
         )
 
     def on_detach(self, label: str, undo: Callable[[], None]) -> None:
-        """Add a function that undoes another change at `detach`."""
+        """Undo another change too when the gate is detached or released.
+
+        Args:
+            label: Name of what was changed, for `SkipGate.patched`.
+            undo: Undoes the change.
+        """
         self._patches.add_undo(label, undo)
 
     @property
@@ -365,7 +339,11 @@ class Hooks:
         return self._guarded
 
     def release(self, reason: str) -> None:
-        """Release the gate with a reason, so that training continues without it; an error would end the training."""
+        """Release the gate, so that training continues without it; an error would end the training.
+
+        Args:
+            reason: One sentence about the cause, which the user reads as a warning.
+        """
         self._giving_up.let_go(reason)
 
     def _failed(self, error: Exception) -> None:
