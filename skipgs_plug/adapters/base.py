@@ -81,7 +81,7 @@ class AbstractAdapter(ABC):
         """Return the family of stand-ins for a script; see `stand_ins`.
 
         Args:
-            command: Command line of the script, which begins with its file.
+            command: Command line of the script.
         """
         return cls.stand_ins
 
@@ -156,6 +156,10 @@ class AbstractAdapter(ABC):
 
 def gate_backwards_only(hooks: Hooks, adapter: AbstractAdapter) -> None:
     """Refuse settings that leave out whole iterations, for a trainer whose loop does not count with a range.
+
+    Args:
+        hooks: Reports to the gate.
+        adapter: The adapter that attaches it.
 
     Raises:
         SkipGSError: There are such settings.

@@ -105,7 +105,11 @@ def builtin_adapters() -> Iterator[type[AbstractAdapter]]:
 
 
 def find_adapter(trainer: Any, name: str | None = None) -> AbstractAdapter:
-    """Return the adapter for a trainer (None: for a script), by name or by trying all in order.
+    """Return the adapter for a trainer, by name or by trying all in order.
+
+    Args:
+        trainer: An object, a module or a function; None for a script.
+        name: Name of the adapter; None to try all.
 
     Raises:
         UnknownTrainerError: No adapter knows it.

@@ -279,7 +279,12 @@ class Engine:
         return answer
 
     def notify_event(self, kind: str, step: int) -> None:
-        """Take note of a structural change in iteration `step`; changes of densification are ignored."""
+        """Take note of a structural change; changes of densification are ignored.
+
+        Args:
+            kind: Name of the change for the report.
+            step: Iteration of the change.
+        """
         assert self.policy is not None
         if not self.config.enabled or step < self.start - 1:
             return

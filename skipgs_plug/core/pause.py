@@ -26,7 +26,12 @@ class Pause:
         self.changes = 0
 
     def extend(self, step: int, n_views: int) -> int:
-        """Pause the iterations after `step`; return the number of iterations that this adds to the pause."""
+        """Pause after a structural change; return the number of iterations that this adds to the pause.
+
+        Args:
+            step: Iteration of the change.
+            n_views: Number of training views.
+        """
         iters = max(n_views, MIN_PAUSE_ITERS) if self._iters is None else self._iters
         begin = max(self.until, step + 1)
         end = step + 1 + iters

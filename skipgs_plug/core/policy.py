@@ -57,20 +57,40 @@ class Policy(ABC):
 
         The call changes nothing. It returns True only in iterations that train nothing; `decide` is then not called
         with their loss.
+
+        Args:
+            view: Key of the view.
+            step: Number of the iteration.
         """
         return None
 
     @abstractmethod
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
-        """Decide on one view in one iteration, and record the answer."""
+        """Decide on one view in one iteration, and record the answer.
+
+        Args:
+            view: Key of the view.
+            loss: Loss of the view, or another value that the user decides by; finite.
+            step: Number of the iteration.
+        """
 
     def overrule(self, own: Decision, answer: Decision) -> None:
-        """Replace the decision that was recorded last, `own`, by `answer`, on which the processes agreed."""
+        """Replace the decision that was recorded last.
+
+        Args:
+            own: That decision.
+            answer: The decision on which the processes agreed.
+        """
         return None
 
     @abstractmethod
     def notify_event(self, step: int, n_views: int) -> None:
-        """Take note of a structural change in iteration `step`."""
+        """Take note of a structural change.
+
+        Args:
+            step: Iteration of the change.
+            n_views: Number of training views.
+        """
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
@@ -159,9 +179,14 @@ class SkipPolicy(Policy):
         return self.means.get(view)
 
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
-        """Decide whether to skip the backward pass of `view`, whose loss is `loss`, in iteration `step`.
+        """Decide whether to skip the backward pass of a view.
 
         Call it once per view and iteration, after the forward pass. The answer is recorded as if it is followed.
+
+        Args:
+            view: Key of the view.
+            loss: Loss of the view. A loss that is not finite enters no mean.
+            step: Number of the iteration, counted like `start_iter`.
         """
         if step < self._start_iter or not self.enabled:
             return decision.INACTIVE
@@ -208,6 +233,10 @@ class SkipPolicy(Policy):
 
         Another process needed the backward pass, or its loss was not finite. In the latter case the iteration does not
         count, like an iteration whose own loss is not finite.
+
+        Args:
+            own: The decision that was recorded.
+            answer: The decision on which the processes agreed.
         """
         if own not in _COUNTED:
             return
@@ -219,10 +248,14 @@ class SkipPolicy(Policy):
             self.budget.backwards += 1
 
     def notify_event(self, step: int, n_views: int) -> None:
-        """Pause after a structural change in iteration `step`.
+        """Pause after a structural change.
 
         Changes before the iteration that precedes `start_iter` belong to densification and are ignored. A
         pause inside warm-up postpones the rest of warm-up.
+
+        Args:
+            step: Iteration of the change.
+            n_views: Number of training views; a pause has at least one iteration for each.
         """
         if not self.enabled or step < self._start_iter - 1:
             return

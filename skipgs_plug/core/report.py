@@ -36,6 +36,12 @@ def counters(
 ) -> dict[str, Any]:
     """Return counters and times.
 
+    Args:
+        stats: Counts of the gate.
+        floor: Least share of backward passes that must run; None if the policy has no floor.
+        times: Seconds of training.
+        left_out: Result of `Pace.report`; None if no iteration is left out.
+
     Returns:
         `iterations` (training backward passes seen, run or skipped); `gated_iterations` (backward passes seen from
         start_iter on, which is `backwards_run` + `backwards_skipped`); `min_bwd_ratio_effective` (floor in force; None
@@ -63,12 +69,23 @@ def counters(
 
 
 def build_report(settings: dict[str, Any], counted: dict[str, Any], views: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the content of skipgs.json: `schema_version` (1), `settings`, all counters, `views` (one row each)."""
+    """Return the content of skipgs.json: `schema_version` (1), `settings`, all counters, `views` (one row each).
+
+    Args:
+        settings: Settings in force, and the name of the adapter.
+        counted: Result of `counters`.
+        views: Result of `GateStats.view_table`.
+    """
     return {"schema_version": SCHEMA_VERSION, "settings": settings, **counted, "views": views}
 
 
 def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
-    """Return the counters as a few lines for people."""
+    """Return the counters as a few lines for people.
+
+    Args:
+        config: Settings in force.
+        counted: Result of `counters`.
+    """
     if not config.enabled:
         return f"SkipGS: off, {counted['iterations']:,} backwards seen."
     if counted["refine_share"] is not None:
@@ -149,7 +166,13 @@ def _why_more(growing: dict[str, Any]) -> str:
 
 
 def write_report(gate: Reporting, path: str | Path, **more: Any) -> None:
-    """Write `gate.report()` as JSON, plus the trainer's own entries (`more`)."""
+    """Write the report of a gate as JSON.
+
+    Args:
+        gate: A `SkipGate`.
+        path: The file.
+        **more: Entries of the trainer's own.
+    """
     text = json.dumps(_finite({**gate.report(), **more}), indent=2, allow_nan=False) + "\n"
     with write_aside(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -59,6 +59,11 @@ class Iteration(NamedTuple):
 class Trainer:
     """Trains one scene by the 3DGS recipe.
 
+    Args:
+        config: Settings.
+        scene: The scene, with at least one training view.
+        backend: Renders and optimizes; None for the one that `config.backend` names.
+
     Attributes:
         step: Next iteration, from 0.
         ran: Number of iterations that ran. It is less than `step` when a gate leaves some out. Views take turns
@@ -159,7 +164,15 @@ class Trainer:
         return self.clock.t_post
 
     def train(self, until: int | None = None, progress: bool = True) -> None:
-        """Run iterations up to `until` (exclusive; default max_steps), fewer when `stop_requested` is set."""
+        """Run iterations; fewer when `stop_requested` is set.
+
+        Args:
+            until: Iteration before which training stops; None for `max_steps`, which is also the largest.
+            progress: Show a progress bar.
+
+        Raises:
+            InputError: A loss is not finite.
+        """
         from tqdm.auto import tqdm
 
         until = self.max_steps if until is None else min(until, self.max_steps)
@@ -183,12 +196,20 @@ class Trainer:
         self._catch_up()
 
     def iterations(self, until: int) -> range:
-        """Return the numbers of the iterations up to `until` (exclusive). A gate replaces it to leave some out."""
+        """Return the numbers of the iterations to run. A gate replaces this method to leave some out.
+
+        Args:
+            until: Iteration before which training stops.
+        """
         return range(self.step, until)
 
     @single_precision()
     def train_step(self) -> float:
-        """Run one iteration and return its loss."""
+        """Run one iteration and return its loss.
+
+        Raises:
+            InputError: The loss is not finite.
+        """
         with self.backend.exclusive_cores():
             return self._train_step()
 
@@ -236,6 +257,11 @@ class Trainer:
     def backward(self, loss: Tensor, view: str, step: int) -> None:
         """Compute gradients, once per iteration. A gate replaces this method on the instance.
 
+        Args:
+            loss: Scalar loss of the view.
+            view: Name of the view.
+            step: Number of the iteration.
+
         Raises:
             InputError: The loss is not finite. The message names view and step.
         """
@@ -256,7 +282,11 @@ class Trainer:
             )
 
     def set_learning_rate(self, step: float) -> None:
-        """Set the learning rates of positions and exposure for iteration `step`; the others are constant."""
+        """Set the learning rates of positions and exposure; the others are constant.
+
+        Args:
+            step: Iteration to take the rates of. A fraction is a point between two iterations.
+        """
         progress = min(step / self.config.schedule, 1.0)
         rate = self.config.means_lr * self.scene.scene_scale * MEANS_LR_END**progress
         self._optimizers["means"].param_groups[0]["lr"] = rate
@@ -264,13 +294,21 @@ class Trainer:
             self.exposure.set_learning_rate(progress)
 
     def active_sh_degree(self, step: int) -> int:
-        """Return the SH degree that iteration `step` renders with."""
+        """Return the SH degree that an iteration renders with.
+
+        Args:
+            step: Number of the iteration.
+        """
         return min(step // self._sh_interval, self.config.sh_degree)
 
     @torch.no_grad()
     @single_precision()
     def render(self, view: View) -> Tensor:
-        """Return the image [H, W, 3] of a view, in [0, 1] up to overshoot. A training view gets its exposure."""
+        """Return the image [H, W, 3] float32 of a view, in [0, 1] up to overshoot.
+
+        Args:
+            view: Camera and size of the image. A training view gets its exposure.
+        """
         degree = self.active_sh_degree(max(self.step - 1, 0))
         image, _ = self._rasterize(view, degree, self._background())
         return self._exposed(image, view)
@@ -291,6 +329,9 @@ class Trainer:
 
         Returns:
             The means by name, their flavours, `num_GS step split views`, and `per_view`: the metrics of each view.
+
+        Raises:
+            InputError: The scene has no views of this split.
         """
         views = {"test": self.scene.test, "train": self.scene.train}[split]
         if not views:
@@ -317,11 +358,20 @@ class Trainer:
         }
 
     def export_ply(self, path: str | Path) -> None:
-        """Write the 62-property INRIA PLY, in the coordinates of the dataset."""
+        """Write the 62-property INRIA PLY, in the coordinates of the dataset.
+
+        Args:
+            path: The file.
+        """
         write_ply(self.scene.frame.dataset_splats(dict(self.splats.items())), path)
 
     def register_state(self, name: str, owner: Stateful) -> None:
-        """Store the state of `owner` in snapshots and checkpoints under `name`."""
+        """Store the state of another object in snapshots and checkpoints.
+
+        Args:
+            name: Name of the entry.
+            owner: Object with `state_dict` and `load_state_dict`.
+        """
         self.registered[name] = owner
 
     def snapshot(self) -> dict[str, Any]:
@@ -330,16 +380,33 @@ class Trainer:
         return state.capture(self)
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot. The snapshot can be restored again later."""
+        """Go back to a snapshot. The snapshot can be restored again later.
+
+        Args:
+            snapshot: Result of `snapshot()` of a trainer with the same scene and settings.
+        """
         state.apply(self, snapshot)
 
     def save_checkpoint(self, path: str | Path) -> None:
-        """Write a checkpoint from which `load_checkpoint` continues exactly."""
+        """Write a checkpoint from which `load_checkpoint` continues exactly.
+
+        Args:
+            path: The file.
+        """
         self.clock.settle()
         state.save_checkpoint(self, path)
 
     def load_checkpoint(self, path: str | Path) -> None:
-        """Continue from a checkpoint of the same scene and settings."""
+        """Continue from a checkpoint of the same scene and settings.
+
+        Args:
+            path: A file of `save_checkpoint`.
+
+        Raises:
+            MissingFileError: The file does not exist.
+            DamagedCheckpointError: The file is damaged or holds NaN.
+            InputError: It belongs to another scene or to other settings.
+        """
         state.load_checkpoint(self, path)
 
     def _forward(self, view: View, degree: int, step: int, with_rows: bool) -> tuple[Tensor, Tensor, dict[str, Any]]:

@@ -79,7 +79,11 @@ class Pace:
         return LoopRange(numbers, EveryNumber(lambda: None))
 
     def begin(self, step: int, policy: Policy | None) -> None:
-        """Begin iteration `step`, in which `policy` decides on backward passes; None before `Engine.configure`.
+        """Begin an iteration.
+
+        Args:
+            step: Number of the iteration.
+            policy: Decides on backward passes; None before `Engine.configure`.
 
         Raises:
             SkipGSError: Iterations are to be left out, and no loop is known that could leave them out.

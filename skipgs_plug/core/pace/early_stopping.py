@@ -78,7 +78,12 @@ class EarlyStopping:
         return self.ended and self.cycle < len(self._ends) - 1
 
     def see(self, view: str, loss: float) -> None:
-        """Record the loss of a watched view; its last loss in a cycle counts."""
+        """Record the loss of a watched view; its last loss in a cycle counts.
+
+        Args:
+            view: Key of the view.
+            loss: Its loss. A loss of 0 or below does not count.
+        """
         if loss > 0.0:
             self._now[view] = loss
 

@@ -32,8 +32,12 @@ def group_part(group: dict[str, Any], name: str | None = None) -> float | None:
     Positions, whose rate has fallen to a tenth when refinement begins, and scales tolerate longer steps. Opacities are
     not raised in refinement: their rate is large already, and longer steps make them flicker.
 
-    A group is identified by its name, or else by the `name` of its optimizer. Without either its shape decides:
-    [N, 1, 3] is the constant band, [N, K, 3] are higher bands, [N, 1] are opacities.
+    A group without any name is identified by its shape: [N, 1, 3] is the constant band, [N, K, 3] are higher bands,
+    [N, 1] are opacities.
+
+    Args:
+        group: One of an optimizer's `param_groups`, which may have a name.
+        name: Name of the optimizer, which stands for that of a group without one; None if unknown.
     """
     name = group.get("name", name)
     if name is not None:
@@ -113,7 +117,12 @@ class GroupInfo:
         return any(param.grad is not None for param in self._params)
 
     def shorter(self, betas: Any, second: float) -> Any:
-        """Return `betas` with the second at most `second`."""
+        """Return the betas of a longer step.
+
+        Args:
+            betas: The trainer's betas.
+            second: Largest value of the second of them.
+        """
         first, squares, *others = betas
         self.betas, self.short = betas, (first, min(squares, second), *others)
         return self.short
