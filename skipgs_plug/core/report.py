@@ -98,7 +98,7 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
         f"{config.start_iter or 0:,}, {counted['iterations']:,} iterations in all.\n"
         f"  floor {'none' if floor is None else format(floor, '.3f')}, warm-up {reasons.get('warm-up', 0):,}, "
         f"held back by the floor {reasons.get('budget', 0):,}, paused {counted['paused']:,} "
-        f"(events {sum(counted['events'].values()):,}), non-finite {counted['non_finite']:,}"
+        f"(changes {sum(counted['events'].values()):,}), non-finite {counted['non_finite']:,}"
     )
 
 
