@@ -61,7 +61,7 @@ class Growing(Phase):
         self.always: dict[str, set[int]] = {}
         self._must: frozenset[int] = frozenset()
         self._must_shares = 1.0, 1.0  # share of the iterations that must run: until the last event, and after it
-        self._first_number: int | None = None
+        self._first: int | None = None
         self._length = 0
         self._epoch = 0
         self._visible: float | None = None  # share that a view shows, in the first measurement; it settles `share`
@@ -72,7 +72,7 @@ class Growing(Phase):
         self._saved_events: dict[str, Any] | None = None
 
     def numbers(self, number: int, end: int) -> range:
-        return range(number if self._first_number is None else self._first_number, end)
+        return range(number if self._first is None else self._first, end)
 
     def begin(self, plan: PhasePlan) -> bool:
         """Receive the facts that are known when the loop begins; return False if no densification event is found.
@@ -85,12 +85,12 @@ class Growing(Phase):
                 'share="auto" must know the training views; give their names to gate.iterations() as views=, '
                 "or a share."
             )
-        numbers, found, densification, hidden = plan.numbers, plan.conditions, plan.densification, plan.named
+        numbers, found, densification, named = plan.numbers, plan.conditions, plan.densification, plan.named
         assert densification is not None
         if plan.accumulates and self._config.grow_share is None:
             # Refinement on accumulated gradients has few steps: 312 of 15,000 iterations in FastGS. Densification is
             # nearly all of the training then, so all of it runs.
-            hidden = set(numbers)
+            named = set(numbers)
         marks = densification.marks
         events = set() if densification.numbers is None else set(densification.numbers(numbers))
         others: dict[str, set[int]] = {}
@@ -101,7 +101,7 @@ class Growing(Phase):
                 others[reason] = hits
         if marks and not any(mark in reason for reason in found for mark in marks):
             return False
-        self.always = {**others, NAMED_FOR_TRAINER: hidden} if hidden else others
+        self.always = {**others, NAMED_FOR_TRAINER: named} if named else others
         self.events = DensificationEvents(events, densification)
         if self._saved_events is not None:
             self.events.load_state_dict(self._saved_events)
@@ -110,13 +110,13 @@ class Growing(Phase):
         # again soon.
         rare = [hits for hits in others.values() if len(hits) < len(events)]
         common = [hits for hits in others.values() if len(hits) >= len(events)]
-        self._must = frozenset(hidden).union(*rare, *(hits - events for hits in common))
-        if self._first_number is None:
-            self._first_number = numbers.start
+        self._must = frozenset(named).union(*rare, *(hits - events for hits in common))
+        if self._first is None:
+            self._first = numbers.start
         # Prunes and selections after the last event need no further iterations.
-        self._length = min(numbers.stop, self.events.end or numbers.stop) - self._first_number
-        end = self._first_number + self._length
-        parts = range(self._first_number, end), range(end, numbers.stop)
+        self._length = min(numbers.stop, self.events.end or numbers.stop) - self._first
+        end = self._first + self._length
+        parts = range(self._first, end), range(end, numbers.stop)
         until, after = (len(self._must.intersection(part)) / max(len(part), 1) for part in parts)
         self._must_shares = until, after
         self._epoch = plan.epoch or self._epoch
@@ -133,7 +133,7 @@ class Growing(Phase):
         return self._must_shares[0] >= 1.0
 
     def shortened(self, end: int) -> int:
-        return 0 if self._first_number is None or self._all_must else end - self._first_number
+        return 0 if self._first is None or self._all_must else end - self._first
 
     def require(self, number: int) -> None:
         self._must |= {number}
@@ -142,7 +142,7 @@ class Growing(Phase):
         self._rates.visibility.restart()  # the grown scene decides how long steps are in refinement
 
     def runs(self, number: int) -> bool:
-        assert self.events is not None and self._first_number is not None
+        assert self.events is not None and self._first is not None
         self._settle()
         assert self.share is not None
         if number in self.events:
@@ -178,8 +178,8 @@ class Growing(Phase):
 
     def _has_room(self, number: int) -> bool:
         """Whether more iterations than `share` can run from `number` on, by `MOST_RAISED_SHARE` of the phase."""
-        assert self.share is not None and self._first_number is not None
-        left = self._length - (number - self._first_number)
+        assert self.share is not None and self._first is not None
+        left = self._length - (number - self._first)
         return self.sampling.run + self.share * left < MOST_RAISED_SHARE * self._length
 
     def _needed(self, number: int) -> int:
@@ -216,8 +216,8 @@ class Growing(Phase):
         events = self.events
         if self.share is None or self._visible is None or events is None or not self._config.compensates:
             return UNCHANGED
-        assert self._first_number is not None
-        ends = number >= self._first_number + self._length  # whether only prunes and terms of the loss follow
+        assert self._first is not None
+        ends = number >= self._first + self._length  # whether only prunes and terms of the loss follow
         share = max(self._share_now or self.share, self._must_shares[ends])
         grown = self._times_grown
         factor = growing_factor(self._length, share, self._visible, events.all_run, grown, events.resets)
@@ -242,7 +242,7 @@ class Growing(Phase):
         """
         events = self.events
         known = self.share is not None and self._config.compensates
-        factor, parts = self._factors(self._first_number or 0) if known else (None, None)
+        factor, parts = self._factors(self._first or 0) if known else (None, None)
         return {
             "share": self.share,
             "iterations_run": self.sampling.run,
@@ -259,7 +259,7 @@ class Growing(Phase):
         return {
             "asked": self._config.growing,
             "share": self.share,
-            "first": self._first_number,
+            "first": self._first,
             "views": self._epoch,
             "gaussians_shown": [self._visible, self._visible_now],
             "share_now": self._share_now,
@@ -270,7 +270,7 @@ class Growing(Phase):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.share, self._first_number = state["share"], state["first"]
+        self.share, self._first = state["share"], state["first"]
         self._must_shares = 1.0, 1.0
         self._epoch = state["views"]
         self._measuring = state["measuring"]

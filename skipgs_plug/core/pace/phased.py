@@ -53,7 +53,7 @@ class Phased(Pace):
         self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
         self._start = 0
         self._last: int | None = None
-        self._hidden: Always = nothing_always
+        self._always: Always = nothing_always
         self._chosen = frozenset(config.always or ())
         self._pure: tuple[str, ...] = ()
         self._known: Known = nothing_known
@@ -85,7 +85,7 @@ class Phased(Pace):
         densification: Densification | None = None,
         known: Known = nothing_known,
     ) -> None:
-        self._hidden, self._pure, self._densification, self._known = always, tuple(pure), densification, known
+        self._always, self._pure, self._densification, self._known = always, tuple(pure), densification, known
         self._attached = True
 
     def require(self, number: int) -> None:
@@ -228,7 +228,7 @@ class Phased(Pace):
 
     def _plan(self, numbers: range, conditions: dict[str, set[int]], before: Phase) -> PhasePlan:
         assert self._last is not None
-        named = {n for n in (*self._hidden(numbers), *self._chosen, *self._required) if n in numbers}
+        named = {n for n in (*self._always(numbers), *self._chosen, *self._required) if n in numbers}
         epoch = self._epoch or (None if self._views is None else len(self._views))
         return PhasePlan(
             numbers,
