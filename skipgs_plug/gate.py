@@ -374,6 +374,9 @@ class SkipGate:
         A state of another scene with the same view names is noticed later: if the first ten losses are all far from
         the means of their views, the gate is released at the tenth.
 
+        Args:
+            state: Result of `state_dict()`.
+
         Raises:
             SkipGSError: The state is damaged, has another version, or belongs to another scene.
         """

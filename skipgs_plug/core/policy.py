@@ -49,7 +49,11 @@ class Policy(ABC):
         return None
 
     def mean(self, view: Hashable) -> float | None:
-        """Return the running mean of a view's loss; None if the view or the policy has no mean."""
+        """Return the running mean of a view's loss; None if the view or the policy has no mean.
+
+        Args:
+            view: Key of the view.
+        """
         return None
 
     def known_ahead(self, view: Hashable, step: int) -> bool | None:
@@ -98,7 +102,11 @@ class Policy(ABC):
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a saved state."""
+        """Continue from a saved state.
+
+        Args:
+            state: Result of `state_dict()`.
+        """
 
 
 class SkipPolicy(Policy):
@@ -158,6 +166,9 @@ class SkipPolicy(Policy):
     def from_config(cls, config: SkipConfig) -> SkipPolicy:
         """Return the policy with these settings.
 
+        Args:
+            config: Settings, of which `start_iter` is given.
+
         Raises:
             SkipGSError: `start_iter` is None.
         """
@@ -175,7 +186,11 @@ class SkipPolicy(Policy):
         return self.budget.floor
 
     def mean(self, view: Hashable) -> float | None:
-        """Return the running mean of a view's loss; None for a new view."""
+        """Return the running mean of a view's loss; None for a new view.
+
+        Args:
+            view: Key of the view.
+        """
         return self.means.get(view)
 
     def decide(self, view: Hashable, loss: float, step: int) -> Decision:
@@ -220,7 +235,12 @@ class SkipPolicy(Policy):
         return answer
 
     def known_ahead(self, view: Hashable, step: int) -> bool | None:
-        """Return False in a pause, in warm-up, for a new view, and while the floor forbids skipping."""
+        """Return False in a pause, in warm-up, for a new view, and while the floor forbids skipping; else None.
+
+        Args:
+            view: Key of the view.
+            step: Number of the iteration, counted like `start_iter`.
+        """
         if step < self._start_iter or not self.enabled or step < self.pause.until:
             return False
         warmup_end = step + self._warmup if self._warmup_end is None else self._warmup_end
@@ -282,6 +302,9 @@ class SkipPolicy(Policy):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict()`, or from a state of the authors' controller (`state_version` 1).
+
+        Args:
+            state: The state.
 
         Raises:
             SkipGSError: The state is of another version, or something is missing from it.
