@@ -19,6 +19,6 @@ class DashGaussian(InriaFamily):
     )
     stand_ins = "dash_gaussian"
     mark = "TrainingScheduler"
-    calls = ("prune_and_densify",)
+    changes = (*InriaFamily.changes, "prune_and_densify")
     arguments = ("render_size",)
     densification = Densification(marks=("densification_interval",), needs="nothing")

@@ -31,7 +31,9 @@ class FastGS(InriaFamily):
     with_share = GROWS_WHOLE
     stand_ins = "fastgs"
     mark = "render_fastgs"
-    calls = ("densify_and_prune_fastgs", "final_prune_fastgs", "optimizer_step")
+    changes = (*InriaFamily.changes, "densify_and_prune_fastgs")
+    pausing = ("final_prune_fastgs",)
+    calls = ("optimizer_step",)
     arguments = ("get_flag", "metric_map")
     renders = ("render_fastgs",)
 

@@ -30,7 +30,7 @@ class GaussianSpa(InriaFamily):
     )
     stand_ins = "gaussianspa"
     mark = "OptimizingSpa"
-    calls = ("densify_and_prune_split",)
+    changes = (*InriaFamily.changes, "densify_and_prune_split")
     renders = ("render_imp", "render")
     structural = (*InriaFamily.structural, "reinitial_pts")
 

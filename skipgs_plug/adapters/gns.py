@@ -35,7 +35,8 @@ class GNS(ImprovedGS):
         f"were left out. {GROWS_WHOLE}"
     )
     mark = "update_opacity_lr"
-    calls = (*ImprovedGS.calls, "final_prune", "update_opacity_lr")
+    changes = (*ImprovedGS.changes, "final_prune")
+    calls = (*ImprovedGS.calls, "update_opacity_lr")
     accumulates_from = 20_000
 
     def __init__(self, trainer: Any = None) -> None:

@@ -28,7 +28,8 @@ class ImprovedGS(InriaFamily):
     with_share = f"All events are kept. {GROWS_WHOLE}"
     stand_ins = "improved_gs"
     mark = "compute_edge_score"
-    calls: ClassVar[tuple[str, ...]] = ("add_densification_stats_abs", "densify_and_prune_Improved")
+    changes = (*InriaFamily.changes, "densify_and_prune_Improved")
+    calls: ClassVar[tuple[str, ...]] = ("add_densification_stats_abs",)
     arguments = ("pixel_weights",)
     densification = Densification(marks=("densification_interval",), needs="nothing")
     structural = (*InriaFamily.structural, "only_prune")

@@ -20,9 +20,9 @@ import torch
 from skipgs_plug.adapters import registry
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.import_hook import when_imported
-from skipgs_plug.adapters.loop_bounds import last_calls
+from skipgs_plug.adapters.loop_bounds import last_calls, undecorated
 from skipgs_plug.adapters.loop_code import LOOP, LoopCode
-from skipgs_plug.adapters.unknown_forks import BY_HAND, Unrecognised, begin_after, left_alone, unrecognised
+from skipgs_plug.adapters.unknown_forks import BY_HAND, CALLS, Unrecognised, begin_after, left_alone, unrecognised
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
@@ -45,8 +45,10 @@ class InriaFamily(AbstractAdapter):
         renders: Names of the functions that render a training view. At least one must exist.
         structural: Methods of `GaussianModel` that make losses jump.
         scenes: Possible names of the loop's variable for its Scene.
-        calls: Names that the adapter knows beyond those of Inria's loop: methods of the model, functions that draw
-            noise, methods that change a tensor in place.
+        changes: Further methods that change the model. The gate begins after the last call of these and `structural`.
+        pausing: Methods that the trainer calls after the gate has begun, too. Each change of theirs pauses the gate.
+        calls: Further names that the adapter knows beyond those of Inria's loop: methods of the model, functions that
+            draw noise, methods that change a tensor in place.
         arguments: Arguments of the renderer that the adapter knows, beyond those of Inria's.
         densification: How to recognise its densification events; None if all iterations of densification must run.
         known_names: Values of names that the loop assigns, if they are known before it. `begin` fills them.
@@ -56,6 +58,8 @@ class InriaFamily(AbstractAdapter):
     renders: ClassVar[tuple[str, ...]] = ("render",)
     structural: ClassVar[tuple[str, ...]] = ("prune_points", "reset_opacity", "training_setup")
     scenes: ClassVar[tuple[str, ...]] = ("scene",)
+    changes: ClassVar[tuple[str, ...]] = ("densify_and_prune",)
+    pausing: ClassVar[tuple[str, ...]] = ()
     calls: ClassVar[tuple[str, ...]] = ()
     arguments: ClassVar[tuple[str, ...]] = ()
     # Statistics are means over visits, so some events may be left out if the others have enough visits.
@@ -67,6 +71,7 @@ class InriaFamily(AbstractAdapter):
         self._model: Callable[[], Any] = lambda: None  # a new model means a new run
         self._label = "image_name"  # attribute of a camera that names its view
         self._code: LoopCode | None = None
+        self._model_class: type = object
         self.known_names: dict[str, Any] = {}
         self._unknown = Unrecognised(*5 * (frozenset(),))
 
@@ -103,8 +108,8 @@ class InriaFamily(AbstractAdapter):
         Raises:
             AdapterMismatchError: It cannot be gated.
         """
-        calls = (*self.calls, *self.structural)
-        self._code, self._unknown = code, unrecognised(code, renderers, model, calls, self.arguments)
+        self._code, self._model_class = code, model
+        self._unknown = unrecognised(code, renderers, model, self._known_calls(), self.arguments)
         self._unknown.refuse(self.difference(code))
         if self._unknown.listed:
             caution(
@@ -304,11 +309,14 @@ class InriaFamily(AbstractAdapter):
         start = self.start_iter(opt, loop)
         if self._code is None or self._code.syntax is None:
             return start
-        return begin_after(start, opt.iterations, last_calls(self._code.syntax, self.may_end_later(), loop))
+        awaited = self._unknown.calls.union(self.structural, self.changes).difference(self.pausing)
+        parts = [part for part in (self._model_class, undecorated(loop.get(LOOP))) if part is not None]
+        ends = last_calls(self._code.syntax, awaited, loop, parts, stops=self._known_calls())
+        return begin_after(start, opt.iterations, ends)
 
-    def may_end_later(self) -> frozenset[str]:
-        """Return the methods of the model whose last call the gate waits for."""
-        return self._unknown.calls
+    def _known_calls(self) -> frozenset[str]:
+        """Return the names of calls that the adapter knows."""
+        return CALLS.union(self.calls, self.structural, self.changes, self.pausing)
 
 
 class Inria(InriaFamily):
@@ -343,9 +351,6 @@ class Inria(InriaFamily):
                 f"{self.difference(code)}: its loop never asks for densify_until_iter. {BY_HAND}"
             )
         super().examine(code, renderers, model)
-
-    def may_end_later(self) -> frozenset[str]:
-        return super().may_end_later() | {"densify_and_prune", "prune_points", "reset_opacity"}
 
     @classmethod
     def stand_ins_for(cls, command: Sequence[str]) -> str:

@@ -31,7 +31,8 @@ class LightGaussian(InriaFamily):
     left_alone = "With `--augmented_view`, jittered cameras (two of three iterations) have means of their own."
     stand_ins = "lightgaussian"
     mark = "calculate_v_imp_score"
-    calls = ("prune_gaussians", "onedownSHdegree", "load_ply", "randn")
+    pausing = ("prune_gaussians",)
+    calls = ("onedownSHdegree", "load_ply", "randn")
     scenes = ("scene", "student_scene")
 
     def __init__(self, trainer: Any = None) -> None:

@@ -34,7 +34,8 @@ class MCMC(InriaFamily):
     left_alone = "The position noise is zero in skipped iterations. Its random numbers are drawn as usual."
     stand_ins = "mcmc"
     mark = NOISE
-    calls = ("add_new_gs", "relocate_gs", "add_", "randn_like", "randn")
+    changes = (*InriaFamily.changes, "add_new_gs", "relocate_gs")
+    calls = ("add_", "randn_like", "randn")
     densification = Densification(marks=("densification_interval",), needs="nothing", resets=False)
 
     def __init__(self, trainer: Any = None) -> None:

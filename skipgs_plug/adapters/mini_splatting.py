@@ -11,9 +11,9 @@ from skipgs_plug.adapters.inria import InriaFamily
 class MiniSplatting(InriaFamily):
     """Both simplifications change the model after the backward of their iteration, and make a new optimizer.
 
-    Gaussians that views show blurred are gathered like gradients, until the next event. Points are made anew from
-    depths every 5,000 iterations, with `share` too. The adapter counts iterations itself, since `update_learning_rate`
-    gets shifted numbers.
+    So does ms_d/train.py in iteration `densify_until_iter`. Gaussians that views show blurred are gathered like
+    gradients, until the next event. Points are made anew from depths every 5,000 iterations, with `share` too. The
+    adapter counts iterations itself, since `update_learning_rate` gets shifted numbers.
     """
 
     name = "mini_splatting"
@@ -21,7 +21,7 @@ class MiniSplatting(InriaFamily):
     project = "[Mini-Splatting](https://github.com/fatPeter/mini-splatting)"
     gated = (
         "`ms/train.py`: from `simp_iteration2` + 1 on, after a pause for the prune in that iteration. `ms_d/train.py`, "
-        "which does not simplify: from `densify_until_iter` on."
+        "which does not simplify: from `densify_until_iter` + 1 on."
     )
     with_share = (
         "By visits; blurred Gaussians are gathered until the next event. Points from depths and both simplifications "
@@ -32,9 +32,9 @@ class MiniSplatting(InriaFamily):
     mark = "num_depth"
     renders = ("render_imp",)
     structural = (*InriaFamily.structural, "reinitial_pts")
-    calls = ("densify_and_prune_split",)
+    changes = (*InriaFamily.changes, "densify_and_prune_split")
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         args = loop["args"]
         simplified = [getattr(args, name) + 1 for name in ("simp_iteration1", "simp_iteration2") if hasattr(args, name)]
-        return max(int(opt.densify_until_iter), *map(int, simplified), 0)
+        return max(int(opt.densify_until_iter) + 1, *map(int, simplified), 0)

@@ -29,17 +29,17 @@ class MiniSplatting2(InriaFamily):
     mark = "depth_reinit"
     renders = ("render_imp",)
     structural = (*InriaFamily.structural, "reinitial_pts", "init_culling")
-    calls = (
-        "add_densification_stats_culling",
+    changes = (
+        *InriaFamily.changes,
         "culling_with_clone",
         "culling_with_importance_pruning",
         "culling_with_interesction_preserving",
         "culling_with_interesction_sampling",
         "densify_and_prune_mask",
-        "depth_reinit",
         "extend_features_rest",
         "interesction_preserving",
     )
+    calls = ("add_densification_stats_culling", "depth_reinit")
     arguments = ("culling",)
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:

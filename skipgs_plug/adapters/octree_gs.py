@@ -26,8 +26,8 @@ class OctreeGS(InriaFamily):
     mark = "set_coarse_interval"
     densification = Densification(marks=("update_interval",), needs="iterations")
     structural = ("prune_anchor", "training_setup")
+    changes = ("adjust_anchor",)
     calls = (
-        "adjust_anchor",
         "eval",
         "get_anchor",
         "set_anchor_mask",

@@ -19,7 +19,8 @@ class ScaffoldGS(InriaFamily):
     left_alone = "Networks and anchors have one optimizer, which is left alone."
     stand_ins = "scaffold_gs"
     mark = "prefilter_voxel"
-    calls = ("adjust_anchor", "eval", "get_anchor", "train", "training_statis")
+    changes = ("adjust_anchor",)
+    calls = ("eval", "get_anchor", "train", "training_statis")
     arguments = ("retain_grad", "visible_mask")
     densification = Densification(marks=("update_interval",), needs="iterations")
     structural = ("prune_anchor", "training_setup")

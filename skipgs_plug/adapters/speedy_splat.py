@@ -25,7 +25,7 @@ class SpeedySplat(InriaFamily):
     left_alone = "The backward passes for pruning scores always run."
     stand_ins = "speedy_splat"
     mark = "score_func"
-    calls = ("prune_gaussians",)
+    pausing = ("prune_gaussians",)
     arguments = ("scores",)
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:

@@ -22,6 +22,7 @@ class Taming(InriaFamily):
     )
     stand_ins = "taming"
     mark = "get_count_array"
-    calls = ("densify_with_score", "modify_functions")
+    changes = (*InriaFamily.changes, "densify_with_score")
+    calls = ("modify_functions",)
     arguments = ("pixel_weights",)
     densification = Densification(marks=("densification_interval",), needs="nothing")

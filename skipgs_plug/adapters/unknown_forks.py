@@ -86,7 +86,7 @@ def unrecognised(
     code: LoopCode,
     renderers: Iterable[Callable[..., object]],
     model: type,
-    calls: Iterable[str],
+    known: frozenset[str],
     arguments: Iterable[str],
 ) -> Unrecognised:
     """Compare a loop and the functions that it calls with the names that its adapter knows.
@@ -95,11 +95,10 @@ def unrecognised(
         code: The training script.
         renderers: Renderers of the script.
         model: GaussianModel of the script.
-        calls: Names that the adapter knows in addition to those of Inria's loop: methods of the model, functions that
-            draw noise, and methods that change tensors in place.
+        known: Names that the adapter knows: methods of the model, functions that draw noise, and methods that change
+            tensors in place.
         arguments: Arguments of the renderers that the adapter knows in addition to those of Inria's loop.
     """
-    known = CALLS | set(calls)
     parameters = {name for one in renderers for name in inspect.signature(one).parameters}
     writes = {name for name in code.repeated if writes_in_place(name)} | ({"data"} & code.stored)
     return Unrecognised(
@@ -107,7 +106,7 @@ def unrecognised(
         frozenset(code.keywords & parameters - ARGUMENTS - set(arguments)),
         frozenset(code.repeated & NOISE - known),
         frozenset(writes - known),
-        frozenset(code.used & known),
+        code.used & known,
     )
 
 
@@ -141,12 +140,14 @@ class Survey:
         self._known = self._changes.union(known, through)
         owners = list(owners)
         self._methods = {ASSIGNED}.union(*map(_callables, owners))
-        self._reader = CallReader(map(_project, owners), self._methods.difference(through), windows)
+        self._reader = CallReader(self._methods.difference(through), windows)
+        for owner in owners:
+            self._reader.trainer.add(owner)
 
     def read(
         self, function: Any, *numbers: str, values: Mapping[str, Any] | None = None, end: int | None = None
     ) -> None:
-        """Read a function or bound method of the trainer, and the functions of its project that it calls.
+        """Read a function or bound method of the trainer, and the trainer's functions that it calls.
 
         Args:
             function: The function.
@@ -154,9 +155,11 @@ class Survey:
             values: Known values of its names.
             end: First iteration in which the trainer no longer calls the function; None if it calls it until the end.
         """
-        plain = undecorated(function)
+        plain, owner = undecorated(function), getattr(function, "__self__", None)
         if plain is not None:
-            self._reader.projects.add(_project(plain))
+            self._reader.trainer.add(plain)
+            if owner is not None:
+                self._reader.trainer.add(type(owner))
             self._reader.note(plain.__name__, end)
             self._reader.read(function, numbers, values or {}, end)
 
@@ -203,19 +206,14 @@ def begin_after(start: int, last: float, ends: Mapping[str, int]) -> int:
 
     Args:
         start: First iteration that the adapter allows the gate to skip.
-        last: Last iteration of the run. The gate does not wait for calls that end after it.
+        last: Last iteration of the run. The gate does not wait for calls that go on until it.
         ends: By the name of each call, the first iteration in which the loop no longer makes the call.
     """
-    late = {name: end for name, end in ends.items() if start < end <= last}
+    late = {name: end for name, end in ends.items() if start < end < last}
     if late:
         listed = ", ".join(f"{spelled(name)} until iteration {end - 1}" for name, end in sorted(late.items()))
         caution(f"The gate starts at iteration {max(late.values())} instead of {start}: the loop calls {listed}.")
     return max([start, *late.values()])
-
-
-def _project(part: Any) -> str:
-    """Return the top-level package of a class, function or module."""
-    return str(getattr(part, "__module__", None) or part.__name__).partition(".")[0]
 
 
 def _callables(owner: Any) -> set[str]:

@@ -68,6 +68,7 @@ class Case:
         pending: gradients are left over when skipping begins, and are to be applied right before `settled`.
         views: keys of all training views.
         leaves_out: its loop counts with a range, so that whole iterations can be left out.
+        later: first iteration that may be skipped, if it is not START of the module.
     """
 
     name: str
@@ -78,11 +79,17 @@ class Case:
     pending: bool = False
     views: tuple[Any, ...] = tuple(NAMES)
     leaves_out: bool = True
+    later: int | None = None
+
+    @property
+    def start(self) -> int:
+        """Return the first iteration that may be skipped."""
+        return self.module.START if self.later is None else self.later
 
     @property
     def refined_from(self) -> int:
-        """Return the iteration from which refinement leaves out iterations; SETTLED of the module, or its START."""
-        return getattr(self.module, "SETTLED", self.module.START)
+        """Return the iteration from which refinement leaves out iterations; SETTLED of the module, or the start."""
+        return getattr(self.module, "SETTLED", self.start)
 
     @property
     def iterations(self) -> range:
@@ -95,6 +102,7 @@ def script(
     settled: int | None = None,
     pending: bool = False,
     views: Any = NAMES,
+    later: int | None = None,
     **options: Any,
 ) -> Case:
     """A train module with its function `training`; resumed with the cameras in another order."""
@@ -105,7 +113,7 @@ def script(
     def resume(checkpoint: Any) -> tuple[Any, Callable[..., Any]]:
         return module, lambda last=module.LAST: module.train(checkpoint, last=last, order=7, **options)
 
-    return Case(name, module, make, resume, settled, pending, tuple(views))
+    return Case(name, module, make, resume, settled, pending, tuple(views), later=later)
 
 
 def gsplat(name: str, cls: type, strategy: type, **options: Any) -> Case:
@@ -193,7 +201,7 @@ SCRIPTS = [
     script("mcmc", mcmc),
     script("mip_splatting", mip_splatting),
     script("absgs", absgs),
-    script("absgs_prune_weight", absgs, use_prune_weight=True),
+    script("absgs_prune_weight", absgs, later=40, use_prune_weight=True, prune_until_iter=40),
     script("pixel_gs", pixel_gs),
     script("two_d_gs", two_d_gs),
     script("scaffold_gs", scaffold_gs),

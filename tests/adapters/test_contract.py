@@ -45,14 +45,14 @@ def test_a_gate_that_skips_nothing_leaves_training_bit_identical(case, settings)
     assert ungated.other_backwards == gated.other_backwards
     report = gate.report()
     assert report["backwards_skipped"] == 0 and report["iterations"] == len(case.iterations)
-    expected = len(case.iterations) - (case.module.START - case.module.FIRST)
+    expected = len(case.iterations) - (case.start - case.module.FIRST)
     assert report["gated_iterations"] == (expected if gate.config.enabled else 0)
 
 
 @each
 def test_skipping_everything_holds_the_model_still(case):
     gated, gate = run(case, policy=SkipAlways())
-    first, start = case.module.FIRST, case.module.START
+    first, start = case.module.FIRST, case.start
     assert gated.backwards == list(range(first, start))
     assert gate.report()["backwards_skipped"] == case.module.LAST + 1 - start
     settled = case.settled or start
@@ -72,11 +72,11 @@ def test_the_rule_decides_which_backwards_run(case):
     gated, gate = run(case, **RULE)
     skipped = [row.step for row in gate.trace if row.skip]
     assert gated.backwards == [i for i in case.iterations if i not in skipped]
-    assert [row.step for row in gate.trace] == list(range(case.module.START, case.module.LAST + 1))
+    assert [row.step for row in gate.trace] == list(range(case.start, case.module.LAST + 1))
     report = gate.report()
     assert report["backwards_skipped"] == len(skipped) > 0
     assert report["backwards_run"] == report["gated_iterations"] - len(skipped) > 0
-    assert report["settings"]["start_iter"] == case.module.START
+    assert report["settings"]["start_iter"] == case.start
     assert gated.structure == alone(case).structure
     assert {row["view"] for row in report["views"]} == set(case.views)
 
@@ -84,7 +84,7 @@ def test_the_rule_decides_which_backwards_run(case):
 @each
 def test_events_pause_the_gate(case):
     gated, gate = run(case, **RULE)
-    start = case.module.START
+    start = case.start
     events = {step for step, kind, _ in gated.structure if step >= start - 1 and kind not in NOT_EVENTS}
     expected = sorted({i for event in events for i in range(event + 1, event + 1 + PAUSE)} & set(case.iterations))
     assert [row.step for row in gate.trace if row.reason == "pause"] == expected

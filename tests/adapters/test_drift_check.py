@@ -37,7 +37,7 @@ def test_what_moves_the_model_in_skipped_iterations_releases_the_gate(case, shak
         train()
     assert gate.released is not None and "whose backward was skipped" in gate.released
     assert [one for one in recwarn if str(one.message) == gate.released]
-    assert f"The loop moved xyz in iteration {case.module.START + 1}" in gate.released
+    assert f"The loop moved xyz in iteration {case.start + 1}" in gate.released
     assert log.backwards[-1] == case.module.LAST == max(log.values)
     assert gate.report()["backwards_skipped"] == 2  # nothing is compared before the first; it moved in the second
 

@@ -48,7 +48,7 @@ def test_an_error_at_any_entry_point_releases_the_gate_once(case, entry, monkeyp
     new_log()
     trainer, train = case.make()
     owner, name = REACHED[entry]
-    failed = fail_from(monkeypatch, owner, name, case.module.START + 3)
+    failed = fail_from(monkeypatch, owner, name, case.start + 3)
     with SkipGate(trainer, warmup=0, pause_iters=0, min_bwd_ratio=0.0) as gate:
         train()
         said = [str(one.message) for one in recwarn if "released" in str(one.message)]
@@ -71,7 +71,7 @@ def test_an_error_while_iterations_are_left_out_releases_the_gate_once(case, way
     new_log()
     trainer, train = case.make()
     owner, name = WAYS[way]
-    failed = fail_from(monkeypatch, owner, name, case.module.START + 3)
+    failed = fail_from(monkeypatch, owner, name, case.start + 3)
     with SkipGate(trainer, refine_share=0.4, pause_iters=0) as gate:
         train()
     said = [str(one.message) for one in recwarn if "released" in str(one.message)]
@@ -96,7 +96,7 @@ def test_an_error_of_an_adapters_own_code_does_the_same(name, monkeypatch, recwa
         owner = get_adapter("gsplat")
     new_log()
     trainer, train = case.make()
-    failed = fail_from(monkeypatch, owner, method, case.module.START + 3)
+    failed = fail_from(monkeypatch, owner, method, case.start + 3)
     with SkipGate(trainer, pause_iters=0, warmup=0, min_bwd_ratio=0.0) as gate:
         train()
     said = [str(one.message) for one in recwarn if "released" in str(one.message)]
@@ -111,7 +111,7 @@ def test_where_warnings_are_errors_the_sentence_is_printed_once_and_training_goe
     monkeypatch.setattr(caution, "_print", printed.append)
     new_log()
     trainer, train = case.make()
-    failed = fail_from(monkeypatch, SkipPolicy, "decide", case.module.START + 3)
+    failed = fail_from(monkeypatch, SkipPolicy, "decide", case.start + 3)
     with SkipGate(trainer, warmup=0, pause_iters=0, min_bwd_ratio=0.0) as gate:
         train()
     assert printed == [gate.released] and "ZeroDivisionError: of decide" in printed[0]
@@ -136,8 +136,8 @@ def test_a_rank_whose_code_fails_raises_since_others_would_wait(monkeypatch):
     case = next(case for case in cases if case.name == "inria")
     new_log()
     trainer, train = case.make()
-    fail_from(monkeypatch, drift_check.DriftCheck, "moved", case.module.START - 3)
+    fail_from(monkeypatch, drift_check.DriftCheck, "moved", case.start - 3)
     monkeypatch.setattr("skipgs_plug.core.distributed.group_size", lambda: 2)
     with SkipGate(trainer) as gate, pytest.raises(ZeroDivisionError, match="of moved"):
         train()
-    assert gate.patched == [] and log.now == case.module.START - 3
+    assert gate.patched == [] and log.now == case.start - 3

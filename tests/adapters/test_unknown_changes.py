@@ -196,7 +196,8 @@ class Loop:
 
 
 def test_ends_of_calls_are_read_through_functions_guards_and_names():
-    reader = CallReader(projects={__name__.partition(".")[0]})
+    reader = CallReader()
+    reader.trainer.add(Loop)
     reader.read(Loop().train, {"step"}, {})
     assert {name: reader.ends[name] for name in ("inner", "prune", "grow", "save")} == {
         "inner": 13,

@@ -41,7 +41,7 @@ class Settled:
             return True
         if isinstance(node, (ast.Name, ast.Attribute)):
             found, value = self._look_up(node)
-            return found and _is_plain(value)
+            return found and is_plain(value)
         if isinstance(node, ast.Call):
             pure = isinstance(node.func, ast.Name) and node.func.id in self._pure and not node.keywords
             return pure and all(argument in self for argument in node.args)
@@ -57,19 +57,20 @@ class Settled:
             return node.id in self._own and node.id in self._names, self._names.get(node.id)
         if isinstance(node, ast.Attribute):
             found, holder = self._look_up(node.value)
-            if found and _only_holds(holder) and node.attr in vars(holder):
+            if found and only_holds(holder) and node.attr in vars(holder):
                 return True, vars(holder)[node.attr]
         return False, None
 
 
-def _is_plain(value: Any) -> bool:
+def is_plain(value: Any) -> bool:
+    """Whether a value is a number, text, a flag, None or a list of them."""
     if isinstance(value, (list, tuple, set, frozenset)):
-        return all(_is_plain(one) for one in value)
+        return all(is_plain(one) for one in value)
     return value is None or isinstance(value, (bool, int, float, str, range))
 
 
-def _only_holds(value: Any) -> bool:
-    """Whether an object only holds values and has no public methods."""
+def only_holds(value: Any) -> bool:
+    """Whether an object, such as a namespace of options, holds values and has no public methods."""
     kind = type(value)
     return hasattr(value, "__dict__") and not any(
         callable(getattr(kind, name)) for name in dir(kind) if not name.startswith("_")
