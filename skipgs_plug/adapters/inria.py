@@ -154,6 +154,7 @@ class InriaFamily(AbstractAdapter):
             raise self.mismatch(f"a train module with {LOOP}() and GaussianModel, or its {LOOP} function")
         code = LoopCode.of_module(names)
         self._refuse_fork(code)
+        self._refuse_loop_elsewhere(code)
         self.examine(code, self._renderers(names), names["GaussianModel"])
         self._attach_to_renderer(hooks, names)
         self._attach_to_model(hooks, names)
@@ -167,6 +168,7 @@ class InriaFamily(AbstractAdapter):
                 f"it was checked with {self.checked}."
             )
         self._refuse_fork(code)
+        self._refuse_loop_elsewhere(code)
         # The script binds names of these modules when it imports them, so they are replaced right before.
         loaded: dict[str, dict[str, Any]] = {}
 
@@ -273,6 +275,15 @@ class InriaFamily(AbstractAdapter):
             raise AdapterMismatchError(
                 f"Adapter {self.name!r} is for {self.checked}, but {code.source} "
                 f"looks like the training script of {right.name!r}."
+            )
+
+    def _refuse_loop_elsewhere(self, code: LoopCode) -> None:
+        """Refuse a script whose training loop is in a function that `training` calls, as 4DGaussians' two stages."""
+        if LOOP not in code.backward:
+            place = ", ".join(f"{name}()" for name in sorted(code.backward & code.used)) or "another module"
+            raise AdapterMismatchError(
+                f"{self.difference(code)}: its training loop is in {place}, not in {LOOP}(), as in 4DGaussians, and is "
+                f"not supported. {BY_HAND}"
             )
 
     def _read_run(self, hooks: Hooks, loop: Mapping[str, Any]) -> None:

@@ -22,6 +22,7 @@ class LoopCode(NamedTuple):
         source: File of the script, or name of the module, for sentences.
         names: Global names of the script, and every global and attribute that its function `training` uses.
         functions: Names of its functions and classes.
+        backward: Names of those that call `backward`.
         used: Every global and attribute that `training` and the functions that it calls use. Empty if there is no
             function `training`.
         repeated: The subset of `used` inside the loop itself and in functions that the loop calls.
@@ -33,6 +34,7 @@ class LoopCode(NamedTuple):
     source: str
     names: frozenset[str]
     functions: frozenset[str]
+    backward: frozenset[str] = frozenset()
     used: frozenset[str] = frozenset()
     repeated: frozenset[str] = frozenset()
     keywords: frozenset[str] = frozenset()
@@ -69,8 +71,11 @@ class LoopCode(NamedTuple):
     def _made(
         cls, source: str, own: set[str], functions: Mapping[str, types.CodeType], syntax: ast.FunctionDef | None
     ) -> LoopCode:
+        backward = {
+            name for name, code in functions.items() if any("backward" in part.co_names for part in _with_inner(code))
+        }
         if LOOP not in functions:
-            return cls(source, frozenset(own), frozenset(functions))
+            return cls(source, frozenset(own), frozenset(functions), frozenset(backward))
         training = functions[LOOP]
         repeated, stored = _in_loop(training)
         called = _called(repeated, functions)
@@ -89,6 +94,7 @@ class LoopCode(NamedTuple):
             source,
             frozenset(own | of_loop),
             frozenset(functions),
+            frozenset(backward),
             frozenset(of_loop | of_called),
             frozenset(repeated | of_called),
             keywords,

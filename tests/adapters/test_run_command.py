@@ -334,6 +334,18 @@ def test_wrong_adapter_is_refused_before_anything_is_imported(checkout, tmp_path
     assert "gaussian_renderer" not in sys.modules
 
 
+def test_loop_outside_of_training_is_refused_before_anything_is_imported(checkout, tmp_path, capfd):
+    source = Path(checkout).read_text().replace("def training(opt, out)", "def scene_reconstruction(opt, out)")
+    stages = (
+        "def training(opt, out):\n    for stage in range(2):\n        scene_reconstruction(opt, out)\n\nif __name__"
+    )
+    Path(checkout).write_text(source.replace("if __name__", stages))
+    assert cli.main(["run", "auto", "--cpu", "--", checkout, str(tmp_path)]) == cli.BAD_INPUT
+    error = capfd.readouterr().err
+    assert "its training loop is in scene_reconstruction(), not in training(), as in 4DGaussians, and is not" in error
+    assert "gaussian_renderer" not in sys.modules
+
+
 def test_missing_extension_is_the_scripts_own_error(checkout, tmp_path, capfd):
     assert cli.main(["run", "inria", "--", checkout, str(tmp_path)]) == 1  # without --cpu there are no stand-ins
     error = capfd.readouterr().err

@@ -158,6 +158,16 @@ def test_what_changes_no_values_in_the_loop_is_not_refused(parts):
     assert gate.report()["backwards_skipped"] == 21
 
 
+def test_loop_in_a_function_that_training_calls_is_refused():
+    fork = unknown_fork(
+        helper="\nreconstruct = training\ndef training(dataset, opt, pipe):\n    reconstruct(dataset, opt, pipe)\n"
+    )
+    with pytest.raises(
+        AdapterMismatchError, match=r"its training loop is in reconstruct\(\), not in training\(\), .* not"
+    ):
+        SkipGate(fork)
+
+
 def test_functions_that_the_loop_calls_are_read_too():
     helper = "\ndef nudge(gaussians):\n    inner(gaussians)\n\ndef inner(gaussians):\n    gaussians.count()\n"
     with pytest.warns(RuntimeWarning, match=r"in skipped iterations: count\(\)"):
