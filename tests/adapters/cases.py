@@ -19,6 +19,7 @@ from lookalikes import (
     faster_gs,
     fastgs,
     fvdb,
+    fvdb_frgs,
     gaussianspa,
     gaussianspa_op,
     gns,
@@ -181,6 +182,14 @@ def lite() -> Case:
     return Case("litegs", litegs, make, leaves_out=False)
 
 
+def frgs(name: str, **options: Any) -> Case:
+    def make() -> tuple[Any, Callable[..., Any]]:
+        trainer = fvdb_frgs.GaussianSplatReconstruction(**options)
+        return trainer, trainer.optimize
+
+    return Case(name, fvdb_frgs, make, views=tuple(str(i) for i in range(len(NAMES))), leaves_out=False)
+
+
 def passes_over(trainer: Any) -> None:
     """A resumed runner takes all minibatches again, and trains on those that are new."""
     trainer._start_step = trainer._global_step
@@ -230,6 +239,8 @@ CASES = [
     runner("edgs", edgs, edgs.EDGSTrainer, "train"),
     runner("3dgrut", threedgrut, threedgrut.Trainer3DGRUT, "run_training"),
     runner("3dgrut_mcmc", threedgrut, threedgrut.Trainer3DGRUT, "run_training", strategy=threedgrut.MCMCStrategy),
+    frgs("fvdb_frgs"),
+    frgs("fvdb_frgs_mcmc", optimizer=fvdb_frgs.OptimizerMCMC),
     runner("fvdb", fvdb, fvdb.SceneOptimizationRunner, "train", ["0", "1", "2", "3", "4"], passes_over, 26),
     studio("nerfstudio"),
     studio("nerfstudio_mcmc", strategy=gsplat_runner.MCMCStrategy()),
