@@ -110,7 +110,7 @@ class AbstractAdapter(ABC):
         raise SkipGSError(f"Adapter {self.name!r} needs a trainer object; it has no script to run.")
 
     def attach_on_call(self, hooks: Hooks, owner: Any, method: str) -> None:
-        """Attach to the object that a method is called on, before the method runs.
+        """Attach to the object that a method is called on, before it runs. A second call releases the gate.
 
         Args:
             hooks: Reports to the gate, and replaces names in the trainer.
@@ -122,6 +122,12 @@ class AbstractAdapter(ABC):
         """
 
         def begins(original: Callable[..., Any], trainer: Any, *args: Any, **kwargs: Any) -> Any:
+            if self.trainer is not None:
+                hooks.release(
+                    "The gate is released: a second training run begins in this process. Training goes on without it, "
+                    "in all its iterations."
+                )
+                return original(trainer, *args, **kwargs)
             self.trainer = trainer
             with hooks.guarded():
                 self.attach(hooks)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import torch
@@ -76,11 +78,10 @@ class FVDB(AbstractAdapter):
     def attach_script(self, hooks: Hooks) -> None:
         gate_backwards_only(hooks, self)
         for runner in (OLD, FRGS):
-            when_imported(
-                hooks,
-                runner.module,
-                lambda module, runner=runner: self.attach_on_call(hooks, getattr(module, runner.name), runner.loop),
-            )
+            when_imported(hooks, runner.module, functools.partial(self._attach_to_class, hooks, runner))
+
+    def _attach_to_class(self, hooks: Hooks, runner: Runner, module: ModuleType) -> None:
+        self.attach_on_call(hooks, getattr(module, runner.name), runner.loop)
 
     def attach(self, hooks: Hooks) -> None:
         runner, kind = self.trainer, _runner_of(self.trainer)
