@@ -85,6 +85,7 @@ class Nerfstudio(AbstractAdapter):
 
         strategy = getattr(pipeline.model, "strategy", None)
         survey = survey_of(self, strategy, type(pipeline.model), through=CALLBACKS)
+        survey.read(trainer.train, "step")
         for callback, end in callbacks(trainer):
             survey.read(callback, "step", "self.step", end=end)
         hooks.wrap(pipeline, "get_train_loss_dict", forwarded)

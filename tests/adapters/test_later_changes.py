@@ -4,7 +4,7 @@ import sys
 
 import pytest
 from cases import SCRIPTS, SkipAlways
-from lookalikes import gsplat_runner, lightgaussian_distill, threedgrut
+from lookalikes import gsplat_runner, lightgaussian_distill, nerfstudio, threedgrut
 from lookalikes.splats import new_log
 from test_unknown_changes import forked, gate_of
 from test_unknown_forks import train, unknown_fork
@@ -130,6 +130,15 @@ OBJECTS = {
             ('_loss"].backward()\n', '_loss"].backward()\n        self.maybe_trim(global_step)\n'),
         ],
         lambda fork: fork.Trainer3DGRUT(),
+    ),
+    "nerfstudio": (
+        nerfstudio,
+        [
+            ("    def step_post_backward(self, step)", f"{TRIM}    def step_post_backward(self, step)"),
+            ("    def train(self", METHODS.format(strategy="pipeline.model") + "    def train(self"),
+            ("scale(loss).backward()\n", "scale(loss).backward()\n        self.maybe_trim(step)\n"),
+        ],
+        lambda fork: fork.Trainer().setup(),
     ),
 }
 
