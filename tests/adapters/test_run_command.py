@@ -346,6 +346,18 @@ def test_loop_outside_of_training_is_refused_before_anything_is_imported(checkou
     assert "gaussian_renderer" not in sys.modules
 
 
+def test_helper_that_the_script_imports_is_read(checkout, tmp_path):
+    """It sets the model up anew in iteration 29, which the script's own source does not show."""
+    script = Path(checkout)
+    late = "def maybe_reset(model, step):\n    if step == 29:\n        model.training_setup()\n"
+    (script.parent / "fork_of_utils.py").write_text(late)
+    source = script.read_text().replace("loss.backward()", "loss.backward(); maybe_reset(gaussians, iteration)")
+    script.write_text(f"from fork_of_utils import maybe_reset\n{source}")
+    with pytest.warns(RuntimeWarning, match=r"30 instead of 20: the loop calls training_setup\(\) until iteration 29"):
+        assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "skipgs.json").read_text())["settings"]["start_iter"] == 30
+
+
 def test_missing_extension_is_the_scripts_own_error(checkout, tmp_path, capfd):
     assert cli.main(["run", "inria", "--", checkout, str(tmp_path)]) == 1  # without --cpu there are no stand-ins
     error = capfd.readouterr().err
