@@ -10,7 +10,7 @@ from raster_scenes import deep_scene, leaves, relative_error
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import rasterization, set_num_threads
-from skipgs_plug.fallback_raster.runtime.constants import tiles
+from skipgs_plug.fallback_raster.runtime.constants import NO_DEPTH, tiles
 from skipgs_plug.fallback_raster.runtime.optimizations import without_optimizations
 from skipgs_plug.fallback_raster.runtime.threads import get_num_threads
 from skipgs_plug.fallback_raster.splats import rasterize_splats
@@ -90,7 +90,7 @@ def test_what_only_just_reaches_an_open_tile_is_listed_there(monkeypatch: pytest
     with without_optimizations("two_pass"):
         whole = rendered(scene)
     # First lists are empty in the tiles of one column, and complete in all others, which are not open then.
-    everything = torch.tensor(two_pass.NO_DEPTH, dtype=torch.int32).view(torch.float32)
+    everything = torch.tensor(NO_DEPTH, dtype=torch.int32).view(torch.float32)
     lists = ending_at(monkeypatch, lambda count: torch.where(torch.arange(count) % 5 == 1, 0.5, everything))
     assert_same(rendered(scene), whole)
     assert lists[0] > 100

@@ -39,7 +39,7 @@ static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedL
         }
         // Back to front: the part that was blended last comes first.
         for (int part = parts - 1; part >= 0; --part) {
-            const Record* const records = (const Record*)(part ? far.records : near.records);
+            const Record* const records = part ? far.records : near.records;
             const int begin = part ? far.tile_start[t] : tile.begin;
             const int tile_end = part ? far.tile_stop[t] : near.tile_stop[t];
             int slot = pairs.slot_end[part * grid.tiles_x * grid.tiles_y + t];
@@ -78,12 +78,12 @@ static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedL
                     const vpatch v_sigma = visit.full <= ALPHA_MAX ? weight * less : (vpatch)0.0f;
                     for (int c = 0; c < D; ++c) v_color[c] += weight * v[b][c];
                     const vpatch v_x = v_sigma * visit.dx, v_y = v_sigma * visit.dy;
-                    m[0] += v_sigma;
-                    m[1] += v_x;
-                    m[2] += v_y;
-                    m[3] += v_x * visit.dx;
-                    m[4] += v_x * visit.dy;
-                    m[5] += v_y * visit.dy;
+                    m[OF_1] += v_sigma;
+                    m[OF_X] += v_x;
+                    m[OF_Y] += v_y;
+                    m[OF_XX] += v_x * visit.dx;
+                    m[OF_XY] += v_x * visit.dy;
+                    m[OF_YY] += v_y * visit.dy;
                     if (ABSGRAD) {
                         abs_x += vabs(v_sigma * visit.p);
                         // One of the two products is rounded before the sum: which one differs between one channel and
@@ -97,10 +97,10 @@ static constexpr auto blend_adjoint = [](const BlendedList& near, const BlendedL
                     b = following;
                 }
                 slots.pair_slot[pairs.tile_pair[k]] = slot--;
-                PairSum& out = ((PairSum*)slots.sums)[slot];
+                PairSum& out = slots.sums[slot];
                 // One folded sum gives six moments and the first two channels.
-                static_assert(__builtin_offsetof(PairSum, color) == 6 * sizeof(float), "the channels follow the moments");
-                for (int c = 0; c < D && c < 2; ++c) m[6 + c] = v_color[c];
+                static_assert(__builtin_offsetof(PairSum, color) == MOMENTS * sizeof(float), "the channels follow the moments");
+                for (int c = 0; c < D && c < 2; ++c) m[MOMENTS + c] = v_color[c];
                 *(v8*)out.moment = sum8(m);
                 for (int c = 2; c < 4; ++c) out.color[c] = c < D ? sum(v_color[c < D ? c : 0]) : 0.0f;
                 out.absolute[0] = ABSGRAD ? r.along * sum(abs_x) : 0.0f;

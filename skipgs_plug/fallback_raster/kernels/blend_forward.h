@@ -25,11 +25,10 @@ static constexpr auto transpose_bits = [](const unsigned char* from, unsigned* w
         a += a;
     }
 };
-static constexpr auto blend_forward = [](const float* packed, const TileLists& lists, const Pixels& pixels,
+static constexpr auto blend_forward = [](const Record* records, const TileLists& lists, const Pixels& pixels,
                                          const BlendedPairs& blended, const Grid& grid, const Channels& channels,
                                          const ListPart& part, int with_alpha, int optimizations, int first,
                                          int last) INLINE {
-    const Record* const records = (const Record*)packed;
     for (int t = first; t < last; ++t) {
         const Tile tile(t, lists.tile_start, grid);
         if (part.continued && tile.begin == tile.end) {

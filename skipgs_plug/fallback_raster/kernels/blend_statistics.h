@@ -7,7 +7,6 @@
 #include "lib/patches.h"
 static constexpr auto blend_statistics = [](const SortedLists& lists, const float* values, float* pair_sums,
                                             const StatisticsMaps& maps, const Grid& grid, int first, int last) INLINE {
-    const Record* const records = (const Record*)lists.records;
     for (int t = first; t < last; ++t) {
         const Tile tile(t, lists.tile_start, grid);
         vpatch T[PATCHES], value[PATCHES], most[PATCHES];
@@ -32,7 +31,7 @@ static constexpr auto blend_statistics = [](const SortedLists& lists, const floa
             for (int s = 0; s < STATISTICS_FLOATS; ++s) sums[s] = (vpatch)0.0f;
             for (unsigned todo = open; todo; todo &= todo - 1) {
                 const int b = __builtin_ctz(todo);
-                const Falloff falloff(tile, b, records[lists.tile_record[k]]);
+                const Falloff falloff(tile, b, lists.records[lists.tile_record[k]]);
                 const vpatch light = T[b];
                 const ipatch taken = (falloff.log2_alpha >= LOG2_ALPHA_MIN) & (light > 0.0f);
                 if (!any(taken)) continue;
@@ -41,12 +40,12 @@ static constexpr auto blend_statistics = [](const SortedLists& lists, const floa
                 const ipatch hit = taken & ~finished;
                 T[b] = hit ? light - weight : (finished ? -light : light);
                 const vpatch one = hit ? (vpatch)1.0f : (vpatch)0.0f;
-                sums[0] += one;
-                sums[1] += one * weight;
-                sums[2] += one * light;
-                sums[3] += one * value[b];
-                sums[4] += one * weight * value[b];
-                sums[5] += one * vsqrt(falloff.dx * falloff.dx + falloff.dy * falloff.dy);
+                sums[PIXELS] += one;
+                sums[WEIGHT] += one * weight;
+                sums[LIGHT] += one * light;
+                sums[VALUE] += one * value[b];
+                sums[WEIGHTED_VALUE] += one * weight * value[b];
+                sums[DISTANCE] += one * vsqrt(falloff.dx * falloff.dx + falloff.dy * falloff.dy);
                 count[b] += hit & 1;
                 const ipatch leads = hit & (weight > most[b]);
                 most[b] = leads ? weight : most[b];

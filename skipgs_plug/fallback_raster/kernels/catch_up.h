@@ -73,16 +73,16 @@ static constexpr auto catch_up = [](const int* rows, int* done, const GradientFa
             interleave3(basis * color.x, basis * color.y, basis * color.z, (float*)product);
         }
         const float* g_row = (const float*)product;
-        float padded[4][16];
+        struct { float mean[16], square[16], values[16], gradient[16]; } padded;  // a row of fewer than 16 floats
         if (width < 16) {
             for (int j = 0; j < 16; ++j) {
                 const bool inside = j < width;
-                padded[0][j] = inside ? m_row[j] : 0.0f;
-                padded[1][j] = inside ? s_row[j] : 0.0f;
-                padded[2][j] = inside ? x_row[j] : 0.0f;
-                padded[3][j] = inside && with_gradient ? g_row[j] : 0.0f;
+                padded.mean[j] = inside ? m_row[j] : 0.0f;
+                padded.square[j] = inside ? s_row[j] : 0.0f;
+                padded.values[j] = inside ? x_row[j] : 0.0f;
+                padded.gradient[j] = inside && with_gradient ? g_row[j] : 0.0f;
             }
-            m_row = padded[0], s_row = padded[1], x_row = padded[2], g_row = padded[3];
+            m_row = padded.mean, s_row = padded.square, x_row = padded.values, g_row = padded.gradient;
         }
         // The last vector overlaps the one before it. Shared floats are computed twice, and loaded before either is
         // stored.

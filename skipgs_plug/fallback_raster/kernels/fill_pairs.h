@@ -14,8 +14,8 @@ static constexpr auto fill_pairs = [](const int* visible, const float* splat_dep
     const int tiles_x = grid.tiles_x;
     const float width = grid.width;
     const BoxTiles tile_of(tiles_x);
-    const Record* const records = (const Record*)packed.records;
-    const TileBox* const boxes = (const TileBox*)footprints.boxes;
+    const Record* const records = packed.records;
+    const TileBox* const boxes = footprints.boxes;
     int* const pair_record = pairs.record;
     long long* const unsorted = pairs.unsorted;
     for (int s = first; s < last; ++s) {
@@ -26,7 +26,7 @@ static constexpr auto fill_pairs = [](const int* visible, const float* splat_dep
         const auto list_larger = [=](int k, int* next, long long key, int pair) __attribute__((noinline)) -> int {
             const bool all = !(optimizations & EXACT_TILES);
             each_tile(records[k], boxes[k], width, tiles_x, all, [&](int tile) INLINE {
-                if (depths.limited && !in_range(depths.ranges, tile, (int)(key >> 32))) return;
+                if (depths.limited && !depths.ranges[tile].holds((int)(key >> 32))) return;
                 pair_record[pair] = k;
                 unsorted[next[tile]++] = key | (unsigned)pair++;
             });
@@ -35,12 +35,12 @@ static constexpr auto fill_pairs = [](const int* visible, const float* splat_dep
         int i = begin;
         for (int k = begin; k < begin + packed.listed_count[s]; ++k) {
             while (i <= packed.listed[k]) pairs.start[i++] = pair;
-            const int meets = footprints.tiles[(long long)FOOTPRINT_INTS * k + 1];
+            const Footprint& footprint = footprints.tiles[k];
             const int depth = ((const int*)splat_depths)[visible[packed.listed[k]]];
             const long long key = (long long)depth << 32;
-            if (meets >= 0) {
-                int* corner = next + footprints.tiles[(long long)FOOTPRINT_INTS * k];
-                for (int remaining = meets; remaining; remaining &= remaining - 1) {
+            if (footprint.meets >= 0) {
+                int* corner = next + footprint.corner;
+                for (int remaining = footprint.meets; remaining; remaining &= remaining - 1) {
                     pair_record[pair] = k;
                     unsorted[corner[tile_of.offset[__builtin_ctz(remaining)]]++] = key | (unsigned)pair++;
                 }

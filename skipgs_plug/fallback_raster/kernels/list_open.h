@@ -29,15 +29,15 @@ static constexpr auto list_open = [](const RowList& visible, const Splats& splat
         const v16 reach_x = half * sigma[0] + 1.0f, reach_y = half * sigma[1] + 1.0f;
         const i16 left = tile(centre[0] - reach_x, tiles_x - 1), right = tile(centre[0] + reach_x, tiles_x - 1) + 1;
         const i16 top = tile(centre[1] - reach_y, tiles_y - 1), bottom = tile(centre[1] + reach_y, tiles_y - 1) + 1;
-        alignas(64) int corner[4][16];
+        alignas(64) int top_left[16], top_right[16], bottom_left[16], bottom_right[16];  // corners in `open_before`
         const int width = tiles_x + 1;
-        *(i16*)corner[0] = top * width + left, *(i16*)corner[1] = top * width + right;
-        *(i16*)corner[2] = bottom * width + left, *(i16*)corner[3] = bottom * width + right;
+        *(i16*)top_left = top * width + left, *(i16*)top_right = top * width + right;
+        *(i16*)bottom_left = bottom * width + left, *(i16*)bottom_right = bottom * width + right;
         for (unsigned todo = bits(deep) & ((1u << lanes) - 1); todo; todo &= todo - 1) {
             const int l = __builtin_ctz(todo);
             found.rows[found_end] = row[l];
-            found_end += open_before[corner[3][l]] - open_before[corner[2][l]]
-                       > open_before[corner[1][l]] - open_before[corner[0][l]];
+            found_end += open_before[bottom_right[l]] - open_before[bottom_left[l]]
+                       > open_before[top_right[l]] - open_before[top_left[l]];
         }
     }
     found.counts[first] = found_end - BLOCK_ROWS * first;

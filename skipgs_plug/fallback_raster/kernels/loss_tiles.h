@@ -22,6 +22,11 @@ static constexpr int RING_ROWS = SSIM_WINDOW - 1 + ROWS_AT_ONCE;  // rows that o
 // Added to the number of a row to make its ring index positive: rows above an image have negative numbers.
 static constexpr int RING_OFFSET = RING_ROWS * 64;
 static_assert(4 * WINDOW_RADIUS % ROWS_AT_ONCE == 0, "the gradient begins with the first row of a tile");
+// Sums over a tile of |image - target| and of 1 - SSIM.
+struct TileLoss {
+    float l1, unlike;
+};
+static_assert(sizeof(TileLoss) == sizeof(float) * TILE_LOSS_FLOATS, "constants.TILE_LOSS_FLOATS");
 // Loads 16 values of an image. A byte is divided by 255 with two products: the first factor has so few digits that its
 // product is exact, so the sum rounds as the quotient does.
 typedef unsigned char c16 __attribute__((ext_vector_type(16), aligned(1)));
@@ -66,7 +71,7 @@ static constexpr auto blur_along = [](const float* p, int channels) INLINE -> v1
     for (int k = 1; k <= WINDOW_RADIUS; ++k) sum += w[WINDOW_RADIUS - k] * (load(p - k * channels) + load(p + k * channels));
     return sum;
 };
-static constexpr auto loss_tiles = [](const float* image, const auto* target, float* gradient, float* sums,
+static constexpr auto loss_tiles = [](const float* image, const auto* target, float* gradient, TileLoss* sums,
                                       const ImageSize& size, const LossWeights& weights, int tiles, int valid,
                                       int with_gradient, int first, int last) INLINE {
     const int height = size.height, channels = size.channels;
@@ -230,7 +235,6 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
                 }
             }
         }
-        sums[2 * item] = sum(l1);
-        sums[2 * item + 1] = sum(unlike);
+        sums[item] = {sum(l1), sum(unlike)};
     }
 };

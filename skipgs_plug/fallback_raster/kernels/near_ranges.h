@@ -8,20 +8,28 @@
 // Reads the projected splats. Writes `taken`, `ranges` and `share`. It runs on one thread.
 #pragma once
 #include "lib/simd.h"
-static constexpr auto near_ranges = [](const int* visible, const Splats& splats, float* taken, int* ranges, float* share,
-                                       const Grid& grid, int m, int n, int first, int last) INLINE {
+#include "lib/tile_lists.h"
+static constexpr auto near_ranges = [](const int* visible, const Splats& splats, float* taken, DepthRange* ranges,
+                                       float* share, const Grid& grid, int m, int n, int first, int last) INLINE {
     constexpr float TAU = 6.2831853f;
     const int tiles_x = grid.tiles_x, tiles_y = grid.tiles_y;
     const float width = grid.width, height = grid.height;
     const int columns = (tiles_x + CELL_TILES - 1) / CELL_TILES, rows = (tiles_y + CELL_TILES - 1) / CELL_TILES;
     const int stride = larger(1, m / MIN_SAMPLED_ROWS);
-    const float *const conics = splats.conics, *const means2d = splats.means2d;
     const int* const depths = (const int*)splats.depths;  // as bits
     const auto volume = [&](int g) INLINE -> float {
-        const float det = conics[3 * g] * conics[3 * g + 2] - conics[3 * g + 1] * conics[3 * g + 1];
+        const float *const conic = splats.conics + 3 * g, a = conic[0], b = conic[1], c = conic[2];
+        const float det = a * c - b * b;
         // At most its opacity over the area of one cell.
         const float most = (float)TILE * TILE * CELL_TILES * CELL_TILES;
         return fminf(TAU / __builtin_sqrtf(fmaxf(det, 1e-12f)), most) * splats.opacities[g];
+    };
+    // Column and row, among cells or tiles of `size` pixels, of the one that holds the centre.
+    const auto column_of = [&](int g, int size, int columns) INLINE -> int {
+        return smaller(columns - 1, (int)(fminf(fmaxf(splats.means2d[2 * g], 0.0f), width) / size));
+    };
+    const auto row_of = [&](int g, int size, int rows) INLINE -> int {
+        return smaller(rows - 1, (int)(fminf(fmaxf(splats.means2d[2 * g + 1], 0.0f), height) / size));
     };
     // One sampled row in 16 is enough to see whether limiting the lists can save anything: the light that all take must
     // be 1.5 times that of lists that end at NEAR_OPTICAL_DEPTH.
@@ -31,7 +39,7 @@ static constexpr auto near_ranges = [](const int* visible, const Splats& splats,
         share[0] = 1.0f;
         return;
     }
-    int least = 0x7fffffff, most = 0;
+    int least = NO_DEPTH, most = 0;
     for (int i = 0; i < m; i += stride) {
         const int depth = depths[visible[i]];
         least = smaller(least, depth), most = larger(most, depth);
@@ -44,8 +52,7 @@ static constexpr auto near_ranges = [](const int* visible, const Splats& splats,
     clear(taken, (long long)columns * rows * CELL_LAYERS);
     for (int i = 0; i < m; i += stride) {
         const int g = visible[i];
-        const int x = smaller(columns - 1, (int)(fminf(fmaxf(means2d[2 * g], 0.0f), width) / (TILE * CELL_TILES)));
-        const int y = smaller(rows - 1, (int)(fminf(fmaxf(means2d[2 * g + 1], 0.0f), height) / (TILE * CELL_TILES)));
+        const int x = column_of(g, TILE * CELL_TILES, columns), y = row_of(g, TILE * CELL_TILES, rows);
         taken[(y * columns + x) * CELL_LAYERS + layer(depths[g])] += volume(g);
     }
     // By cell: the first layer that is left out. It is stored in the cell's first layer.
@@ -59,15 +66,13 @@ static constexpr auto near_ranges = [](const int* visible, const Splats& splats,
     }
     for (int t = 0; t < tiles_x * tiles_y; ++t) {
         const int l = (int)taken[(t / tiles_x / CELL_TILES * columns + t % tiles_x / CELL_TILES) * CELL_LAYERS];
-        ranges[2 * t] = -0x7fffffff;
-        ranges[2 * t + 1] = l < CELL_LAYERS ? least + (int)((float)l / scale) : 0x7fffffff;
+        ranges[t] = {-NO_DEPTH, l < CELL_LAYERS ? least + (int)((float)l / scale) : NO_DEPTH};
     }
     int listed = 0, all = 0;
     for (int i = 0; i < m; i += stride, ++all) {
         const int g = visible[i];
-        const int x = smaller(tiles_x - 1, (int)(fminf(fmaxf(means2d[2 * g], 0.0f), width) / TILE));
-        const int y = smaller(tiles_y - 1, (int)(fminf(fmaxf(means2d[2 * g + 1], 0.0f), height) / TILE));
-        listed += depths[g] < ranges[2 * (y * tiles_x + x) + 1];
+        const int x = column_of(g, TILE, tiles_x), y = row_of(g, TILE, tiles_y);
+        listed += depths[g] < ranges[y * tiles_x + x].end;
     }
     share[0] = all ? (float)listed / all : 1.0f;
 };

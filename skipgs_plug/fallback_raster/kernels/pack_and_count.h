@@ -15,16 +15,16 @@ static constexpr auto pack_and_count =
     const float width = grid.width, height = grid.height;
     const bool limited = depths.limited;
     const BoxTiles tile_of(tiles_x);
-    Record* const records = (Record*)packed.records;
-    TileBox* const boxes = (TileBox*)footprints.boxes;
+    Record* const records = packed.records;
+    TileBox* const boxes = footprints.boxes;
     const auto add_two = [](int* to, const int* numbers) INLINE {
         typedef int two __attribute__((ext_vector_type(2), aligned(4)));
         *(two*)to += *(const two*)numbers;
     };
     int least = limited ? NO_DEPTH : -NO_DEPTH, most = limited ? -NO_DEPTH : NO_DEPTH;
     for (int t = 0; limited && t < tiles; ++t) {
-        least = smaller(least, depths.ranges[2 * t]);
-        most = larger(most, depths.ranges[2 * t + 1]);
+        least = smaller(least, depths.ranges[t].first);
+        most = larger(most, depths.ranges[t].end);
     }
     for (int s = first; s < last; ++s) {
         int* count = counts.of_tiles + (long long)s * (tiles + SPARE_COUNTS);
@@ -66,10 +66,10 @@ static constexpr auto pack_and_count =
             const i16 bottom = clamped(__builtin_elementwise_floor(my + half_h - 0.5f), -1.0f, height - 1.0f);
             static_assert(TILE == 16, "pixels to tiles");
             const i16 empty = (left > right) | (top > bottom);
-            alignas(64) int box[BOX_INTS][16];  // fields of the `TileBox` of each lane
+            alignas(64) struct { int first_column[16], last_column[16], first_row[16], last_row[16]; } box;  // by lane
             const i16 first_column = left >> 4, last_column = right >> 4, first_row = top >> 4, last_row = bottom >> 4;
-            *(i16*)box[0] = first_column, *(i16*)box[1] = last_column, *(i16*)box[2] = first_row;
-            *(i16*)box[3] = last_row;
+            *(i16*)box.first_column = first_column, *(i16*)box.last_column = last_column;
+            *(i16*)box.first_row = first_row, *(i16*)box.last_row = last_row;
             // The tiles of a small box that the ellipse meets.
             const i16 columns = last_column - first_column, lines = last_row - first_row;
             const i16 small = (columns < BOX_COLUMNS) & (lines < BOX_ROWS);
@@ -105,23 +105,23 @@ static constexpr auto pack_and_count =
                 for (int k = 0; k < channels.number; ++k) record.color[k] = gather(colors, row, channels.stride, k);
             v16* const by_lane = (v16*)&record;
             transpose(by_lane);
-            // By lane: first tile and tiles met; pairs in the two upper tiles; pairs in the two lower tiles, which
-            // begin at `below`.
-            alignas(64) int footprint[16][FOOTPRINT_INTS], upper[16][2], lower[16][2], below[16], key[16];
-            interleave2((v16)corner, (v16)meets, (float*)footprint[0]);
+            // By lane: the footprint; pairs in the two upper tiles; pairs in the two lower tiles, which begin at
+            // `below`.
+            alignas(64) Footprint footprint[16];
+            alignas(64) int upper[16][2], lower[16][2], below[16], key[16];
+            interleave2((v16)corner, (v16)meets, (float*)footprint);
             interleave2((v16)(meets & 1), (v16)(meets >> 1 & 1), (float*)upper[0]);
             interleave2((v16)(meets >> BOX_COLUMNS & 1), (v16)(meets >> (BOX_COLUMNS + 1) & 1), (float*)lower[0]);
             *(i16*)below = last_row > first_row ? corner + tiles_x : (i16)tiles;
             *(i16*)key = depth;
             const unsigned tiny = bits((meets & ~TWO_BY_TWO) == 0);  // lanes whose box is at most 2 x 2 tiles
             if (chosen == 0xffff && tiny == 0xffff && !limited) {
-                int* own = footprints.tiles + (long long)FOOTPRINT_INTS * (begin + found);
                 for (int l = 0; l < 16; ++l) {
-                    *(v2*)(own + FOOTPRINT_INTS * l) = *(const v2*)footprint[l];
+                    footprints.tiles[begin + found + l] = footprint[l];
                     store((float*)(records + begin + found + l), by_lane[l]);
                     packed.listed[begin + found + l] = i + l;
                     // Add to two counters at a time: a branch for each would often be mispredicted.
-                    add_two(count + footprint[l][0], upper[l]);
+                    add_two(count + footprint[l].corner, upper[l]);
                     add_two(count + below[l], lower[l]);
                 }
                 of_slice += __builtin_reduce_add(met);
@@ -129,8 +129,8 @@ static constexpr auto pack_and_count =
                 continue;
             }
             for (unsigned remaining = chosen; remaining; remaining &= remaining - 1) {
-                const int l = __builtin_ctz(remaining), corner = footprint[l][0];
-                int own_meets = footprint[l][1], pairs = 0;
+                const int l = __builtin_ctz(remaining), corner = footprint[l].corner;
+                int own_meets = footprint[l].meets, pairs = 0;
                 Record& own_record = records[begin + found];  // overwritten by the next record if this one has no pairs
                 store((float*)&own_record, by_lane[l]);
                 if (!limited && (tiny >> l & 1)) {
@@ -140,23 +140,22 @@ static constexpr auto pack_and_count =
                 } else if (own_meets >= 0) {
                     for (int todo = limited ? own_meets : 0; todo; todo &= todo - 1) {
                         const int j = __builtin_ctz(todo);
-                        if (!in_range(depths.ranges, corner + tile_of.offset[j], key[l])) own_meets &= ~(1 << j);
+                        if (!depths.ranges[corner + tile_of.offset[j]].holds(key[l])) own_meets &= ~(1 << j);
                     }
                     for (int todo = own_meets; todo; todo &= todo - 1) ++count[corner + tile_of.offset[__builtin_ctz(todo)]];
                     pairs = __builtin_popcount(own_meets);
                 } else {
                     int met = 0;
                     TileBox& own = boxes[begin + found];
-                    own = {box[0][l], box[1][l], box[2][l], box[3][l]};
+                    own = {box.first_column[l], box.last_column[l], box.first_row[l], box.last_row[l]};
                     each_tile(own_record, own, width, tiles_x, !(optimizations & EXACT_TILES), [&](int tile) INLINE {
                         ++met;
-                        if (!limited || in_range(depths.ranges, tile, key[l])) ++count[tile], ++pairs;
+                        if (!limited || depths.ranges[tile].holds(key[l])) ++count[tile], ++pairs;
                     });
                     if (dense) tiles_per_gauss[row[l]] = met;
                 }
                 of_slice += pairs;
-                footprints.tiles[(long long)FOOTPRINT_INTS * (begin + found)] = corner;
-                footprints.tiles[(long long)FOOTPRINT_INTS * (begin + found) + 1] = own_meets;
+                footprints.tiles[begin + found] = {corner, own_meets};
                 packed.listed[begin + found] = i + l;
                 found += pairs > 0;
             }

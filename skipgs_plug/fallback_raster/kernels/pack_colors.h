@@ -11,7 +11,7 @@ static constexpr auto pack_colors = [](const int* visible, const RecordList& pac
         const int begin = slice_begin(s, m, slices);
         for (int k = begin; k < begin + packed.listed_count[s]; ++k) {
             const float* color = colors + (long long)visible[packed.listed[k]] * channels.stride + channels.first;
-            for (int c = 0; c < channels.number; ++c) ((Record*)packed.records)[k].color[c] = color[c];
+            for (int c = 0; c < channels.number; ++c) packed.records[k].color[c] = color[c];
         }
     }
 };

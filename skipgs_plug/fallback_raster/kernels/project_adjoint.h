@@ -3,7 +3,7 @@
 // Reads the gradients of visible rows. Writes `v_gaussians` and the partial sum `v_poses` of its own block. No other
 // thread writes to that block.
 #pragma once
-#include "lib/project_adjoint.h"
+#include "lib/project_block_adjoint.h"
 static constexpr auto project_adjoint = [](const Gaussians& gaussians, const Camera& camera, const RowList& visible,
                                            const ProjectedGradients& v_projected, const GaussianGradients& v_gaussians,
                                            float* v_poses, int n, int with_depth, int antialiased, int with_pose,

@@ -3,7 +3,7 @@
 // Reads the slots of the pairs. Writes `v_splats` of its own block; from the second pass over the channels on it adds
 // to them. No other thread writes to that block.
 #pragma once
-#include "lib/reduce_pairs.h"
+#include "lib/reduce_block_pairs.h"
 static constexpr auto reduce_pairs = [](const PairSums& sums, const float* conics, const float* opacities,
                                         const SplatGradients& v_splats, int n, const Channels& channels, int absgrad,
                                         int parts, int first, int last) INLINE {

@@ -3,7 +3,7 @@
 // Reads the gradients of the colours of visible rows. Writes `v_means`, `v_sh` and the partial sum `v_positions` of its
 // own block. No other thread writes to that block.
 #pragma once
-#include "lib/sh_adjoint.h"
+#include "lib/sh_block_adjoint.h"
 static constexpr auto sh_adjoint = [](const float* means, const Harmonics& sh, const RowList& visible, const float* colors,
                                       const float* v_colors, float* v_means, const HarmonicsGradients& v_sh,
                                       float* v_positions, int n, int optimizations, int first, int last) INLINE {

@@ -4,9 +4,9 @@
 // Reads the slots of the pairs, and the parameters and forward results of visible rows. Writes all gradients of its own
 // block, and adds to `v_centers.absolute`. No other thread writes to that block.
 #pragma once
-#include "lib/project_adjoint.h"
-#include "lib/reduce_pairs.h"
-#include "lib/sh_adjoint.h"
+#include "lib/project_block_adjoint.h"
+#include "lib/reduce_block_pairs.h"
+#include "lib/sh_block_adjoint.h"
 static constexpr auto splat_adjoint =
     [](const PairSums& sums, const Gaussians& gaussians, const float* logits, const Camera& camera, const Harmonics& sh,
        const Rendered& rendered, const GaussianGradients& v_gaussians, float* v_logits, const HarmonicsGradients& v_sh,

@@ -14,18 +14,26 @@ BLOCK_ROWS = 512
 # Floats of a `Record`, the data of a Gaussian that the blend reads: one cache line (`kernels/lib/record.h`).
 RECORD_FLOATS = 16
 
-# Ints of the footprint of a Gaussian: the first tile of its box, and the tiles of the box that it meets, as bits
-# (`kernels/lib/tile_lists.h`). The second int is -1 if the box is too large for the bits.
+# Ints of a `Footprint`, the tiles of a small Gaussian as bits (`kernels/lib/tile_lists.h`).
 FOOTPRINT_INTS = 2
 
 # Ints of a `TileBox`, the box of tiles around a larger Gaussian (`kernels/lib/ellipse.h`): two columns and two rows.
 BOX_INTS = 4
+
+# Ints of a `DepthRange`, the depths that a tile lists (`kernels/lib/tile_lists.h`).
+DEPTH_RANGE_INTS = 2
+
+# Bits of a depth greater than every finite float's: the largest int.
+NO_DEPTH = 2**31 - 1
 
 # Counters of a slice beyond those of its tiles: counting two neighbouring tiles at a time may touch these two.
 SPARE_COUNTS = 2
 
 # Floats of a `PairSum`, the part of a Gaussian's gradient from one tile: one cache line (`kernels/lib/record.h`).
 PAIR_FLOATS = 16
+
+# Floats of a `TileLoss`, the sums of the loss over one tile (`kernels/loss_tiles.h`).
+TILE_LOSS_FLOATS = 2
 
 # SH coefficients of degree 1 to 3 for each channel: (3 + 1)^2 - 1, all but the constant one.
 HIGHER_BANDS = 15

@@ -16,7 +16,8 @@ class ArrayKind(NamedTuple):
     """A contiguous tensor on the CPU, which a kernel sees as a pointer."""
 
     dtype: torch.dtype
-    element: str  # type of an element in C++
+    # Type of an element in C++: a number, or `struct` and the name of a record that the headers of the kernels define.
+    element: str
 
     @property
     def cpp(self) -> str:

@@ -16,9 +16,9 @@ from ..runtime.buffers import floats, ints, longs
 from ..runtime.constants import BOX_INTS, FOOTPRINT_INTS, MAX_CHANNELS, RECORD_FLOATS, SPARE_COUNTS
 from ..runtime.launch import worker
 from ..runtime.optimizations import active_optimizations
-from ..runtime.parameters import FloatArray, FloatOutput, IntArray, IntOutput, LongOutput
+from ..runtime.parameters import FloatArray, IntArray, IntOutput, LongOutput
 from ..runtime.threads import get_num_threads
-from .structs import Channels, Grid, Splats, grid
+from .structs import Channels, DepthRangeArray, FootprintOutput, Grid, RecordOutput, Splats, TileBoxOutput, grid
 
 # Most (tile, Gaussian) pairs of an image: kernels number pairs with 32-bit ints.
 MAX_PAIRS = 2**31 - 1
@@ -31,16 +31,16 @@ SLICES_PER_THREAD = 4
 class RecordList(NamedTuple):
     """Records of those of the `m` visible Gaussians that have pairs. Each slice begins where its Gaussians begin."""
 
-    records: Annotated[FloatOutput, "m, RECORD_FLOATS"]  # a `Record` each
+    records: Annotated[RecordOutput, "m, RECORD_FLOATS"]
     listed: Annotated[IntOutput, "m"]  # index of each record's Gaussian among the visible ones
     listed_count: Annotated[IntOutput, "slices"]  # number of records in each slice
 
 
 class Footprints(NamedTuple):
-    """The box of tiles around each record, and the tiles of a small box that the ellipse meets."""
+    """The tiles that the ellipse of each record meets: of a small box as bits, else the box."""
 
-    tiles: Annotated[IntOutput, "m, FOOTPRINT_INTS"]
-    boxes: Annotated[IntOutput, "m, BOX_INTS"]  # a `TileBox` each, written only for larger boxes
+    tiles: Annotated[FootprintOutput, "m, FOOTPRINT_INTS"]
+    boxes: Annotated[TileBoxOutput, "m, BOX_INTS"]  # written only for boxes that are too large for the bits
 
 
 class PairCounts(NamedTuple):
@@ -53,7 +53,7 @@ class PairCounts(NamedTuple):
 class DepthRanges(NamedTuple):
     """The range of depths, as bits of float32, that each tile lists."""
 
-    ranges: Annotated[IntArray, "grid.tiles_x * grid.tiles_y if limited else 0, 2"]  # first depth, and end
+    ranges: Annotated[DepthRangeArray, "grid.tiles_x * grid.tiles_y if limited else 0, DEPTH_RANGE_INTS"]
     limited: int  # 1 if there are ranges; 0 lists all depths
 
 
@@ -204,7 +204,7 @@ def bin_gaussians(
     width: int,
     height: int,
     dense: bool = True,
-    ranges: Tensor | None = None,  # [tiles, 2] int32
+    ranges: Tensor | None = None,  # [tiles, DEPTH_RANGE_INTS] int32
     before: int = 0,
 ) -> Bins:
     """List the visible Gaussians of one image per tile, not yet sorted by depth.
@@ -216,8 +216,7 @@ def bin_gaussians(
         width: Image width in pixels.
         height: Image height in pixels.
         dense: Whether to count the tiles of all rows in `tiles_per_gauss`, including pairs outside `ranges`.
-        ranges: Depths that each tile lists, as bits of float32: from the first of two numbers up to the second,
-            exclusive. None lists all depths.
+        ranges: Depths that each tile lists, a `DepthRange` each. None lists all depths.
         before: Pairs in other lists of the same image. They count towards the limit.
 
     Returns:

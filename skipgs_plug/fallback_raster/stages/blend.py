@@ -21,7 +21,7 @@ from typing import Annotated, NamedTuple
 from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, FloatOutput, IntArray, IntOutput
 from .binning import TileLists
-from .structs import BLOCKS, Channels, Grid, PairSums, SplatGradients
+from .structs import BLOCKS, Channels, Grid, PairSumOutput, PairSums, RecordArray, SplatGradients
 
 
 class Pixels(NamedTuple):
@@ -56,7 +56,7 @@ class ListPart(NamedTuple):
 class BlendedList(NamedTuple):
     """The blended part of the lists of one pass."""
 
-    records: Annotated[FloatArray, "M, RECORD_FLOATS"]
+    records: Annotated[RecordArray, "M, RECORD_FLOATS"]
     tile_start: Annotated[IntArray, "grid.tiles_x * grid.tiles_y + 1"]
     tile_stop: Annotated[IntArray, "grid.tiles_x, grid.tiles_y"]
 
@@ -88,12 +88,12 @@ class PairSlots(NamedTuple):
     """The slots of the sums of blended pairs, in the order of the lists."""
 
     pair_slot: Annotated[IntOutput, "pairs.P"]  # 1 + slot of each pair; 0, as before the call, if it was not blended
-    sums: Annotated[FloatOutput, "Q, PAIR_FLOATS"]  # a `PairSum` each
+    sums: Annotated[PairSumOutput, "Q, PAIR_FLOATS"]
 
 
 def blend_forward(
     *,
-    packed: Annotated[FloatArray, "M, RECORD_FLOATS"],
+    records: Annotated[RecordArray, "M, RECORD_FLOATS"],
     lists: TileLists,
     pixels: Pixels,
     blended: BlendedPairs,

@@ -144,7 +144,7 @@ def _blend_lists(bins: Bins, block_start: Tensor, colors: Tensor, pixels: Pixels
         if channels.first > 0:
             bins.pack_colors(colors, channels)
         FORWARD[compiled_width(channels.number)](
-            packed=bins.packed.records,
+            records=bins.packed.records,
             lists=lists,
             pixels=pixels,
             blended=blended,

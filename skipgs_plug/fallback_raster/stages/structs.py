@@ -4,13 +4,27 @@ Sizes are expressions that `guard.Sizes` checks: `n` is the number of Gaussians,
 blocks of BLOCK_ROWS rows. The gradient of the loss with respect to a quantity has its name with `v_` in front.
 """
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeAlias
+
+import torch
+from torch import Tensor
 
 from ..runtime.constants import tiles
-from ..runtime.parameters import FloatArray, FloatOutput, IntArray, IntOutput
+from ..runtime.parameters import ArrayKind, FloatArray, FloatOutput, IntArray, IntOutput
 
 # C++ expression for the number of blocks, for workers whose items are blocks of the `n` Gaussians.
 BLOCKS = "(n + BLOCK_ROWS - 1) / BLOCK_ROWS"
+
+# Arrays of records, whose fields are defined in C++: `Record` and `PairSum` in `kernels/lib/record.h`, the others in
+# `kernels/lib/tile_lists.h` and `kernels/lib/ellipse.h`.
+RecordArray: TypeAlias = Annotated[Tensor, ArrayKind(torch.float32, "const struct Record")]
+RecordOutput: TypeAlias = Annotated[Tensor, ArrayKind(torch.float32, "struct Record")]
+PairSumArray: TypeAlias = Annotated[Tensor, ArrayKind(torch.float32, "const struct PairSum")]
+PairSumOutput: TypeAlias = Annotated[Tensor, ArrayKind(torch.float32, "struct PairSum")]
+FootprintOutput: TypeAlias = Annotated[Tensor, ArrayKind(torch.int32, "struct Footprint")]
+TileBoxOutput: TypeAlias = Annotated[Tensor, ArrayKind(torch.int32, "struct TileBox")]
+DepthRangeArray: TypeAlias = Annotated[Tensor, ArrayKind(torch.int32, "const struct DepthRange")]
+DepthRangeOutput: TypeAlias = Annotated[Tensor, ArrayKind(torch.int32, "struct DepthRange")]
 
 
 class Gaussians(NamedTuple):
@@ -148,4 +162,4 @@ class PairSums(NamedTuple):
     far_block_start: Annotated[IntArray, "blocks(n) + 1"]
     far_pair_start: Annotated[IntArray, "F + 1"]
     pair_slot: Annotated[IntArray, "P"]  # 1 + the slot of each pair, 0 if it was not blended
-    slots: Annotated[FloatArray, "Q, PAIR_FLOATS"]  # a `PairSum` each
+    slots: Annotated[PairSumArray, "Q, PAIR_FLOATS"]

@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from ..runtime.buffers import floats, ints
+from ..runtime.constants import DEPTH_RANGE_INTS, NO_DEPTH
 from ..runtime.launch import worker
 from ..runtime.optimizations import OPTIMIZATIONS, active_optimizations
-from ..runtime.parameters import FloatOutput, IntArray, IntOutput
+from ..runtime.parameters import FloatOutput, IntArray
 from .binning import Bins, bin_gaussians
 from .rows import visible_rows
-from .structs import BLOCKS, BlockRows, Grid, RowList, Splats, grid
+from .structs import BLOCKS, BlockRows, DepthRangeOutput, Grid, RowList, Splats, grid
 
 # Visible Gaussians per tile of the image below which everything is listed in one pass: sampling would cost more time
 # than it saves.
@@ -25,8 +26,6 @@ MIN_ROWS_PER_TILE = 128
 # Share of the sampled rows in the first lists above which everything is listed in one pass: a second pass would cost
 # more time than it saves.
 MAX_NEAR_SHARE = 0.7
-# Bits of a depth greater than every finite float's: the largest int.
-NO_DEPTH = 0x7FFFFFFF
 
 # Tiles along each side of a cell, over which the light that Gaussians take is averaged.
 CELL_TILES = 4
@@ -51,7 +50,7 @@ def _near_ranges(
     splats: Splats,
     # Scratch.
     taken: Annotated[FloatOutput, "-(-grid.tiles_x // CELL_TILES) * -(-grid.tiles_y // CELL_TILES), CELL_LAYERS"],
-    ranges: Annotated[IntOutput, "grid.tiles_x * grid.tiles_y, 2"],
+    ranges: Annotated[DepthRangeOutput, "grid.tiles_x * grid.tiles_y, DEPTH_RANGE_INTS"],
     share: Annotated[FloatOutput, "1"],  # of the sampled rows that lie in the ranges
     grid: Grid,
     m: int,
@@ -78,14 +77,14 @@ def near_ranges(
     width: int,
     height: int,
 ) -> Tensor | None:
-    """Return the depths [tiles, 2] that the first lists hold. None if a single pass is faster."""
+    """Return the depths [tiles, DEPTH_RANGE_INTS] that the first lists hold. None if a single pass is faster."""
     tiling = grid(width, height)
     tiles = tiling.tiles_x * tiling.tiles_y
     wanted = OPTIMIZATIONS["two_pass"] | OPTIMIZATIONS["saturation"]
     if active_optimizations() & wanted != wanted or len(visible) < MIN_ROWS_PER_TILE * tiles:
         return None
     cells = -(-tiling.tiles_x // CELL_TILES) * -(-tiling.tiles_y // CELL_TILES)
-    ranges, share = ints(tiles, 2), floats(1)
+    ranges, share = ints(tiles, DEPTH_RANGE_INTS), floats(1)
     _near_ranges(
         visible=visible,
         splats=splats,
@@ -101,7 +100,7 @@ def near_ranges(
 
 def bin_behind(
     near: Bins,
-    ranges: Tensor,  # [tiles, 2] of the first lists
+    ranges: Tensor,  # [tiles, DEPTH_RANGE_INTS] of the first lists
     still_open: Tensor,  # [tiles], not zero where a pixel is not finished
     block_start: Tensor,  # [blocks + 1]
     splats: Splats,  # R rows, as for `bin_gaussians`

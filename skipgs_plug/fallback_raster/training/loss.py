@@ -19,7 +19,7 @@ is a fifth more work, but costs less than writing them for a second pass, and no
 """
 
 import math
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -27,13 +27,17 @@ from torch.autograd.function import once_differentiable
 
 from ..runtime.arguments import as_kernels_read
 from ..runtime.buffers import floats
-from ..runtime.constants import LOSS_TILE_ROWS, LOSS_TILE_VECTORS, MAX_LOSS_CHANNELS, SSIM_WINDOW
+from ..runtime.constants import LOSS_TILE_ROWS, LOSS_TILE_VECTORS, MAX_LOSS_CHANNELS, SSIM_WINDOW, TILE_LOSS_FLOATS
 from ..runtime.launch import Worker, worker
-from ..runtime.parameters import ByteArray, FloatArray, FloatOutput
+from ..runtime.parameters import ArrayKind, ByteArray, FloatArray, FloatOutput
 
 # Most numbers (pixels times channels) in a row of an image: kernels compute columns in float32, which is exact up to
 # 2^24.
 MAX_ROW = 2**24
+
+
+# An array of records, whose fields are defined in `kernels/loss_tiles.h`.
+TileLossOutput: TypeAlias = Annotated[Tensor, ArrayKind(torch.float32, "struct TileLoss")]
 
 
 class ImageSize(NamedTuple):
@@ -59,7 +63,7 @@ def _loss_tiles(name: str, pixels: Any) -> Worker[...]:
         image: Annotated[FloatArray, "size.images, size.height, size.width, size.channels"],
         target: Annotated[pixels, "size.images, size.height, size.width, size.channels"],
         gradient: Annotated[FloatOutput, "size.images if with_gradient else 0, size.height, size.width, size.channels"],
-        sums: Annotated[FloatOutput, "tiles, 2"],  # |image - target| and 1 - SSIM summed over each tile
+        sums: Annotated[TileLossOutput, "tiles, TILE_LOSS_FLOATS"],
         size: ImageSize,
         weights: LossWeights,
         tiles: int,
@@ -88,7 +92,7 @@ class _L1Ssim(torch.autograd.Function):
         border = SSIM_WINDOW - 1 if valid else 0
         windows = images * (height - border) * (width - border) * channels
         weights = LossWeights((1.0 - ssim_lambda) / image.numel(), ssim_lambda / windows)
-        gradient, sums = floats(*image.shape) if with_gradient else floats(0), floats(tiles, 2)
+        gradient, sums = floats(*image.shape) if with_gradient else floats(0), floats(tiles, TILE_LOSS_FLOATS)
         _LOSS_TILES[target.dtype](
             image=image,
             target=target,

@@ -26,8 +26,9 @@ static_assert(sizeof(Records16) == 16 * sizeof(Record), "the fields of a record"
 
 // Sums over the pixels of a tile. v_sigma is the gradient of the loss by sigma = -ln(alpha / opacity). The gradients of
 // the 2D mean and the conic follow from its moments about the mean.
+enum Moment { OF_1, OF_X, OF_Y, OF_XX, OF_XY, OF_YY, MOMENTS };  // sums of v_sigma times 1, dx, dy, dx^2, dx dy, dy^2
 struct PairSum {
-    float moment[6];    // v_sigma times 1, dx, dy, dx^2, dx dy, dy^2
+    float moment[MOMENTS];
     float color[4];     // gradient of the colour
     float absolute[2];  // |v_x|, |v_y| of the 2D mean
     float unused[4];

@@ -74,7 +74,7 @@ struct SortedTile {
     // Distributes pairs to buckets of equal ranges of depth. `bucket` [buckets + 1] receives the end of each. Returns
     // log2 of the range.
     static int deal(const long long* from, long long* to, int count, int* bucket, int buckets) {
-        int least = 0x7fffffff, most = 0, shift = 0;
+        int least = NO_DEPTH, most = 0, shift = 0;
         for (int i = 0; i < count; ++i) {
             const int key = (int)(from[i] >> 32);
             least = smaller(least, key), most = larger(most, key);

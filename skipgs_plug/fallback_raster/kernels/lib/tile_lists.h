@@ -16,9 +16,17 @@ struct BoxTiles {
     }
 };
 
-// Bits of a depth greater than every finite float's: the largest int.
-static constexpr int NO_DEPTH = 0x7fffffff;
-// Whether a tile lists a depth, given as bits: from the first of the tile's two numbers up to the second, exclusive.
-static constexpr auto in_range = [](const int* ranges, int tile, int depth) INLINE -> bool {
-    return depth >= ranges[2 * tile] && depth < ranges[2 * tile + 1];
+// The tiles that a Gaussian meets, if its box is small.
+struct Footprint {
+    int corner;  // first tile of the box
+    int meets;   // bits of the tiles that the ellipse meets; -1 if the box is too large: then it has a `TileBox`
 };
+static_assert(sizeof(Footprint) == sizeof(int) * FOOTPRINT_INTS, "constants.FOOTPRINT_INTS");
+
+// The depths that a tile lists, as bits of float32: from `first` up to `end`, exclusive.
+struct DepthRange {
+    int first, end;
+
+    bool holds(int depth) const { return depth >= first && depth < end; }
+};
+static_assert(sizeof(DepthRange) == sizeof(int) * DEPTH_RANGE_INTS, "constants.DEPTH_RANGE_INTS");

@@ -11,7 +11,7 @@ static constexpr auto reduce_block_pairs = [](int block, const PairSums& sums, c
     const int row_begin = BLOCK_ROWS * block, rows_here = smaller(BLOCK_ROWS, n - row_begin);
     const bool more = channels.first > 0;  // an earlier pass over the channels wrote gradients here
     const int stride = channels.stride;
-    const PairSum* const slots = (const PairSum*)sums.slots;
+    const PairSum* const slots = sums.slots;
     if (!more && dense) {
         // Clear one block at a time, so that it is still in the cache when the gradients are written.
         clear(v_splats.means2d + 2ll * row_begin, 2 * rows_here);
@@ -56,10 +56,10 @@ static constexpr auto reduce_block_pairs = [](int block, const PairSums& sums, c
         PairSum sum;
         store((float*)&sum, total);
         const float* m = sum.moment;
-        const float a = conics[3 * g], b = conics[3 * g + 1], c = conics[3 * g + 2];
-        const float v_center[2] = {-(a * m[1] + b * m[2]), -(b * m[1] + c * m[2])};
-        const float v_conic[3] = {0.5f * m[3], m[4], 0.5f * m[5]};
-        const float v_opacity = m[0] == 0.0f ? 0.0f : -m[0] / opacities[g];
+        const float *const conic = conics + 3 * g, a = conic[0], b = conic[1], c = conic[2];
+        const float v_center[2] = {-(a * m[OF_X] + b * m[OF_Y]), -(b * m[OF_X] + c * m[OF_Y])};
+        const float v_conic[3] = {0.5f * m[OF_XX], m[OF_XY], 0.5f * m[OF_YY]};
+        const float v_opacity = m[OF_1] == 0.0f ? 0.0f : -m[OF_1] / opacities[g];
         for (int j = 0; j < 2; ++j) v_splats.means2d[2 * g + j] = v_center[j] + (more ? v_splats.means2d[2 * g + j] : 0.0f);
         for (int j = 0; j < 3; ++j) v_splats.conics[3 * g + j] = v_conic[j] + (more ? v_splats.conics[3 * g + j] : 0.0f);
         v_splats.opacities[g] = v_opacity + (more ? v_splats.opacities[g] : 0.0f);
