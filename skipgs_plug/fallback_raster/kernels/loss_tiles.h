@@ -1,9 +1,9 @@
 // Sums |image - target| and 1 - SSIM over each tile, and computes the gradient of the loss.
 //
 // A tile is processed once, from its first row to its last. Two ring buffers of rows hold the inputs of the vertical
-// blurs, already blurred along the row. The first holds x, d, x^2 + y^2 and d^2 of shifted images, where d = x - y. The
-// second holds three coefficients of the gradient. Blurring the first ring vertically gives SSIM, WINDOW_RADIUS rows
-// late. Blurring the second gives the gradient, another WINDOW_RADIUS rows late.
+// blurs, already blurred along the row. The first holds the maps: x, d, x^2 + y^2 and d^2 of shifted images, where
+// d = x - y. The second holds three coefficients of the gradient. Blurring the first ring vertically gives SSIM,
+// WINDOW_RADIUS rows late. Blurring the second gives the gradient, another WINDOW_RADIUS rows late.
 //
 // Reads both images. Writes the sums and the gradient of its own tiles. No other thread writes to these tiles.
 #pragma once
@@ -14,9 +14,12 @@ static constexpr float w[SSIM_WINDOW] = {0.00102838f, 0.00759876f, 0.03600077f, 
 static constexpr int WINDOW_RADIUS = SSIM_WINDOW / 2;  // pixels
 // Vectors of 16 floats that the window reaches to one side of a tile, for the largest number of channels.
 static constexpr int MAX_REACH_VECTORS = (WINDOW_RADIUS * MAX_LOSS_CHANNELS + 15) / 16;
-// Vectors of a row of a tile with the window's reach on both sides, and floats of a row with twice that reach.
-static constexpr int WIDEST = LOSS_TILE_VECTORS + 2 * MAX_REACH_VECTORS;
-static constexpr int SHIFTED = 16 * (LOSS_TILE_VECTORS + 4 * MAX_REACH_VECTORS);
+// Most vectors of 16 floats in a row of coefficients, which covers a tile and the window's reach on both sides, and in a
+// row of pixels, which reaches as far again.
+static constexpr int MAX_COEFFICIENT_VECTORS = LOSS_TILE_VECTORS + 2 * MAX_REACH_VECTORS;
+static constexpr int MAX_PIXEL_VECTORS = LOSS_TILE_VECTORS + 4 * MAX_REACH_VECTORS;
+enum Map { MAP_X, MAP_D, MAP_SQUARES, MAP_D_SQUARED, MAPS };  // of shifted images
+enum Coefficient { OFFSET, SLOPE_D, SLOPE_X, COEFFICIENTS };  // of the gradient
 static constexpr int ROWS_AT_ONCE = 4;  // rows blurred vertically together: their windows share most of their inputs
 static constexpr int RING_ROWS = SSIM_WINDOW - 1 + ROWS_AT_ONCE;  // rows that one vertical blur reads
 // Added to the number of a row to make its ring index positive: rows above an image have negative numbers.
@@ -99,7 +102,7 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
         };
 
         // Shifts that are subtracted from x and d: approximate means of the tile, by channel.
-        alignas(64) float shift_x[SHIFTED], shift_d[SHIFTED];
+        alignas(64) float shift_x[16 * MAX_PIXEL_VECTORS], shift_d[16 * MAX_PIXEL_VECTORS];
         {
             float mean_x[MAX_LOSS_CHANNELS], mean_y[MAX_LOSS_CHANNELS], counted[MAX_LOSS_CHANNELS];
             for (int c = 0; c < channels; ++c) mean_x[c] = mean_y[c] = counted[c] = 0.0f;
@@ -130,12 +133,14 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
         }
 
         v16 l1 = (v16)0.0f, unlike = (v16)0.0f;
-        alignas(64) float maps[4][SHIFTED], slopes[ROWS_AT_ONCE][3][16 * WIDEST];
-        alignas(64) v16 blurred[RING_ROWS * WIDEST * 4], sloping[RING_ROWS * LOSS_TILE_VECTORS * 3];
+        alignas(64) float maps[MAPS][16 * MAX_PIXEL_VECTORS];
+        alignas(64) float slopes[ROWS_AT_ONCE][COEFFICIENTS][16 * MAX_COEFFICIENT_VECTORS];
+        alignas(64) v16 blurred[RING_ROWS * MAX_COEFFICIENT_VECTORS * MAPS];
+        alignas(64) v16 sloping[RING_ROWS * LOSS_TILE_VECTORS * COEFFICIENTS];
         // Rows are grouped alike with and without a gradient, so that sums are added in the same order.
         const int start_row = top - 2 * WINDOW_RADIUS + (WINDOW_RADIUS - more_rows) / ROWS_AT_ONCE * ROWS_AT_ONCE;
         // Windows of the first groups read rows that were never computed: zeros, which do not count.
-        for (int i = 0; i < RING_ROWS * wide * 4; ++i) blurred[i] = (v16)0.0f;
+        for (int i = 0; i < RING_ROWS * wide * MAPS; ++i) blurred[i] = (v16)0.0f;
         for (int first_row = start_row; first_row < bottom + more_rows + WINDOW_RADIUS; first_row += ROWS_AT_ONCE) {
             for (int row = first_row; row < first_row + ROWS_AT_ONCE; ++row) {
                 const bool inside = row >= 0 && row < height, own_row = row >= top && row < bottom;
@@ -156,21 +161,22 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
                     const v16 d = a - b - from_d;
                     a -= from_x;
                     b = a - d;
-                    store(maps[0] + 16 * vector, a);
-                    store(maps[1] + 16 * vector, d);
-                    store(maps[2] + 16 * vector, a * a + b * b);
-                    store(maps[3] + 16 * vector, d * d);
+                    store(maps[MAP_X] + 16 * vector, a);
+                    store(maps[MAP_D] + 16 * vector, d);
+                    store(maps[MAP_SQUARES] + 16 * vector, a * a + b * b);
+                    store(maps[MAP_D_SQUARED] + 16 * vector, d * d);
                 }
-                v16* out = blurred + (row + RING_OFFSET) % RING_ROWS * wide * 4;
+                v16* out = blurred + (row + RING_OFFSET) % RING_ROWS * wide * MAPS;
                 for (int vector = 0; vector < wide; ++vector)
-                    for (int m = 0; m < 4; ++m) out[4 * vector + m] = blur_along(maps[m] + 16 * (vector + side), channels);
+                    for (int m = 0; m < MAPS; ++m)
+                        out[MAPS * vector + m] = blur_along(maps[m] + 16 * (vector + side), channels);
             }
 
             const int centre = first_row - WINDOW_RADIUS;  // first of ROWS_AT_ONCE rows whose SSIM is computed
             if (centre + ROWS_AT_ONCE <= top - more_rows) continue;
             const v16* line[RING_ROWS];
             for (int k = 0; k < RING_ROWS; ++k)
-                line[k] = blurred + (first_row + ROWS_AT_ONCE + k + RING_OFFSET) % RING_ROWS * wide * 4;
+                line[k] = blurred + (first_row + ROWS_AT_ONCE + k + RING_OFFSET) % RING_ROWS * wide * MAPS;
             bool own_row[ROWS_AT_ONCE], row_counts[ROWS_AT_ONCE];
             for (int r = 0; r < ROWS_AT_ONCE; ++r) {
                 own_row[r] = centre + r >= top && centre + r < bottom;
@@ -182,15 +188,16 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
                 const v16 column = lane + (float)i;
                 const i16 in_row = (column < (float)(valid ? span - reach : span)) & (column >= (float)(valid ? reach : 0));
                 const v16 from_x = load(shift_x + 16 * (vector + side)), from_d = load(shift_d + 16 * (vector + side));
-                v16 blurs[4][ROWS_AT_ONCE];
-                for (int m = 0; m < 4; ++m) blur_down(line, 4 * vector + m, blurs[m]);
+                v16 blurs[MAPS][ROWS_AT_ONCE];
+                for (int m = 0; m < MAPS; ++m) blur_down(line, MAPS * vector + m, blurs[m]);
                 for (int r = 0; r < ROWS_AT_ONCE; ++r) {
-                    const v16 blur[4] = {blurs[0][r], blurs[1][r], blurs[2][r], blurs[3][r]};
+                    const v16 blur[MAPS] = {blurs[MAP_X][r], blurs[MAP_D][r], blurs[MAP_SQUARES][r], blurs[MAP_D_SQUARED][r]};
                     const i16 counts = row_counts[r] ? in_row : (i16)0;
-                    const v16 mean_x = blur[0] + from_x, mean_d = blur[1] + from_d, mean_y = mean_x - mean_d;
-                    const v16 shifted_y = blur[0] - blur[1];
-                    const v16 variances = vmax(blur[2] - blur[0] * blur[0] - shifted_y * shifted_y, (v16)0.0f);
-                    const v16 variance_d = vmax(blur[3] - blur[1] * blur[1], (v16)0.0f);
+                    const v16 mean_x = blur[MAP_X] + from_x, mean_d = blur[MAP_D] + from_d, mean_y = mean_x - mean_d;
+                    const v16 shifted_y = blur[MAP_X] - blur[MAP_D];
+                    const v16 variances =
+                        vmax(blur[MAP_SQUARES] - blur[MAP_X] * blur[MAP_X] - shifted_y * shifted_y, (v16)0.0f);
+                    const v16 variance_d = vmax(blur[MAP_D_SQUARED] - blur[MAP_D] * blur[MAP_D], (v16)0.0f);
                     const v16 below1 = mean_x * mean_x + mean_y * mean_y + 1e-4f, below2 = variances + 9e-4f;
                     const v16 both = 1.0f / (below1 * below2), b1 = both * below2, b2 = both * below1;
                     const v16 luminance = mean_d * mean_d * b1, structure = variance_d * b2;
@@ -201,33 +208,35 @@ static constexpr auto loss_tiles = [](const float* image, const auto* target, fl
                     // blur(slope_x).
                     const v16 slope_d = 2.0f * b2 * (1.0f - luminance), slope_x = -structure * slope_d;
                     const v16 offset = 2.0f * (1.0f - structure) * b1 * mean_d * (1.0f - mean_x * mean_d * b1)
-                                   - blur[1] * slope_d - blur[0] * slope_x;
-                    store(slopes[r][0] + 16 * vector, counts ? offset : (v16)0.0f);
-                    store(slopes[r][1] + 16 * vector, counts ? slope_d : (v16)0.0f);
-                    store(slopes[r][2] + 16 * vector, counts ? slope_x : (v16)0.0f);
+                                   - blur[MAP_D] * slope_d - blur[MAP_X] * slope_x;
+                    store(slopes[r][OFFSET] + 16 * vector, counts ? offset : (v16)0.0f);
+                    store(slopes[r][SLOPE_D] + 16 * vector, counts ? slope_d : (v16)0.0f);
+                    store(slopes[r][SLOPE_X] + 16 * vector, counts ? slope_x : (v16)0.0f);
                 }
             }
             if (!with_gradient) continue;
             for (int r = 0; r < ROWS_AT_ONCE; ++r) {
-                v16* out = sloping + (centre + r + RING_OFFSET) % RING_ROWS * LOSS_TILE_VECTORS * 3;
+                v16* out = sloping + (centre + r + RING_OFFSET) % RING_ROWS * LOSS_TILE_VECTORS * COEFFICIENTS;
                 for (int vector = 0; vector < own; ++vector)
-                    for (int m = 0; m < 3; ++m) out[3 * vector + m] = blur_along(slopes[r][m] + 16 * (vector + more), channels);
+                    for (int m = 0; m < COEFFICIENTS; ++m)
+                        out[COEFFICIENTS * vector + m] = blur_along(slopes[r][m] + 16 * (vector + more), channels);
             }
 
             const int done = centre - WINDOW_RADIUS;  // first of ROWS_AT_ONCE rows whose gradient is computed
             if (done < top) continue;
             for (int k = 0; k < RING_ROWS; ++k)
-                line[k] = sloping + (centre + ROWS_AT_ONCE + k + RING_OFFSET) % RING_ROWS * LOSS_TILE_VECTORS * 3;
+                line[k] = sloping + (centre + ROWS_AT_ONCE + k + RING_OFFSET) % RING_ROWS * LOSS_TILE_VECTORS * COEFFICIENTS;
             for (int vector = 0; vector < own; ++vector) {
                 const int i = 16 * (begin + vector), at = 16 * (vector + more + side);
-                v16 blurs[3][ROWS_AT_ONCE];
-                for (int m = 0; m < 3; ++m) blur_down(line, 3 * vector + m, blurs[m]);
+                v16 blurs[COEFFICIENTS][ROWS_AT_ONCE];
+                for (int m = 0; m < COEFFICIENTS; ++m) blur_down(line, COEFFICIENTS * vector + m, blurs[m]);
                 for (int r = 0; r < smaller(ROWS_AT_ONCE, bottom - done); ++r) {
-                    const v16 blur[3] = {blurs[0][r], blurs[1][r], blurs[2][r]};
+                    const v16 blur[COEFFICIENTS] = {blurs[OFFSET][r], blurs[SLOPE_D][r], blurs[SLOPE_X][r]};
                     const long long row = done + r;
                     const v16 a = piece(x + row * span, i), d = a - piece(y + row * span, i);
                     const v16 sign = d > 0.0f ? (v16)1.0f : (d < 0.0f ? (v16)-1.0f : (v16)0.0f);
-                    const v16 v_unlike = blur[0] + (d - load(shift_d + at)) * blur[1] + (a - load(shift_x + at)) * blur[2];
+                    const v16 v_unlike = blur[OFFSET] + (d - load(shift_d + at)) * blur[SLOPE_D]
+                                       + (a - load(shift_x + at)) * blur[SLOPE_X];
                     const v16 v = weights.l1 * sign + weights.ssim * v_unlike;
                     float* out = gradient + (start + row) * span + i;
                     if (i + 16 <= span) store(out, v);

@@ -47,9 +47,9 @@ static constexpr auto project_forward = [](const Gaussians& gaussians, const flo
         if (antialiased) opacity *= compensation;
         // Each comparison is false for NaN, so a Gaussian with a NaN anywhere is culled.
         i16 visible = (z >= limits.near_plane) & (z <= limits.far_plane) & (cov.det > 0.0f) & (opacity >= ALPHA_MIN);
-        v16 reach = vmin((v16)3.33f, vsqrt(LN_4 * log2(255.0f * vmax(opacity, (v16)1e-3f))));
-        const float* K = camera.K;
-        v16 u = K[0] * center.x * iz + K[2], v = K[4] * center.y * iz + K[5];
+        v16 reach = vmin((v16)MAX_DEVIATIONS, vsqrt(LN_4 * log2(255.0f * vmax(opacity, (v16)1e-3f))));
+        const auto [fx, fy, cx, cy] = intrinsics(camera);
+        v16 u = fx * center.x * iz + cx, v = fy * center.y * iz + cy;
         v16 sigma_x = vsqrt(cov.xx), sigma_y = vsqrt(cov.yy);
         v16 radius_x = vmin((v16)1e9f, __builtin_elementwise_ceil(reach * sigma_x));
         v16 radius_y = vmin((v16)1e9f, __builtin_elementwise_ceil(reach * sigma_y));

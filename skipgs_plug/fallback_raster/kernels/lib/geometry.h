@@ -7,6 +7,31 @@
 #pragma once
 #include "simd.h"
 
+// Focal lengths and principal point of a camera, pixels.
+struct Intrinsics {
+    float fx, fy, cx, cy;
+};
+static constexpr auto intrinsics = [](const Camera& camera) INLINE -> Intrinsics {
+    const float* K = camera.K;
+    return {K[0], K[4], K[2], K[5]};
+};
+
+// Share of the image's width and height by which the point where the Jacobian is taken may lie outside the image, as in
+// gsplat and in Inria's rasterizer: 30 % of half the field of view. Farther out the linear projection of a Gaussian is
+// so wrong that it would fill the image.
+static constexpr float JACOBIAN_MARGIN = 0.15f;
+
+// Most standard deviations from a centre to a pixel that the Gaussian contributes to: sqrt(2 ln 255), rounded up.
+static constexpr float MAX_DEVIATIONS = 3.33f;
+
+// Bounds of a sphere around a Gaussian, which are a little larger than those of the Gaussian: culling by the sphere must
+// not cull what the exact test keeps. Standard deviations: MAX_DEVIATIONS and a hundredth more for rounding.
+static constexpr float SPHERE_DEVIATIONS = 3.37f;
+// Pixels that the sphere reaches farther: one by which a radius is rounded up, and half a pixel for rounding.
+static constexpr float SPHERE_MARGIN = 1.5f;
+// The same as a share of a coordinate in pixels: 80 times the rounding of a float.
+static constexpr float SPHERE_RELATIVE_MARGIN = 1e-5f;
+
 // Centres of 16 rows in world space and in camera space.
 struct Centers {
     v16 world[3], x, y, z;
@@ -41,25 +66,34 @@ static constexpr auto rotations = [](const float* quats, const int* row) INLINE 
              {2.0f * (x * z - w * y), 2.0f * (y * z + w * x), 1.0f - 2.0f * (x * x + y * y)}}};
 };
 
+// x / z and y / z where the Jacobian is taken.
+struct Tangents {
+    v16 x, y;
+};
+static constexpr auto jacobian_tangents = [](const Camera& camera, const Centers& center, v16 iz) INLINE -> Tangents {
+    const auto [fx, fy, cx, cy] = intrinsics(camera);
+    const float margin_x = JACOBIAN_MARGIN * camera.width / fx, margin_y = JACOBIAN_MARGIN * camera.height / fy;
+    const v16 right = (v16)((camera.width - cx) / fx + margin_x), left = (v16)(-cx / fx - margin_x);
+    const v16 bottom = (v16)((camera.height - cy) / fy + margin_y), top = (v16)(-cy / fy - margin_y);
+    return {vmin(right, vmax(left, center.x * iz)), vmin(bottom, vmax(top, center.y * iz))};
+};
+
 // T = J W M, with all that it is made of.
 struct SplatAxes {
-    v16 ux, uy;  // x / z and y / z where the Jacobian is taken
+    v16 ux, uy;  // `Tangents`
     v16 J00, J02, J11, J12, WM[3][3], T0[3], T1[3];
 };
 static constexpr auto splat_axes = [](const Camera& camera, const Centers& center, v16 iz, const v16 (&R)[3][3],
                                       const v16 (&S)[3]) INLINE -> SplatAxes {
-    const float *V = camera.viewmat, *K = camera.K;
-    const float fx = K[0], cx = K[2], fy = K[4], cy = K[5];
+    const float* V = camera.viewmat;
+    const auto [fx, fy, cx, cy] = intrinsics(camera);
     SplatAxes a;
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j)
             a.WM[i][j] = (V[4 * i] * R[0][j] + V[4 * i + 1] * R[1][j] + V[4 * i + 2] * R[2][j]) * S[j];
 
-    // The Jacobian is taken no further than 30 % of the half field of view outside the image.
-    const float margin_x = 0.15f * camera.width / fx, margin_y = 0.15f * camera.height / fy;
-    const v16 right = (v16)((camera.width - cx) / fx + margin_x), left = (v16)(-cx / fx - margin_x);
-    const v16 bottom = (v16)((camera.height - cy) / fy + margin_y), top = (v16)(-cy / fy - margin_y);
-    a.ux = vmin(right, vmax(left, center.x * iz)), a.uy = vmin(bottom, vmax(top, center.y * iz));
+    const Tangents tangents = jacobian_tangents(camera, center, iz);
+    a.ux = tangents.x, a.uy = tangents.y;
     a.J00 = fx * iz, a.J02 = -fx * a.ux * iz, a.J11 = fy * iz, a.J12 = -fy * a.uy * iz;
     for (int j = 0; j < 3; ++j) {
         a.T0[j] = a.J00 * a.WM[0][j] + a.J02 * a.WM[2][j];
@@ -69,19 +103,22 @@ static constexpr auto splat_axes = [](const Camera& camera, const Centers& cente
 };
 
 // Whether the sphere of radius `longest` around a centre reaches no pixel: the rows of T are at most as long as those of J
-// times `longest`, and a radius is 3.33 standard deviations at most, rounded up. A hundredth more pays for rounding.
+// times `longest`, and a radius is MAX_DEVIATIONS standard deviations at most, rounded up.
 static constexpr auto beyond = [](const Camera& camera, const Centers& center, v16 iz, v16 longest) INLINE -> i16 {
-    const float* K = camera.K;
-    const float fx = K[0], cx = K[2], fy = K[4], cy = K[5], width = camera.width, height = camera.height;
-    const float margin_x = 0.15f * width / fx, margin_y = 0.15f * height / fy;
-    const v16 x = center.x, y = center.y;
-    const v16 ux = vmin((v16)((width - cx) / fx + margin_x), vmax((v16)(-cx / fx - margin_x), x * iz));
-    const v16 uy = vmin((v16)((height - cy) / fy + margin_y), vmax((v16)(-cy / fy - margin_y), y * iz));
-    const v16 u = fx * x * iz + cx, v = fy * y * iz + cy, size = longest * iz;
-    // By how much they are outside, squared: no roots.
-    const v16 over_x = vmax(-u, u - width) - (1.5f + 1e-5f * vabs(u)), over_y = vmax(-v, v - height) - (1.5f + 1e-5f * vabs(v));
-    const v16 spread_x = 3.37f * 3.37f * (fx * fx * size * size * (1.0f + ux * ux) + camera.eps2d);
-    const v16 spread_y = 3.37f * 3.37f * (fy * fy * size * size * (1.0f + uy * uy) + camera.eps2d);
+    const auto [fx, fy, cx, cy] = intrinsics(camera);
+    const auto [ux, uy] = jacobian_tangents(camera, center, iz);
+    const v16 u = fx * center.x * iz + cx, v = fy * center.y * iz + cy, size = longest * iz;
+    // By how many pixels an axis lies outside of the image and of the margin, and the sphere's extent along the axis,
+    // squared: no roots.
+    const auto outside = [](v16 u, float pixels) INLINE -> v16 {
+        return vmax(-u, u - pixels) - (SPHERE_MARGIN + SPHERE_RELATIVE_MARGIN * vabs(u));
+    };
+    const auto extent = [&](float focal, v16 tangent) INLINE -> v16 {
+        return SPHERE_DEVIATIONS * SPHERE_DEVIATIONS
+             * (focal * focal * size * size * (1.0f + tangent * tangent) + camera.eps2d);
+    };
+    const v16 over_x = outside(u, camera.width), over_y = outside(v, camera.height);
+    const v16 spread_x = extent(fx, ux), spread_y = extent(fy, uy);
     return ((over_x > 0.0f) & (over_x * over_x > spread_x)) | ((over_y > 0.0f) & (over_y * over_y > spread_y));
 };
 

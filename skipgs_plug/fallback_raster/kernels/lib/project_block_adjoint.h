@@ -110,7 +110,8 @@ static constexpr auto project_block_adjoint =
         // Projection: u = fx x / z + cx; J00 = fx / z; J02 = -fx ux / z with ux = x / z where it is not clamped.
         v16 inside_x = axes.ux == x * iz ? (v16)1.0f : (v16)0.0f, inside_y = axes.uy == y * iz ? (v16)1.0f : (v16)0.0f;
         v16 v_tx = v_u - inside_x * v_J02 * iz, v_ty = v_v - inside_y * v_J12 * iz;
-        v16 v_x = saturated(camera.K[0] * iz * v_tx, 1e20f), v_y = saturated(camera.K[4] * iz * v_ty, 1e20f);
+        const Intrinsics focal = intrinsics(camera);
+        v16 v_x = saturated(focal.fx * iz * v_tx, 1e20f), v_y = saturated(focal.fy * iz * v_ty, 1e20f);
         // Fused by hand: which product Clang fuses with a sum depends on the surrounding code.
         const v16 along_J =
             __builtin_elementwise_fma(axes.J00, v_J00, axes.J02 * v_J02) + axes.J11 * v_J11 + axes.J12 * v_J12;
