@@ -15,7 +15,7 @@ from .runtime.buffers import floats, ints, zeros
 from .runtime.constants import blocks
 from .runtime.optimizations import OPTIMIZATIONS, active_optimizations
 from .stages.compose import compose, compose_adjoint
-from .stages.project import Limits, Projected, project_adjoint, project_forward
+from .stages.project import Limits, Projected, ProjectFlags, project_adjoint, project_forward
 from .stages.rows import all_rows, put_rows, take_rows, visible_rows
 from .stages.sh import sh_adjoint, sh_forward
 from .stages.structs import (
@@ -25,6 +25,7 @@ from .stages.structs import (
     Gaussians,
     Harmonics,
     HarmonicsGradients,
+    ProjectAdjointFlags,
     ProjectedGradients,
     RowList,
     Splats,
@@ -92,11 +93,7 @@ class Project(torch.autograd.Function):
             projected=projected,
             found=found,
             n=n,
-            antialiased=int(antialiased),
-            raw=0,
-            dense=1,
-            with_radii=1,
-            optimizations=active_optimizations(),
+            flags=ProjectFlags(int(antialiased), raw=0, dense=1, with_radii=1, optimizations=active_optimizations()),
         )
         visible, block_start = visible_rows(found)
         means2d, depths, conics, sigmas, compensations, radii, _ = projected
@@ -138,10 +135,12 @@ class Project(torch.autograd.Function):
             v_gaussians=v_gaussians,
             v_poses=v_poses,
             n=n,
-            with_depth=int(v_projected.depths.numel() > 0),
-            antialiased=int(v_projected.compensations.numel() > 0),
-            with_pose=int(with_pose),
-            optimizations=active_optimizations(),
+            flags=ProjectAdjointFlags(
+                with_depth=int(v_projected.depths.numel() > 0),
+                antialiased=int(v_projected.compensations.numel() > 0),
+                with_pose=int(with_pose),
+                optimizations=active_optimizations(),
+            ),
         )
         v_viewmat = None
         if with_pose:

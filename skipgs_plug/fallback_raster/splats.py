@@ -18,10 +18,10 @@ from .runtime.buffers import floats, ints, zeros
 from .runtime.constants import FACTOR_FLOATS, TILE, blocks, tiles
 from .runtime.optimizations import active_optimizations
 from .stages.compose import compose, pair_sums
-from .stages.project import Limits, Projected, project_forward
+from .stages.project import Limits, Projected, ProjectFlags, project_forward
 from .stages.rows import take_rows, visible_rows
 from .stages.sh import sh_forward
-from .stages.splat_adjoint import CenterGradients, Rendered, splat_adjoint
+from .stages.splat_adjoint import CenterGradients, Rendered, SplatAdjointFlags, splat_adjoint
 from .stages.structs import (
     BlockRows,
     Camera,
@@ -231,11 +231,12 @@ class _Render(torch.autograd.Function):
             factors=factors,
             v_centers=CenterGradients(v_centres, floats(0) if absolute is None else absolute),
             n=len(means),
-            antialiased=int(view.antialiased),
-            with_centers=int(with_centres),
-            absgrad=int(absolute is not None),
-            parts=ctx.composed.parts,
-            optimizations=active_optimizations(),
+            flags=SplatAdjointFlags(
+                antialiased=int(view.antialiased),
+                with_centers=int(with_centres),
+                absgrad=int(absolute is not None),
+                optimizations=active_optimizations(),
+            ),
         )
         if lazy is not None:
             lazy.receive(Factors(rows, *factors, degree))
@@ -271,10 +272,8 @@ def _project(
         projected=projected,
         found=found,
         n=n,
-        antialiased=int(antialiased),
-        raw=1,
-        dense=0,
-        with_radii=int(with_radii),
-        optimizations=active_optimizations(),
+        flags=ProjectFlags(
+            int(antialiased), raw=1, dense=0, with_radii=int(with_radii), optimizations=active_optimizations()
+        ),
     )
     return _View(camera, antialiased, projected, visible_rows(found))

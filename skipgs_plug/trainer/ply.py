@@ -22,9 +22,9 @@ from skipgs_plug.trainer.scene import check_points
 
 log = logging.getLogger(__name__)
 
-REST = 15  # SH coefficients of degrees 1 to 3 per colour channel
+HIGHER_COEFFICIENTS = 15  # number of SH coefficients of degrees 1 to 3 for each colour channel
 SATURATING = ("opacity", "scale_0", "scale_1", "scale_2")  # may be infinite in a saturated model
-REST_COUNTS = (0, 9, 24, 45)  # f_rest properties of SH degrees 0 to 3
+F_REST_COUNTS = (0, 9, 24, 45)  # numbers of f_rest properties of SH degrees 0 to 3
 MAX_LOG_SCALE = 80.0  # largest logarithm of a scale in a file: float32 overflows at e^88
 MAX_LOGIT = 20.0  # opacity logit that stands for infinity in a file: its opacity is 1 in float32
 MIN_LOG_SCALE = -40.0  # smallest logarithm of a scale: the square of e^-40 is still a normal float32
@@ -36,7 +36,7 @@ BRIGHTEST = 2.0  # float colours up to this value have a range of 0 to 1; in a r
 PACKED_COLOURS = ("rgb", "rgba")  # format of the Point Cloud Library: one number with bytes 0xAARRGGBB
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
-    *(f"f_rest_{i}" for i in range(3 * REST)),
+    *(f"f_rest_{i}" for i in range(3 * HIGHER_COEFFICIENTS)),
     *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 
@@ -56,13 +56,13 @@ def write_ply(splats: Mapping[str, Tensor], path: str | Path) -> None:
     values = saturated({name: tensor.detach().cpu().float() for name, tensor in splats.items()}, path)
     positions = splats["means"].detach().cpu()  # float64 where float32 would lose some
     n = len(values["means"])
-    rest = torch.zeros(n, REST, 3, dtype=torch.float32)
+    rest = torch.zeros(n, HIGHER_COEFFICIENTS, 3, dtype=torch.float32)
     rest[:, : values["shN"].shape[1]] = values["shN"]
     columns = [
         values["means"],
         torch.zeros(n, 3, dtype=torch.float32),
         values["sh0"].reshape(n, 3),
-        rest.transpose(1, 2).reshape(n, 3 * REST),
+        rest.transpose(1, 2).reshape(n, 3 * HIGHER_COEFFICIENTS),
         values["opacities"].reshape(n, 1),
         values["scales"],
         values["quats"],
@@ -120,9 +120,9 @@ def read_start(path: str | Path) -> tuple[tuple[np.ndarray, np.ndarray], dict[st
 def model_of(path: Path, vertices: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
     """Return the Gaussians of `read_ply`."""
     count = sum(name.startswith("f_rest_") for name in vertices)
-    if count not in REST_COUNTS:
+    if count not in F_REST_COUNTS:
         raise InputError(
-            f"PLY {path} has {count} f_rest properties, expected one of {REST_COUNTS}; export it with "
+            f"PLY {path} has {count} f_rest properties, expected one of {F_REST_COUNTS}; export it with "
             "spherical harmonics of degree 3 or less."
         )
     names = [n for n in PROPERTIES if n[0] != "n" and (not n.startswith("f_rest") or int(n[7:]) < count)]

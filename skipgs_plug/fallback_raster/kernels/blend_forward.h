@@ -1,4 +1,4 @@
-// Front-to-back compositing, one tile at a time.
+// Front-to-back compositing, one tile at a time, of at most COMPILED_CHANNELS channels.
 //
 // Reads the records and lists of its own tiles. Writes the pixels of these tiles and, for each pair, the patches that
 // blended it. No other thread writes to these tiles.
@@ -39,14 +39,14 @@ static constexpr auto blend_forward = [](const Record* records, const TileLists&
         const int begin = tile.begin, end = tile.end;
         SortedTile list(begin, lists.sorted ? begin : end, lists);
 
-        alignas(64) vpatch P[PATCHES], T[PATCHES], C[PATCHES][D];
+        alignas(64) vpatch P[PATCHES], T[PATCHES], C[PATCHES][COMPILED_CHANNELS];
         alignas(64) ipatch stop[PATCHES];
         unsigned open = 0;  // patches with an unfinished pixel
         for (int b = 0; b < PATCHES; ++b) {
             const ipatch inside = tile.inside(b);
             P[b] = inside ? (vpatch)1.0f : (vpatch)0.0f;
             T[b] = (vpatch)1.0f;
-            for (int c = 0; c < D; ++c) C[b][c] = (vpatch)0.0f;
+            for (int c = 0; c < COMPILED_CHANNELS; ++c) C[b][c] = (vpatch)0.0f;
             stop[b] = (ipatch)begin;
             if (any(inside)) open |= 1u << b;
         }
@@ -55,7 +55,7 @@ static constexpr auto blend_forward = [](const Record* records, const TileLists&
         if (part.continued) {
             for (int q = 0; q < TILE_QUADS; ++q) {
                 const Quad quad(tile, q, grid.width);
-                read_patches(pixels.image + channels.first, quad, channels.stride, channels.number, C[0], D);
+                read_patches(pixels.image + channels.first, quad, channels.stride, channels.number, C[0], COMPILED_CHANNELS);
                 read_patches(pixels.product_left, quad, 1, 1, P, 1);
                 read_patches(pixels.transmittance, quad, 1, 1, T, 1);
                 read_patches((const float*)pixels.pixel_stop, quad, 1, 1, (vpatch*)stop, 1);
@@ -107,10 +107,10 @@ static constexpr auto blend_forward = [](const Record* records, const TileLists&
                 // Process several Gaussians at a time, step by step: a processor cannot look far enough ahead to
                 // overlap the long chains of single Gaussians. The chain between Gaussians is short because the product
                 // has no select in it: it also continues in finished pixels, where it falls below TRANSMITTANCE_MIN.
-                vpatch product = P[b], transmitted = T[b], color[D];
+                vpatch product = P[b], transmitted = T[b], color[COMPILED_CHANNELS];
                 ipatch stopped = stop[b];
                 unsigned long long taken = 0;
-                for (int c = 0; c < D; ++c) color[c] = C[b][c];
+                for (int c = 0; c < COMPILED_CHANNELS; ++c) color[c] = C[b][c];
                 for (unsigned long long remaining = live[b]; remaining;) {
                     int member[SIDE_BY_SIDE];  // index in the group
                     const Record* r[SIDE_BY_SIDE];
@@ -133,7 +133,8 @@ static constexpr auto blend_forward = [](const Record* records, const TileLists&
                         const ipatch hit = (t[i] >= LOG2_ALPHA_MIN) & (product > TRANSMITTANCE_MIN);
                         // Select instead of multiplying by zero, so that a NaN colour stays in the pixels that it
                         // covers.
-                        for (int c = 0; c < D; ++c) color[c] = hit ? color[c] + weight * r[i]->color[c] : color[c];
+                        for (int c = 0; c < COMPILED_CHANNELS; ++c)
+                            color[c] = hit ? color[c] + weight * r[i]->color[c] : color[c];
                         transmitted = hit ? product : transmitted;
                         stopped = hit ? (ipatch)(base + member[i] + 1) : stopped;
                         taken |= (unsigned long long)any(hit) << (member[i] & (GROUP_SIZE - 1));
@@ -148,7 +149,7 @@ static constexpr auto blend_forward = [](const Record* records, const TileLists&
                 T[b] = transmitted;
                 stop[b] = stopped;
                 live[b] = taken;
-                for (int c = 0; c < D; ++c) C[b][c] = color[c];
+                for (int c = 0; c < COMPILED_CHANNELS; ++c) C[b][c] = color[c];
             }
             // The patches in which each Gaussian was blended. The adjoint visits only these.
             alignas(32) unsigned char by_patch[GROUP_SIZE / 8][32] = {};
@@ -177,7 +178,7 @@ static constexpr auto blend_forward = [](const Record* records, const TileLists&
         blended.tile_blended[t] = blended_here;
         for (int q = 0; q < TILE_QUADS; ++q) {
             const Quad quad(tile, q, grid.width);
-            write_patches(pixels.image + channels.first, quad, channels.stride, channels.number, C[0], D);
+            write_patches(pixels.image + channels.first, quad, channels.stride, channels.number, C[0], COMPILED_CHANNELS);
             write_patches(pixels.transmittance, quad, 1, 1, T, 1);
             if (with_alpha) write_patches(pixels.alpha, quad, 1, 1, covered, 1);
             write_patches((float*)pixels.pixel_stop, quad, 1, 1, (const vpatch*)stop, 1);

@@ -43,10 +43,11 @@ static constexpr auto distance = [](const MissedSteps& missed, float eps, v16 m,
     return fma(fma(-below, quotient, moved), inverse, quotient);
 };
 static constexpr int ROW_VECTORS = 3;  // vectors of 16 floats in a row: 45 coefficients of the higher bands at most
-static_assert(ROW_VECTORS * 16 == 3 * (HIGHER_BANDS + 1) && FACTOR_FLOATS == 4, "an outer product fills a row");
+static_assert(ROW_VECTORS * 16 == 3 * (HIGHER_COEFFICIENTS + 1) && FACTOR_FLOATS == 4, "an outer product fills a row");
 static constexpr auto catch_up = [](const int* rows, int* done, const GradientFactors& factors, const Moments& parameter,
                                     const MissedSteps& missed, const Decay& decay, const SafeRange& safe, int m, int n,
-                                    int width, int now, int with_gradient, int first, int last) INLINE {
+                                    int width, int first, int last) INLINE {
+    const int now = missed.number, with_gradient = factors.given;
     alignas(64) float bands[16][16];  // values of the higher bands for the next 16 rows
     for (int i = first; i < last; ++i) {
         if (with_gradient && (i - first) % 16 == 0) {

@@ -6,11 +6,12 @@
 // advances the next free positions in `counts`. No other thread writes to these positions.
 #pragma once
 #include "lib/ellipse.h"
+#include "lib/slices.h"
 #include "lib/tile_lists.h"
 static constexpr auto fill_pairs = [](const int* visible, const float* splat_depths, const RecordList& packed,
                                       const Footprints& footprints, const DepthRanges& depths, const PairCounts& counts,
-                                      const Pairs& pairs, const Grid& grid, int m, int n, int slices, int optimizations,
-                                      int first, int last) INLINE {
+                                      const Pairs& pairs, const Grid& grid, const Slices& slices, int n,
+                                      int optimizations, int first, int last) INLINE {
     const int tiles_x = grid.tiles_x;
     const float width = grid.width;
     const BoxTiles tile_of(tiles_x);
@@ -21,7 +22,7 @@ static constexpr auto fill_pairs = [](const int* visible, const float* splat_dep
     for (int s = first; s < last; ++s) {
         int* next = counts.of_tiles + (long long)s * (tiles_x * grid.tiles_y + SPARE_COUNTS);
         int pair = (int)counts.of_slices[s];
-        const int begin = slice_begin(s, m, slices), end = slice_begin(s + 1, m, slices);
+        const int begin = slice_begin(s, slices), end = slice_begin(s + 1, slices);
         // Not inlined: few Gaussians are large, and the loop over the others needs the registers.
         const auto list_larger = [=](int k, int* next, long long key, int pair) __attribute__((noinline)) -> int {
             const bool all = !(optimizations & EXACT_TILES);
@@ -49,6 +50,6 @@ static constexpr auto fill_pairs = [](const int* visible, const float* splat_dep
             pair = list_larger(k, next, key, pair);
         }
         while (i < end) pairs.start[i++] = pair;
-        if (s == slices - 1) pairs.start[m] = pair;
+        if (s == slices.number - 1) pairs.start[slices.m] = pair;
     }
 };

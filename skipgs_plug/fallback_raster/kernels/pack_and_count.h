@@ -6,14 +6,16 @@
 // `tiles_per_gauss` of their rows. No other thread writes to these slices.
 #pragma once
 #include "lib/ellipse.h"
+#include "lib/slices.h"
 #include "lib/tile_lists.h"
 static constexpr auto pack_and_count =
     [](const int* visible, const Splats& splats, const float* colors, const Channels& channels, const DepthRanges& depths,
        const RecordList& packed, const Footprints& footprints, const PairCounts& counts, int* tiles_per_gauss,
-       const Grid& grid, int m, int n, int slices, int dense, int optimizations, int first, int last) INLINE {
+       const Grid& grid, const Slices& slices, int n, const PackFlags& flags, int first, int last) INLINE {
     const int tiles_x = grid.tiles_x, tiles = tiles_x * grid.tiles_y;
     const float width = grid.width, height = grid.height;
     const bool limited = depths.limited;
+    const int dense = flags.dense, optimizations = flags.optimizations;
     const BoxTiles tile_of(tiles_x);
     Record* const records = packed.records;
     TileBox* const boxes = footprints.boxes;
@@ -31,9 +33,9 @@ static constexpr auto pack_and_count =
         for (int t = 0; t < tiles + SPARE_COUNTS; ++t) count[t] = 0;
         long long of_slice = 0;
         int found = 0;
-        const int begin = slice_begin(s, m, slices), end = slice_begin(s + 1, m, slices);
+        const int begin = slice_begin(s, slices), end = slice_begin(s + 1, slices);
         if (dense) {
-            const int row_begin = s > 0 ? visible[begin] : 0, row_end = s < slices - 1 ? visible[end] : n;
+            const int row_begin = s > 0 ? visible[begin] : 0, row_end = s < slices.number - 1 ? visible[end] : n;
             clear((float*)tiles_per_gauss + row_begin, row_end - row_begin);
         }
         for (int i = begin; i < end; i += 16) {

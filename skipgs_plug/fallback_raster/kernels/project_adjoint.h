@@ -6,8 +6,8 @@
 #include "lib/project_block_adjoint.h"
 static constexpr auto project_adjoint = [](const Gaussians& gaussians, const Camera& camera, const RowList& visible,
                                            const ProjectedGradients& v_projected, const GaussianGradients& v_gaussians,
-                                           float* v_poses, int n, int with_depth, int antialiased, int with_pose,
-                                           int optimizations, int first, int last) INLINE {
+                                           float* v_poses, int n, const ProjectAdjointFlags& flags, int first,
+                                           int last) INLINE {
     project_block_adjoint(first, gaussians, nullptr, camera, visible, v_projected, v_gaussians, nullptr, v_poses, n,
-                          /* raw */ 0, with_depth, antialiased, with_pose, optimizations);
+                          /* raw */ false, flags);
 };

@@ -6,8 +6,8 @@
 #include "lib/geometry.h"
 static constexpr auto project_forward = [](const Gaussians& gaussians, const float* opacities, const Camera& camera,
                                            const Limits& limits, const Projected& projected, const BlockRows& found, int n,
-                                           int antialiased, int raw, int dense, int with_radii, int optimizations,
-                                           int first, int last) INLINE {
+                                           const ProjectFlags& flags, int first, int last) INLINE {
+    const auto [antialiased, raw, dense, with_radii, optimizations] = flags;
     const int block = first, row_begin = BLOCK_ROWS * block, row_end = smaller(row_begin + BLOCK_ROWS, n);
     int end = row_begin;
     for (int base = row_begin; base < row_end; base += 16) {

@@ -6,6 +6,6 @@
 #include "lib/reduce_block_pairs.h"
 static constexpr auto reduce_pairs = [](const PairSums& sums, const float* conics, const float* opacities,
                                         const SplatGradients& v_splats, int n, const Channels& channels, int absgrad,
-                                        int parts, int first, int last) INLINE {
-    reduce_block_pairs(first, sums, conics, opacities, v_splats, n, channels, /* dense */ 1, absgrad, parts);
+                                        int first, int last) INLINE {
+    reduce_block_pairs(first, sums, conics, opacities, v_splats, n, channels, /* dense */ true, absgrad);
 };

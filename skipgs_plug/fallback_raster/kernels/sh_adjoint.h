@@ -8,6 +8,7 @@ static constexpr auto sh_adjoint = [](const float* means, const Harmonics& sh, c
                                       const float* v_colors, float* v_means, const HarmonicsGradients& v_sh,
                                       float* v_positions, int n, int optimizations, int first, int last) INLINE {
     const FactorOutput no_factors = {nullptr, nullptr};
-    sh_block_adjoint(first, means, sh, visible, colors, v_colors, v_means, v_sh, no_factors, v_positions + 3 * first, n,
-                     /* factored */ 0, /* with_position */ 1, optimizations);
+    const HarmonicsGradients v_dense = {v_sh.sh0, v_sh.shN, /* factored */ 0};
+    sh_block_adjoint(first, means, sh, visible, colors, v_colors, v_means, v_dense, no_factors, v_positions + 3 * first, n,
+                     /* with_position */ true, optimizations);
 };

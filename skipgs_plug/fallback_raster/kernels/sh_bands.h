@@ -12,7 +12,7 @@ static constexpr auto sh_bands = [](const float* directions, float* bands, int n
         gather4(directions, row, direction);
         for (int band = 0; band < 16; ++band) basis[band] = (v16)0.0f;
         harmonics(direction[0], direction[1], direction[2], degree, basis);
-        for (int band = 0; band < HIGHER_BANDS; ++band)
-            for (int l = 0; l < lanes; ++l) bands[(long long)HIGHER_BANDS * row[l] + band] = basis[band + 1][l];
+        for (int band = 0; band < HIGHER_COEFFICIENTS; ++band)
+            for (int l = 0; l < lanes; ++l) bands[(long long)HIGHER_COEFFICIENTS * row[l] + band] = basis[band + 1][l];
     }
 };

@@ -10,8 +10,9 @@
 static constexpr auto splat_adjoint =
     [](const PairSums& sums, const Gaussians& gaussians, const float* logits, const Camera& camera, const Harmonics& sh,
        const Rendered& rendered, const GaussianGradients& v_gaussians, float* v_logits, const HarmonicsGradients& v_sh,
-       const FactorOutput& factors, const CenterGradients& v_centers, int n, int antialiased,
-       int with_centers, int absgrad, int parts, int optimizations, int first, int last) INLINE {
+       const FactorOutput& factors, const CenterGradients& v_centers, int n,
+       const SplatAdjointFlags& flags, int first, int last) INLINE {
+        const auto [antialiased, with_centers, absgrad, optimizations] = flags;
         // The functions below index rows from row 0 of all, so these buffers of one block are addressed relative to it.
         // Vector loads may read the padding behind the last row; its content does not matter.
         alignas(64) float center[2 * BLOCK_ROWS], conic[3 * BLOCK_ROWS + 16], alpha[BLOCK_ROWS];
@@ -23,8 +24,8 @@ static constexpr auto splat_adjoint =
                                          counted(color, 3)};
         if (absgrad) clear(magnitude, 2 * BLOCK_ROWS);
         const Channels channels = {/* stride */ 3, /* first */ 0, /* number */ 3};
-        reduce_block_pairs(first, sums, rendered.conics, rendered.opacities, v_splats, n, channels, /* dense */ 0, absgrad,
-                           parts);
+        reduce_block_pairs(first, sums, rendered.conics, rendered.opacities, v_splats, n, channels, /* dense */ false,
+                           absgrad);
         for (int i = sums.block_start[first]; i < sums.block_start[first + 1]; ++i)
             for (int j = 0; j < 2; ++j) {
                 if (with_centers) v_centers.centers[2 * i + j] = v_splats.means2d[2 * sums.rows[i] + j];
@@ -35,10 +36,10 @@ static constexpr auto splat_adjoint =
         const Harmonics raw_sh = {sh.position,   sh.sh0,         sh.shN, /* sh0_stride */ 3,
                                   sh.shN_stride, /* shN_offset */ 0, sh.degree};
         sh_block_adjoint(first, gaussians.means, raw_sh, visible, rendered.colors, v_splats.colors, v_gaussians.means, v_sh,
-                         factors, /* v_position */ nullptr, n, v_sh.factored, /* with_position */ 0, optimizations);
+                         factors, /* v_position */ nullptr, n, /* with_position */ false, optimizations);
         const ProjectedGradients v_projected = {v_splats.means2d, /* depths */ nullptr, v_splats.conics,
                                                 /* compensations */ nullptr, v_splats.opacities};
         project_block_adjoint(first, gaussians, logits, camera, visible, v_projected, v_gaussians, v_logits,
-                              /* v_poses */ nullptr, n, /* raw */ 1, /* with_depth */ 0, antialiased, /* with_pose */ 0,
-                              optimizations);
+                              /* v_poses */ nullptr, n, /* raw */ true,
+                              {/* with_depth */ 0, antialiased, /* with_pose */ 0, optimizations});
     };

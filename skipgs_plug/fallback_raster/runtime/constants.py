@@ -35,8 +35,8 @@ PAIR_FLOATS = 16
 # Floats of a `TileLoss`, the sums of the loss over one tile (`kernels/loss_tiles.h`).
 TILE_LOSS_FLOATS = 2
 
-# SH coefficients of degree 1 to 3 for each channel: (3 + 1)^2 - 1, all but the constant one.
-HIGHER_BANDS = 15
+# Number of SH coefficients of degrees 1 to 3 for each channel: (3 + 1)^2 - 1, all but the constant one.
+HIGHER_COEFFICIENTS = 15
 
 # Floats in a row of each factor of a `FactoredGradient`: three of a direction or a colour, and one unused, so that rows
 # move as vectors of four.

@@ -16,12 +16,12 @@ from .optimizations import OPTIMIZATIONS
 KERNELS = Path(__file__).parent.parent / "kernels"
 
 _INCLUDE = re.compile(r'^#include "([\w/]+\.h)"$', re.MULTILINE)
-_FIRST = "lib/simd.h"  # the first file of every kernel
+_PRELUDE_FILE = "lib/simd.h"  # every kernel begins with this file
 
 
 def read_kernel(name: str) -> str:
     """Return the text of `kernels/<name>` with its includes resolved. Paths are relative to the including file."""
-    return _read(name, {_FIRST})
+    return _read(name, {_PRELUDE_FILE})
 
 
 def _read(name: str, done: set[str]) -> str:
@@ -52,7 +52,7 @@ def declare(values: dict[str, int | float]) -> str:
 
 
 # The text before the constants in every kernel.
-PRELUDE = read_kernel(_FIRST)
+PRELUDE = read_kernel(_PRELUDE_FILE)
 
 SHARED = {name: value for name, value in vars(constants).items() if name.isupper()} | {
     name.upper(): bit for name, bit in OPTIMIZATIONS.items()

@@ -28,26 +28,40 @@ MAX_PAIRS = 2**31 - 1
 SLICES_PER_THREAD = 4
 
 
-class RecordList(NamedTuple):
-    """Records of those of the `m` visible Gaussians that have pairs. Each slice begins where its Gaussians begin."""
+class Slices(NamedTuple):
+    """Division of the list of visible Gaussians into slices of equal length, one for each item of a kernel."""
 
-    records: Annotated[RecordOutput, "m, RECORD_FLOATS"]
-    listed: Annotated[IntOutput, "m"]  # index of each record's Gaussian among the visible ones
-    listed_count: Annotated[IntOutput, "slices"]  # number of records in each slice
+    m: int  # number of visible Gaussians
+    number: int  # number of slices
+
+
+class RecordList(NamedTuple):
+    """Records of the visible Gaussians that have pairs. Each slice begins where its Gaussians begin."""
+
+    records: Annotated[RecordOutput, "slices.m, RECORD_FLOATS"]
+    listed: Annotated[IntOutput, "slices.m"]  # index of each record's Gaussian among the visible ones
+    listed_count: Annotated[IntOutput, "slices.number"]  # number of records in each slice
+
+
+class PackFlags(NamedTuple):
+    """Options of `pack_and_count`."""
+
+    dense: int  # 1 to count the tiles of all rows, also of those that are not listed
+    optimizations: int  # bits of `OPTIMIZATIONS`
 
 
 class Footprints(NamedTuple):
     """The tiles that the ellipse of each record meets: of a small box as bits, else the box."""
 
-    tiles: Annotated[FootprintOutput, "m, FOOTPRINT_INTS"]
-    boxes: Annotated[TileBoxOutput, "m, BOX_INTS"]  # written only for boxes that are too large for the bits
+    tiles: Annotated[FootprintOutput, "slices.m, FOOTPRINT_INTS"]
+    boxes: Annotated[TileBoxOutput, "slices.m, BOX_INTS"]  # written only for boxes that are too large for the bits
 
 
 class PairCounts(NamedTuple):
     """Numbers of pairs by slice. `scan_pairs` turns them into start positions."""
 
-    of_tiles: Annotated[IntOutput, "slices, grid.tiles_x * grid.tiles_y + SPARE_COUNTS"]
-    of_slices: Annotated[LongOutput, "slices + 1"]
+    of_tiles: Annotated[IntOutput, "slices.number, grid.tiles_x * grid.tiles_y + SPARE_COUNTS"]
+    of_slices: Annotated[LongOutput, "slices.number + 1"]
 
 
 class DepthRanges(NamedTuple):
@@ -60,7 +74,7 @@ class DepthRanges(NamedTuple):
 class Pairs(NamedTuple):
     """The (tile, Gaussian) pairs, numbered by row, then tile."""
 
-    start: Annotated[IntOutput, "m + 1"]  # number of each visible Gaussian's first pair
+    start: Annotated[IntOutput, "slices.m + 1"]  # number of each visible Gaussian's first pair
     record: Annotated[IntOutput, "P"]
     unsorted: Annotated[LongOutput, "P"]  # by tile: depth in the upper 32 bits, number of the pair in the lower
 
@@ -77,23 +91,22 @@ class TileLists(NamedTuple):
     sorted: int  # 1 if the lists are sorted already
 
 
-@worker(file="pack_colors.h", items="slices", grain="1")
+@worker(file="pack_colors.h", items="slices.number", grain="1")
 def _pack_colors(
     *,
-    visible: Annotated[IntArray, "m"],
+    visible: Annotated[IntArray, "slices.m"],
     packed: RecordList,  # the kernel replaces the colours
     colors: Annotated[FloatArray, "n, channels.stride"],
     channels: Channels,
-    m: int,
+    slices: Slices,
     n: int,
-    slices: int,
 ) -> None: ...
 
 
-@worker(file="pack_and_count.h", items="slices", grain="1")
+@worker(file="pack_and_count.h", items="slices.number", grain="1")
 def pack_and_count(
     *,
-    visible: Annotated[IntArray, "m"],
+    visible: Annotated[IntArray, "slices.m"],
     splats: Splats,
     colors: Annotated[FloatArray, "n, channels.stride"],
     channels: Channels,
@@ -101,13 +114,11 @@ def pack_and_count(
     packed: RecordList,
     footprints: Footprints,
     counts: PairCounts,
-    tiles_per_gauss: Annotated[IntOutput, "n if dense else 0"],
+    tiles_per_gauss: Annotated[IntOutput, "n if flags.dense else 0"],
     grid: Grid,
-    m: int,
+    slices: Slices,
     n: int,
-    slices: int,
-    dense: int,
-    optimizations: int,
+    flags: PackFlags,
 ) -> None: ...
 
 
@@ -117,14 +128,14 @@ def scan_pairs(
     counts: PairCounts,  # input: numbers of pairs; output: start of each slice in each tile's list, and its first pair
     tile_start: Annotated[IntOutput, "grid.tiles_x * grid.tiles_y + 1"],
     grid: Grid,
-    slices: int,
+    slices: Slices,
 ) -> None: ...
 
 
-@worker(file="fill_pairs.h", items="slices", grain="1")
+@worker(file="fill_pairs.h", items="slices.number", grain="1")
 def fill_pairs(
     *,
-    visible: Annotated[IntArray, "m"],
+    visible: Annotated[IntArray, "slices.m"],
     splat_depths: Annotated[FloatArray, "n"],
     packed: RecordList,
     footprints: Footprints,
@@ -132,9 +143,8 @@ def fill_pairs(
     counts: PairCounts,  # next free position of each slice in each tile's list
     pairs: Pairs,
     grid: Grid,
-    m: int,
+    slices: Slices,
     n: int,
-    slices: int,
     optimizations: int,
 ) -> None: ...
 
@@ -191,9 +201,8 @@ class Bins:
             packed=self.packed,
             colors=colors,
             channels=channels,
-            m=len(self.visible),
+            slices=Slices(len(self.visible), len(self.packed.listed_count)),
             n=len(colors),
-            slices=len(self.packed.listed_count),
         )
 
 
@@ -229,12 +238,12 @@ def bin_gaussians(
     tiling = grid(width, height)
     n, channels = colors.shape
     # A few rows are not worth several slices.
-    slices = 1 if m < 1024 or get_num_threads() == 1 else SLICES_PER_THREAD * get_num_threads()
+    slices = Slices(m, 1 if m < 1024 or get_num_threads() == 1 else SLICES_PER_THREAD * get_num_threads())
     depths = DepthRanges(ints(0) if ranges is None else ranges, int(ranges is not None))
-    packed = RecordList(floats(m, RECORD_FLOATS), ints(m), ints(slices))
+    packed = RecordList(floats(m, RECORD_FLOATS), ints(m), ints(slices.number))
     footprints = Footprints(ints(m, FOOTPRINT_INTS), ints(m, BOX_INTS))
     tile_count = tiling.tiles_x * tiling.tiles_y
-    counts = PairCounts(ints(slices, tile_count + SPARE_COUNTS), longs(slices + 1))
+    counts = PairCounts(ints(slices.number, tile_count + SPARE_COUNTS), longs(slices.number + 1))
     tile_start, pair_start = ints(tile_count + 1), ints(m + 1)
     tiles_per_gauss = ints(n if dense else 0)
     pack_and_count(
@@ -248,11 +257,9 @@ def bin_gaussians(
         counts=counts,
         tiles_per_gauss=tiles_per_gauss,
         grid=tiling,
-        m=m,
-        n=n,
         slices=slices,
-        dense=int(dense),
-        optimizations=active_optimizations(),
+        n=n,
+        flags=PackFlags(int(dense), active_optimizations()),
     )
     scan_pairs(counts=counts, tile_start=tile_start, grid=tiling, slices=slices)
     total = counts.of_slices.tolist()[-1]
@@ -272,9 +279,8 @@ def bin_gaussians(
         counts=counts,
         pairs=pairs,
         grid=tiling,
-        m=m,
-        n=n,
         slices=slices,
+        n=n,
         optimizations=active_optimizations(),
     )
     return Bins(visible, packed, tile_start, ints(total), ints(total), pairs, tiles_per_gauss, tiling)

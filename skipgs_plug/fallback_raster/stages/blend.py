@@ -68,6 +68,7 @@ class BackwardPairs(NamedTuple):
     tile_pair: Annotated[IntArray, "P"]
     pair_patches: Annotated[IntArray, "P"]
     slot_end: Annotated[IntArray, "parts * grid.tiles_x * grid.tiles_y"]  # end of the slots of each tile
+    parts: int  # number of passes over the lists: 1 or 2
 
 
 class FinalPixels(NamedTuple):
@@ -117,7 +118,6 @@ def blend_adjoint(
     grid: Grid,
     channels: Channels,
     with_transmittance: int,
-    parts: int,
     optimizations: int,
 ) -> None:
     """Stub of the adjoint kernels."""
@@ -125,31 +125,35 @@ def blend_adjoint(
 
 # Numbers of channels that kernels are compiled for. One (depth) and three (colour) are the common cases. Four serve
 # colour with depth, and wider features.
-_WIDTHS = (1, 3, 4)
+_COMPILED_CHANNELS = (1, 3, 4)
 _TILES = "grid.tiles_x * grid.tiles_y"
 
 FORWARD = {
-    width: worker(
-        file="blend_forward.h", items=_TILES, grain="2", name=f"blend_forward_{width}", constants={"D": width}
+    number: worker(
+        file="blend_forward.h",
+        items=_TILES,
+        grain="2",
+        name=f"blend_forward_{number}",
+        constants={"COMPILED_CHANNELS": number},
     )(blend_forward)
-    for width in _WIDTHS
+    for number in _COMPILED_CHANNELS
 }
 ADJOINT = {
-    (width, absgrad): worker(
+    (number, absgrad): worker(
         file="blend_adjoint.h",
         items=_TILES,
         grain="2",
-        name=f"blend_adjoint_{width}{'_abs' if absgrad else ''}",
-        constants={"D": width, "ABSGRAD": int(absgrad)},
+        name=f"blend_adjoint_{number}{'_abs' if absgrad else ''}",
+        constants={"COMPILED_CHANNELS": number, "ABSGRAD": int(absgrad)},
     )(blend_adjoint)
-    for width in _WIDTHS
+    for number in _COMPILED_CHANNELS
     for absgrad in (False, True)
 }
 
 
-def compiled_width(channels: int) -> int:
+def compiled_channels(channels: int) -> int:
     """Return the smallest number of channels with a compiled kernel that holds `channels` (1 to MAX_CHANNELS)."""
-    return min(width for width in _WIDTHS if width >= channels)
+    return min(number for number in _COMPILED_CHANNELS if number >= channels)
 
 
 @worker(file="reduce_pairs.h", items=BLOCKS, grain="1")
@@ -164,5 +168,4 @@ def reduce_pairs(
     n: int,
     channels: Channels,
     absgrad: int,
-    parts: int,
 ) -> None: ...

@@ -21,7 +21,7 @@ from .blend import (
     PairSlots,
     PixelGradients,
     Pixels,
-    compiled_width,
+    compiled_channels,
     reduce_pairs,
 )
 from .structs import Channels, PairSums, RowList, SplatGradients, Splats
@@ -143,7 +143,7 @@ def _blend_lists(bins: Bins, block_start: Tensor, colors: Tensor, pixels: Pixels
     for channels in _passes(colors.shape[1]):
         if channels.first > 0:
             bins.pack_colors(colors, channels)
-        FORWARD[compiled_width(channels.number)](
+        FORWARD[compiled_channels(channels.number)](
             records=bins.packed.records,
             lists=lists,
             pixels=pixels,
@@ -179,7 +179,7 @@ def pair_sums(
     if parts > 1:
         per_tile = torch.cat([per_tile, last.blended.tile_blended])
     slot_end = per_tile.cumsum(0, dtype=torch.int32)
-    pairs = BackwardPairs(lists.tile_record, lists.tile_pair, last.blended.pair_patches, slot_end)
+    pairs = BackwardPairs(lists.tile_record, lists.tile_pair, last.blended.pair_patches, slot_end, parts)
     slots = PairSlots(
         pair_slot=zeros(len(lists.tile_record), dtype=torch.int32),
         sums=scratch("pair_sums", int(slot_end[-1]), PAIR_FLOATS),
@@ -193,11 +193,12 @@ def pair_sums(
         far_pair_start=lists.pairs.start,
         pair_slot=slots.pair_slot,
         slots=slots.sums,
+        parts=parts,
     )
     for some in _passes(channels):
         if channels > MAX_CHANNELS:
             bins.pack_colors(colors, some)
-        ADJOINT[compiled_width(some.number), with_absolute](
+        ADJOINT[compiled_channels(some.number), with_absolute](
             near=near.as_list(),
             far=last.as_list(),
             pairs=pairs,
@@ -207,7 +208,6 @@ def pair_sums(
             grid=grid,
             channels=some,
             with_transmittance=int(len(v_pixels.transmittance) > 0),
-            parts=parts,
             optimizations=active_optimizations(),
         )
         yield some, sums
@@ -246,6 +246,5 @@ def compose_adjoint(
             n=len(colors),
             channels=channels,
             absgrad=int(with_absolute),
-            parts=composed.parts,
         )
     return v_splats.means2d, v_splats.conics, v_splats.opacities, v_splats.colors

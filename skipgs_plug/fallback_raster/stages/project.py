@@ -8,7 +8,16 @@ from typing import Annotated, NamedTuple
 
 from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, FloatOutput, IntArray, IntOutput
-from .structs import BLOCKS, BlockRows, Camera, GaussianGradients, Gaussians, ProjectedGradients, RowList
+from .structs import (
+    BLOCKS,
+    BlockRows,
+    Camera,
+    GaussianGradients,
+    Gaussians,
+    ProjectAdjointFlags,
+    ProjectedGradients,
+    RowList,
+)
 
 
 class Limits(NamedTuple):
@@ -19,6 +28,16 @@ class Limits(NamedTuple):
     radius_clip: float  # Gaussians of at most this radius, pixels
 
 
+class ProjectFlags(NamedTuple):
+    """Inputs and outputs that the projection has."""
+
+    antialiased: int  # 1 to compensate opacities for `eps2d`
+    raw: int  # 1 if scales are logarithms and opacities are logits
+    dense: int  # 1 to write zeros for rows that are not visible
+    with_radii: int
+    optimizations: int  # bits of `OPTIMIZATIONS`
+
+
 class Projected(NamedTuple):
     """Gaussians on the image plane. Rows that are not visible are zero with `dense`, and undefined without."""
 
@@ -26,9 +45,9 @@ class Projected(NamedTuple):
     depths: Annotated[FloatOutput, "n"]
     conics: Annotated[FloatOutput, "n, 3"]  # upper triangle of the inverse 2D covariance
     sigmas: Annotated[FloatOutput, "n, 2"]  # standard deviations along x and y in pixels
-    compensations: Annotated[FloatOutput, "n if antialiased else 0"]  # factors of opacities, for `eps2d`
-    radii: Annotated[IntOutput, "n if with_radii else 0, 2"]  # pixels
-    opacities: Annotated[FloatOutput, "n if raw else 0"]  # activated, and compensated where antialiased
+    compensations: Annotated[FloatOutput, "n if flags.antialiased else 0"]  # factors of opacities, for `eps2d`
+    radii: Annotated[IntOutput, "n if flags.with_radii else 0, 2"]  # pixels
+    opacities: Annotated[FloatOutput, "n if flags.raw else 0"]  # activated, and compensated where antialiased
 
 
 @worker(file="project_forward.h", items=BLOCKS, grain="1")
@@ -41,11 +60,7 @@ def project_forward(
     projected: Projected,
     found: BlockRows,  # visible rows
     n: int,
-    antialiased: int,
-    raw: int,
-    dense: int,  # 1 writes zeros for rows that are not visible
-    with_radii: int,
-    optimizations: int,
+    flags: ProjectFlags,
 ) -> None: ...
 
 
@@ -68,10 +83,7 @@ def project_adjoint(
     visible: RowList,
     v_projected: ProjectedGradients,
     v_gaussians: GaussianGradients,
-    v_poses: Annotated[FloatOutput, "blocks(n) if with_pose else 0, 3, 4"],  # viewmat's gradient, by block
+    v_poses: Annotated[FloatOutput, "blocks(n) if flags.with_pose else 0, 3, 4"],  # viewmat's gradient, by block
     n: int,
-    with_depth: int,
-    antialiased: int,
-    with_pose: int,
-    optimizations: int,
+    flags: ProjectAdjointFlags,
 ) -> None: ...

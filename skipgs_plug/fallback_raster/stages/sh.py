@@ -43,7 +43,7 @@ def sh_adjoint(
 def sh_bands(
     *,
     directions: Annotated[FloatArray, "n, FACTOR_FLOATS"],
-    bands: Annotated[FloatOutput, "n, HIGHER_BANDS"],  # values of the higher basis functions
+    bands: Annotated[FloatOutput, "n, HIGHER_COEFFICIENTS"],  # values of the higher basis functions
     n: int,
     degree: int,
 ) -> None: ...

@@ -18,6 +18,7 @@ from .structs import (
     Harmonics,
     HarmonicsGradients,
     PairSums,
+    ProjectAdjointFlags,
     ProjectedGradients,
     RowList,
     SplatGradients,
@@ -35,16 +36,25 @@ class Rendered(NamedTuple):
 class CenterGradients(NamedTuple):
     """Packed gradients of the 2D means of visible Gaussians."""
 
-    centers: Annotated[FloatOutput, "sums.M if with_centers else 0, 2"]
+    centers: Annotated[FloatOutput, "sums.M if flags.with_centers else 0, 2"]
     # The kernel adds the sum over pixels of |v_means2d|.
-    absolute: Annotated[FloatOutput, "sums.M if absgrad else 0, 2"]
+    absolute: Annotated[FloatOutput, "sums.M if flags.absgrad else 0, 2"]
+
+
+class SplatAdjointFlags(NamedTuple):
+    """Inputs and outputs that the adjoint has."""
+
+    antialiased: int  # 1 if opacities were compensated
+    with_centers: int  # 1 to write the gradients of the 2D means
+    absgrad: int  # 1 to add up the absolute gradients of the 2D means
+    optimizations: int  # bits of `OPTIMIZATIONS`
 
 
 @worker(
     file="splat_adjoint.h",
     items=BLOCKS,
     grain="1",
-    structs=(Channels, ProjectedGradients, RowList, SplatGradients),
+    structs=(Channels, ProjectAdjointFlags, ProjectedGradients, RowList, SplatGradients),
 )
 def splat_adjoint(
     *,
@@ -60,9 +70,5 @@ def splat_adjoint(
     factors: FactorOutput,
     v_centers: CenterGradients,
     n: int,
-    antialiased: int,
-    with_centers: int,
-    absgrad: int,
-    parts: int,
-    optimizations: int,
+    flags: SplatAdjointFlags,
 ) -> None: ...

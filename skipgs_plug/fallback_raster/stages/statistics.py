@@ -7,8 +7,8 @@ from ..runtime.parameters import FloatArray, FloatOutput, IntArray, IntOutput
 from .structs import Grid, RecordArray
 
 # Sums of a (tile, Gaussian) pair over the pixels in which it contributes: the number of these pixels, the Gaussian's
-# weight in the colour, the transmittance in front of it, the values of the pixels, values times weight, and the distance
-# in pixels from its centre. In C++ the upper-case names are the indices of the sums.
+# weight in the colour, the transmittance in front of it, the values of the pixels, values times weight, and the
+# distance in pixels from its centre. In C++ the names in upper case are the indices of the sums.
 STATISTICS = ("pixels", "weight", "light", "value", "weighted_value", "distance")
 # Floats of a pair: the kernel adds up eight vectors at a time.
 STATISTICS_FLOATS = 8

@@ -97,10 +97,19 @@ class ProjectedGradients(NamedTuple):
     """Gradients of the outputs of the projection."""
 
     means2d: Annotated[FloatArray, "n, 2"]
-    depths: Annotated[FloatArray, "n if with_depth else 0"]
+    depths: Annotated[FloatArray, "n if flags.with_depth else 0"]
     conics: Annotated[FloatArray, "n, 3"]
-    compensations: Annotated[FloatArray, "n if antialiased else 0"]
+    compensations: Annotated[FloatArray, "n if flags.antialiased else 0"]
     opacities: Annotated[FloatArray, "0"]  # used only by `splat_adjoint`, which passes it inside C++
+
+
+class ProjectAdjointFlags(NamedTuple):
+    """Inputs and outputs that the adjoint of the projection has."""
+
+    with_depth: int  # 1 if the depths have a gradient
+    antialiased: int  # 1 if opacities were compensated
+    with_pose: int  # 1 to compute the gradient of the camera's pose
+    optimizations: int  # bits of `OPTIMIZATIONS`
 
 
 class GaussianGradients(NamedTuple):
@@ -163,3 +172,4 @@ class PairSums(NamedTuple):
     far_pair_start: Annotated[IntArray, "F + 1"]
     pair_slot: Annotated[IntArray, "P"]  # 1 + the slot of each pair, 0 if it was not blended
     slots: Annotated[PairSumArray, "Q, PAIR_FLOATS"]
+    parts: int  # number of passes over the lists: 1 or 2

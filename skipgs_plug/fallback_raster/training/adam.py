@@ -8,7 +8,7 @@ from torch import Tensor
 from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, FloatOutput, IntArray
 
-_ALL = torch.empty(0, dtype=torch.int32, device="cpu")  # in place of a mask: every row
+_NO_MASK = torch.empty(0, dtype=torch.int32, device="cpu")  # stands for a mask of rows: all rows are updated
 
 
 class Moments(NamedTuple):
@@ -81,7 +81,7 @@ def adam_step(
         return
     n = values.numel() if wanted is None else len(wanted)
     _adam(
-        wanted=_ALL if wanted is None else wanted,
+        wanted=_NO_MASK if wanted is None else wanted,
         gradient=gradient,
         parameter=Moments(values, mean, square),
         decay=decay(betas, eps),

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..runtime.buffers import floats, zeros
-from ..runtime.constants import HIGHER_BANDS
+from ..runtime.constants import HIGHER_COEFFICIENTS
 from ..stages.sh import sh_bands
 
 
@@ -56,7 +56,7 @@ class FactoredGradient(Tensor):
         if isinstance(content, Tensor):
             return content
         rows, directions, colors, degree = content
-        bands = floats(len(rows), HIGHER_BANDS)
+        bands = floats(len(rows), HIGHER_COEFFICIENTS)
         sh_bands(directions=directions, bands=bands, n=len(rows), degree=degree)
         product = bands[:, : self.shape[1], None] * colors[:, None, :3]
         product = torch.where((colors[:, :3] != 0).any(1)[:, None, None], product, 0.0)

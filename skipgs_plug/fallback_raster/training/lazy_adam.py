@@ -8,7 +8,7 @@ from numpy import float32
 from torch import Tensor
 
 from ..runtime.buffers import floats, zeros
-from ..runtime.constants import HIGHER_BANDS
+from ..runtime.constants import HIGHER_COEFFICIENTS
 from ..runtime.launch import worker
 from ..runtime.parameters import FloatArray, IntArray, IntOutput
 from .adam import Decay, Moments, decay
@@ -26,17 +26,19 @@ STEPS_PER_CHECK = 32
 class GradientFactors(NamedTuple):
     """A gradient as factors of outer products. See `Factors`."""
 
-    directions: Annotated[FloatArray, "m if with_gradient else 0, FACTOR_FLOATS"]
-    colors: Annotated[FloatArray, "m if with_gradient else 0, FACTOR_FLOATS"]
+    directions: Annotated[FloatArray, "m if given else 0, FACTOR_FLOATS"]
+    colors: Annotated[FloatArray, "m if given else 0, FACTOR_FLOATS"]
     degree: int
+    given: int  # 1 if there is a gradient, 0 if only missed steps are applied
 
 
 class MissedSteps(NamedTuple):
-    """The arguments `rate` and `root` of `adam_step` for each missed step."""
+    """The arguments `rate` and `root` of `adam_step` for missed steps, and for a step with a gradient after them."""
 
     rates: Annotated[FloatArray, "steps"]
     roots: Annotated[FloatArray, "steps"]
     inverse_roots: Annotated[FloatArray, "steps"]
+    number: int  # number of missed steps
 
 
 class SafeRange(NamedTuple):
@@ -62,8 +64,6 @@ def _catch_up(
     m: int,
     n: int,
     width: int,
-    now: int,  # number of steps before the one with a gradient
-    with_gradient: int,
 ) -> None: ...
 
 
@@ -92,7 +92,10 @@ class _Missed:
 
     def advance(self, rows: Tensor, gradient: Factors | None, state: dict[str, Tensor]) -> None:
         """Apply the steps up to `now` to rows [n], and the step recorded last if `gradient` is given."""
-        directions, colors, degree = (floats(0), floats(0), 0) if gradient is None else gradient[1:]
+        if gradient is None:
+            factors = GradientFactors(floats(0), floats(0), degree=0, given=0)
+        else:
+            factors = GradientFactors(gradient.directions, gradient.colors, gradient.degree, given=1)
         beta1, beta2 = self.betas
         smallest = self._least * beta1 ** (STEPS_PER_CHECK + 1)
         safe = SafeRange(
@@ -105,16 +108,14 @@ class _Missed:
         _catch_up(
             rows=rows,
             done=self.done,
-            factors=GradientFactors(directions, colors, degree),
+            factors=factors,
             parameter=Moments(self.param.detach(), state["exp_avg"], state["exp_avg_sq"]),
-            missed=MissedSteps(self.rates, self.roots, self.inverse_roots),
+            missed=MissedSteps(self.rates, self.roots, self.inverse_roots, self.now),
             decay=decay(self.betas, self.eps),
             safe=safe,
             m=len(rows),
             n=len(self.done),
             width=self.param[0].numel(),
-            now=self.now,
-            with_gradient=int(gradient is not None),
         )
         # Kernels bypass torch's version counter, with which it detects outdated tensors in a backward pass.
         torch.autograd.graph.increment_version(self.param)
@@ -145,9 +146,10 @@ class LazyAdam(Adam):
         self._missed: _Missed | None = None
         given = [param for group in self.param_groups for param in group["params"]]
         if len(given) != 1 or not _fits(given[0]):
+            found = [(tuple(param.shape), param.dtype, param.device.type) for param in given]
             raise ValueError(
-                f"LazyAdam takes one contiguous float32 parameter [N, K, 3] on the CPU with K of 1 to {HIGHER_BANDS}, "
-                f"got {[(tuple(param.shape), param.dtype, param.device.type) for param in given]}; use Adam for others."
+                "LazyAdam takes one contiguous float32 parameter [N, K, 3] on the CPU with K of 1 to "
+                f"{HIGHER_COEFFICIENTS}, got {found}; use Adam for others."
             )
         if not eps > 0:
             raise ValueError(f"LazyAdam needs eps > 0, got {eps}: rows without any gradient would become NaN.")
@@ -230,6 +232,6 @@ def _fits(param: Tensor) -> bool:
         and param.is_contiguous()
         and param.dim() == 3
         and len(param) > 0
-        and 1 <= param.shape[1] <= HIGHER_BANDS
+        and 1 <= param.shape[1] <= HIGHER_COEFFICIENTS
         and param.shape[2] == 3
     )

@@ -33,7 +33,7 @@ from ..runtime.parameters import ArrayKind, ByteArray, FloatArray, FloatOutput
 
 # Most numbers (pixels times channels) in a row of an image: kernels compute columns in float32, which is exact up to
 # 2^24.
-MAX_ROW = 2**24
+MAX_ROW_NUMBERS = 2**24
 
 
 # An array of records, whose fields are defined in `kernels/loss_tiles.h`.
@@ -167,9 +167,9 @@ def l1_ssim_loss(
         raise ValueError(
             f"images may have at most {MAX_LOSS_CHANNELS} channels, got {image.shape[-1]}; are they [H, W, C]?"
         )
-    if image.shape[-2] * image.shape[-1] > MAX_ROW:
+    if image.shape[-2] * image.shape[-1] > MAX_ROW_NUMBERS:
         raise ValueError(
-            f"a row of an image may have at most {MAX_ROW} numbers, got {image.shape[-2]} pixels of "
+            f"a row of an image may have at most {MAX_ROW_NUMBERS} numbers, got {image.shape[-2]} pixels of "
             f"{image.shape[-1]} channels."
         )
     if padding not in ("same", "valid"):

@@ -15,8 +15,8 @@ ADAM_REPLACED = "torch.optim.adam.adam"  # the function that `torch.optim.Adam` 
 # Most elements of a parameter that the kernel steps, because it indexes them in 32 bits. Torch steps larger parameters.
 MAX_NUMBERS = 2**30
 # Options of torch's Adam that only torch's function supports, and all options of a group of parameters but `betas`.
-_TORCHS = ("amsgrad", "maximize", "weight_decay", "capturable", "differentiable", "has_complex")
-_OPTIONS = (*_TORCHS[:-1], "lr", "eps", "foreach", "fused", "decoupled_weight_decay")
+_UNSUPPORTED_OPTIONS = ("amsgrad", "maximize", "weight_decay", "capturable", "differentiable", "has_complex")
+_GROUP_OPTIONS = (*_UNSUPPORTED_OPTIONS[:-1], "lr", "eps", "foreach", "fused", "decoupled_weight_decay")
 
 # Imported by name, because torch.optim deletes its attribute for the module.
 _module: Any = importlib.import_module("torch.optim.adam")
@@ -106,7 +106,7 @@ class Adam(torch.optim.Adam):
             beta2=group["betas"][1],
             grad_scale=grad_scale,
             found_inf=found_inf,
-            **{name: group[name] for name in _OPTIONS if name in group},
+            **{name: group[name] for name in _GROUP_OPTIONS if name in group},
         )
 
     def _advance_param(self, param: Tensor, *numbers: Any) -> bool:
@@ -187,7 +187,7 @@ def instead_of_torchs_adam() -> Iterator[None]:
 
 def _plain(options: dict[str, Any], *betas: Any) -> bool:
     """Return whether `adam` supports all options that are set, and the decays are numbers."""
-    for name in _TORCHS:
+    for name in _UNSUPPORTED_OPTIONS:
         if options.get(name):
             return False
     return not any(isinstance(beta, Tensor) for beta in betas)

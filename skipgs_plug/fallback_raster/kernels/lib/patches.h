@@ -58,9 +58,9 @@ static constexpr auto read_patches = [](const float* image, const Quad& quad, in
         for (int i = 0; i < count; ++i) a[i] = read_rows(image, quad, stride, 4 * i);
         if (count == 1) columns[0] = a[0];
         if (count == 3) {
-            columns[0] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(a[0], a[1], 0, 3, 6, 6), a[2], 0, 1, 2, 5);
-            columns[1] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(a[0], a[1], 1, 4, 7, 7), a[2], 0, 1, 2, 6);
-            columns[2] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(a[0], a[1], 2, 5, 5, 5), a[2], 0, 1, 4, 7);
+            columns[0] = SHUFFLE_WITHIN_QUARTERS(SHUFFLE_WITHIN_QUARTERS(a[0], a[1], 0, 3, 6, 6), a[2], 0, 1, 2, 5);
+            columns[1] = SHUFFLE_WITHIN_QUARTERS(SHUFFLE_WITHIN_QUARTERS(a[0], a[1], 1, 4, 7, 7), a[2], 0, 1, 2, 6);
+            columns[2] = SHUFFLE_WITHIN_QUARTERS(SHUFFLE_WITHIN_QUARTERS(a[0], a[1], 2, 5, 5, 5), a[2], 0, 1, 4, 7);
         }
         if (count == 4) transpose_4x4(a, columns);
     } else
@@ -79,9 +79,9 @@ static constexpr auto write_patches = [](float* image, const Quad& quad, int str
         v16 a[4];
         if (count == 1) a[0] = columns[0];
         if (count == 3) {
-            a[0] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(columns[0], columns[1], 0, 4, 4, 1), columns[2], 0, 1, 4, 3);
-            a[1] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(columns[0], columns[1], 5, 5, 2, 6), columns[2], 0, 5, 2, 3);
-            a[2] = SHUFFLE_QUARTERS(SHUFFLE_QUARTERS(columns[0], columns[1], 3, 3, 7, 7), columns[2], 6, 0, 2, 7);
+            a[0] = SHUFFLE_WITHIN_QUARTERS(SHUFFLE_WITHIN_QUARTERS(columns[0], columns[1], 0, 4, 4, 1), columns[2], 0, 1, 4, 3);
+            a[1] = SHUFFLE_WITHIN_QUARTERS(SHUFFLE_WITHIN_QUARTERS(columns[0], columns[1], 5, 5, 2, 6), columns[2], 0, 5, 2, 3);
+            a[2] = SHUFFLE_WITHIN_QUARTERS(SHUFFLE_WITHIN_QUARTERS(columns[0], columns[1], 3, 3, 7, 7), columns[2], 6, 0, 2, 7);
         }
         if (count == 4) transpose_4x4(columns, a);
         for (int i = 0; i < count; ++i) write_rows(image, quad, stride, 4 * i, a[i]);

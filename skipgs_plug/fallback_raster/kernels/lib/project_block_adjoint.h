@@ -9,8 +9,9 @@
 static constexpr auto project_block_adjoint =
     [](int block, const Gaussians& gaussians, const float* opacities, const Camera& camera, const RowList& visible,
        const ProjectedGradients& v_projected, const GaussianGradients& v_gaussians, float* v_opacities, float* v_poses, int n,
-       int raw, int with_depth, int antialiased, int with_pose, int optimizations) INLINE {
-    v16 pose[12] = {};
+       bool raw, const ProjectAdjointFlags& flags) INLINE {
+    const auto [with_depth, antialiased, with_pose, optimizations] = flags;
+    v16 pose[12] = {};  // gradient of the first three rows of `camera.viewmat`, by row
     // Clear one block at a time, so that it is still in the cache when the gradients are written.
     const int row_begin = BLOCK_ROWS * block, rows = smaller(BLOCK_ROWS, n - row_begin);
     const bool empty = visible.block_start[block] == visible.block_start[block + 1];

@@ -9,7 +9,7 @@ struct Record {
     float x, y;  // centre
     float along, slant, across, log2_opacity;
     float half_height, half_width;  // of the box around the ellipse
-    float color[4];                 // channels of one pass
+    float color[MAX_CHANNELS];      // channels of one pass
     float row_slope;                // dx / dy of the points with the largest alpha in each row of pixels
     float column_slope;             // dy / dx of the points with the largest alpha in each column
     float reach;                    // p^2 + w^2 on the ellipse
@@ -19,18 +19,20 @@ static_assert(sizeof(Record) == sizeof(float) * RECORD_FLOATS, "constants.RECORD
 
 // Records of 16 Gaussians by field. Transposed, they are 16 records.
 struct Records16 {
-    v16 x, y, along, slant, across, log2_opacity, half_height, half_width, color[4];
+    v16 x, y, along, slant, across, log2_opacity, half_height, half_width, color[MAX_CHANNELS];
     v16 row_slope, column_slope, reach, inverse_along;
 };
 static_assert(sizeof(Records16) == 16 * sizeof(Record), "the fields of a record");
 
-// Sums over the pixels of a tile. v_sigma is the gradient of the loss by sigma = -ln(alpha / opacity). The gradients of
-// the 2D mean and the conic follow from its moments about the mean.
-enum Moment { OF_1, OF_X, OF_Y, OF_XX, OF_XY, OF_YY, MOMENTS };  // sums of v_sigma times 1, dx, dy, dx^2, dx dy, dy^2
+// Moments about the mean: sums of v_sigma times 1, dx, dy, dx^2, dx dy and dy^2. v_sigma is the gradient of the loss by
+// sigma = -ln(alpha / opacity). The gradients of the 2D mean and the conic follow from its moments.
+enum Moment { OF_1, OF_X, OF_Y, OF_XX, OF_XY, OF_YY, MOMENTS };
+
+// Sums over the pixels of a tile.
 struct PairSum {
     float moment[MOMENTS];
-    float color[4];     // gradient of the colour
-    float absolute[2];  // |v_x|, |v_y| of the 2D mean
+    float color[MAX_CHANNELS];  // gradient of the colour
+    float absolute[2];          // |v_x|, |v_y| of the 2D mean
     float unused[4];
 };
 static_assert(sizeof(PairSum) == sizeof(float) * PAIR_FLOATS, "constants.PAIR_FLOATS");

@@ -6,8 +6,8 @@
 // With `dense` the whole block is written, with zeros for rows without pairs; else only visible rows are. This function
 // is inlined, so callers that pass constant flags drop the other cases.
 static constexpr auto reduce_block_pairs = [](int block, const PairSums& sums, const float* conics, const float* opacities,
-                                              const SplatGradients& v_splats, int n, const Channels& channels, int dense,
-                                              int absgrad, int parts) INLINE {
+                                              const SplatGradients& v_splats, int n, const Channels& channels, bool dense,
+                                              bool absgrad) INLINE {
     const int row_begin = BLOCK_ROWS * block, rows_here = smaller(BLOCK_ROWS, n - row_begin);
     const bool more = channels.first > 0;  // an earlier pass over the channels wrote gradients here
     const int stride = channels.stride;
@@ -22,8 +22,8 @@ static constexpr auto reduce_block_pairs = [](int block, const PairSums& sums, c
     // Pairs between the prefetch of a slot and its use. 16 and 64 took as long.
     constexpr int PREFETCH_PAIRS = 32;
     alignas(64) const PairSum nothing = {};
-    int j = parts > 1 ? sums.far_block_start[block] : 0;
-    const int far_end = parts > 1 ? sums.far_block_start[block + 1] : 0;
+    int j = sums.parts > 1 ? sums.far_block_start[block] : 0;
+    const int far_end = sums.parts > 1 ? sums.far_block_start[block + 1] : 0;
     const int end = sums.block_start[block + 1];
     for (int i = sums.block_start[block]; i < end; ++i) {
         const int g = sums.rows[i];

@@ -3,13 +3,13 @@
 #include "sh.h"
 
 // With `with_position`, `v_position` receives this block's part of the gradient of the camera's position. With
-// `factored`, the gradient of the higher bands goes to `factors`, one row for each visible Gaussian. This function is
-// inlined, so callers that pass constant flags drop the other cases.
+// `v_sh.factored`, the gradient of the higher bands goes to `factors`, one row for each visible Gaussian. This function
+// is inlined, so callers that pass constant flags drop the other cases.
 static constexpr auto sh_block_adjoint =
     [](int block, const float* means, const Harmonics& sh, const RowList& visible, const float* colors, const float* v_colors,
-       float* v_means, const HarmonicsGradients& v_sh, const FactorOutput& factors, float* v_position, int n, int factored,
-       int with_position, int optimizations) INLINE {
-    const int degree = sh.degree;
+       float* v_means, const HarmonicsGradients& v_sh, const FactorOutput& factors, float* v_position, int n,
+       bool with_position, int optimizations) INLINE {
+    const int degree = sh.degree, factored = v_sh.factored;
     float position_sum[3] = {0.0f, 0.0f, 0.0f};
     // Clear one block at a time, so that it is still in the cache when the gradients are written.
     const long long row_begin = (long long)BLOCK_ROWS * block;

@@ -59,13 +59,15 @@ static constexpr auto sum = [](auto a) -> float {
     auto d = c.lo + c.hi;
     return d.x + d.y;
 };
-// A quarter is four neighbouring floats of a v16: 128 bits. Within each quarter, picks floats of `a` (0 to 3) and `b`
-// (4 to 7).
-#define QUARTER(q, i) (i) + 4 * (q) + ((i) < 4 ? 0 : 12)
-#define QUARTERS(q, i, j, k, l) QUARTER(q, i), QUARTER(q, j), QUARTER(q, k), QUARTER(q, l)
-#define SHUFFLE_QUARTERS(a, b, ...) \
-    __builtin_shufflevector(a, b, QUARTERS(0, __VA_ARGS__), QUARTERS(1, __VA_ARGS__), QUARTERS(2, __VA_ARGS__), \
-                            QUARTERS(3, __VA_ARGS__))
+// A quarter is four neighbouring floats of a v16: 128 bits. SHUFFLE_WITHIN_QUARTERS makes each quarter of its result of
+// four floats of the same quarter of `a` (0 to 3) and `b` (4 to 7). The other two macros give the indices of these floats
+// for the compiler, to which `b` begins at 16.
+#define INDEX_IN_QUARTER(q, i) (i) + 4 * (q) + ((i) < 4 ? 0 : 12)
+#define INDICES_IN_QUARTER(q, i, j, k, l) \
+    INDEX_IN_QUARTER(q, i), INDEX_IN_QUARTER(q, j), INDEX_IN_QUARTER(q, k), INDEX_IN_QUARTER(q, l)
+#define SHUFFLE_WITHIN_QUARTERS(a, b, ...) \
+    __builtin_shufflevector(a, b, INDICES_IN_QUARTER(0, __VA_ARGS__), INDICES_IN_QUARTER(1, __VA_ARGS__), \
+                            INDICES_IN_QUARTER(2, __VA_ARGS__), INDICES_IN_QUARTER(3, __VA_ARGS__))
 // Eight calls of `sum` folded together, with a third of the instructions: first within quarters, until each holds parts
 // of four sums, then across quarters.
 static constexpr auto sum8 = [](const auto* a) INLINE -> v8 {
@@ -82,9 +84,11 @@ static constexpr auto sum8 = [](const auto* a) INLINE -> v8 {
     } else {
         v16 b[4], c[2];
         for (int i = 0; i < 4; ++i)
-            b[i] = SHUFFLE_QUARTERS(a[2 * i], a[2 * i + 1], 0, 4, 1, 5) + SHUFFLE_QUARTERS(a[2 * i], a[2 * i + 1], 2, 6, 3, 7);
+            b[i] = SHUFFLE_WITHIN_QUARTERS(a[2 * i], a[2 * i + 1], 0, 4, 1, 5)
+                 + SHUFFLE_WITHIN_QUARTERS(a[2 * i], a[2 * i + 1], 2, 6, 3, 7);
         for (int i = 0; i < 2; ++i)
-            c[i] = SHUFFLE_QUARTERS(b[2 * i], b[2 * i + 1], 0, 1, 4, 5) + SHUFFLE_QUARTERS(b[2 * i], b[2 * i + 1], 2, 3, 6, 7);
+            c[i] = SHUFFLE_WITHIN_QUARTERS(b[2 * i], b[2 * i + 1], 0, 1, 4, 5)
+                 + SHUFFLE_WITHIN_QUARTERS(b[2 * i], b[2 * i + 1], 2, 3, 6, 7);
         const v8 low = c[0].lo + c[0].hi, high = c[1].lo + c[1].hi;
         return __builtin_shufflevector(low, high, 0, 1, 2, 3, 8, 9, 10, 11)
              + __builtin_shufflevector(low, high, 4, 5, 6, 7, 12, 13, 14, 15);
@@ -179,13 +183,13 @@ static constexpr auto copy_row = [](float* to, const float* from, int width) INL
 static constexpr auto transpose_4x4 = [](const v16* a, v16* b) INLINE {
     v16 low[2], high[2];
     for (int i = 0; i < 2; ++i) {
-        low[i] = SHUFFLE_QUARTERS(a[2 * i], a[2 * i + 1], 0, 4, 1, 5);
-        high[i] = SHUFFLE_QUARTERS(a[2 * i], a[2 * i + 1], 2, 6, 3, 7);
+        low[i] = SHUFFLE_WITHIN_QUARTERS(a[2 * i], a[2 * i + 1], 0, 4, 1, 5);
+        high[i] = SHUFFLE_WITHIN_QUARTERS(a[2 * i], a[2 * i + 1], 2, 6, 3, 7);
     }
     for (int i = 0; i < 2; ++i) {
         const v16 *c = i ? high : low;
-        b[2 * i] = SHUFFLE_QUARTERS(c[0], c[1], 0, 1, 4, 5);
-        b[2 * i + 1] = SHUFFLE_QUARTERS(c[0], c[1], 2, 3, 6, 7);
+        b[2 * i] = SHUFFLE_WITHIN_QUARTERS(c[0], c[1], 0, 1, 4, 5);
+        b[2 * i + 1] = SHUFFLE_WITHIN_QUARTERS(c[0], c[1], 2, 3, 6, 7);
     }
 };
 static constexpr auto join = [](const v4* r) INLINE -> v16 {
@@ -295,10 +299,10 @@ static constexpr auto transpose = [](v16* a) INLINE {
     auto high4 = [](v16 a, v16 b) -> v16 {
         return __builtin_shufflevector(a, b, 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
     };
-    auto low2 = [](v16 a, v16 b) -> v16 { return SHUFFLE_QUARTERS(a, b, 0, 1, 4, 5); };
-    auto high2 = [](v16 a, v16 b) -> v16 { return SHUFFLE_QUARTERS(a, b, 2, 3, 6, 7); };
-    auto low1 = [](v16 a, v16 b) -> v16 { return SHUFFLE_QUARTERS(a, b, 0, 4, 2, 6); };
-    auto high1 = [](v16 a, v16 b) -> v16 { return SHUFFLE_QUARTERS(a, b, 1, 5, 3, 7); };
+    auto low2 = [](v16 a, v16 b) -> v16 { return SHUFFLE_WITHIN_QUARTERS(a, b, 0, 1, 4, 5); };
+    auto high2 = [](v16 a, v16 b) -> v16 { return SHUFFLE_WITHIN_QUARTERS(a, b, 2, 3, 6, 7); };
+    auto low1 = [](v16 a, v16 b) -> v16 { return SHUFFLE_WITHIN_QUARTERS(a, b, 0, 4, 2, 6); };
+    auto high1 = [](v16 a, v16 b) -> v16 { return SHUFFLE_WITHIN_QUARTERS(a, b, 1, 5, 3, 7); };
     exchange(8, low8, high8);
     exchange(4, low4, high4);
     exchange(2, low2, high2);

@@ -1,9 +1,6 @@
-// Index arithmetic of the tile lists: slices of the rows, small boxes of tiles as bits, and ranges of depth.
+// Entries of the tile lists: small boxes of tiles as bits, and ranges of depth.
 #pragma once
 #include "simd.h"
-
-// The first of `n` rows of slice `s`. The slice before it ends there.
-static constexpr auto slice_begin = [](int s, int n, int slices) -> int { return (int)((long long)s * n / slices); };
 
 // A small box of tiles as the bits of a non-negative int, row by row: 6 x 5 tiles use 30 of its 31 bits.
 static constexpr int BOX_COLUMNS = 6, BOX_ROWS = 5;
