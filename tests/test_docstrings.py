@@ -22,6 +22,7 @@ DOCUMENTED = {
     "skipgs_plug.trainer.scene": ("Scene",),
     "skipgs_plug.trainer.synthetic": ("make_scene",),
     "skipgs_plug.adapters.registry": ("register_adapter",),
+    "skipgs_plug.compat.settings": ("settings_class",),
     "skipgs_plug.fallback_raster.install": ("install_as_gsplat",),
     "skipgs_plug.fallback_raster.rasterize": ("rasterization",),
     "skipgs_plug.fallback_raster.runtime.threads": ("set_num_threads",),

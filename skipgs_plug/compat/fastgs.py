@@ -5,37 +5,22 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from .compose import render, splats
 from .inria import RasterizerModule
+from .settings import settings_class
 from .sparse_adam import SparseGaussianAdam
 from .statistics import gather
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam"]
 
 
-class GaussianRasterizationSettings(NamedTuple):
-    """Settings of a call, with the fields of the CUDA module."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-    mult: float
-    prefiltered: bool
-    debug: bool
-    get_flag: bool | None
-    metric_map: Tensor | None  # [H * W], 1 for pixels that count
+# `metric_map` [H * W] is 1 for pixels that count. Both it and `get_flag` may be None.
+GaussianRasterizationSettings = settings_class({"campos": ("mult",), "debug": ("get_flag", "metric_map")})
 
 
 class GaussianRasterizer(RasterizerModule):

@@ -6,30 +6,16 @@ depth as a third result.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from .compose import NEAR_PLANE, render, splats
+from .settings import settings_class
 
-
-class GaussianRasterizationSettings(NamedTuple):
-    """Settings of a call, with the fields of the CUDA module. `antialiasing` is None in the classic version."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-    prefiltered: bool
-    debug: bool
-    antialiasing: bool | None = None
+# The classic version has no `antialiasing`: there it is None.
+GaussianRasterizationSettings = settings_class({"debug": ("antialiasing",)}, defaults=(None,))
 
 
 class RasterizerModule(torch.nn.Module):

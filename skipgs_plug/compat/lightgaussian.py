@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from .compose import render, splats
 from .inria import RasterizerModule
+from .settings import settings_class
 from .statistics import gather
 
-
-class GaussianRasterizationSettings(NamedTuple):
-    """Settings of a call, with the fields of the CUDA module."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-    prefiltered: bool
-    debug: bool
-    f_count: bool
+# `f_count` is whether the call counts the importance of each Gaussian.
+GaussianRasterizationSettings = settings_class({"debug": ("f_count",)})
 
 
 class GaussianRasterizer(RasterizerModule):

@@ -2,33 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 from torch import Tensor
 
 from .compose import render, splats
 from .inria import RasterizerModule
+from .settings import settings_class
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
 
-class GaussianRasterizationSettings(NamedTuple):
-    """Settings of a call, with the fields of the CUDA module."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    kernel_size: float
-    subpixel_offset: Tensor  # [H, W, 2] pixels
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-    prefiltered: bool
-    debug: bool
+# `kernel_size` is in square pixels, `subpixel_offset` [H, W, 2] in pixels.
+GaussianRasterizationSettings = settings_class({"tanfovy": ("kernel_size", "subpixel_offset")})
 
 
 class GaussianRasterizer(RasterizerModule):

@@ -2,33 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 from torch import Tensor
 
 from .compose import render, splats
 from .inria import RasterizerModule
+from .settings import settings_class
 from .statistics import gather
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
 
-class GaussianRasterizationSettings(NamedTuple):
-    """Settings of a call, with the fields of the CUDA module."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: Tensor
-    scale_modifier: float
-    depth_threshold: float | None  # world units; None without gradients
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-    prefiltered: bool
-    debug: bool
+# `depth_threshold` is in world units. It is None in calls without gradients.
+GaussianRasterizationSettings = settings_class({"scale_modifier": ("depth_threshold",)})
 
 
 class GaussianRasterizer(RasterizerModule):

@@ -2,35 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from .compose import render, splats
 from .inria import RasterizerModule
+from .settings import settings_class
 from .sparse_adam import SparseGaussianAdam
 from .statistics import gather
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam"]
 
 
-class GaussianRasterizationSettings(NamedTuple):
-    """Settings of a call, with the fields of the CUDA module."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-    prefiltered: bool
-    debug: bool
-    pixel_weights: Tensor | None  # [H, W]; without them the sums are empty
+# `pixel_weights` is [H, W], or None: then the sums are empty.
+GaussianRasterizationSettings = settings_class({"debug": ("pixel_weights",)})
 
 
 class GaussianRasterizer(RasterizerModule):

@@ -29,12 +29,39 @@ from skipgs_plug.compat import (
     taming,
 )
 from skipgs_plug.compat.knn import distCUDA2
+from skipgs_plug.compat.settings import settings_class
 from skipgs_plug.compat.sparse_adam import SparseGaussianAdam
 from skipgs_plug.compat.ssim import fused_ssim
 
 
 def rasterizer(family, **fields):
     return family.GaussianRasterizer(family.GaussianRasterizationSettings(**camera(), **fields))
+
+
+# The positional order of each CUDA module.
+ORDERS = {
+    "inria": "bg scale_modifier viewmatrix projmatrix sh_degree campos prefiltered debug antialiasing",
+    "fastgs": "bg scale_modifier viewmatrix projmatrix sh_degree campos mult prefiltered debug get_flag metric_map",
+    "taming": "bg scale_modifier viewmatrix projmatrix sh_degree campos prefiltered debug pixel_weights",
+    "lightgaussian": "bg scale_modifier viewmatrix projmatrix sh_degree campos prefiltered debug f_count",
+    "mip_splatting": (
+        "kernel_size subpixel_offset bg scale_modifier viewmatrix projmatrix sh_degree campos prefiltered debug"
+    ),
+    "pixel_gs": "bg scale_modifier depth_threshold viewmatrix projmatrix sh_degree campos prefiltered debug",
+}
+
+
+@pytest.mark.parametrize("family", ORDERS)
+def test_settings_have_the_positional_order_of_the_cuda_module(family):
+    module = importlib.import_module(f"skipgs_plug.compat.{family}")
+    fields = ["image_height", "image_width", "tanfovx", "tanfovy", *ORDERS[family].split()]
+    settings = module.GaussianRasterizationSettings(*fields)
+    assert [getattr(settings, name) for name in fields] == fields == list(settings)
+
+
+def test_fields_must_follow_a_base_field():
+    with pytest.raises(ValueError, match=r"^No base field campus; expected one of image_height, "):
+        settings_class({"campus": ("mult",)})
 
 
 def test_inria_classic_returns_two_and_current_three():
