@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from skipgs_plug import fallback_raster
+
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("", "docs/", "docs/how_it_works/", "benchmarks/notes/", "examples/", "tests/")
 PAGES = sorted(page for folder in FOLDERS for page in ROOT.glob(f"{folder}*.md"))
@@ -45,6 +47,13 @@ def test_lists_begin_after_an_empty_line_as_the_site_needs_it(page: Path) -> Non
 def test_user_path_stays_below_8000_words() -> None:
     words = {page.name: sum(any(map(str.isalnum, word)) for word in page.read_text().split()) for page in USER_PATH}
     assert sum(words.values()) < 8_000, words
+
+
+def test_every_public_name_of_the_rasterizer_is_on_its_api_page() -> None:
+    page = (ROOT / "docs/api/rasterizer.md").read_text()
+    listed = [line.removeprefix("::: ") for line in page.splitlines() if line.startswith("::: ")]
+    homes = {name: f"skipgs_plug.fallback_raster.{home}.{name}" for name, home in fallback_raster._HOMES.items()}
+    assert sorted(listed) == sorted(homes[name] for name in fallback_raster.__all__)
 
 
 def test_notes_and_inner_pages_are_listed_and_out_of_the_reading_path() -> None:

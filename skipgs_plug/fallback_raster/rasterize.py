@@ -66,15 +66,16 @@ def rasterization(
     colors, backgrounds and viewmats.
 
     Args:
-        means: Centres in world space.
-        quats: Rotations w, x, y, z of any length; zero stands for no rotation.
-        scales: Standard deviations along the axes, world units.
-        opacities: In [0, 1].
-        colors: D channels per Gaussian (per camera if C is given), or K >= (sh_degree + 1)^2 SH coefficients. The
-            constant band and the higher bands may also be a pair of tensors, which saves joining them in every
-            iteration. gsplat does not offer that.
-        viewmats: World to camera, x right, y down, z forward.
-        Ks: Intrinsics in pixels; pixel centres lie at +0.5.
+        means: Centres [N, 3] in world space.
+        quats: Rotations [N, 4], w, x, y, z of any length; zero stands for no rotation.
+        scales: Standard deviations [N, 3] along the axes, world units.
+        opacities: Opacities [N] in [0, 1].
+        colors: D channels per Gaussian [N, D], or K >= (sh_degree + 1)^2 SH coefficients [N, K, 3]. With a first
+            dimension C, each camera has colours of its own. The constant band [N, 1, 3] and the higher bands
+            [N, K - 1, 3] may also be a pair of tensors, which saves joining them in every iteration. gsplat does not
+            offer that.
+        viewmats: Matrices [C, 4, 4] from world to camera, x right, y down, z forward.
+        Ks: Intrinsics [C, 3, 3] in pixels; pixel centres lie at +0.5.
         width: Image width in pixels.
         height: Image height in pixels.
         near_plane: Gaussians nearer than this are culled, world units. Gaussians behind the camera always are.
@@ -84,7 +85,7 @@ def rasterization(
         sh_degree: 0 to 3 to read `colors` as SH coefficients, None to read them as colours.
         packed: If True, `info` has one row per visible (camera, Gaussian) pair, as in gsplat's packed mode.
         tile_size: Accepted for gsplat's callers and ignored: tiles are always 16 pixels wide.
-        backgrounds: Colour behind all Gaussians; black if None.
+        backgrounds: Colour [C, D] behind all Gaussians; black if None.
         render_mode: Colour, accumulated depth (D), expected depth (ED), or colour and depth.
         sparse_grad: Not supported.
         absgrad: Also sum the absolute gradients of the 2D means over pixels (AbsGS), in `info["means2d"].absgrad`.

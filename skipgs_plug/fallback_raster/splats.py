@@ -81,20 +81,20 @@ def rasterize_splats(
     Differentiable in means, quats, log_scales, logits, sh0 and shN. Bit-equal for any number of threads.
 
     Args:
-        means: Centres in world space.
-        quats: Rotations w, x, y, z of any length.
-        log_scales: Logarithms of the standard deviations in world units.
-        logits: Logits of the opacities.
-        sh0: SH coefficients of degree 0.
-        shN: SH coefficients of the higher degrees.
-        viewmat: World to camera, x right, y down, z forward.
-        K: Intrinsics in pixels; pixel centres lie at +0.5.
+        means: Centres [N, 3] in world space.
+        quats: Rotations [N, 4], w, x, y, z of any length.
+        log_scales: Logarithms [N, 3] of the standard deviations in world units.
+        logits: Logits [N] of the opacities.
+        sh0: SH coefficients [N, 1, 3] of degree 0.
+        shN: SH coefficients [N, K - 1, 3] of the higher degrees.
+        viewmat: Matrix [4, 4] from world to camera, x right, y down, z forward.
+        K: Intrinsics [3, 3] in pixels; pixel centres lie at +0.5.
         width: Image width in pixels.
         height: Image height in pixels.
         sh_degree: Degree of the SH that are evaluated, 0 to 3.
         near_plane: Gaussians nearer than this are culled, world units. Gaussians behind the camera always are.
         far_plane: Gaussians farther than this are culled, world units.
-        background: Colour behind all Gaussians; black if None.
+        background: Colour [3] behind all Gaussians; black if None.
         antialiased: Scale opacities down for the area that the low-pass filter of 0.3 square pixels adds
             (Mip-Splatting).
         absgrad: Also sum the absolute gradients of the 2D means over pixels (AbsGS), in `info["means2d"].absgrad`.

@@ -40,7 +40,15 @@ def take_rows(
     source: Tensor,  # [R, ...], numbers of 32 bits
     rows: Tensor,  # [M] int32
 ) -> Tensor:
-    """Return `source[rows]`, computed on all cores: torch's indexing takes as long as some kernels."""
+    """Return `source[rows]`, computed on all cores: torch's indexing takes as long as some kernels.
+
+    Args:
+        source: Tensor [R, ...] on the CPU whose numbers have 32 bits. It is not differentiated.
+        rows: Row numbers [M], int32, each from 0 to R - 1. They are not checked.
+
+    Returns:
+        The rows [M, ...], of the dtype of `source`.
+    """
     shape = len(rows), *source.shape[1:]
     taken = floats(*shape)
     source_floats = source.contiguous().view(torch.float32)

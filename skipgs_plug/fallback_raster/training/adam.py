@@ -110,10 +110,11 @@ def adam_rows(
     Other rows keep their values and moments, as with the CUDA kernels of Taming 3DGS and gsplat's SelectiveAdam.
 
     Args:
-        visibility: Rows to update.
-        param: Parameter with a gradient, float32. On devices other than the CPU, plain torch updates it.
-        mean: Running mean of its gradient.
-        square: Running mean of its squared gradient.
+        visibility: Whether to update each row, [N] bool.
+        param: Parameter [N, ...] with a gradient, float32, changed in place. On devices other than the CPU, plain torch
+            updates it.
+        mean: Running mean of its gradient, of the same shape, changed in place.
+        square: Running mean of its squared gradient, of the same shape, changed in place.
         rate: Learning rate.
         betas: Decays of the two means.
         eps: Added to the square root of `square`.

@@ -31,11 +31,11 @@ def sum_norms(
     """Add the norm of each gradient to `norms` and 1 to `counts`, for the rows that are visible in an image.
 
     Args:
-        rows: Rows of the visible Gaussians.
-        gradient: Gradients of their 2D means.
+        rows: Rows [M] of the visible Gaussians, int32, no row twice.
+        gradient: Gradients [M, 2] of their 2D means, float32.
         scale: Factors of x and y, applied before the norm, such as half the image's size in pixels.
-        norms: Sums of norms. Changed in place.
-        counts: Numbers of images. Changed in place.
+        norms: Sums of norms [N], float32, changed in place.
+        counts: Numbers of images [N], float32, changed in place.
     """
     _sum_norms(
         rows=rows,

@@ -129,7 +129,7 @@ def l1_ssim_loss(
     free.
 
     Args:
-        image: Rendered image, usually in [0, 1].
+        image: Rendered image [..., H, W, C], usually in [0, 1].
         target: Photograph of the same shape, float, or uint8 for values in [0, 255] that are divided by 255.
         ssim_lambda: Weight of the SSIM term.
         padding: "same" continues the images with black (Inria, and the default of fused_ssim). "valid" averages SSIM

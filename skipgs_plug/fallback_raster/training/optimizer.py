@@ -11,7 +11,8 @@ from torch import Tensor
 
 from .adam import adam_step
 
-ADAM_REPLACED = "torch.optim.adam.adam"  # the function that `torch.optim.Adam` calls in each step
+ADAM_REPLACED = "torch.optim.adam.adam"
+"""Name of the function that `torch.optim.Adam` calls in each step, which `instead_of_torchs_adam` replaces."""
 # Most elements of a parameter that the kernel steps, because it indexes them in 32 bits. Torch steps larger parameters.
 MAX_NUMBERS = 2**30
 # Options of torch's Adam that only torch's function supports, and all options of a group of parameters but `betas`.
@@ -119,7 +120,16 @@ class Adam(torch.optim.Adam):
 
 
 def moments(optimizer: torch.optim.Optimizer, param: Tensor) -> dict[str, Tensor]:
-    """Return the state of a parameter in `torch.optim.Adam`: `step`, `exp_avg`, `exp_avg_sq`; zeros at first."""
+    """Return the state of a parameter in an optimizer like `torch.optim.Adam`. A missing state is created as zeros.
+
+    Args:
+        optimizer: The optimizer. Its `state` receives the tensors.
+        param: One of its parameters.
+
+    Returns:
+        `step`, a scalar that counts the steps, and the running means of the gradient, `exp_avg`, and of the squared
+        gradient, `exp_avg_sq`, of the shape of the parameter.
+    """
     state: dict[str, Tensor] = optimizer.state[param]
     if not state:
         state["step"] = torch.tensor(0.0, dtype=torch.float32)
