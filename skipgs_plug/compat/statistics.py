@@ -10,6 +10,7 @@ from torch import Tensor
 from skipgs_plug.fallback_raster.runtime.buffers import floats, ints, zeros
 from skipgs_plug.fallback_raster.stages.binning import bin_gaussians
 from skipgs_plug.fallback_raster.stages.statistics import (
+    STATISTICS,
     STATISTICS_FLOATS,
     SortedLists,
     StatisticsMaps,
@@ -74,5 +75,6 @@ def gather(f: Footprint, values: Tensor | None = None) -> Statistics:
         grid=bins.grid,
     )
     total = zeros(len(f), STATISTICS_FLOATS).index_add_(0, rows, pair_sums)
-    count, weight, light, value, weighted, distance = (column.contiguous() for column in total[:, :6].unbind(dim=1))
+    columns = total[:, : len(STATISTICS)].unbind(dim=1)
+    count, weight, light, value, weighted, distance = (column.contiguous() for column in columns)
     return Statistics(count.to(torch.int32), weight, light, value, weighted, distance, *maps)

@@ -23,7 +23,7 @@ from .training.gradient_norms import _sum_norms
 from .training.lazy_adam import _catch_up
 from .training.loss import _LOSS_TILES, PHOTO_DTYPE
 
-RGB_CHANNELS = 3  # of the images of training; kernels of other numbers are not loaded ahead
+RGB_CHANNELS = 3  # number of channels of images in training; kernels for other numbers are not loaded ahead
 
 
 def load_kernels_ahead(absgrad: bool = False, lazy: bool = True, densify: bool = True) -> list[threading.Thread]:

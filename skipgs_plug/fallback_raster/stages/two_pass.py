@@ -112,11 +112,12 @@ def bin_behind(
         The lists, and the start of each block of rows [blocks + 1] in them. None if no Gaussian is left.
     """
     tiling = near.grid
-    is_open = (still_open != 0) & (ranges[:, 1] < NO_DEPTH)
+    _, ends = ranges.unbind(1)
+    is_open = (still_open != 0) & (ends < NO_DEPTH)
     if not bool(is_open.any()):
         return None
-    behind = torch.full_like(ranges, NO_DEPTH)
-    behind[is_open, 0] = ranges[is_open, 1]
+    firsts = torch.where(is_open, ends, NO_DEPTH)
+    behind = torch.stack([firsts, torch.full_like(firsts, NO_DEPTH)], 1)
     open_before = torch.zeros(tiling.tiles_y + 1, tiling.tiles_x + 1, dtype=torch.int32, device="cpu")
     open_before[1:, 1:] = is_open.view(tiling.tiles_y, tiling.tiles_x).cumsum(0).cumsum(1)
     found = BlockRows(ints(len(colors)), ints(len(block_start) - 1))
@@ -127,7 +128,7 @@ def bin_behind(
         found=found,
         grid=tiling,
         n=len(colors),
-        least=int(behind[:, 0].min()),
+        least=int(firsts.min()),
     )
     rows, starts = visible_rows(found)
     if len(rows) == 0:

@@ -16,9 +16,9 @@ static constexpr auto intrinsics = [](const Camera& camera) INLINE -> Intrinsics
     return {K[0], K[4], K[2], K[5]};
 };
 
-// Share of the image's width and height by which the point where the Jacobian is taken may lie outside the image, as in
-// gsplat and in Inria's rasterizer: 30 % of half the field of view. Farther out the linear projection of a Gaussian is
-// so wrong that it would fill the image.
+// Share of the image's width and height by which the point where the Jacobian is taken may lie outside the image: 30 % of
+// half the field of view, as in gsplat. Without a bound the Jacobian, and with it the Gaussian's size in pixels, would
+// grow with the distance from the image.
 static constexpr float JACOBIAN_MARGIN = 0.15f;
 
 // Most standard deviations from a centre to a pixel that the Gaussian contributes to: sqrt(2 ln 255), rounded up.
@@ -29,7 +29,7 @@ static constexpr float MAX_DEVIATIONS = 3.33f;
 static constexpr float SPHERE_DEVIATIONS = 3.37f;
 // Pixels that the sphere reaches farther: one by which a radius is rounded up, and half a pixel for rounding.
 static constexpr float SPHERE_MARGIN = 1.5f;
-// The same as a share of a coordinate in pixels: 80 times the rounding of a float.
+// Further pixels for the rounding of a coordinate, as a share of it: about 80 times the distance to the next float.
 static constexpr float SPHERE_RELATIVE_MARGIN = 1e-5f;
 
 // Centres of 16 rows in world space and in camera space.
