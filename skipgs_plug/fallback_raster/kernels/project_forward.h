@@ -7,7 +7,6 @@
 static constexpr auto project_forward = [](const Gaussians& gaussians, const float* opacities, const Camera& camera,
                                            const Limits& limits, const Projected& projected, const BlockRows& found, int n,
                                            const ProjectFlags& flags, int first, int last) INLINE {
-    const auto [antialiased, raw, dense, with_radii, optimizations] = flags;
     const int block = first, row_begin = BLOCK_ROWS * block, row_end = smaller(row_begin + BLOCK_ROWS, n);
     int end = row_begin;
     for (int base = row_begin; base < row_end; base += 16) {
@@ -22,29 +21,29 @@ static constexpr auto project_forward = [](const Gaussians& gaussians, const flo
         // Gaussians near each other in space often lie near each other in memory. The tests let NaN through to the full
         // test below.
         v16 longest = vmax(vmax(vabs(S[0]), vabs(S[1])), vabs(S[2]));
-        if (raw) longest = vexp(vmax(vmax(S[0], S[1]), S[2]));
+        if (flags.raw) longest = vexp(vmax(vmax(S[0], S[1]), S[2]));
         i16 outside = (z < limits.near_plane) | (z > limits.far_plane);
-        if (optimizations & SPHERES) outside |= beyond(camera, center, iz, longest);
+        if (flags.optimizations & SPHERES) outside |= beyond(camera, center, iz, longest);
         if (!any(~outside)) {
-            if (dense) {
-                if (with_radii) clear((float*)projected.radii + 2ll * base, 2 * lanes);
+            if (flags.dense) {
+                if (flags.with_radii) clear((float*)projected.radii + 2ll * base, 2 * lanes);
                 clear(projected.means2d + 2ll * base, 2 * lanes);
                 clear(projected.depths + base, lanes);
                 clear(projected.conics + 3ll * base, 3 * lanes);
                 clear(projected.sigmas + 2ll * base, 2 * lanes);
-                if (antialiased) clear(projected.compensations + base, lanes);
+                if (flags.antialiased) clear(projected.compensations + base, lanes);
             }
             continue;
         }
-        if (raw)
+        if (flags.raw)
             for (int j = 0; j < 3; ++j) S[j] = vexp(S[j]);
         const Covariances cov = project_rows(camera, gaussians.quats, row, center, iz, S).cov;
 
         v16 compensation = (v16)1.0f;
-        if (antialiased) compensation = vsqrt(cov.sharp_det / cov.det);
+        if (flags.antialiased) compensation = vsqrt(cov.sharp_det / cov.det);
         v16 opacity = gather(opacities, row, 1, 0);
-        if (raw) opacity = sigmoid(opacity);
-        if (antialiased) opacity *= compensation;
+        if (flags.raw) opacity = sigmoid(opacity);
+        if (flags.antialiased) opacity *= compensation;
         // Each comparison is false for NaN, so a Gaussian with a NaN anywhere is culled.
         i16 visible = (z >= limits.near_plane) & (z <= limits.far_plane) & (cov.det > 0.0f) & (opacity >= ALPHA_MIN);
         v16 reach = vmin((v16)MAX_DEVIATIONS, vsqrt(LN_4 * log2(255.0f * vmax(opacity, (v16)1e-3f))));
@@ -62,8 +61,8 @@ static constexpr auto project_forward = [](const Gaussians& gaussians, const flo
 
         const v16 none = (v16)0.0f;
         append_rows(found.rows, end, row, bits(visible) & ((1u << lanes) - 1));
-        if (!dense && !any(visible)) continue;
-        if (with_radii) {
+        if (!flags.dense && !any(visible)) continue;
+        if (flags.with_radii) {
             const i16 rx = __builtin_convertvector(visible ? radius_x : none, i16);
             const i16 ry = __builtin_convertvector(visible ? radius_y : none, i16);
             scatter2((float*)projected.radii, row, (v16)rx, (v16)ry, lanes);
@@ -73,8 +72,8 @@ static constexpr auto project_forward = [](const Gaussians& gaussians, const flo
         scatter3(projected.conics, row, visible ? cov.conic_a : none, visible ? cov.conic_b : none,
                  visible ? cov.conic_c : none, lanes);
         scatter2(projected.sigmas, row, visible ? sigma_x : none, visible ? sigma_y : none, lanes);
-        if (antialiased) store_some(projected.compensations + base, visible ? compensation : none, lanes);
-        if (raw) store_some(projected.opacities + base, visible ? opacity : none, lanes);
+        if (flags.antialiased) store_some(projected.compensations + base, visible ? compensation : none, lanes);
+        if (flags.raw) store_some(projected.opacities + base, visible ? opacity : none, lanes);
     }
     found.counts[block] = end - row_begin;
 };

@@ -12,7 +12,6 @@ static constexpr auto splat_adjoint =
        const Rendered& rendered, const GaussianGradients& v_gaussians, float* v_logits, const HarmonicsGradients& v_sh,
        const FactorOutput& factors, const CenterGradients& v_centers, int n,
        const SplatAdjointFlags& flags, int first, int last) INLINE {
-        const auto [antialiased, with_centers, absgrad, optimizations] = flags;
         // The functions below index rows from row 0 of all, so these buffers of one block are addressed relative to it.
         // Vector loads may read the padding behind the last row; its content does not matter.
         alignas(64) float center[2 * BLOCK_ROWS], conic[3 * BLOCK_ROWS + 16], alpha[BLOCK_ROWS];
@@ -22,24 +21,24 @@ static constexpr auto splat_adjoint =
         };
         const SplatGradients v_splats = {counted(center, 2), counted(conic, 3), counted(alpha, 1), counted(magnitude, 2),
                                          counted(color, 3)};
-        if (absgrad) clear(magnitude, 2 * BLOCK_ROWS);
+        if (flags.absgrad) clear(magnitude, 2 * BLOCK_ROWS);
         const Channels channels = {/* stride */ 3, /* first */ 0, /* number */ 3};
         reduce_block_pairs(first, sums, rendered.conics, rendered.opacities, v_splats, n, channels, /* dense */ false,
-                           absgrad);
+                           flags.absgrad);
         for (int i = sums.block_start[first]; i < sums.block_start[first + 1]; ++i)
             for (int j = 0; j < 2; ++j) {
-                if (with_centers) v_centers.centers[2 * i + j] = v_splats.means2d[2 * sums.rows[i] + j];
-                if (absgrad) v_centers.absolute[2 * i + j] += v_splats.absolute[2 * sums.rows[i] + j];
+                if (flags.with_centers) v_centers.centers[2 * i + j] = v_splats.means2d[2 * sums.rows[i] + j];
+                if (flags.absgrad) v_centers.absolute[2 * i + j] += v_splats.absolute[2 * sums.rows[i] + j];
             }
         const RowList visible = {sums.rows, sums.block_start};
         // Strides of raw parameters as constants, so that the compiler drops the other cases.
         const Harmonics raw_sh = {sh.position,   sh.sh0,         sh.shN, /* sh0_stride */ 3,
                                   sh.shN_stride, /* shN_offset */ 0, sh.degree};
         sh_block_adjoint(first, gaussians.means, raw_sh, visible, rendered.colors, v_splats.colors, v_gaussians.means, v_sh,
-                         factors, /* v_position */ nullptr, n, /* with_position */ false, optimizations);
+                         factors, /* v_position */ nullptr, n, /* with_position */ false, flags.optimizations);
         const ProjectedGradients v_projected = {v_splats.means2d, /* depths */ nullptr, v_splats.conics,
                                                 /* compensations */ nullptr, v_splats.opacities};
         project_block_adjoint(first, gaussians, logits, camera, visible, v_projected, v_gaussians, v_logits,
                               /* v_poses */ nullptr, n, /* raw */ true,
-                              {/* with_depth */ 0, antialiased, /* with_pose */ 0, optimizations});
+                              {/* with_depth */ 0, flags.antialiased, /* with_pose */ 0, flags.optimizations});
     };

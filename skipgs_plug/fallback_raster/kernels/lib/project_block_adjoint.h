@@ -10,7 +10,6 @@ static constexpr auto project_block_adjoint =
     [](int block, const Gaussians& gaussians, const float* opacities, const Camera& camera, const RowList& visible,
        const ProjectedGradients& v_projected, const GaussianGradients& v_gaussians, float* v_opacities, float* v_poses, int n,
        bool raw, const ProjectAdjointFlags& flags) INLINE {
-    const auto [with_depth, antialiased, with_pose, optimizations] = flags;
     v16 pose[12] = {};  // gradient of the first three rows of `camera.viewmat`, by row
     // Clear one block at a time, so that it is still in the cache when the gradients are written.
     const int row_begin = BLOCK_ROWS * block, rows = smaller(BLOCK_ROWS, n - row_begin);
@@ -30,12 +29,12 @@ static constexpr auto project_block_adjoint =
         v16 center[2], conic[3], single[2] = {};
         gather2(v_projected.means2d, row, center);
         gather3(v_projected.conics, row, n, conic);
-        if (with_depth) single[0] = gather(v_projected.depths, row, 1, 0);
+        if (flags.with_depth) single[0] = gather(v_projected.depths, row, 1, 0);
         if (raw) single[1] = gather(v_projected.opacities, row, 1, 0);
-        else if (antialiased) single[1] = gather(v_projected.compensations, row, 1, 0);
+        else if (flags.antialiased) single[1] = gather(v_projected.compensations, row, 1, 0);
         i16 some = (single[0] != 0.0f) | (single[1] != 0.0f) | (center[0] != 0.0f) | (center[1] != 0.0f);
         for (int j = 0; j < 3; ++j) some |= conic[j] != 0.0f;
-        append_rows(received, count, row, (optimizations & CONTRIBUTED_ONLY ? bits(some) : ~0u) & ((1u << lanes) - 1));
+        append_rows(received, count, row, (flags.optimizations & CONTRIBUTED_ONLY ? bits(some) : ~0u) & ((1u << lanes) - 1));
     }
     for (int base = 0; base < count; base += 16) {
         const int lanes = smaller(16, count - base);
@@ -45,13 +44,13 @@ static constexpr auto project_block_adjoint =
         gather2(v_projected.means2d, row, v_center);
         gather3(v_projected.conics, row, n, v_conic);
         v16 v_u = v_center[0], v_v = v_center[1], va = v_conic[0], vb = 0.5f * v_conic[1], vc = v_conic[2];
-        if (with_depth) v_depth = gather(v_projected.depths, row, 1, 0);
-        if (antialiased && !raw) v_comp = gather(v_projected.compensations, row, 1, 0);
+        if (flags.with_depth) v_depth = gather(v_projected.depths, row, 1, 0);
+        if (flags.antialiased && !raw) v_comp = gather(v_projected.compensations, row, 1, 0);
         v16 v_alpha = (v16)0.0f, opacity = (v16)0.0f;
         if (raw) {
             v_alpha = gather(v_projected.opacities, row, 1, 0);
             opacity = sigmoid(gather(opacities, row, 1, 0));
-            if (antialiased) v_comp = v_alpha * opacity;
+            if (flags.antialiased) v_comp = v_alpha * opacity;
         }
         v16 S[3];
         gather3(gaussians.scales, row, n, S);
@@ -67,7 +66,7 @@ static constexpr auto project_block_adjoint =
         const v16(&R)[3][3] = rotation.R;
 
         if (raw) {
-            const v16 v_opacity = antialiased ? v_alpha * vsqrt(cov.sharp_det / cov.det) : v_alpha;
+            const v16 v_opacity = flags.antialiased ? v_alpha * vsqrt(cov.sharp_det / cov.det) : v_alpha;
             scatter(v_opacities, row, v_opacity * opacity * (1.0f - opacity), lanes);
         }
 
@@ -83,7 +82,7 @@ static constexpr auto project_block_adjoint =
         v16 pc = cov.conic_b * va + cov.conic_c * vb, pd = cov.conic_b * vb + cov.conic_c * vc;
         v16 v_xx = -(pa * cov.conic_a + pb * cov.conic_b), v_xy = -(pa * cov.conic_b + pb * cov.conic_c);
         v16 v_yy = -(pc * cov.conic_b + pd * cov.conic_c);
-        if (antialiased) {
+        if (flags.antialiased) {
             // compensation = sqrt(sharp det / det); both determinants here are divided by cov.xx.
             v16 half_comp = cov.sharp_det > 1e-30f ? 0.5f * v_comp * vsqrt(cov.sharp_det / cov.det) : (v16)0.0f;
             v16 i_sharp = 1.0f / vmax(cov.sharp_det, (v16)1e-30f), i_blurred = 1.0f / cov.det;
@@ -126,7 +125,7 @@ static constexpr auto project_block_adjoint =
             for (int j = 0; j < 3; ++j)
                 v_M[i][j] = saturated(V[i] * v_WM[0][j] + V[4 + i] * v_WM[1][j] + V[8 + i] * v_WM[2][j], 1e30f);
         }
-        if (with_pose) {
+        if (flags.with_pose) {
             const i16 in_use = lane < (float)lanes;
             const v16 v_camera[3] = {v_x, v_y, v_z};
             for (int i = 0; i < 3; ++i) {
@@ -169,6 +168,6 @@ static constexpr auto project_block_adjoint =
                  saturated((v_qx - along * qx) * back, 1e38f), saturated((v_qy - along * qy) * back, 1e38f),
                  saturated((v_qz - along * qz) * back, 1e38f), lanes);
     }
-    if (with_pose)
+    if (flags.with_pose)
         for (int i = 0; i < 12; ++i) v_poses[12 * block + i] = sum(pose[i]);
 };
