@@ -144,7 +144,7 @@ def test_pairs_are_counted_beyond_32_bits() -> None:
         counts=binning.PairCounts(counts, totals),
         tile_start=torch.zeros(5, dtype=torch.int32),
         grid=grid(32, 32),
-        slices=2,
+        slices=binning.Slices(m=0, number=2),
     )
     assert totals.tolist() == [0, 2**32, 2**33]
 
