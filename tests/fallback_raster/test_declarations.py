@@ -38,6 +38,10 @@ def test_a_file_compiles_by_itself(file: str, database: dict[str, list[str]], tm
     compile_alone(KERNELS / file, database[file], tmp_path)
 
 
+def test_no_two_files_have_the_same_name() -> None:
+    assert len({Path(file).name for file in FILES}) == len(FILES)
+
+
 def test_a_name_that_nobody_declares_is_found(
     database: dict[str, list[str]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
