@@ -16,7 +16,11 @@ class AdapterMismatchError(SkipGSError):
 
 
 class BrokenTrainingError(SkipGSError):
-    """The training itself is broken, for example because losses stay non-finite. It is raised at any time."""
+    """The training itself cannot go on, for example because another process has ended. It is raised at any time."""
+
+
+class ReleaseError(SkipGSError):
+    """The gate is of no use to this training. It is released at any time, and refuses nothing."""
 
 
 class GateOrderError(SkipGSError):

@@ -11,6 +11,7 @@ import torch
 
 from skipgs_plug import cli
 from skipgs_plug.adapters.speedy_splat import SpeedySplat
+from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.scripts.checkpoints import Checkpoints
 
 RENDERER = """
@@ -372,6 +373,18 @@ def test_script_in_a_subfolder_may_extend_its_path_first(checkout, tmp_path, cap
     assert cli.main(["run", "auto", "--cpu", "--warmup", "10", "--", str(inner), str(tmp_path)]) == 0
     assert json.loads((tmp_path / "skipgs.json").read_text())["backwards_skipped"] > 0
     assert not any("_Finder" in repr(finder) for finder in sys.meta_path)
+
+
+@pytest.mark.parametrize("options", [[], ["--share", "auto"], ["--no-gate"]], ids=lambda options: " ".join(options))
+def test_an_error_while_the_gate_attaches_lets_the_script_train(checkout, tmp_path, capfd, monkeypatch, options):
+    def fails(*args, **kwargs):
+        raise TypeError("of the adapter")
+
+    monkeypatch.setattr(Hooks, "loop", fails)
+    with pytest.warns(RuntimeWarning, match=r"goes on without it.*TypeError: of the adapter; report it to the project"):
+        assert cli.main(["run", "inria", "--cpu", *options, "--", checkout, str(tmp_path)]) == 0
+    error = capfd.readouterr().err
+    assert (tmp_path / "model.pth").exists() and "Traceback" not in error and "nothing was gated" not in error
 
 
 def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
