@@ -4,7 +4,16 @@ from __future__ import annotations
 
 
 class SkipGSError(RuntimeError):
-    """Base of all errors of the gate and the adapters: one sentence that names the thing and the fix."""
+    """Base of all errors of the gate and the adapters: one sentence that names the thing and the fix.
+
+    Args:
+        sentence: The sentence.
+        in_script: The sentence for the user of a script, who has no gate to call; None if it is the same.
+    """
+
+    def __init__(self, sentence: str = "", in_script: str | None = None) -> None:
+        super().__init__(sentence)
+        self.in_script = in_script
 
 
 class UnknownTrainerError(SkipGSError):

@@ -34,6 +34,7 @@ class Release:
     Attributes:
         reason: The sentence of the warning; None while the gate is attached.
         refuses: The argument.
+        in_script: Whether the trainer is a script, whose user has no gate to call.
     """
 
     def __init__(self, enabled: bool, refuses: Callable[[], bool]) -> None:
@@ -41,6 +42,7 @@ class Release:
         self._undo: list[Callable[[], None]] = []
         self.reason: str | None = None
         self.refuses = refuses
+        self.in_script = False
 
     def undoes(self, undo: Callable[[], None]) -> None:
         """Add a function that undoes a part of the attachment when the gate is released."""
@@ -60,6 +62,8 @@ class Release:
         """
         if self.reason is not None:
             return
+        if self.in_script and isinstance(error, SkipGSError) and error.in_script is not None:
+            error.args = (error.in_script,)
         if self.ends(error, refuses) or (self._enabled and not distributed.all_failed(step)):
             self._take_back()
             raise error

@@ -1,5 +1,6 @@
 """A gate for a script imports none of the trainer's modules: the script may extend its path first."""
 
+import runpy
 import sys
 import textwrap
 
@@ -7,7 +8,7 @@ import pytest
 from cases import RULE
 from lookalikes.splats import new_log
 
-from skipgs_plug import SkipGate
+from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.adapters.base import AbstractAdapter
 
 # By adapter: the trainer's module, its content, and the lines of a script that imports it.
@@ -34,7 +35,10 @@ SCRIPTS = {
         """
         from gaussian_splatting.prepare import prepare_trainer
         from lookalikes import step_trainer
-        step_trainer.training(prepare_trainer(), step_trainer.dataset(), step_trainer.LAST)
+        def training(trainer, dataset):
+            for step in range(1, step_trainer.LAST + 1):
+                trainer.step(step_trainer.pick_camera(dataset, step))
+        training(prepare_trainer(), step_trainer.dataset())
         """,
     ),
     "gsplat": (
@@ -70,9 +74,12 @@ def script(request, tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name == top or name.startswith(f"{top}.")]:
         monkeypatch.delitem(sys.modules, name)
 
-    def run():
+    path = tmp_path / "train.py"
+    path.write_text(textwrap.dedent(lines))
+
+    def run(gate):
         monkeypatch.syspath_prepend(tmp_path)
-        exec(textwrap.dedent(lines), {"__name__": "__main__"})
+        runpy.run_path(str(path), init_globals=gate.script_globals)
 
     new_log()
     yield request.param, run
@@ -83,9 +90,36 @@ def script(request, tmp_path, monkeypatch):
 def test_a_script_extends_its_path_before_it_imports_its_trainer(script):
     name, run = script
     with SkipGate(adapter=name, **RULE) as gate:
-        run()
+        run(gate)
     gate.verify()
     assert gate.report()["backwards_skipped"] > 0 and gate.patched == []
+
+
+NOT_TOLD = [
+    ({"refine_share": "auto"}, 'refine_share="auto" must know the training views.*; give a share, such as 0.2'),
+    ({"grow_share": 0.5}, "grow_share leaves out iterations of densification.*; remove grow_share"),
+    ({"compensate": True}, "compensate=True must know the last iteration.*; use the gate without it"),
+]
+
+
+@pytest.mark.parametrize("script", ["step_trainer"], indirect=True)
+@pytest.mark.parametrize(("settings", "sentence"), NOT_TOLD)
+def test_a_refused_script_gets_no_advice_to_call_a_gate(script, settings, sentence):
+    name, run = script
+    with pytest.raises(SkipGSError, match=sentence) as error, SkipGate(adapter=name, **settings) as gate:
+        run(gate)
+    assert "gate." not in str(error.value)
+
+
+@pytest.mark.parametrize("script", ["step_trainer"], indirect=True)
+def test_a_script_that_is_warned_gets_no_advice_to_call_a_gate(script, recwarn):
+    name, run = script
+    with SkipGate(adapter=name, share=0.5) as gate:
+        run(gate)
+    assert gate.released is None
+    assert [str(one.message).partition("known, so ")[2] for one in recwarn] == [
+        "its densification runs whole, and iterations are left out after it."
+    ]
 
 
 def test_an_error_after_the_import_releases_the_gate_and_the_script_trains(script, monkeypatch, recwarn):
@@ -96,5 +130,5 @@ def test_an_error_after_the_import_releases_the_gate_and_the_script_trains(scrip
     monkeypatch.setattr(AbstractAdapter, "attach_on_call", fails)
     monkeypatch.setattr("skipgs_plug.core.hooks.Hooks.always", fails)
     with SkipGate(adapter=name, **RULE) as gate:
-        run()
+        run(gate)
     assert [str(one.message) for one in recwarn] == [gate.released] and "of the adapter" in gate.released

@@ -98,9 +98,10 @@ class Growing:
             SkipGSError: "auto" needs the number of views, and it is unknown.
         """
         if self.share is None and epoch is None:
+            needed = 'share="auto" must know the training views'
             raise SkipGSError(
-                'share="auto" must know the training views; give their names to gate.iterations() as views=, '
-                "or a share."
+                f"{needed}; give their names to gate.iterations() as views=, or a share.",
+                in_script=f"{needed}, which this trainer does not tell; give a share, such as 0.2.",
             )
         marks = densification.marks
         events = set() if densification.numbers is None else set(densification.numbers(numbers))

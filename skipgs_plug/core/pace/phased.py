@@ -200,8 +200,12 @@ class Phased(Pace):
             SkipGSError: The present iteration could have been left out.
         """
         how = "so the gate must count them; write the loop as for step in gate.iterations(range(...))."
-        if needed:
-            raise SkipGSError(f"share and refine_share leave out iterations, {how}")
+        if needed or self._giving_up.in_script:
+            leaves_out = "share and refine_share leave out iterations"
+            raise SkipGSError(
+                f"{leaves_out}, {how}",
+                in_script=f"{leaves_out}, but this adapter names no loop; use the gate without them.",
+            )
         if not self._asked:
             caution(f"refine_share leaves out iterations from {self._start} on, {how}")
 
@@ -246,7 +250,7 @@ class Phased(Pace):
                     why = f"No condition of the loop that names {marks} holds before iteration {self._start}"
                 else:
                     why = f"The numbers given as always replace the loop's conditions, also those that name {marks}"
-                self._grow_whole(why)
+                self._grow_whole(f"{why}.")
         held = {reason: hits for reason, hits in found[1].items() if hits}
         leaves_out = self.growing is not None and bool(grown) and self.growing.leaves_out
         before = self.refining.first - begun if leaves_out else 0
@@ -261,16 +265,20 @@ class Phased(Pace):
         if self.growing is None or self._densification is not None or self._start == 0:
             return
         if self._config.share is None:
-            raise SkipGSError(
+            sentence = (
                 "grow_share leaves out iterations of densification, but the densification events of this trainer are "
-                "not known; remove grow_share, or give events= to gate.iterations()."
+                "not known; remove grow_share"
             )
-        self._grow_whole("In a loop of your own give events= to gate.iterations()")
+            raise SkipGSError(f"{sentence}, or give events= to gate.iterations().", in_script=f"{sentence}.")
+        if self._giving_up.in_script:
+            self._grow_whole()
+        else:
+            self._grow_whole("In a loop of your own give events= to gate.iterations().")
 
-    def _grow_whole(self, reason: str) -> None:
+    def _grow_whole(self, *reasons: str) -> None:
         caution(
             "The densification events of this trainer are not known, so its densification runs whole, and iterations "
-            f"are left out after it. {reason}."
+            + " ".join(("are left out after it.", *reasons))
         )
         self.growing = None
 

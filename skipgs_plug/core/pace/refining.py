@@ -99,9 +99,10 @@ class Refining:
         total = last + 1 - self.first
         if self._auto and self.share is None:
             if epoch is None:
+                needed = 'refine_share="auto" must know the training views'
                 raise SkipGSError(
-                    'refine_share="auto" must know the training views; give their names to gate.iterations() as views='
-                    ", or a share."
+                    f"{needed}; give their names to gate.iterations() as views=, or a share.",
+                    in_script=f"{needed}, which this trainer does not tell; give a share, such as 0.2.",
                 )
             self.share = refining_share(total, epoch, grown)
         assert self.share is not None
