@@ -412,16 +412,48 @@ def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
             "import S, GaussianRasterizationSettings,",
             "import name 'S'",
         ),
+        ("import torch\n", "import torch, diff_gaussian_rasterization._C\n", "No module named"),
+        ("import torch\n", "import torch, diff_gaussian_rasterization as d; d._C.x\n", "no attribute '_C'"),
+        (
+            "import torch\n",
+            "import torch, simple_knn._C as k; k.distCUDA2(torch.ones(9, 3), 4)\n",
+            "takes 1 positional",
+        ),
+        ("import torch\n", "import torch, fused_ssim as f; f.fused_ssim(1, 2, window=3)\n", "argument 'window'"),
+        ("return {", "settings.kernel_size; return {", "no attribute 'kernel_size'"),
+        ("return {", "GaussianRasterizer(settings).integrate(model.xyz); return {", "no attribute 'integrate'"),
+        ("return {", "GaussianRasterizer(settings).markVisible(); return {", "markVisible() missing 1 required"),
+        (
+            "image, radii = GaussianRasterizer(settings)(",
+            "image, radii = (lambda *args, **kwargs: (out := GaussianRasterizer(settings)(*args, **kwargs), out[2]))(",
+            "output 2 of a rasterizer that has 2 outputs",
+        ),
     ],
-    ids=["setting", "argument", "result", "name"],
 )
-def test_rasterizer_of_a_forks_own_is_one_sentence(checkout, tmp_path, capfd, old, new, found):
+def test_what_the_stand_ins_lack_is_one_sentence(checkout, tmp_path, capfd, old, new, found):
     renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
     renderer.write_text(renderer.read_text().replace(old, new))
     assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
     error = capfd.readouterr().err
-    assert "uses its own rasterizer, for which --cpu has no stand-in" in error and found in error
-    assert "Traceback" not in error
+    assert "The script uses what the stand-ins of --cpu do not have (" in error and found in error
+    assert "it needs CUDA; run it without --cpu." in error and "Traceback" not in error
+
+
+def test_an_option_that_a_stand_in_refuses_is_one_sentence(checkout, tmp_path, capfd):
+    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
+    renderer.write_text(renderer.read_text().replace("scales=", "cov3D_precomp=torch.ones(12, 6), scales="))
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
+    error = capfd.readouterr().err
+    assert "skipgs-plug: The CPU stand-in needs scales and rotations" in error and "Traceback" not in error
+
+
+@pytest.mark.parametrize("line", ["(1, 2)[2]", "len(1, 2)", "None.integrate", "import simple_knx"])
+def test_an_error_of_the_scripts_own_keeps_its_traceback(checkout, tmp_path, capfd, line):
+    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
+    renderer.write_text(f"{line}\n" + renderer.read_text())
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
+    error = capfd.readouterr().err
+    assert "Traceback" in error and "stand-ins of --cpu" not in error
 
 
 def test_no_advice_to_give_what_is_given(checkout, tmp_path, capfd):
