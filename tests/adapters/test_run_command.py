@@ -242,6 +242,20 @@ def test_gate_goes_on_with_the_scripts_own_checkpoint(train, capfd):
     assert counted(given) == counted(whole)
 
 
+def test_a_checkpoint_may_be_an_open_file(checkout, train, capfd):
+    script = Path(checkout)
+    text = script.read_text()
+    for call, mode in (("torch.save(saved, ", "wb"), ("torch.load(", "rb")):
+        (line,) = (line.strip() for line in text.splitlines() if call in line)
+        path = line.partition(call)[2][:-1]
+        text = text.replace(line, f'with open({path}, "{mode}") as file: {line.replace(path, "file")}')
+    script.write_text(text)
+    _, whole = train("whole", "--save")
+    code, resumed = train("resumed", "--start", str(whole / "chkpnt40.pth"))
+    assert code == 0 and counted(resumed) == counted(whole)
+    assert f"The gate takes its state from {whole / 'chkpnt40.pth.skipgs.json'}." in capfd.readouterr().err
+
+
 def test_no_gate_runs_a_script_that_no_adapter_knows(tmp_path, capfd):
     script = tmp_path / "train.py"
     script.write_text("import pathlib, sys\npathlib.Path(sys.argv[1]).write_text('trained')\nsys.exit(3)\n")
