@@ -16,8 +16,7 @@ from skipgs_plug.adapters.gsplat_strategy import (
     survey_of,
 )
 from skipgs_plug.adapters.import_hook import when_imported
-from skipgs_plug.adapters.loop_code import LoopCode
-from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
+from skipgs_plug.adapters.loop_code import LoopCode, function_names
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
@@ -111,7 +110,6 @@ class GsplatRunner(AbstractAdapter):
         hooks.loop(
             function_names(type(runner).train), "train", always=lambda numbers: iterations_that_run(strategy, numbers)
         )
-        catch_up_schedulers(hooks, "train")
         hooks.check_drift(lambda: runner.optimizers)
         self._relocations = leave_out_noise(hooks, strategy, type(strategy))
         self.output_folder = runner.cfg.result_dir

@@ -16,9 +16,8 @@ from skipgs_plug.adapters.gsplat_strategy import (
     survey_of,
 )
 from skipgs_plug.adapters.import_hook import when_imported
-from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.adapters.loop_code import LoopCode, function_names
 from skipgs_plug.adapters.loss_scaler import guard_scaler
-from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 
@@ -92,7 +91,6 @@ class Nerfstudio(AbstractAdapter):
         hooks.wrap(pipeline.datamanager, "next_train", batch_made)
         hooks.gate_tensor_backward(LOOP)
         hooks.loop(function_names(type(trainer).train), "train", always=self.always_run, pure=("step_check",))
-        catch_up_schedulers(hooks, "scheduler_step_all")
         guard_scaler(hooks, trainer.grad_scaler)
         hooks.optimizer_names(lambda: trainer.optimizers.optimizers)
         hooks.check_drift(lambda: trainer.optimizers.optimizers)

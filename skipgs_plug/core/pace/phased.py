@@ -93,6 +93,15 @@ class Phased(Pace):
         if self.growing is not None:
             self.growing.require(number)
 
+    def is_named(self, number: int) -> bool:
+        if number >= self._start:
+            named = self.refining.always
+        elif self.growing is not None and self.growing.events is not None and number not in self.growing.events:
+            named = self.growing.always
+        else:
+            return True
+        return number in self._required or any(number in numbers for numbers in named.values())
+
     def follow(
         self,
         numbers: range,
