@@ -48,7 +48,7 @@ def refuse_several(because: str, instead: str) -> None:
         raise SkipGSError(f"{because}, but {group_size()} train together; {instead}.")
 
 
-def agree(own: Decision, device: torch.device | None = None) -> Decision:
+def agree(own: Decision, device: torch.device | None = None) -> Decision | None:
     """Combine this rank's decision with those of all others: skip only if every rank would.
 
     Args:
@@ -56,7 +56,7 @@ def agree(own: Decision, device: torch.device | None = None) -> Decision:
         device: Device of the loss, to which votes go if the group has no CPU backend; None for a plain number.
 
     Returns:
-        The decision of all ranks; INACTIVE if the gate of another rank is released, and this one must be too.
+        The decision of all ranks; None if the gate of another rank is released, and this one must be too.
 
     Raises:
         BrokenTrainingError: Another rank stopped with an error, or does not answer.
@@ -66,7 +66,7 @@ def agree(own: Decision, device: torch.device | None = None) -> Decision:
     if lowest == _END:
         raise BrokenTrainingError("The gate of another process stopped with an error; see its output.")
     if lowest == _RELEASE:
-        return decision.INACTIVE
+        return None
     if lowest == _POISONED:
         return decision.NON_FINITE
     if lowest == _RUN and own.skip:
@@ -98,7 +98,7 @@ def all_failed(step: int | None) -> bool:
     number = next(_failures)
     said = [f"skipgs_plug/error {number} in iteration {step} on rank {rank}" for rank in range(size)]
     try:
-        store.set(said[dist.get_rank()], "")
+        store.set(said[dist.get_rank()], "1")
         store.wait(said)
     except RuntimeError:  # the time is over, or the rank that holds the store has ended
         return False

@@ -113,10 +113,10 @@ class Release:
             self.release(error, step)
             return decision.INACTIVE, decision.INACTIVE
         answer = distributed.agree(own, device)
-        if answer is not decision.INACTIVE:
+        if answer is not None:
             return own, answer
         self.release(ReleaseError("the gate of another process is released; see its output"), step)
-        return answer, answer
+        return decision.INACTIVE, decision.INACTIVE
 
     def let_go(self, reason: str) -> None:
         """Undo the attachment, and warn with the reason, once."""

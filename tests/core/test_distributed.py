@@ -10,6 +10,7 @@ import signal
 import sys
 import time
 import warnings
+from collections.abc import Hashable
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,8 @@ import torch.distributed as dist
 import torch.distributed.nn
 import torch.multiprocessing as mp
 
-from skipgs_plug import SkipGate, SkipGSError
-from skipgs_plug.core import distributed
+from skipgs_plug import Decision, SkipGate, SkipGSError
+from skipgs_plug.core import decision, distributed
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.policy import RefinementPolicy
@@ -217,6 +218,28 @@ def test_an_error_of_the_gate_releases_it_on_all_ranks_together(
         assert end["said"] == "" and "The gate is released in iteration" in end["released"]
         cause = "like the 9 losses before it" if place == "losses" else "ZeroDivisionError: of"
         assert (cause if rank in ranks else "the gate of another process is released") in end["released"]
+
+
+class Inactive(SkipPolicy):
+    """A policy that begins later than the gate."""
+
+    def decide(self, view: Hashable, loss: float, step: int) -> Decision:
+        return decision.INACTIVE
+
+
+def never_begin(rank: int, folder: str) -> None:
+    start(rank, folder)
+    gate = SkipGate(start_iter=0, policy=Inactive(start_iter=0))
+    for step in range(3):
+        gate.backward(torch.ones(1, requires_grad=True).sum(), view="a", step=step)
+    Path(folder, f"{rank}.txt").write_text(str(gate.released))
+    dist.destroy_process_group()
+
+
+@pytest.mark.timeout(120)
+def test_a_policy_that_has_not_begun_releases_no_gate(tmp_path: Path) -> None:
+    mp.spawn(never_begin, args=(str(tmp_path),), nprocs=2)
+    assert [(tmp_path / f"{rank}.txt").read_text() for rank in range(2)] == ["None", "None"]
 
 
 @pytest.mark.timeout(120)
