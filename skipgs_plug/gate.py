@@ -182,10 +182,10 @@ class SkipGate:
         Raises:
             GateOrderError: `backward` was already called for this view in this iteration, `update` or `step` was
                 called before it, or the iteration number decreases.
-            SkipGSError: The loss is not a tensor, or losses stay non-finite. The first iteration also raises it if the
-                key is not usable, or if a share is given and the loop does not run over `iterations`. In later
-                iterations, such an error releases the gate with a warning, like any other error of the gate itself;
-                see `released`.
+            SkipGSError: The loss is not a tensor, or it is not finite and `on_nonfinite` is "raise". The first
+                iteration also raises it if the key is not usable, or if a share is given and the loop does not run over
+                `iterations`. In later iterations, such an error releases the gate with a warning, like any other error
+                of the gate itself; see `released`. So do losses that stay non-finite, in any iteration.
 
         Examples:
             A batch of two views in one iteration:
@@ -269,6 +269,8 @@ class SkipGate:
         Raises:
             GateOrderError: No iteration has run yet and `step` is not given.
         """
+        if self.released is not None:
+            return
         step = self._iteration.step if step is None else int(step)
         if step is None or self._engine.policy is None:
             raise GateOrderError("notify_event() came before the first iteration; give its step.")
@@ -419,7 +421,10 @@ class SkipGate:
             else:
                 distributed.refuse_unreachable_ranks()
                 adapter.attach(self._hooks)
-        except BaseException:
+        except BaseException as error:
+            if isinstance(error, Exception) and not isinstance(error, SkipGSError):
+                self._engine.giving_up.on_error(error, None)  # not foreseen, so the trainer runs without a gate
+                return
             self._hooks.restore()
             raise
 

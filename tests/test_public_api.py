@@ -73,7 +73,6 @@ HOOKS = {
     "always": "(self, always: 'Always') -> 'None'",
     "backward": "(self, loss: 'torch.Tensor', run: 'Callable[[], Any]', view: 'Any' = None) -> 'Any'",
     "before": "(self, owner: 'Any', name: 'str', call: 'Callable[..., Any]') -> 'None'",
-    "catch_up": "(self, owner: 'Any', name: 'str', caller: 'str') -> 'None'",
     "check_drift": "(self, optimizers: 'Optimizers') -> 'None'",
     "event": "(self, kind: 'str') -> 'None'",
     "events": "(self, owner: 'Any', *names: 'str') -> 'None'",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -16,13 +15,14 @@ from skipgs_plug.adapters.gsplat_strategy import (
     strategy_events,
     survey_of,
 )
-from skipgs_plug.adapters.loop_code import LoopCode
-from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
+from skipgs_plug.adapters.import_hook import when_imported
+from skipgs_plug.adapters.loop_code import LoopCode, function_names
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.host_copy import HostCopy
 
+MODULE = "gsplat.distributed"
 EXPECTED = ("cfg", "parser", "trainset", "rasterize_splats", "world_size")
 BATCH = "batch"  # one key for the joint loss of random batches: a batch never comes up twice
 
@@ -60,7 +60,7 @@ class GsplatRunner(AbstractAdapter):
 
     @classmethod
     def recognises_script(cls, code: LoopCode) -> bool:
-        return {"Runner", "gsplat.distributed"} <= code.names  # simple_trainer_2dgs.py has no gsplat.distributed
+        return {"Runner", MODULE} <= code.names  # simple_trainer_2dgs.py has no gsplat.distributed
 
     def attach_script(self, hooks: Hooks) -> None:
         def started(
@@ -72,7 +72,7 @@ class GsplatRunner(AbstractAdapter):
         # Only the launcher attaches in each spawned process.
         if not getattr(torch.multiprocessing.spawn, GATES_SPAWNED, False):
             refuse_other_processes(hooks)
-        hooks.wrap(importlib.import_module("gsplat.distributed"), "_distributed_worker", started)
+        when_imported(hooks, MODULE, lambda module: hooks.wrap(module, "_distributed_worker", started))
 
     def attach(self, hooks: Hooks) -> None:
         runner = self.trainer
@@ -110,7 +110,6 @@ class GsplatRunner(AbstractAdapter):
         hooks.loop(
             function_names(type(runner).train), "train", always=lambda numbers: iterations_that_run(strategy, numbers)
         )
-        catch_up_schedulers(hooks, "train")
         hooks.check_drift(lambda: runner.optimizers)
         self._relocations = leave_out_noise(hooks, strategy, type(strategy))
         self.output_folder = runner.cfg.result_dir

@@ -24,7 +24,12 @@ def when_imported(hooks: Hooks, name: str, call: Callable[[ModuleType], None]) -
     if name in sys.modules:
         call(sys.modules[name])
         return
-    finder = _Finder(name, call)
+
+    def guarded(module: ModuleType) -> None:
+        with hooks.guarded():
+            call(module)
+
+    finder = _Finder(name, guarded)
     sys.meta_path.insert(0, finder)
     hooks.on_detach(f"sys.meta_path ({name})", lambda: sys.meta_path.remove(finder))
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import ast
 import dis
+import inspect
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -101,6 +102,11 @@ class LoopCode(NamedTuple):
             frozenset(stored),
             syntax,
         )
+
+
+def function_names(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the global names of a function under its decorators."""
+    return inspect.unwrap(function).__globals__  # type: ignore[attr-defined]
 
 
 def _called(used: set[str], functions: Mapping[str, types.CodeType]) -> list[types.CodeType]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -16,12 +15,13 @@ from skipgs_plug.adapters.gsplat_strategy import (
     strategy_events,
     survey_of,
 )
-from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.adapters.import_hook import when_imported
+from skipgs_plug.adapters.loop_code import LoopCode, function_names
 from skipgs_plug.adapters.loss_scaler import guard_scaler
-from skipgs_plug.adapters.schedulers import catch_up_schedulers, function_names
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 
+MODULE = "nerfstudio.engine.trainer"
 LOOP = "train_iteration"
 CALLBACKS = ("step_cb", "step_post_backward")  # of splatfacto
 
@@ -60,7 +60,7 @@ class Nerfstudio(AbstractAdapter):
 
     def attach_script(self, hooks: Hooks) -> None:
         refuse_other_processes(hooks)
-        self.attach_on_call(hooks, importlib.import_module("nerfstudio.engine.trainer").Trainer, "train")
+        when_imported(hooks, MODULE, lambda module: self.attach_on_call(hooks, module.Trainer, "train"))
 
     def attach(self, hooks: Hooks) -> None:
         trainer = self.trainer
@@ -92,7 +92,6 @@ class Nerfstudio(AbstractAdapter):
         hooks.wrap(pipeline.datamanager, "next_train", batch_made)
         hooks.gate_tensor_backward(LOOP)
         hooks.loop(function_names(type(trainer).train), "train", always=self.always_run, pure=("step_check",))
-        catch_up_schedulers(hooks, "scheduler_step_all")
         guard_scaler(hooks, trainer.grad_scaler)
         hooks.optimizer_names(lambda: trainer.optimizers.optimizers)
         hooks.check_drift(lambda: trainer.optimizers.optimizers)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -10,10 +9,13 @@ from typing import Any
 import torch
 
 from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
+
+MODULE = "gaussian_splatting.prepare"
 
 # Attributes of the outermost trainer that `step` or this adapter uses.
 EXPECTED = ("step", "curr_step", "optimizer", "update_learning_rate", "preprocess", "before_optim_hook", "optim_step")
@@ -56,9 +58,6 @@ class StepTrainer(AbstractAdapter):
         return "prepare_trainer" in code.names
 
     def attach_script(self, hooks: Hooks) -> None:
-        # `python -m gaussian_splatting.train` binds this name when it is run.
-        prepare = importlib.import_module("gaussian_splatting.prepare")
-
         def prepared(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             options = sys._getframe(2).f_globals.get("args")  # frame 2 is the script's
             self.output_folder = getattr(options, "destination", None)
@@ -66,7 +65,8 @@ class StepTrainer(AbstractAdapter):
             self.attach(hooks)
             return self.trainer
 
-        hooks.wrap(prepare, "prepare_trainer", prepared)
+        # `python -m gaussian_splatting.train` binds this name after the import.
+        when_imported(hooks, MODULE, lambda module: hooks.wrap(module, "prepare_trainer", prepared))
         hooks.loop(hooks.script_globals, "training")
 
     def attach(self, hooks: Hooks) -> None:

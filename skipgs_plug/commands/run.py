@@ -43,7 +43,8 @@ def run(args: Args) -> int:
     with spawned.gated_when_spawned(functools.partial(run_spawned, args, command)) as processes:
         code, gate = run_gated(args, command, functools.partial(run_script, command, on_cpu=args.cpu))
     verify(code, gate)
-    if code == 0 and not processes and not (args.no_gate if gate is None else gate.trained):
+    seen = args.no_gate if gate is None else gate.trained or gate.released
+    if code == 0 and not processes and not seen:
         say(f"{script_name(command)} ended without a training iteration; nothing was gated.")
     return code
 
@@ -79,8 +80,7 @@ def verify(code: int, gate: SkipGate | None) -> None:
     """
     if code or gate is None or not gate.trained or not gate.config.enabled:
         return
-    if gate.released is None:
-        gate.verify()
+    gate.verify()
 
 
 def run_gated(

@@ -66,7 +66,9 @@ def splats(
     if (shs is None) == (colors is None):
         raise ValueError("Give the rasterizer either shs or colors_precomp.")
     if covariances is not None or scales is None or rotations is None:
-        raise NotImplementedError("The CPU stand-in needs scales and rotations: run without --compute_cov3D_python.")
+        raise NotImplementedError(
+            "The CPU stand-in needs scales and rotations: run without --compute_cov3D_python, or with CUDA."
+        )
     return Splats(means3D, means2D, opacities, scales, rotations, dc, shs, colors, scores)
 
 

@@ -18,12 +18,29 @@ from .settings import settings_class
 GaussianRasterizationSettings = settings_class({"debug": ("antialiasing",)}, defaults=(None,))
 
 
+class MissingOutputError(IndexError):
+    """A script reads an output that the stand-in's rasterizer does not have."""
+
+
+class Outputs(tuple[Any, ...]):
+    """Outputs of a rasterizer. The rasterizer of a fork can have more."""
+
+    def __getitem__(self, index: Any) -> Any:
+        try:
+            return super().__getitem__(index)
+        except IndexError:
+            raise MissingOutputError(f"output {index} of a rasterizer that has {len(self)} outputs") from None
+
+
 class RasterizerModule(torch.nn.Module):
     """Base of the rasterizer class of every family."""
 
     def __init__(self, raster_settings: Any) -> None:
         super().__init__()
         self.raster_settings = raster_settings
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Outputs:
+        return Outputs(super().__call__(*args, **kwargs))
 
     @torch.no_grad()
     def markVisible(self, positions: Tensor) -> Tensor:

@@ -27,6 +27,8 @@ class GaussianRasterizer(RasterizerModule):
     def forward(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **gaussians: Any) -> tuple:
         settings = self.raster_settings
         if settings.subpixel_offset.any():
-            raise NotImplementedError("The CPU stand-in has no subpixel offsets: run without --ray_jitter.")
+            raise NotImplementedError(
+                "The CPU stand-in has no subpixel offsets: run without --ray_jitter, or with CUDA."
+            )
         scene = splats(means3D, means2D, opacities, **gaussians)
         return render(settings, scene, antialiased=True, eps2d=settings.kernel_size, absgrad=True)[:2]

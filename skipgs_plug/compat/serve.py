@@ -100,8 +100,12 @@ def _extras(family: str) -> AbstractContextManager[None]:
     return one_free_gpu() if family == "scaffold_gs" else nullcontext()
 
 
+class StandIn(ModuleType):
+    """A module that a trainer imports in place of a CUDA module. Its class tells errors of its users from others."""
+
+
 def _module(name: str, source: str, offered: tuple[str, ...]) -> ModuleType:
-    module = ModuleType(name, f"CPU stand-in for {name}, served by skipgs_plug.")
+    module = StandIn(name, f"CPU stand-in for {name}, served by skipgs_plug.")
     ours = importlib.import_module(source, __package__)
     for attribute in offered:
         setattr(module, attribute, getattr(ours, attribute))

@@ -25,7 +25,7 @@ class SkipConfig:
             max(0.5, 1 - 0.5 * share that warm-up would have skipped); 0.0 removes the floor.
         enabled: False leaves training bit-identical to training without a gate.
         on_nonfinite: How to treat a NaN or infinite loss: "skip" its backward pass, "raise" an error, or "pass" it
-            on. It never enters a mean.
+            on. It never enters a mean. If as many in a row as there are views are not finite, the gate is released.
         pause_iters: Number of backward passes that run after a structural change. None is max(number of views, 500).
         share: Share of all iterations that runs, densification included, or "auto" for as many as the scene needs. It
             is the value of `grow_share` and `refine_share` where they are None.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import weakref
 from typing import Any
@@ -13,11 +14,13 @@ from torch import Tensor
 
 from skipgs_plug.core import decision
 from skipgs_plug.core.decision import Decision
-from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.errors import BrokenTrainingError, SkipGSError
 
-# Smallest wins: one rank's error stops all, one poisoned loss is left out by all, one backward makes all run.
-_ABORT, _POISONED, _RUN, _SKIP = range(4)
+# Smallest wins: one rank's error ends the training or releases the gates of all, one poisoned loss is left out by all,
+# one backward makes all run.
+_END, _RELEASE, _POISONED, _RUN, _SKIP = range(5)
 
+_failures = itertools.count()  # number of the next call of `all_failed`
 
 _AVAILABLE = dist.is_available()  # whether this build of PyTorch has torch.distributed
 
@@ -45,20 +48,25 @@ def refuse_several(because: str, instead: str) -> None:
         raise SkipGSError(f"{because}, but {group_size()} train together; {instead}.")
 
 
-def agree(own: Decision, device: torch.device | None = None) -> Decision:
+def agree(own: Decision, device: torch.device | None = None) -> Decision | None:
     """Combine this rank's decision with those of all others: skip only if every rank would.
 
     Args:
         own: Decision of this rank.
         device: Device of the loss, to which votes go if the group has no CPU backend; None for a plain number.
 
+    Returns:
+        The decision of all ranks; None if the gate of another rank is released, and this one must be too.
+
     Raises:
-        SkipGSError: Another rank stopped with an error, or does not answer.
+        BrokenTrainingError: Another rank stopped with an error, or does not answer.
     """
     vote = _SKIP if own.skip else _RUN
     lowest = _lowest(_POISONED if own is decision.NON_FINITE else vote, device)
-    if lowest == _ABORT:
-        raise SkipGSError("The gate of another process stopped with an error; see its output.")
+    if lowest == _END:
+        raise BrokenTrainingError("The gate of another process stopped with an error; see its output.")
+    if lowest == _RELEASE:
+        return None
     if lowest == _POISONED:
         return decision.NON_FINITE
     if lowest == _RUN and own.skip:
@@ -66,17 +74,42 @@ def agree(own: Decision, device: torch.device | None = None) -> Decision:
     return own
 
 
-def abort(device: torch.device | None = None) -> None:
-    """Tell the other ranks that this rank raises an error, so that they do not wait. They may have ended already."""
+def tell_error(ends: bool, device: torch.device | None = None) -> None:
+    """Tell the other ranks, in place of a vote, about an error on this rank. They may have ended already.
+
+    Args:
+        ends: Whether the error ends the training. Otherwise, the gates of all ranks are released.
+        device: See `agree`.
+    """
     with contextlib.suppress(SkipGSError):
-        _lowest(_ABORT, device)
+        _lowest(_END if ends else _RELEASE, device)
+
+
+def all_failed(step: int | None) -> bool:
+    """Return whether all ranks meet an error of the gate's own code in iteration `step`.
+
+    A rank calls it after such an error, and waits for the others, at most for the time-out of `init_process_group`. It
+    tells them through the store of the group, because a reduction could meet one of the trainer's.
+    """
+    size = group_size()
+    if size == 1:
+        return True
+    store = dist.distributed_c10d._get_default_store()
+    number = next(_failures)
+    said = [f"skipgs_plug/error {number} in iteration {step} on rank {rank}" for rank in range(size)]
+    try:
+        store.set(said[dist.get_rank()], "1")
+        store.wait(said)
+    except RuntimeError:  # the time is over, or the rank that holds the store has ended
+        return False
+    return True
 
 
 def mean(values: Tensor) -> list[float]:
     """Return the mean of each value [K] over all ranks, with one read of the device. All ranks must call it together.
 
     Raises:
-        SkipGSError: Another rank does not answer.
+        BrokenTrainingError: Another rank does not answer.
     """
     size = group_size()
     if size == 1:
@@ -106,7 +139,7 @@ def _reduced(values: Tensor, operation: Any) -> list[float]:
         dist.all_reduce(values, op=operation, group=group)
         return values.cpu().tolist()  # type: ignore[no-any-return]
     except RuntimeError as error:  # NCCL reports a missing peer only when the result is read
-        raise SkipGSError(
+        raise BrokenTrainingError(
             "Another process of the group did not answer: it ended, or waited longer than the time-out of "
             "init_process_group(); see its output, and resume all from their last checkpoint. PyTorch says: "
             f"{str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__}"

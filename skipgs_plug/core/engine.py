@@ -242,8 +242,9 @@ class Engine:
         self.iteration.ran = True
         try:
             skip = self.decide(view, copy).skip
-        except SkipGSError:
-            drop_gradients(loss)
+        except SkipGSError as error:
+            if self.giving_up.ends(error):
+                drop_gradients(loss)
             raise
         if skip:
             drop_gradients(loss)
@@ -262,7 +263,7 @@ class Engine:
         now = self.iteration
         assert now.step is not None
         self.stats.iterations += 1
-        if not now.gated:
+        if not now.gated or self.giving_up.reason is not None:
             now.decision = decision.INACTIVE
             return now.decision
         mean = None if self.trace is None else self.mean(view)
@@ -366,12 +367,7 @@ class Engine:
                 self._ranks_checked = True
             return self._own(view, loss, step)
         device = signal.device if isinstance(signal, Tensor) else None
-        try:
-            own = self._own(view, loss, step)
-        except SkipGSError:
-            distributed.abort(device)
-            raise
-        answer = distributed.agree(own, device)
+        own, answer = self.giving_up.agreed(lambda: self._own(view, loss, step), step, device)
         if answer is not own:
             assert self.policy is not None
             self.policy.overrule(own, answer)

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 
 class SkipGSError(RuntimeError):
-    """Base of all errors of the gate and the adapters: one sentence that names the thing and the fix."""
+    """Base of all errors of the gate and the adapters: one sentence that names the thing and the fix.
+
+    Args:
+        sentence: The sentence.
+        in_script: The sentence for the user of a script, who has no gate to call; None if it is the same.
+    """
+
+    def __init__(self, sentence: str = "", in_script: str | None = None) -> None:
+        super().__init__(sentence)
+        self.in_script = in_script
 
 
 class UnknownTrainerError(SkipGSError):
@@ -16,7 +25,11 @@ class AdapterMismatchError(SkipGSError):
 
 
 class BrokenTrainingError(SkipGSError):
-    """The training itself is broken, for example because losses stay non-finite. It is raised at any time."""
+    """The training itself cannot go on, for example because another process has ended. It is raised at any time."""
+
+
+class ReleaseError(SkipGSError):
+    """The gate is of no use to this training. It is released at any time, and refuses nothing."""
 
 
 class GateOrderError(SkipGSError):

@@ -71,9 +71,9 @@ class Hooks(LoopHooks):
         self._giving_up.undoes(self.restore)
         # Refusals come with the first iteration, when nothing is lost yet.
         self._giving_up.refuses = lambda: max(self._iterations, self._backwards) <= 1
+        self._giving_up.in_script = in_script
         self._guarded = self._giving_up.guarded(lambda: self._iteration.step)
         self._ready = False
-        self._in_script = in_script
         self.script_globals: dict[str, Any] = {}
         self._iteration = engine.iteration
         self._drift: DriftCheck | None = None
@@ -123,7 +123,7 @@ class Hooks(LoopHooks):
                 self._release_moved(moved)
                 return
             before = self._iteration.step
-            if before is not None and step < before and (self._in_script or not self._engine.config.enabled):
+            if before is not None and step < before and (self._giving_up.in_script or not self._engine.config.enabled):
                 self._giving_up.let_go(
                     f"The gate is released: iterations went back from {before} to {step}, as in a second training run "
                     "of one process. Training goes on without it, in all its iterations"
@@ -354,7 +354,9 @@ class Hooks(LoopHooks):
         self._patches.restore()
 
     def verify(self) -> None:
-        """Raise AdapterMismatchError unless training ran, with one training backward per iteration."""
+        """Raise AdapterMismatchError unless training ran, with one training backward per iteration, or without gate."""
+        if self.released:
+            return
         if self._iterations == 0:
             raise self._mismatch("no iteration of a training loop was seen")
         if self._iterations <= CHECKED_ITERATIONS:

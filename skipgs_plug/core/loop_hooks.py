@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -12,6 +11,7 @@ from skipgs_plug.core.optimizers import Named, Optimizers
 from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_known
 from skipgs_plug.core.pace.loop_range import LoopRange, replace_range
 from skipgs_plug.core.pace.phased import Phased
+from skipgs_plug.core.pace.schedulers import catch_up_schedulers
 from skipgs_plug.core.trainer_info import Densification
 
 
@@ -40,7 +40,8 @@ class LoopHooks:
     ) -> None:
         """Name the functions whose loop over `range` may be the training loop, so that iterations can be left out.
 
-        Iterations that the loop's own conditions name (`if iteration % 1000 == 0`) always run.
+        Iterations that the loop's own conditions name (`if iteration % 1000 == 0`) always run. Learning-rate schedulers
+        of PyTorch are kept where they would be if all iterations ran.
 
         Args:
             names: Global names of the functions' module; `script_globals` for a script that is about to run.
@@ -60,6 +61,7 @@ class LoopHooks:
         if isinstance(pace, Phased):
             pace.describe(always or nothing_always, pure, densification, known or nothing_known)
             replace_range(self._patches, names, functions, pace)
+            catch_up_schedulers(self._patches, pace)
 
     def always(self, always: Always) -> None:
         """Name iterations that must run, if the loop is the user's own.
@@ -124,27 +126,3 @@ class LoopHooks:
     def gap(self) -> int:
         """Number of iterations that were left out right before the present one."""
         return self._engine.pace.gap
-
-    def catch_up(self, owner: Any, name: str, caller: str) -> None:
-        """Call `owner.name` once more for every iteration that was left out before the present one.
-
-        For what advances per call instead of by the iteration's number.
-
-        Args:
-            owner: The object or class that holds the function, as for `wrap`.
-            name: Attribute of the function.
-            caller: Name of the function whose calls count.
-
-        Raises:
-            AdapterMismatchError: The owner has no function of this name.
-        """
-        if not self._engine.pace.leaves_out:
-            return
-
-        def repeated(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            if sys._getframe(2).f_code.co_name == caller:  # 0 is this function, 1 the wrapper
-                for _ in range(self.gap):
-                    original(*args, **kwargs)
-            return original(*args, **kwargs)
-
-        self._patches.wrap(owner, name, repeated)

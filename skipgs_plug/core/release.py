@@ -7,9 +7,12 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from types import TracebackType
 
-from skipgs_plug.core import distributed
+import torch
+
+from skipgs_plug.core import decision, distributed
 from skipgs_plug.core.caution import caution
-from skipgs_plug.core.errors import BrokenTrainingError, GateOrderError, SkipGSError
+from skipgs_plug.core.decision import Decision
+from skipgs_plug.core.errors import BrokenTrainingError, GateOrderError, ReleaseError, SkipGSError
 
 log = logging.getLogger(__name__)
 
@@ -17,8 +20,12 @@ log = logging.getLogger(__name__)
 class Release:
     """Releases the gate after an error, so that training continues without it.
 
-    A refusal is raised while it costs no trained iterations. An error of the training itself is raised at any time, and
-    so is every error for which other processes would wait. Any other error releases the gate, with one warning.
+    A refusal is raised while it costs no trained iterations. An error of the training itself is raised at any time. Any
+    other error releases the gate, with one warning.
+
+    Processes that train together must all skip a backward pass or none, and leave out the same iterations. Their gates
+    are released together: if all meet an error in the same iteration, or if one tells the others in a vote. An error
+    of which the others do not hear is raised.
 
     Args:
         enabled: Whether the gate is on. A gate that is off refuses nothing.
@@ -27,6 +34,7 @@ class Release:
     Attributes:
         reason: The sentence of the warning; None while the gate is attached.
         refuses: The argument.
+        in_script: Whether the trainer is a script, whose user has no gate to call.
     """
 
     def __init__(self, enabled: bool, refuses: Callable[[], bool]) -> None:
@@ -34,6 +42,7 @@ class Release:
         self._undo: list[Callable[[], None]] = []
         self.reason: str | None = None
         self.refuses = refuses
+        self.in_script = False
 
     def undoes(self, undo: Callable[[], None]) -> None:
         """Add a function that undoes a part of the attachment when the gate is released."""
@@ -49,19 +58,65 @@ class Release:
 
         Raises:
             Exception: The error, if it is a refusal that costs nothing, if it is an error of the training itself, or if
-                other processes would wait for this one.
+                other processes did not meet one.
         """
         if self.reason is not None:
             return
-        broken = isinstance(error, (BrokenTrainingError, GateOrderError))
-        refusal = isinstance(error, SkipGSError) and (self.refuses() if refuses is None else refuses)
-        if broken or (self._enabled and (refusal or distributed.group_size() > 1)):
+        if self.in_script and isinstance(error, SkipGSError) and error.in_script is not None:
+            error.args = (error.in_script,)
+        if self.ends(error, refuses) or (self._enabled and not distributed.all_failed(step)):
             self._take_back()
             raise error
-        why = str(error) if isinstance(error, SkipGSError) else f"{type(error).__name__}: {error}"
+        self.release(error, step)
+
+    def ends(self, error: Exception, refuses: bool | None = None) -> bool:
+        """Return whether an error ends the training: a refusal that costs nothing, or an error of the training itself.
+
+        Args:
+            error: The error.
+            refuses: See `on_error`.
+        """
+        if isinstance(error, (BrokenTrainingError, GateOrderError)):
+            return True
+        if not self._enabled or isinstance(error, ReleaseError) or not isinstance(error, SkipGSError):
+            return False
+        return self.refuses() if refuses is None else refuses
+
+    def release(self, error: Exception, step: int | None) -> None:
+        """Release the gate after an error of which all processes know, and warn with its message."""
+        foreseen = isinstance(error, SkipGSError)
+        why = str(error) if foreseen else f"{type(error).__name__}: {error}; report it to the project skipgs_plug"
         where = "" if step is None else f" in iteration {step}"
         log.debug("The error that releases the gate:", exc_info=error)
         self.let_go(f"The gate is released{where}, and training goes on without it, in all its iterations ({why})")
+
+    def agreed(
+        self, decide: Callable[[], Decision], step: int, device: torch.device | None
+    ) -> tuple[Decision, Decision]:
+        """Return this rank's decision, and the one on which all ranks agree; both are INACTIVE if the gate is released.
+
+        Args:
+            decide: Returns the decision of this rank.
+            step: Present iteration.
+            device: See `distributed.agree`.
+
+        Raises:
+            Exception: An error on this rank or on another one ends the training.
+        """
+        try:
+            own = decide()
+        except Exception as error:
+            ends = self.ends(error)
+            distributed.tell_error(ends, device)
+            if ends:
+                raise
+            self.release(error, step)
+            return decision.INACTIVE, decision.INACTIVE
+        answer = distributed.agree(own, device)
+        if answer is not None:
+            return own, answer
+        self.release(ReleaseError("the gate of another process is released; see its output"), step)
+        return decision.INACTIVE, decision.INACTIVE
 
     def let_go(self, reason: str) -> None:
         """Undo the attachment, and warn with the reason, once."""

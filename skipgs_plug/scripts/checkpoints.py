@@ -55,13 +55,13 @@ class Checkpoints:
         @functools.wraps(save)
         def save_both(obj: Any, f: Any, *args: Any, **kwargs: Any) -> None:
             save(obj, f, *args, **kwargs)
-            if isinstance(f, (str, os.PathLike)):
-                self._save_beside(Path(f))
+            if (path := _path_of(f)) is not None:
+                self._save_beside(path)
 
         @functools.wraps(load)
         def load_and_remember(f: Any, *args: Any, **kwargs: Any) -> Any:
-            if self._search and isinstance(f, (str, os.PathLike)):
-                beside = _beside(Path(f))
+            if self._search and (path := _path_of(f)) is not None:
+                beside = _beside(path)
                 (self._found if beside.is_file() else self._without).append(beside)
             return load(f, *args, **kwargs)
 
@@ -116,6 +116,12 @@ class Checkpoints:
         except Exception as error:  # the script has its checkpoint and can continue to train
             why = f"{type(error).__name__}: {error}"
             _say(f"{_beside(checkpoint)} could not be written ({why}): if a run resumes here, its gate starts afresh.")
+
+
+def _path_of(file: Any) -> Path | None:
+    """Return the path of a file that a script saves or loads, by its path or as an open file; None if it has none."""
+    name = file if isinstance(file, os.PathLike) else getattr(file, "name", file)
+    return Path(name) if isinstance(name, (str, os.PathLike)) else None
 
 
 def _beside(checkpoint: Path) -> Path:

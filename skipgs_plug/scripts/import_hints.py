@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import re
-import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
 # Modules that every checkout of the Inria family contains.
 OF_CHECKOUTS = frozenset({"arguments", "gaussian_renderer", "scene", "utils"})
 EXTENSIONS = ("diff_", "simple_knn", "fused_ssim")
-# Functions of the stand-ins, as messages of a `TypeError` name them.
-RASTERIZER = re.compile(r"GaussianRaster\w+|\bsplats\(\)")
 # Packages by the name of their module, where the two differ.
 PACKAGES = {
     "cv2": "opencv-python",
@@ -60,30 +57,6 @@ def install_hint(module: str, script: Path, on_cpu: bool = False) -> str:
     return (
         f"{script.name} needs the module {module}, which is not installed and not in its folder. If {module} is part "
         "of the checkout, fetch the whole checkout; otherwise install the package that the trainer's README names."
-    )
-
-
-def foreign_rasterizer(error: BaseException) -> str | None:
-    """Return a sentence that explains an error from a rasterizer call that the CPU stand-in does not support.
-
-    Returns:
-        The sentence; None for any other error.
-    """
-    text, last = str(error), traceback.extract_tb(error.__traceback__)[-1:]
-    found = None
-    if isinstance(error, ModuleNotFoundError):
-        return None
-    if isinstance(error, ImportError) and error.name and error.name.startswith(EXTENSIONS):
-        found = text.partition(" (")[0]
-    elif isinstance(error, TypeError) and RASTERIZER.search(text):
-        found = text
-    elif isinstance(error, ValueError) and "to unpack" in text and "gaussian_renderer" in last[0].filename:
-        found = f"{text} where the renderer unpacks the results"
-    if found is None:
-        return None
-    return (
-        f"The script uses its own rasterizer, for which --cpu has no stand-in ({found}): run it on a GPU, without "
-        "--cpu."
     )
 
 

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.scripts.import_hints import foreign_rasterizer, install_hint
+from skipgs_plug.scripts.import_hints import install_hint
+from skipgs_plug.scripts.stand_in_hints import stand_in_hint
 
 Attach = Callable[[], dict[str, Any]]  # see `run_script`
 
@@ -64,7 +65,7 @@ def _run(
         except SkipGSError:
             raise
         except BaseException as error:
-            if on_cpu and (sentence := foreign_rasterizer(error)):
+            if on_cpu and (sentence := stand_in_hint(error)):
                 print(f"skipgs-plug: {sentence}", file=sys.stderr)
                 return 1
             _print_traceback(error, program)

@@ -11,6 +11,7 @@ import torch
 
 from skipgs_plug import cli
 from skipgs_plug.adapters.speedy_splat import SpeedySplat
+from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.scripts.checkpoints import Checkpoints
 
 RENDERER = """
@@ -241,6 +242,20 @@ def test_gate_goes_on_with_the_scripts_own_checkpoint(train, capfd):
     assert counted(given) == counted(whole)
 
 
+def test_a_checkpoint_may_be_an_open_file(checkout, train, capfd):
+    script = Path(checkout)
+    text = script.read_text()
+    for call, mode in (("torch.save(saved, ", "wb"), ("torch.load(", "rb")):
+        (line,) = (line.strip() for line in text.splitlines() if call in line)
+        path = line.partition(call)[2][:-1]
+        text = text.replace(line, f'with open({path}, "{mode}") as file: {line.replace(path, "file")}')
+    script.write_text(text)
+    _, whole = train("whole", "--save")
+    code, resumed = train("resumed", "--start", str(whole / "chkpnt40.pth"))
+    assert code == 0 and counted(resumed) == counted(whole)
+    assert f"The gate takes its state from {whole / 'chkpnt40.pth.skipgs.json'}." in capfd.readouterr().err
+
+
 def test_no_gate_runs_a_script_that_no_adapter_knows(tmp_path, capfd):
     script = tmp_path / "train.py"
     script.write_text("import pathlib, sys\npathlib.Path(sys.argv[1]).write_text('trained')\nsys.exit(3)\n")
@@ -398,6 +413,18 @@ def test_script_in_a_subfolder_may_extend_its_path_first(checkout, tmp_path, cap
     assert not any("_Finder" in repr(finder) for finder in sys.meta_path)
 
 
+@pytest.mark.parametrize("options", [[], ["--share", "auto"], ["--no-gate"]], ids=lambda options: " ".join(options))
+def test_an_error_while_the_gate_attaches_lets_the_script_train(checkout, tmp_path, capfd, monkeypatch, options):
+    def fails(*args, **kwargs):
+        raise TypeError("of the adapter")
+
+    monkeypatch.setattr(Hooks, "loop", fails)
+    with pytest.warns(RuntimeWarning, match=r"goes on without it.*TypeError: of the adapter; report it to the project"):
+        assert cli.main(["run", "inria", "--cpu", *options, "--", checkout, str(tmp_path)]) == 0
+    error = capfd.readouterr().err
+    assert (tmp_path / "model.pth").exists() and "Traceback" not in error and "nothing was gated" not in error
+
+
 def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(SpeedySplat, "stand_ins", "inria")  # the look-alike has Inria's rasterizer
     wrong = ["run", "speedy_splat", "--no-gate", "--cpu", "--", checkout, str(tmp_path)]
@@ -423,16 +450,48 @@ def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
             "import S, GaussianRasterizationSettings,",
             "import name 'S'",
         ),
+        ("import torch\n", "import torch, diff_gaussian_rasterization._C\n", "No module named"),
+        ("import torch\n", "import torch, diff_gaussian_rasterization as d; d._C.x\n", "no attribute '_C'"),
+        (
+            "import torch\n",
+            "import torch, simple_knn._C as k; k.distCUDA2(torch.ones(9, 3), 4)\n",
+            "takes 1 positional",
+        ),
+        ("import torch\n", "import torch, fused_ssim as f; f.fused_ssim(1, 2, window=3)\n", "argument 'window'"),
+        ("return {", "settings.kernel_size; return {", "no attribute 'kernel_size'"),
+        ("return {", "GaussianRasterizer(settings).integrate(model.xyz); return {", "no attribute 'integrate'"),
+        ("return {", "GaussianRasterizer(settings).markVisible(); return {", "markVisible() missing 1 required"),
+        (
+            "image, radii = GaussianRasterizer(settings)(",
+            "image, radii = (lambda *args, **kwargs: (out := GaussianRasterizer(settings)(*args, **kwargs), out[2]))(",
+            "output 2 of a rasterizer that has 2 outputs",
+        ),
     ],
-    ids=["setting", "argument", "result", "name"],
 )
-def test_rasterizer_of_a_forks_own_is_one_sentence(checkout, tmp_path, capfd, old, new, found):
+def test_what_the_stand_ins_lack_is_one_sentence(checkout, tmp_path, capfd, old, new, found):
     renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
     renderer.write_text(renderer.read_text().replace(old, new))
     assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
     error = capfd.readouterr().err
-    assert "uses its own rasterizer, for which --cpu has no stand-in" in error and found in error
-    assert "Traceback" not in error
+    assert "The script uses what the stand-ins of --cpu do not have (" in error and found in error
+    assert "it needs CUDA; run it without --cpu." in error and "Traceback" not in error
+
+
+def test_an_option_that_a_stand_in_refuses_is_one_sentence(checkout, tmp_path, capfd):
+    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
+    renderer.write_text(renderer.read_text().replace("scales=", "cov3D_precomp=torch.ones(12, 6), scales="))
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
+    error = capfd.readouterr().err
+    assert "skipgs-plug: The CPU stand-in needs scales and rotations" in error and "Traceback" not in error
+
+
+@pytest.mark.parametrize("line", ["(1, 2)[2]", "len(1, 2)", "None.integrate", "import simple_knx"])
+def test_an_error_of_the_scripts_own_keeps_its_traceback(checkout, tmp_path, capfd, line):
+    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
+    renderer.write_text(f"{line}\n" + renderer.read_text())
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
+    error = capfd.readouterr().err
+    assert "Traceback" in error and "stand-ins of --cpu" not in error
 
 
 def test_no_advice_to_give_what_is_given(checkout, tmp_path, capfd):

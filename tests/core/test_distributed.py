@@ -10,8 +10,10 @@ import signal
 import sys
 import time
 import warnings
+from collections.abc import Hashable
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -21,9 +23,13 @@ import torch.distributed as dist
 # step. A group that exists by then lives until the interpreter's end, and its threads can abort the process there.
 import torch.distributed.nn
 import torch.multiprocessing as mp
+from skipgs_plug.core.pace.policy import RefinementPolicy
 
-from skipgs_plug import SkipGate, SkipGSError
-from skipgs_plug.core import distributed
+from skipgs_plug import Decision, SkipGate, SkipGSError
+from skipgs_plug.core import decision, distributed
+from skipgs_plug.core.engine import Engine
+from skipgs_plug.core.pace.phased import Phased
+from skipgs_plug.core.policy import SkipPolicy
 
 STEPS = 300
 
@@ -138,6 +144,109 @@ def test_ranks_in_trouble_end_within_the_time_out(tmp_path: Path, kind: str, siz
         assert set(said.values()) == {"done"}
     else:
         assert all("did not answer" in sentence for sentence in said.values())
+
+
+def release(rank: int, folder: str, place: str, ranks: tuple[int, ...]) -> None:
+    """The gate's own code fails at a place on some ranks, from iteration 60 on; says what each rank did."""
+    start(rank, folder, seconds=5)
+    owner, name, share = PLACES[place]
+    now, original = 0, getattr(owner, name)
+
+    def fails(*args: Any) -> Any:
+        if now >= 60 and rank in ranks:
+            raise ZeroDivisionError(f"of {name}")
+        return original(*args)
+
+    setattr(owner, name, fails)
+    parameter = torch.nn.Parameter(torch.ones(1))
+    parameter.register_hook(lambda grad: (dist.all_reduce(grad := grad.clone()), grad)[1])
+    gate = SkipGate(start_iter=20, warmup=5, min_bwd_ratio=0.0, refine_share=share, compensate=False)
+    ran, said, poison = [], "", 1.0
+    try:
+        for now in gate.iterations(range(200), always=[60]):
+            poison = math.nan if place == "losses" and now >= 60 and rank in ranks else 1.0
+            with warnings.catch_warnings(record=True):
+                warnings.simplefilter("always")
+                if gate.backward(parameter.sum() * poison, view=f"v{now % 3}", step=now):
+                    ran.append(now)
+    except (ZeroDivisionError, SkipGSError) as error:
+        said = str(error)
+    Path(folder, f"{rank}.json").write_text(json.dumps({"ran": ran, "said": said, "released": gate.released}))
+    os._exit(0)  # a broken group is not left in order
+
+
+# By name: a function of the gate that fails, and the refine_share of the gate; None for losses that are not finite.
+PLACES: dict[str, Any] = {
+    "decision": (SkipPolicy, "decide", None),
+    "decision with a share": (RefinementPolicy, "decide", 0.5),
+    "iteration": (Engine, "open_iteration", None),
+    "number": (Phased, "_runs", 0.5),
+    "losses": (SkipPolicy, "notify_event", None),
+}
+
+
+def released(folder: Path, place: str, ranks: tuple[int, ...]) -> list[dict[str, Any]]:
+    context = mp.get_context("spawn")
+    processes = [context.Process(target=release, args=(rank, str(folder), place, ranks)) for rank in range(2)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(60)
+    assert not any(process.is_alive() for process in processes)
+    return [json.loads((folder / f"{rank}.json").read_text()) for rank in range(2)]
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize(
+    ("place", "ranks"),
+    [
+        ("decision", (1,)),
+        ("decision with a share", (1,)),
+        ("iteration", (0, 1)),
+        ("number", (0, 1)),
+        ("losses", (1,)),
+    ],
+)
+def test_an_error_of_the_gate_releases_it_on_all_ranks_together(
+    tmp_path: Path, place: str, ranks: tuple[int, ...]
+) -> None:
+    one, two = released(tmp_path, place, ranks)
+    assert one["ran"] == two["ran"] and len(one["ran"]) < 200
+    later = 70 if place == "losses" else 60
+    assert [step for step in one["ran"] if step >= later] == list(range(later, 200))
+    for rank, end in enumerate((one, two)):
+        assert end["said"] == "" and "The gate is released in iteration" in end["released"]
+        cause = "like the 9 losses before it" if place == "losses" else "ZeroDivisionError: of"
+        assert (cause if rank in ranks else "the gate of another process is released") in end["released"]
+
+
+class Inactive(SkipPolicy):
+    """A policy that begins later than the gate."""
+
+    def decide(self, view: Hashable, loss: float, step: int) -> Decision:
+        return decision.INACTIVE
+
+
+def never_begin(rank: int, folder: str) -> None:
+    start(rank, folder)
+    gate = SkipGate(start_iter=0, policy=Inactive(start_iter=0))
+    for step in range(3):
+        gate.backward(torch.ones(1, requires_grad=True).sum(), view="a", step=step)
+    Path(folder, f"{rank}.txt").write_text(str(gate.released))
+    dist.destroy_process_group()
+
+
+@pytest.mark.timeout(120)
+def test_a_policy_that_has_not_begun_releases_no_gate(tmp_path: Path) -> None:
+    mp.spawn(never_begin, args=(str(tmp_path),), nprocs=2)
+    assert [(tmp_path / f"{rank}.txt").read_text() for rank in range(2)] == ["None", "None"]
+
+
+@pytest.mark.timeout(120)
+def test_an_error_of_which_the_other_rank_does_not_hear_ends_both(tmp_path: Path) -> None:
+    one, two = released(tmp_path, "number", ranks=(1,))
+    assert two["said"] == "of _runs" and "did not answer" in one["said"]
+    assert one["released"] is None and two["released"] is None
 
 
 def refine(rank: int, folder: str, share: float | str, nothing_on_the_cpu: bool) -> None:

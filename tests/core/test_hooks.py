@@ -12,7 +12,6 @@ from torch.optim import lr_scheduler as schedulers
 
 from skipgs_plug import AdapterMismatchError, GateOrderError, SkipGate, SkipGSError, UnknownTrainerError
 from skipgs_plug.adapters import AbstractAdapter, TrainerInfo
-from skipgs_plug.adapters.schedulers import catch_up_schedulers
 from skipgs_plug.core.pace.refining import Refining
 from skipgs_plug.core.policy import SkipPolicy
 
@@ -401,27 +400,44 @@ SCHEDULERS = {
 }
 
 
+def train(trainer, every, twentieth, first: int = 0, stop: int | None = None) -> None:
+    """Train with schedulers that step in every iteration, and with one that steps in every twentieth."""
+    for step in range(first, 100):
+        trainer.begin(step)
+        (trainer.render("v0") ** 2).mean().backward()
+        trainer.optimizer.step()
+        [scheduler.step() for scheduler in every]
+        if step % 20 == 0:
+            twentieth.step()
+        if step == stop:
+            return
+
+
+class Scheduling(Toy):
+    def attach(self, hooks) -> None:
+        super().attach(hooks)
+        hooks.loop(globals(), "train")
+
+
+@pytest.mark.parametrize("stop", [None, 50], ids=["whole", "resumed"])
 @pytest.mark.parametrize("kind", SCHEDULERS)
-def test_schedulers_that_count_calls_are_where_they_would_be_if_all_iterations_ran(kind) -> None:
-    class Scheduling(Toy):
-        def attach(self, hooks) -> None:
-            super().attach(hooks)
-            catch_up_schedulers(hooks, "train")
-
-    def train(trainer, steps) -> float:
-        scheduler = SCHEDULERS[kind](trainer.optimizer)
-        for step in steps:
-            trainer.begin(step)
-            (trainer.render("v0") ** 2).mean().backward()
-            trainer.optimizer.step()
-            scheduler.step()
-        return trainer.optimizer.param_groups[0]["lr"]
-
-    expected = train(ToyTrainer(), range(100))
-    trainer = ToyTrainer()
-    with SkipGate(trainer, adapter=Scheduling(trainer), refine_share=0.1) as gate:
-        assert train(trainer, gate.iterations(range(100), always=[70])) == pytest.approx(expected)
-    assert gate.stats()["iterations_skipped"] > 60
+def test_schedulers_that_count_calls_are_where_they_would_be_if_all_iterations_ran(kind, stop) -> None:
+    rates = []
+    for settings in ({"enabled": False}, {"refine_share": 0.1}):
+        trainer = ToyTrainer()
+        every = [SCHEDULERS[kind](trainer.optimizer)]
+        twentieth = schedulers.ExponentialLR(trainer.optimizer, 0.9)
+        with SkipGate(trainer, adapter=Scheduling(trainer), **settings) as gate:
+            train(trainer, every, twentieth, stop=stop)
+        state = gate.state_dict()
+        if stop is not None:
+            with SkipGate(trainer, adapter=Scheduling(trainer), **settings) as resumed:
+                resumed.load_state_dict(state)
+                train(trainer, every, twentieth, first=stop + 1)
+        every[0].step()  # once more, after training
+        rates.append(trainer.optimizer.param_groups[0]["lr"])
+    assert rates[1] == pytest.approx(rates[0])
+    assert gate.stats()["iterations_skipped"] > 20
 
 
 def test_processes_without_a_group_are_refused(monkeypatch) -> None:

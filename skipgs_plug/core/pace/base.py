@@ -109,6 +109,10 @@ class Pace:
     def require(self, number: int) -> None:
         """Make iteration `number` run. Call it for a need that shows only during the run."""
 
+    def is_named(self, number: int) -> bool:
+        """Return whether a condition of the loop, or the adapter, may name iteration `number`."""
+        return True
+
     @property
     def leaves_out(self) -> bool:
         """Whether whole iterations may be left out; the pace then needs the training loop."""

@@ -46,9 +46,10 @@ class Compensated(Pace):
 
     def begin(self, step: int, policy: Policy | None) -> None:
         if self._last is None:
+            needed = "compensate=True must know the last iteration"
             raise SkipGSError(
-                "compensate=True must know the last iteration: write the loop as "
-                "for step in gate.iterations(range(...))."
+                f"{needed}: write the loop as for step in gate.iterations(range(...)).",
+                in_script=f"{needed}, which this trainer does not tell; use the gate without it.",
             )
         if step < self._start:
             self._rates.pause()

@@ -81,9 +81,10 @@ class Growing(Phase):
             SkipGSError: "auto" needs the number of views, and it is unknown.
         """
         if self.share is None and plan.epoch is None:
+            needed = 'share="auto" must know the training views'
             raise SkipGSError(
-                'share="auto" must know the training views; give their names to gate.iterations() as views=, '
-                "or a share."
+                f"{needed}; give their names to gate.iterations() as views=, or a share.",
+                in_script=f"{needed}, which this trainer does not tell; give a share, such as 0.2.",
             )
         numbers, found, densification, named = plan.numbers, plan.conditions, plan.densification, plan.named
         assert densification is not None
@@ -134,6 +135,9 @@ class Growing(Phase):
 
     def shortened(self, end: int) -> int:
         return 0 if self._first is None or self._all_must else end - self._first
+
+    def is_named(self, number: int) -> bool:
+        return self.events is None or number in self.events or any(number in hits for hits in self.always.values())
 
     def require(self, number: int) -> None:
         self._must |= {number}

@@ -54,9 +54,11 @@ class LoopFinder:
             return True
         self._without += needed
         if self._without == SEARCHED:
+            sentence = (
+                "No loop over range(...) counts the iterations of this trainer, so the gate cannot leave any out; "
+                "use it without share and refine_share"
+            )
             raise AdapterMismatchError(
-                "No loop over range(...) counts the iterations of this trainer, so the gate cannot leave any "
-                "out; use it without share and refine_share, or write the loop as: "
-                "for step in gate.iterations(range(...))."
+                f"{sentence}, or write the loop as: for step in gate.iterations(range(...)).", in_script=f"{sentence}."
             )
         return False

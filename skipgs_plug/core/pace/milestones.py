@@ -396,9 +396,10 @@ def read_loop(
             and node.lineno <= line - first + 1 <= (node.iter.end_lineno or node.lineno)
         ):
             return LoopCode(node, tree, code, {**names, **known}, known, frozenset(pure))
+    found = f"Line {line} of {code.co_filename} is not in a loop over one number"
     raise SkipGSError(
-        f"Line {line} of {code.co_filename} is not in a loop over one number; "
-        "write the loop as: for step in gate.iterations(range(...))."
+        f"{found}; write the loop as: for step in gate.iterations(range(...)).",
+        in_script=f"{found}; name the iterations that must run (--always).",
     )
 
 

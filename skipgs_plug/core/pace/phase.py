@@ -72,6 +72,10 @@ class Phase:
         """Whether iteration `number` runs; called once for each number, in order."""
         return True
 
+    def is_named(self, number: int) -> bool:
+        """Return whether a condition of the loop, or the adapter, may name iteration `number`."""
+        return True
+
     def require(self, number: int) -> None:
         """Make iteration `number` run. Call it for a need that shows only during the run."""
 

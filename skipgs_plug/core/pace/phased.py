@@ -93,6 +93,10 @@ class Phased(Pace):
         self.refining.require(number)
         self.growing.require(number)
 
+    def is_named(self, number: int) -> bool:
+        phase = self.growing if number < self._start else self.refining
+        return number in self._required or phase.is_named(number)
+
     def follow(
         self,
         numbers: range,
@@ -199,8 +203,12 @@ class Phased(Pace):
             SkipGSError: The present iteration could have been left out.
         """
         how = "so the gate must count them; write the loop as for step in gate.iterations(range(...))."
-        if needed:
-            raise SkipGSError(f"share and refine_share leave out iterations, {how}")
+        if needed or self._giving_up.in_script:
+            leaves_out = "share and refine_share leave out iterations"
+            raise SkipGSError(
+                f"{leaves_out}, {how}",
+                in_script=f"{leaves_out}, but this adapter names no loop; use the gate without them.",
+            )
         if not self._asked:
             caution(f"refine_share leaves out iterations from {self._start} on, {how}")
 
@@ -246,8 +254,8 @@ class Phased(Pace):
         assert self._densification is not None
         marks = ", ".join(self._densification.marks)
         if self._config.always is None:
-            return f"No condition of the loop that names {marks} holds before iteration {self._start}"
-        return f"The numbers given as always replace the loop's conditions, also those that name {marks}"
+            return f"No condition of the loop that names {marks} holds before iteration {self._start}."
+        return f"The numbers given as always replace the loop's conditions, also those that name {marks}."
 
     def _require_events(self) -> None:
         """Let the growing phase run whole if its densification events are not known.
@@ -258,16 +266,20 @@ class Phased(Pace):
         if not self.growing.leaves_out or self._densification is not None or self._start == 0:
             return
         if self._config.share is None:
-            raise SkipGSError(
+            sentence = (
                 "grow_share leaves out iterations of densification, but the densification events of this trainer are "
-                "not known; remove grow_share, or give events= to gate.iterations()."
+                "not known; remove grow_share"
             )
-        self._grow_whole("In a loop of your own give events= to gate.iterations()")
+            raise SkipGSError(f"{sentence}, or give events= to gate.iterations().", in_script=f"{sentence}.")
+        if self._giving_up.in_script:
+            self._grow_whole()
+        else:
+            self._grow_whole("In a loop of your own give events= to gate.iterations().")
 
-    def _grow_whole(self, reason: str) -> None:
+    def _grow_whole(self, *reasons: str) -> None:
         caution(
             "The densification events of this trainer are not known, so its densification runs whole, and iterations "
-            f"are left out after it. {reason}."
+            + " ".join(("are left out after it.", *reasons))
         )
         self.growing = Phase()
 

@@ -94,9 +94,10 @@ class Refining(Phase):
         total = plan.last + 1 - self._first
         if self._auto and self.share is None:
             if plan.epoch is None:
+                needed = 'refine_share="auto" must know the training views'
                 raise SkipGSError(
-                    'refine_share="auto" must know the training views; give their names to gate.iterations() as views='
-                    ", or a share."
+                    f"{needed}; give their names to gate.iterations() as views=, or a share.",
+                    in_script=f"{needed}, which this trainer does not tell; give a share, such as 0.2.",
                 )
             self.share = refining_share(total, plan.epoch, grown)
         assert self.share is not None
@@ -153,6 +154,9 @@ class Refining(Phase):
             of_share = not self._over and self.ran_for[OF_SHARE] < self.sampling.due
             self.ran_for[OF_SHARE if of_share else OF_LOOP] += 1
         return runs
+
+    def is_named(self, number: int) -> bool:
+        return any(number in hits for hits in self.always.values())
 
     def require(self, number: int) -> None:
         self._must |= {number}

@@ -1,0 +1,59 @@
+"""Explain an error of a script that uses what a CPU stand-in does not have."""
+
+from __future__ import annotations
+
+import re
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("skipgs_plug.compat", "skipgs_plug.fallback_raster")  # hold the stand-ins and the rasterizer behind them
+FOLDERS = tuple(Path(__file__).parents[1] / package.rpartition(".")[2] for package in PACKAGES)
+# Begins the message of a `TypeError` of a call with other arguments than the function has.
+SIGNATURE = re.compile(r"([\w.]+)\(\) (got|takes|missing) ")
+
+
+def stand_in_hint(error: BaseException) -> str | None:
+    """Return a sentence that explains an error of a script that uses what a CPU stand-in does not have.
+
+    That can be a name, an argument or an output, or an option that the stand-in refuses.
+
+    Returns:
+        The sentence; None for any other error.
+    """
+    text, last = str(error), traceback.extract_tb(error.__traceback__)[-1:]
+    inside = bool(last) and any(folder in Path(last[0].filename).parents for folder in FOLDERS)
+    lacks = False
+    if isinstance(error, NotImplementedError) and inside:
+        return text
+    if isinstance(error, AttributeError):
+        lacks = is_stand_in(error.obj)
+    elif isinstance(error, ImportError) and error.name:  # of a name, or of a module inside a stand-in
+        lacks = any(is_stand_in(sys.modules.get(name)) for name in (error.name, error.name.rpartition(".")[0]))
+        text = text.partition(" (")[0]
+    elif isinstance(error, TypeError) and (call := SIGNATURE.match(text)):
+        lacks = inside or call[1].partition(".")[0] in callables()
+    elif isinstance(error, IndexError):
+        lacks = is_stand_in(error)
+    elif isinstance(error, ValueError) and "to unpack" in text:
+        lacks = "gaussian_renderer" in last[0].filename
+        text += " where the renderer unpacks the outputs"
+    if not lacks:
+        return None
+    return f"The script uses what the stand-ins of --cpu do not have ({text}): it needs CUDA; run it without --cpu."
+
+
+def is_stand_in(thing: Any) -> bool:
+    """Return whether this is a module or class of the stand-ins, or an object of such a class."""
+    kind = thing if isinstance(thing, type) else type(thing)
+    return kind.__module__.startswith(PACKAGES)
+
+
+def callables() -> Iterator[str]:
+    """Yield the names of the stand-ins' classes and functions, with which messages of a `TypeError` begin."""
+    for module in [module for module in sys.modules.values() if is_stand_in(module)]:
+        for value in vars(module).values():
+            kinds = value.__mro__ if isinstance(value, type) else (value,)
+            yield from (kind.__name__ for kind in kinds if str(getattr(kind, "__module__", "")).startswith(PACKAGES))
