@@ -39,13 +39,13 @@ class Release:
         """Add a function that undoes a part of the attachment when the gate is released."""
         self._undo.append(undo)
 
-    def on_error(self, error: Exception, step: int | None, refuses: bool | None = None) -> None:
+    def on_error(self, error: Exception, step: int | None, refuses: bool = True) -> None:
         """Raise an error of the gate's own code, or release the gate.
 
         Args:
             error: The error.
             step: Present iteration; None if it is not known.
-            refuses: Whether a refusal costs nothing, if the caller knows better than the attribute `refuses`.
+            refuses: Whether the caller may still refuse the run, if that costs nothing.
 
         Raises:
             Exception: The error, if it is a refusal that costs nothing, if it is an error of the training itself, or if
@@ -54,7 +54,7 @@ class Release:
         if self.reason is not None:
             return
         broken = isinstance(error, (BrokenTrainingError, GateOrderError))
-        refusal = isinstance(error, SkipGSError) and (self.refuses() if refuses is None else refuses)
+        refusal = isinstance(error, SkipGSError) and refuses and self.refuses()
         if broken or (self._enabled and (refusal or distributed.group_size() > 1)):
             self._take_back()
             raise error
