@@ -73,8 +73,7 @@ def closure(function: Any) -> dict[str, Any]:
     return held
 
 
-@functools.lru_cache(maxsize=1024)
-def syntax_of(function: FunctionType) -> ast.FunctionDef | None:
+def read_syntax(function: FunctionType) -> ast.FunctionDef | None:
     """Return the syntax of a function, whose first line is line 1; None if there is no source."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
@@ -82,3 +81,6 @@ def syntax_of(function: FunctionType) -> ast.FunctionDef | None:
         return None
     name = function.__code__.co_name
     return next((node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name), None)
+
+
+syntax_of = functools.lru_cache(maxsize=1024)(read_syntax)  # the same tree each time, which nobody may change
