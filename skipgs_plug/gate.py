@@ -131,8 +131,9 @@ class SkipGate:
         It also works for your own loop around a trainer that the gate is attached to.
 
         Some iterations always run: the last one, and every iteration whose number fulfils a condition of your loop,
-        such as `if step % 1000 == 0`. The gate reads the conditions from the source of the loop. If a scheduler
-        advances by one with each call, set it to the number of the iteration instead.
+        such as `if step % 1000 == 0`. The gate reads the conditions from the source of the loop, and of your own
+        functions that the loop calls with the number. If a scheduler advances by one with each call, set it to the
+        number of the iteration instead.
 
         Args:
             numbers: All iterations of the run, or all remaining ones, as a range with step 1.

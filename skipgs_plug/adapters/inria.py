@@ -20,12 +20,13 @@ import torch
 from skipgs_plug.adapters import registry
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.import_hook import when_imported
-from skipgs_plug.adapters.loop_bounds import last_calls, undecorated
+from skipgs_plug.adapters.loop_bounds import last_calls
 from skipgs_plug.adapters.loop_code import LOOP, LoopCode
 from skipgs_plug.adapters.unknown_forks import BY_HAND, CALLS, Unrecognised, begin_after, left_alone, unrecognised
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.pace.called import undecorated
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 from skipgs_plug.core.views import view_key
 

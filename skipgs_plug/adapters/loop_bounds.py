@@ -6,14 +6,13 @@ Both are read from the source of the loop and of the trainer's functions that it
 from __future__ import annotations
 
 import ast
-import functools
 import inspect
 import math
 import textwrap
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from types import CodeType, FunctionType, MethodType
+from types import CodeType
 from typing import Any
 
 from skipgs_plug.adapters.loop_names import (
@@ -29,6 +28,7 @@ from skipgs_plug.adapters.loop_names import (
     without,
 )
 from skipgs_plug.adapters.trainer_code import Part, TrainerCode
+from skipgs_plug.core.pace.called import called, syntax_of, undecorated
 
 NUMBER = "iteration"  # variable that holds the iteration's number in every loop of the Inria family
 ASSIGNED = "data ="  # represents an assignment to a tensor's `data` among the names of calls
@@ -82,7 +82,7 @@ class CallReader:
                 of the run.
         """
         plain = undecorated(function)
-        syntax = None if plain is None else _syntax_of(plain)
+        syntax = None if plain is None else syntax_of(plain)
         if plain is None or syntax is None or plain.__code__ in self._open or len(self._open) == MAX_DEPTH:
             return
         owner = getattr(function, "__self__", None)
@@ -141,9 +141,9 @@ class CallReader:
     def _follow(self, name: str, call: ast.Call, scope: Scope, end: int | None) -> None:
         if name in self._stops:
             return
-        function = _called(call.func, scope)
+        function = called(call.func, scope.values, lambda place: value_of(place, scope), scope.code)
         plain = undecorated(function)
-        syntax = None if plain is None or plain not in self.trainer else _syntax_of(plain)
+        syntax = None if plain is None or plain not in self.trainer else syntax_of(plain)
         if syntax is None:
             return
         owner = getattr(function, "__self__", None)
@@ -216,53 +216,6 @@ def function_of(source: Path | Any, name: str) -> ast.FunctionDef | None:
     except (OSError, TypeError, ValueError, SyntaxError):
         return None
     return next((node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name), None)
-
-
-def undecorated(function: Any) -> FunctionType | None:
-    """Return the function under its decorators, even without `functools.wraps`; None if it is not a Python function."""
-    function = function.__func__ if isinstance(function, MethodType) else function
-    if not isinstance(function, FunctionType):
-        return None
-    function = inspect.unwrap(function)
-    for cell in getattr(function, "__closure__", None) or ():
-        held = getattr(cell, "cell_contents", None)
-        if isinstance(held, FunctionType) and held.__name__ == function.__name__ and held is not function:
-            return undecorated(held)
-    return function if isinstance(function, FunctionType) else None
-
-
-@functools.lru_cache(maxsize=1024)
-def _syntax_of(function: FunctionType) -> ast.FunctionDef | None:
-    return function_of(function, function.__code__.co_name)
-
-
-def _called(node: ast.expr, scope: Scope) -> Any:
-    """Return the function that an expression names; None if unknown. Properties are not evaluated."""
-    match node:
-        case ast.Name(name):
-            return scope.values.get(name)
-        case ast.Attribute(ast.Call(ast.Name("super"), []), name):
-            return _inherited(name, scope)
-        case ast.Attribute(place, name):
-            owner = value_of(place, scope)
-            found = inspect.getattr_static(owner, name, None)
-            if isinstance(found, FunctionType) and not inspect.isclass(owner) and not inspect.ismodule(owner):
-                in_class = inspect.getattr_static(type(owner), name, None) is found
-                return MethodType(found, owner) if in_class else found
-            return found.__func__ if isinstance(found, staticmethod) else found
-    return None
-
-
-def _inherited(name: str, scope: Scope) -> Any:
-    """Return the method that `super().name` names in the function that is being read."""
-    owner = scope.values.get("self")
-    above = iter(type(owner).__mro__)
-    for cls in above:
-        own = undecorated(vars(cls).get(name))
-        if own is not None and own.__code__ is scope.code:
-            break
-    found = next((vars(cls)[name] for cls in above if isinstance(vars(cls).get(name), FunctionType)), None)
-    return None if found is None else MethodType(found, owner)
 
 
 def _sooner(one: int | None, other: int | None) -> int | None:

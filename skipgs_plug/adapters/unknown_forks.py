@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 
 import torch
 
-from skipgs_plug.adapters.loop_bounds import ASSIGNED, CallReader, undecorated
+from skipgs_plug.adapters.loop_bounds import ASSIGNED, CallReader
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Adapter
+from skipgs_plug.core.pace.called import undecorated
 
 # Functions that draw random numbers.
 NOISE = frozenset({"randn", "randn_like", "normal"})

@@ -48,13 +48,13 @@ class Release:
         """Add a function that undoes a part of the attachment when the gate is released."""
         self._undo.append(undo)
 
-    def on_error(self, error: Exception, step: int | None, refuses: bool | None = None) -> None:
+    def on_error(self, error: Exception, step: int | None, refuses: bool = True) -> None:
         """Raise an error of the gate's own code, or release the gate.
 
         Args:
             error: The error.
             step: Present iteration; None if it is not known.
-            refuses: Whether a refusal costs nothing, if the caller knows better than the attribute `refuses`.
+            refuses: Whether the caller may still refuse the run, if that costs nothing.
 
         Raises:
             Exception: The error, if it is a refusal that costs nothing, if it is an error of the training itself, or if
@@ -69,7 +69,7 @@ class Release:
             raise error
         self.release(error, step)
 
-    def ends(self, error: Exception, refuses: bool | None = None) -> bool:
+    def ends(self, error: Exception, refuses: bool = True) -> bool:
         """Return whether an error ends the training: a refusal that costs nothing, or an error of the training itself.
 
         Args:
@@ -80,7 +80,7 @@ class Release:
             return True
         if not self._enabled or isinstance(error, ReleaseError) or not isinstance(error, SkipGSError):
             return False
-        return self.refuses() if refuses is None else refuses
+        return refuses and self.refuses()
 
     def release(self, error: Exception, step: int | None) -> None:
         """Release the gate after an error of which all processes know, and warn with its message."""

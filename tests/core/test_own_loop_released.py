@@ -113,6 +113,19 @@ def test_a_bad_key_is_refused_in_the_first_iteration_and_releases_later(recwarn)
     assert [str(one.message) for one in recwarn] == [gate.released] and "in iteration 9" in gate.released
 
 
+def test_second_part_of_a_loop_that_cannot_be_planned_releases_the_gate(recwarn):
+    loop, upcoming = Loop(), 60
+    gate = SkipGate(start_iter=50, refine_share=0.3)
+    loop.train(gate, range(40))
+    for step in gate.iterations(range(40, LAST)):
+        gate.backward(loop.losses()[0], view="a.png", step=step)
+        loop.stepped.append(step)
+        if step == upcoming:
+            upcoming += 10
+    assert loop.stepped == list(range(LAST)) and "(step == upcoming)" in gate.released
+    assert [str(one.message) for one in recwarn][1:] == [gate.released]  # the first names gate.iterations()
+
+
 def test_an_error_of_the_loops_own_backward_stays_its_own():
     loss = torch.ones((), requires_grad=True) * 2
     loss.backward()

@@ -70,14 +70,14 @@ def only_shows(statement: ast.If, names: Mapping[str, Any], around: ast.AST) -> 
         names: Names and values that the function had before the loop.
         around: Syntax tree of the function. Variables that a branch assigns must not be read elsewhere in it.
     """
+    if not any(isinstance(part, ast.Call) and _is_bars(part, names) for part in ast.walk(statement)):
+        return False
     inside = {id(part) for part in ast.walk(statement)}
     read = {
         part.id
         for part in ast.walk(around)
         if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Load) and id(part) not in inside
     }
-    if not any(isinstance(part, ast.Call) and _is_bars(part, names) for part in ast.walk(statement)):
-        return False
     only = all(_shows(one, names, read) for one in [*statement.body, *statement.orelse])
     return only and not any(_moves_inside(one, names) for one in statement.orelse)
 

@@ -3,63 +3,135 @@
 from __future__ import annotations
 
 import ast
-import types
+import inspect
+import linecache
+import math
+import re
+from collections import deque
 from collections.abc import Collection, Mapping
+from types import CodeType
 from typing import Any
+
+import torch
+
+# Built-in functions that conditions may call. They change nothing.
+PURE = frozenset({"abs", "all", "any", "bool", "divmod", "float", "frozenset", "getattr", "int", "isinstance", "len"})
+PURE |= {"list", "max", "min", "range", "round", "set", "sorted", "sum", "tuple"}
+_UNKNOWN = object()
+# Containers whose length an option may be.
+_CONTAINERS = (deque, dict, frozenset, list, range, set, tuple, torch.utils.data.DataLoader, torch.utils.data.Dataset)
 
 
 class Settled:
     """Recognises the options of a run: names that a function has before its loop and that the loop does not assign.
 
-    Only plain values count (numbers, text, flags, None and lists of them), in variables of the function itself or in
-    objects without methods, such as a namespace of options. Methods of other objects, such as a model, may change them.
+    Only plain values count (numbers, text, flags, None and collections of them), in variables of the function itself,
+    in constants of its module, in dictionaries, or in objects without methods, such as a namespace of options. Methods
+    of other objects, such as a model, may change them.
 
     Args:
         code: Code of the function that holds the loop.
         source: Syntax tree of the function, or of the whole module for a loop at module level.
         names: Names and values that the function has before the loop.
         changing: Names and attributes that the loop assigns or changes.
+        shared: Further names that other functions may change.
         pure: Names of functions that only read their arguments.
     """
 
     def __init__(
         self,
-        code: types.CodeType,
+        code: CodeType,
         source: ast.AST,
         names: Mapping[str, Any],
         changing: Collection[str],
+        shared: Collection[str],
         pure: Collection[str],
     ) -> None:
-        own = {*code.co_varnames, *code.co_cellvars} if code.co_varnames or code.co_cellvars else set(code.co_names)
-        shared = (node.names for node in ast.walk(source) if isinstance(node, (ast.Global, ast.Nonlocal)))
-        self._own = own.difference(*shared)  # other functions may change shared names
+        declared = (node.names for node in ast.walk(source) if isinstance(node, (ast.Global, ast.Nonlocal)))
+        # A module's own variables are its names.
+        self._own = {*code.co_varnames, *code.co_cellvars} if code.co_flags & inspect.CO_NEWLOCALS else {*code.co_names}
+        of_module = switched(code.co_filename).difference(code.co_varnames, code.co_cellvars)
+        self._shared = of_module.union(code.co_freevars, shared, *declared)
         self._names, self._changing, self._pure = names, changing, pure
 
     def __contains__(self, node: object) -> bool:
-        """Whether an expression consists of options, constants and pure functions only."""
-        if isinstance(node, ast.Constant):
-            return True
-        if isinstance(node, (ast.Name, ast.Attribute)):
-            found, value = self._look_up(node)
-            return found and is_plain(value)
-        if isinstance(node, ast.Call):
-            pure = isinstance(node.func, ast.Name) and node.func.id in self._pure and not node.keywords
-            return pure and all(argument in self for argument in node.args)
-        if isinstance(node, (ast.BoolOp, ast.BinOp, ast.UnaryOp, ast.Compare, ast.Tuple, ast.List, ast.Set)):
-            return all(part in self for part in ast.iter_child_nodes(node) if isinstance(part, ast.expr))
+        """Whether an expression consists of options, constants and functions that only read."""
+        return self._holds(node, False)
+
+    def keeps_value(self, node: ast.expr) -> bool:
+        """Whether an expression consists of options, and of lengths of containers that the loop does not change.
+
+        Functions that the loop calls can change such a container. So a length may tell how often an iteration is
+        needed, but it does not show that a condition never holds.
+        """
+        return self._holds(node, True)
+
+    def only_reads(self, call: ast.Call) -> bool:
+        """Whether a call changes nothing, whatever its arguments are."""
+        if isinstance(call.func, ast.Name):
+            return call.func.id in self._pure
+        if isinstance(call.func, ast.Attribute):
+            holder = self._look_up(call.func.value)
+            return holder is math or (isinstance(holder, dict) and call.func.attr == "get")
         return False
 
-    def _look_up(self, node: ast.expr) -> tuple[bool, Any]:
-        """Return whether a name or an attribute is a known option, and its value."""
+    def _holds(self, node: object, lengths: bool) -> bool:
+        if isinstance(node, ast.Constant):
+            return True
+        if isinstance(node, (ast.BoolOp, ast.BinOp, ast.UnaryOp, ast.Compare, ast.IfExp, ast.Tuple, ast.List, ast.Set)):
+            return all(self._holds(part, lengths) for part in ast.iter_child_nodes(node) if isinstance(part, ast.expr))
+        if not isinstance(node, (ast.Name, ast.Attribute, ast.Subscript, ast.Call)):
+            return False
+        value = self._look_up(node)
+        if isinstance(value, (list, set)) and not self._is_own(node):
+            return False  # any function can change it
+        if value is not _UNKNOWN or not isinstance(node, ast.Call):
+            return is_plain(value)
+        match node:
+            case ast.Call(ast.Name("len"), [held]) if lengths and isinstance(self._look_up(held), _CONTAINERS):
+                return True
+            case ast.Call(_, arguments, []):
+                return self.only_reads(node) and all(self._holds(argument, lengths) for argument in arguments)
+        return False
+
+    def _is_own(self, node: ast.expr) -> bool:
+        """Whether a value is that of a variable of the function itself, or is held by one."""
+        while isinstance(node, (ast.Attribute, ast.Subscript)):
+            node = node.value
+        return isinstance(node, ast.Name) and node.id in self._own
+
+    def _look_up(self, node: ast.expr) -> Any:
+        """Return the value of an option, or of an object that holds options; `_UNKNOWN` if it is neither."""
         if ast.unparse(node) in self._changing:
-            return False, None
-        if isinstance(node, ast.Name):
-            return node.id in self._own and node.id in self._names, self._names.get(node.id)
-        if isinstance(node, ast.Attribute):
-            found, holder = self._look_up(node.value)
-            if found and only_holds(holder) and node.attr in vars(holder):
-                return True, vars(holder)[node.attr]
-        return False, None
+            return _UNKNOWN
+        match node:
+            case ast.Name(name):
+                return _UNKNOWN if name in self._shared else self._names.get(name, _UNKNOWN)
+            case ast.Attribute(holder, name):
+                return _attribute(self._look_up(holder), name, _UNKNOWN)
+            case ast.Call(ast.Name("getattr"), [holder, ast.Constant(str(name)), ast.Constant(default)]):
+                return _attribute(self._look_up(holder), name, default)
+            case ast.Call(ast.Attribute(holder, "get"), [ast.Constant(key)]):
+                return _item(self._look_up(holder), key, None)
+            case ast.Call(ast.Attribute(holder, "get"), [ast.Constant(key), ast.Constant(default)]):
+                return _item(self._look_up(holder), key, default)
+            case ast.Subscript(holder, ast.Constant(key)):
+                return _item(self._look_up(holder), key, _UNKNOWN)
+        return _UNKNOWN
+
+
+def switched(file: str) -> set[str]:
+    """Return the global names of a source file that its functions may assign."""
+    declared = re.findall(r"\bglobal\s+(\w+(?:\s*,\s*\w+)*)", "".join(linecache.getlines(file)))
+    return {name.strip() for names in declared for name in names.split(",")}
+
+
+def _attribute(holder: Any, name: str, default: Any) -> Any:
+    return vars(holder).get(name, default) if only_holds(holder) else _UNKNOWN
+
+
+def _item(holder: Any, key: Any, default: Any) -> Any:
+    return holder.get(key, default) if isinstance(holder, dict) else _UNKNOWN
 
 
 def is_plain(value: Any) -> bool:

@@ -1,0 +1,86 @@
+"""The function that a call in the source of a trainer names, and the source of that function."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import functools
+import inspect
+import textwrap
+from collections.abc import Callable, Mapping
+from types import CodeType, FunctionType, MethodType
+from typing import Any
+
+
+def called(
+    function: ast.expr, names: Mapping[str, Any], value: Callable[[ast.expr], Any], code: CodeType | None = None
+) -> Any:
+    """Return the function that an expression names; None if it is unknown. Properties are not evaluated.
+
+    Args:
+        function: The expression before the brackets of the call.
+        names: Names and values where the call is.
+        value: Returns the value of an expression there; None if it is unknown.
+        code: Code of the function that makes the call, for `super()`; None outside of methods.
+    """
+    match function:
+        case ast.Name(name):
+            return names.get(name)
+        case ast.Attribute(ast.Call(ast.Name("super"), []), name):
+            return _inherited(name, names.get("self"), code)
+        case ast.Attribute(place, name):
+            owner = value(place)
+            found = inspect.getattr_static(owner, name, None)
+            if isinstance(found, FunctionType) and not inspect.isclass(owner) and not inspect.ismodule(owner):
+                in_class = inspect.getattr_static(type(owner), name, None) is found
+                return MethodType(found, owner) if in_class else found
+            return found.__func__ if isinstance(found, staticmethod) else found
+    return None
+
+
+def _inherited(name: str, owner: Any, code: CodeType | None) -> Any:
+    """Return the method that `super().name` names in the method with this code."""
+    above = iter(type(owner).__mro__)
+    for cls in above:
+        own = undecorated(vars(cls).get(name))
+        if own is not None and own.__code__ is code:
+            break
+    found = next((vars(cls)[name] for cls in above if isinstance(vars(cls).get(name), FunctionType)), None)
+    return None if found is None else MethodType(found, owner)
+
+
+def undecorated(function: Any) -> FunctionType | None:
+    """Return the function under its decorators, even without `functools.wraps`; None if it is not a Python function."""
+    function = function.__func__ if isinstance(function, MethodType) else function
+    if not isinstance(function, FunctionType):
+        return None
+    function = inspect.unwrap(function)
+    if not isinstance(function, FunctionType):
+        return None
+    for held in closure(function).values():
+        if isinstance(held, FunctionType) and held.__name__ == function.__name__ and held is not function:
+            return undecorated(held)
+    return function
+
+
+def closure(function: Any) -> dict[str, Any]:
+    """Return names and values of the variables that a function shares with the function around it, if they are set."""
+    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    held: dict[str, Any] = {}
+    for name, cell in cells:
+        with contextlib.suppress(ValueError):  # not set yet
+            held[name] = cell.cell_contents
+    return held
+
+
+def read_syntax(function: FunctionType) -> ast.FunctionDef | None:
+    """Return the syntax of a function, whose first line is line 1; None if there is no source."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    except (OSError, TypeError, ValueError, SyntaxError):
+        return None
+    name = function.__code__.co_name
+    return next((node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name), None)
+
+
+syntax_of = functools.lru_cache(maxsize=1024)(read_syntax)  # the same tree each time, which nobody may change

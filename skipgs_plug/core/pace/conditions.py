@@ -1,0 +1,160 @@
+"""Syntax of conditions: where the statements of a loop have them, and the conditions under which they are reached."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+from skipgs_plug.core.pace.in_place import InPlace
+
+_POINT = (ast.Eq, ast.NotEq, ast.In, ast.NotIn, ast.Is, ast.IsNot)
+_ENDS = (ast.Return, ast.Continue, ast.Break, ast.Raise)
+Guards = tuple[ast.expr, ...]
+
+
+class Condition(NamedTuple):
+    """A condition in the source.
+
+    Attributes:
+        test: The condition.
+        guards: Conditions that all hold where it is evaluated.
+        function: The function that contains it, if the loop calls one; None in the loop itself.
+    """
+
+    test: ast.expr
+    guards: Guards
+    function: InPlace | None
+
+
+def conditions_in(
+    body: Sequence[ast.stmt], functions: Mapping[int, InPlace], guards: Guards = (), function: InPlace | None = None
+) -> Iterator[Condition]:
+    """Yield all conditions in statements, and in the functions that they call.
+
+    Args:
+        body: The statements.
+        functions: Called functions by the id of the call.
+        guards: Conditions under which the statements run.
+        function: The function that the statements are of; None for the loop.
+    """
+    for statement in body:
+        if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            continue
+        for part in ast.iter_child_nodes(statement):
+            if not isinstance(part, (ast.stmt, ast.ExceptHandler, ast.match_case)):
+                for call, reached in _calls(part, guards):
+                    if (inside := functions.get(id(call))) is not None:
+                        yield from conditions_in(inside.body, functions, reached, inside)
+        if isinstance(statement, (ast.If, ast.While)):
+            yield Condition(statement.test, guards, function)
+            yield from conditions_in(statement.body, functions, (*guards, statement.test), function)
+            yield from conditions_in(statement.orelse, functions, (*guards, _not(statement.test)), function)
+        else:
+            if isinstance(statement, ast.Match):
+                yield from (Condition(equal, guards, function) for equal in _cases(statement))
+            for block in _blocks(statement):
+                yield from conditions_in(block, functions, guards, function)
+            for part in ast.iter_child_nodes(statement):
+                if isinstance(part, ast.expr):
+                    yield from (Condition(*found, function) for found in _values(part, guards))
+        ends = _ends_early([statement])
+        if ends is not None:
+            guards = (*guards, _not(ends))
+
+
+def leaves(node: ast.expr) -> Iterator[ast.expr]:
+    """Yield the parts of a condition that are no `and`, `or` or `not`."""
+    if isinstance(node, ast.BoolOp):
+        for part in node.values:
+            yield from leaves(part)
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+        yield from leaves(node.operand)
+    else:
+        yield node
+
+
+def is_point(leaf: ast.expr) -> bool:
+    """Whether a part picks single numbers, by equality, membership, a remainder or the result of a function."""
+    if isinstance(leaf, ast.Compare):
+        return any(isinstance(operator, _POINT) for operator in leaf.ops) or any(
+            isinstance(part, ast.Mod) for part in ast.walk(leaf)
+        )
+    if isinstance(leaf, ast.IfExp):
+        parts = [part for value in (leaf.test, leaf.body, leaf.orelse) for part in leaves(value)]
+        return any(is_point(part) for part in parts if not isinstance(part, ast.Constant))
+    # The training backward of a user's own loop receives the number too, but is not a milestone.
+    return not (isinstance(leaf, ast.Call) and isinstance(leaf.func, ast.Attribute) and leaf.func.attr == "backward")
+
+
+def is_inside(node: ast.stmt | ast.expr, outer: ast.stmt) -> bool:
+    """Whether a node is part of a statement. An expression that replaces a name has the position of the name."""
+    end = outer.end_lineno or outer.lineno, outer.end_col_offset or outer.col_offset
+    return position(outer) <= position(node) < end
+
+
+def position(node: ast.stmt | ast.expr) -> tuple[int, int]:
+    """Return line and column where a node begins."""
+    return node.lineno, node.col_offset
+
+
+def _not(test: ast.expr) -> ast.expr:
+    return ast.copy_location(ast.UnaryOp(ast.Not(), test), test)
+
+
+def _blocks(statement: ast.stmt) -> Iterator[list[ast.stmt]]:
+    for field in ("body", "orelse", "finalbody"):
+        yield getattr(statement, field, [])
+    for part in (*getattr(statement, "handlers", ()), *getattr(statement, "cases", ())):
+        yield part.body
+
+
+def _ends_early(body: Sequence[ast.stmt]) -> ast.expr | None:
+    """Return the condition under which statements end the iteration or the function early; None if they never do."""
+    ways: list[ast.expr] = []
+    for statement in body:
+        if isinstance(statement, _ENDS):
+            ways.append(ast.copy_location(ast.Constant(True), statement))
+        elif isinstance(statement, ast.If):
+            for test, block in ((statement.test, statement.body), (_not(statement.test), statement.orelse)):
+                if (inside := _ends_early(block)) is not None:
+                    ways.append(ast.copy_location(ast.BoolOp(ast.And(), [test, inside]), test))
+        elif isinstance(statement, (ast.With, ast.AsyncWith)) and (inside := _ends_early(statement.body)) is not None:
+            ways.append(inside)
+    return ast.copy_location(ast.BoolOp(ast.Or(), ways), ways[0]) if len(ways) > 1 else next(iter(ways), None)
+
+
+def _cases(statement: ast.Match) -> Iterator[ast.expr]:
+    for part in (part for case in statement.cases for part in ast.walk(case.pattern)):
+        if isinstance(part, ast.MatchValue):
+            yield ast.copy_location(ast.Compare(statement.subject, [ast.Eq()], [part.value]), part.value)
+
+
+def _values(node: ast.AST, guards: Guards) -> Iterator[tuple[ast.expr, Guards]]:
+    """Yield conditions inside an expression, as in `flag = iteration % 10 == 0` or `a if iteration in b else c`."""
+    if isinstance(node, (ast.BoolOp, ast.Compare)) or (isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not)):
+        yield node, guards
+    elif isinstance(node, ast.IfExp):
+        yield node.test, guards
+        yield from _values(node.body, (*guards, node.test))
+        yield from _values(node.orelse, (*guards, _not(node.test)))
+    else:
+        for child in ast.iter_child_nodes(node):
+            yield from _values(child, guards)
+
+
+def _calls(node: ast.AST, guards: Guards) -> Iterator[tuple[ast.Call, Guards]]:
+    """Yield the calls in an expression, each with the conditions under which it is made."""
+    if isinstance(node, ast.Call):
+        yield node, guards
+    if isinstance(node, ast.BoolOp):
+        for part in node.values:
+            yield from _calls(part, guards)
+            guards = (*guards, part if isinstance(node.op, ast.And) else _not(part))
+    elif isinstance(node, ast.IfExp):
+        yield from _calls(node.test, guards)
+        yield from _calls(node.body, (*guards, node.test))
+        yield from _calls(node.orelse, (*guards, _not(node.test)))
+    else:
+        for child in ast.iter_child_nodes(node):
+            yield from _calls(child, guards)

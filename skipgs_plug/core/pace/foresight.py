@@ -1,0 +1,144 @@
+"""Conditions of a loop evaluated for numbers that the loop has not reached."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+from collections.abc import Collection, Iterator, Mapping
+from types import CodeType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skipgs_plug.core.pace.conditions import Guards, is_point, leaves
+from skipgs_plug.core.pace.in_place import PLACES, comprehended
+from skipgs_plug.core.pace.settled import Settled
+
+Numbers = npt.NDArray[np.bool_]  # a truth for each number of a range
+_NUMBERS = "numbers of the loop"  # no name in any source
+
+
+class Unforeseeable(Exception):
+    """A condition on the number depends on values that the loop computes."""
+
+
+class Foresight:
+    """Tells which expressions of a loop can be evaluated ahead, for any number.
+
+    Args:
+        target: Name of the loop's number.
+        counted: Other names that hold the number, and that the loop changes.
+        names: Names and values before the loop.
+        changing: Names and attributes that the loop assigns or changes.
+        settled: Recognises the options of the run.
+
+    Attributes:
+        target, names: The arguments.
+    """
+
+    def __init__(
+        self,
+        target: str,
+        counted: Collection[str],
+        names: Mapping[str, Any],
+        changing: Collection[str],
+        settled: Settled,
+    ) -> None:
+        self.target, self.names = target, names
+        self._numbers = {target, *counted}
+        self._changing, self._settled = changing, settled
+
+    def __contains__(self, node: ast.expr) -> bool:
+        """Whether the values of an expression in all iterations are known before the loop."""
+        if self.mentions(node):
+            return not self.depends_on_loop(node)
+        return node in self._settled or self._settled.keeps_value(node)
+
+    def mentions(self, node: ast.AST) -> bool:
+        """Whether the number occurs in this part of the source."""
+        return any(isinstance(part, ast.Name) and part.id in self._numbers for part in ast.walk(node))
+
+    def is_known(self, leaf: ast.expr) -> bool:
+        """Whether a part of a condition that does not mention the number is the same in all iterations."""
+        return leaf in self._settled
+
+    def depends_on_loop(self, node: ast.expr) -> bool:
+        """Whether an expression depends on the number and on values that the loop computes."""
+        if not self.mentions(node):
+            return False
+        parts = list(ast.walk(node))
+        inner = {name.id for name in comprehended(parts)}
+        read = {ast.unparse(part) for part in parts if isinstance(part, PLACES)} - inner
+        reads = all(self._settled.only_reads(part) for part in parts if isinstance(part, ast.Call))
+        return not reads or not read.isdisjoint(self._changing)
+
+    def is_off(self, test: ast.expr) -> bool:
+        """Whether a condition never holds because an option is off."""
+        parts = test.values if isinstance(test, ast.BoolOp) and isinstance(test.op, ast.And) else [test]
+        return any(part in self._settled and not eval(_compiled(part), dict(self.names)) for part in parts)
+
+    def branches(self, numbers: range, test: ast.expr, guards: Guards) -> Iterator[tuple[set[int], set[int]]]:
+        """Yield the numbers for which a condition holds, and those for which it does not, of those that reach it.
+
+        There is one pair for each assumed value of the parts that do not depend on the number.
+
+        Raises:
+            Unforeseeable: The condition depends on a value that the loop changes.
+        """
+        return _Evaluation(self, test, guards, numbers).branches()
+
+
+class _Evaluation:
+    """Evaluates one condition, and the guards in front of it, for all numbers at once."""
+
+    def __init__(self, foresight: Foresight, test: ast.expr, guards: Guards, numbers: range) -> None:
+        self._foresight, self._test, self._guards, self._numbers = foresight, test, guards, numbers
+
+    def branches(self) -> Iterator[tuple[set[int], set[int]]]:
+        reached = np.ones(len(self._numbers), dtype=bool)
+        for guard in self._guards:
+            reached = self._holds(guard, reached, True)
+        numbers = np.array(self._numbers)
+        for assumed in (True, False):
+            holds = self._holds(self._test, reached, assumed)
+            yield set(numbers[holds].tolist()), set(numbers[reached & ~holds].tolist())
+
+    def _holds(self, node: ast.expr, reached: Numbers, assumed: bool) -> Numbers:
+        """Return where a part of a condition holds, of the numbers that reach it."""
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+            return reached & ~self._holds(node.operand, reached, not assumed)
+        if isinstance(node, ast.BoolOp):
+            is_and = isinstance(node.op, ast.And)
+            undecided = reached
+            for part in sorted(node.values, key=self._is_unforeseeable):  # because other parts may decide alone
+                holds = self._holds(part, undecided, assumed)
+                undecided = holds if is_and else undecided & ~holds
+            return undecided if is_and else reached & ~undecided
+        if self._foresight.depends_on_loop(node):
+            if reached.any() and is_point(node) and any(leaf is node for leaf in leaves(self._test)):
+                raise Unforeseeable
+        elif self._foresight.mentions(node) or self._foresight.is_known(node):
+            return reached & self._values(node, assumed)
+        return reached & assumed
+
+    def _is_unforeseeable(self, part: ast.expr) -> bool:
+        return any(self._foresight.depends_on_loop(leaf) for leaf in leaves(part))
+
+    def _values(self, node: ast.expr, assumed: bool) -> Numbers:
+        """Return the truth of a part for all numbers; `assumed` where an error shows that it is not known yet."""
+        names, target = dict(self._foresight.names), self._foresight.target
+        names[_NUMBERS] = self._numbers
+        each = ast.comprehension(ast.Name(target, ast.Store()), ast.Name(_NUMBERS, ast.Load()), [], 0)
+        truth = ast.UnaryOp(ast.Not(), ast.UnaryOp(ast.Not(), node))
+        with contextlib.suppress(Exception):  # a name is not bound yet, or a number has another type
+            return np.array(eval(_compiled(ast.ListComp(truth, [each])), names), dtype=bool)
+        code, found = _compiled(node), np.full(len(self._numbers), assumed)
+        for index, names[target] in enumerate(self._numbers):
+            with contextlib.suppress(Exception):
+                found[index] = bool(eval(code, names))
+        return found
+
+
+def _compiled(node: ast.expr) -> CodeType:
+    return compile(ast.fix_missing_locations(ast.Expression(node)), "<condition>", "eval")

@@ -1,0 +1,269 @@
+"""Functions of the project that a loop calls with its number, read as if their statements stood in its place."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import inspect
+import itertools
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from types import CodeType, FunctionType, MethodType
+from typing import Any, NamedTuple
+
+from skipgs_plug.core.pace.called import called, closure, read_syntax, undecorated
+from skipgs_plug.core.pace.project import Project
+from skipgs_plug.core.pace.settled import switched
+
+# Largest depth of nested calls that are read, as from a loop to a trainer, a logger and its file.
+MAX_DEPTH = 3
+PLACES = (ast.Name, ast.Attribute, ast.Subscript)
+_READS = (
+    *(*PLACES, ast.BinOp, ast.BoolOp, ast.Compare, ast.Constant, ast.List, ast.Tuple, ast.UnaryOp),
+    *(ast.boolop, ast.cmpop, ast.expr_context, ast.operator, ast.unaryop),
+)
+_DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+_BINDS_NAME = (*_DEFINITIONS, ast.ExceptHandler, ast.MatchAs, ast.MatchStar)
+_ABSENT = object()
+
+
+class InPlace(NamedTuple):
+    """A function that is read in place of a call.
+
+    Attributes:
+        body: Its statements, in the names of the loop. Parameters are replaced by the arguments, and names that the
+            loop does not know get the name of the function or of its module in front.
+        code: Its code.
+    """
+
+    body: list[ast.stmt]
+    code: CodeType
+
+
+class CalledFunctions:
+    """The functions that a loop calls with its number, and the functions that they call with it.
+
+    Only functions of the user's own project are read, and methods of objects that exist before the loop.
+
+    Args:
+        body: The loop's statements.
+        code: Code of the function that holds the loop.
+        names: Names and values before the loop. Names of the functions are added.
+        target: Name of the loop's number.
+        unknown: Names and attributes that the loop assigns.
+        pure: Names of functions that are evaluated and not read.
+
+    Attributes:
+        in_place: The functions, by the id of the call in the syntax tree.
+        unknown: The argument, and variables of the functions whose values are not known before the loop.
+        counted: Variables of the functions that begin with the number and are assigned again.
+        shared: Added names that other functions may change.
+    """
+
+    def __init__(
+        self,
+        body: list[ast.stmt],
+        code: CodeType,
+        names: dict[str, Any],
+        target: str,
+        unknown: Collection[str],
+        pure: Collection[str],
+    ) -> None:
+        self.in_place: dict[int, InPlace] = {}
+        self.unknown, self.counted, self.shared = set(unknown), set[str](), set[str]()
+        self._names, self._target, self._pure = names, target, pure
+        self._project = Project(code, names)
+        self._open = [code]  # code of the loop and of the functions that are being read, outermost first
+        self._follow(body, {target})
+
+    def __iter__(self) -> Iterator[ast.stmt]:
+        """Iterate over the statements of all functions."""
+        return (statement for function in self.in_place.values() for statement in function.body)
+
+    def _follow(self, body: list[ast.stmt], numbers: set[str]) -> None:
+        """Read the functions that statements call with the number.
+
+        Args:
+            body: The statements.
+            numbers: Names and attributes that hold the number, or a value that is computed from it.
+        """
+        nodes = [node for statement in body for node in _reached(statement)]
+        for node in nodes:
+            if isinstance(node, ast.Assign) and self._is_of(node.value, numbers):
+                numbers |= {ast.unparse(target) for target in node.targets if isinstance(target, PLACES)}
+        holders = {text.rpartition(".")[0] for text in numbers}
+        for node in nodes:
+            if isinstance(node, ast.Call) and self._receives(node, numbers, holders):
+                function = called(node.func, self._names, self._value, self._open[-1])
+                plain = undecorated(function)
+                if plain is not None and plain.__code__ not in self._open and plain in self._project:
+                    self._read(node, function, plain, numbers)
+
+    def _receives(self, call: ast.Call, numbers: Collection[str], holders: Collection[str]) -> bool:
+        """Whether a function receives the number, or an object that holds it in an attribute."""
+        name = call.func.id if isinstance(call.func, ast.Name) else None
+        if name in self._pure or name in self.unknown:
+            return False
+        given = [*call.args, *(keyword.value for keyword in call.keywords)]
+        if any(self._is_of(value, numbers) for value in given):
+            return True
+        given += [call.func.value] if isinstance(call.func, ast.Attribute) else []
+        return any(isinstance(one, (ast.Name, ast.Attribute)) and ast.unparse(one) in holders for one in given)
+
+    def _is_of(self, value: ast.expr, numbers: Collection[str]) -> bool:
+        """Whether a value is computed from the number alone."""
+        places = (part for part in ast.walk(value) if isinstance(part, PLACES))
+        return self._is_plain(value) and any(ast.unparse(one) in numbers for one in places)
+
+    def _is_plain(self, value: ast.expr) -> bool:
+        """Whether an expression only reads names, attributes and entries, so that it can stand in several places."""
+        return all(
+            part.func.id in self._pure and not part.keywords
+            if isinstance(part, ast.Call) and isinstance(part.func, ast.Name)
+            else isinstance(part, _READS)
+            for part in ast.walk(value)
+        )
+
+    def _value(self, place: ast.expr) -> Any:
+        """Return the value that a name or attribute has before the loop and in it; None if unknown."""
+        if ast.unparse(place) in self.unknown:
+            return None
+        match place:
+            case ast.Name(name):
+                return self._names.get(name)
+            case ast.Attribute(holder, name):
+                found = inspect.getattr_static(self._value(holder), name, None)
+                return None if hasattr(type(found), "__get__") else found  # a property is not evaluated
+            case ast.Subscript(holder, ast.Constant(key)):
+                held = self._value(holder)
+                return held.get(key) if isinstance(held, dict) else None
+        return None
+
+    def _read(self, call: ast.Call, function: Any, plain: FunctionType, numbers: set[str]) -> None:
+        syntax = read_syntax(plain) if len(self._open) <= MAX_DEPTH else None
+        if syntax is None:
+            return
+        renamed = _Renamed(self._meanings(call, function, plain, syntax, numbers))
+        body = [renamed.visit(statement) for statement in syntax.body]
+        self.in_place[id(call)] = InPlace(body, plain.__code__)
+        self._open.append(plain.__code__)
+        self._follow(body, set(numbers))
+        self._open.pop()
+
+    def _meanings(
+        self, call: ast.Call, function: Any, plain: FunctionType, syntax: ast.FunctionDef, numbers: Collection[str]
+    ) -> dict[str, ast.expr]:
+        """Return the expressions, in names of the loop, that the names in a function stand for."""
+        times = sum(one.code.co_name == syntax.name for one in self.in_place.values())
+        prefix = f"{syntax.name}{times + 1}" if times else syntax.name  # each call has local variables of its own
+        given, defaults = self._given(call, function, plain, syntax.args, prefix)
+        bound = _bound(syntax)
+        own = bound.union(inspect.signature(plain).parameters)
+        inner = {node.id for node in comprehended(ast.walk(syntax))}
+        found: dict[str, ast.expr] = {}
+        for name in {node.id for node in ast.walk(syntax) if isinstance(node, ast.Name)}:
+            if name in inner and name not in own:
+                found[name] = ast.Name(f"{prefix}.{name}", ast.Load())
+            elif name not in own:
+                found |= self._from_outside(name, plain, prefix)
+            elif name in given and name not in bound and self._is_plain(given[name]):
+                found[name] = given[name]
+            elif name in defaults and name not in bound:
+                found[name] = self._named(f"{prefix}.{name}", defaults[name])
+            else:
+                found[name] = ast.Name(f"{prefix}.{name}", ast.Load())
+                self.unknown.add(f"{prefix}.{name}")
+                if name in given and self._is_of(given[name], numbers):
+                    self.counted.add(f"{prefix}.{name}")
+        return found
+
+    def _from_outside(self, name: str, plain: FunctionType, prefix: str) -> dict[str, ast.expr]:
+        """Return the meaning of a name that a function does not assign; nothing if it means the same in the loop."""
+        surrounding, loop = closure(plain), self._open[0]
+        if name in surrounding:
+            value, own = surrounding[name], f"{prefix}.{name}"
+            same, changes = name in (*loop.co_cellvars, *loop.co_freevars), True
+        elif name in plain.__globals__:
+            value, own = plain.__globals__[name], f"{plain.__module__}.{name}"
+            same = plain.__module__ == self._names.get("__name__")
+            changes = name in switched(plain.__code__.co_filename)
+        else:
+            return {}  # a built-in function
+        if same and name != self._target and self._names.get(name, _ABSENT) is value:
+            return {}
+        if changes:
+            self.shared.add(own)
+        return {name: self._named(own, value)}
+
+    def _given(
+        self, call: ast.Call, function: Any, plain: FunctionType, parameters: ast.arguments, prefix: str
+    ) -> tuple[dict[str, ast.expr], dict[str, Any]]:
+        """Return the arguments of a call, and the default values of further parameters if no argument is hidden."""
+        values = [*itertools.takewhile(lambda value: not isinstance(value, ast.Starred), call.args)]
+        hidden = len(values) < len(call.args) or any(keyword.arg is None for keyword in call.keywords)
+        if isinstance(function, MethodType):
+            owner = call.func.value if isinstance(call.func, ast.Attribute) else call.func
+            if not self._is_plain(owner) or owner is call.func:  # super().name(...), or a name of the bound method
+                own = self._names.get("self") is function.__self__
+                owner = ast.Name("self", ast.Load()) if own else self._named(f"{prefix}.self", function.__self__)
+            values.insert(0, owner)
+        names = [one.arg for one in (*parameters.posonlyargs, *parameters.args)]
+        given = dict(zip(names, values, strict=False))
+        given |= {keyword.arg: keyword.value for keyword in call.keywords if keyword.arg is not None}
+        defaults = {
+            name: one.default
+            for name, one in inspect.signature(plain).parameters.items()
+            if name not in given and one.default is not inspect.Parameter.empty
+        }
+        return given, {} if hidden else defaults
+
+    def _named(self, name: str, value: Any) -> ast.expr:
+        self._names[name] = value
+        return ast.Name(name, ast.Load())
+
+
+class _Renamed(ast.NodeTransformer):
+    """Puts expressions in place of names."""
+
+    def __init__(self, meanings: Mapping[str, ast.expr]) -> None:
+        self._meanings = meanings
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        meaning = self._meanings.get(node.id)
+        if meaning is None:
+            return node
+        if isinstance(meaning, ast.Name):
+            return ast.copy_location(ast.Name(meaning.id, node.ctx), node)
+        return ast.copy_location(copy.deepcopy(meaning), node)
+
+
+def comprehended(nodes: Iterable[ast.AST]) -> Iterator[ast.Name]:
+    """Yield the names that comprehensions among these nodes give to their values."""
+    for node in nodes:
+        if isinstance(node, ast.comprehension):
+            yield from (part for part in ast.walk(node.target) if isinstance(part, ast.Name))
+
+
+def _bound(syntax: ast.FunctionDef) -> set[str]:
+    """Return the names that a function gives to values of its own."""
+    found: set[str | None] = set()
+    shared: set[str] = set()
+    inner = set(map(id, comprehended(ast.walk(syntax))))
+    for node in ast.walk(syntax):
+        if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load) and id(node) not in inner:
+            found.add(node.id)
+        elif isinstance(node, _BINDS_NAME) and node is not syntax:
+            found.add(node.name)
+        elif isinstance(node, (ast.Import, ast.ImportFrom)):
+            found |= {one.asname or one.name.partition(".")[0] for one in node.names}
+        elif isinstance(node, (ast.Global, ast.Nonlocal)):
+            shared |= set(node.names)
+    return {name for name in found if name is not None} - shared
+
+
+def _reached(node: ast.AST) -> Iterator[ast.AST]:
+    """Iterate over a statement, without the functions and classes that it defines."""
+    if isinstance(node, (*_DEFINITIONS, ast.Lambda)):
+        return
+    yield node
+    for child in ast.iter_child_nodes(node):
+        yield from _reached(child)

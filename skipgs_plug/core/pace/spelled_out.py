@@ -1,0 +1,113 @@
+"""Names of a loop, and calls of functions without effects, replaced by the expressions that they stand for."""
+
+from __future__ import annotations
+
+import ast
+import copy
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+from skipgs_plug.core.pace.foresight import Foresight
+from skipgs_plug.core.pace.in_place import InPlace
+
+
+class SpelledOut(ast.NodeTransformer):
+    """Replaces names and calls in statements by expressions of the number and of options. It changes the statements.
+
+    Examples are `index = step % len(views)`, and `is_due(step)` for a function that returns `step % 100 == 0`. A name
+    is replaced after its assignment only; before it, the value is the previous iteration's.
+
+    Args:
+        functions: Called functions by the id of the call. Their statements are changed, too.
+        foresight: Tells which expressions have values that are known before the loop.
+        assigned_once: Returns whether the loop assigns a name or attribute in one place only.
+    """
+
+    def __init__(
+        self,
+        functions: Mapping[int, InPlace],
+        foresight: Foresight,
+        assigned_once: Callable[[str], bool],
+    ) -> None:
+        self._functions, self._foresight, self._assigned_once = functions, foresight, assigned_once
+        self._meanings: dict[str, ast.expr] = {}
+
+    def spell(self, body: Sequence[ast.stmt]) -> None:
+        """Replace names and calls in these statements."""
+        for statement in body:
+            if isinstance(statement, (ast.With, ast.AsyncWith)):
+                for item in statement.items:
+                    self.visit(item)
+                self.spell(statement.body)
+                continue
+            self.visit(statement)
+            for target, value in _assigned(statement):
+                name = ast.unparse(target)
+                once = isinstance(target, (ast.Name, ast.Attribute)) and self._assigned_once(name)
+                if once and value in self._foresight:
+                    self._meanings[name] = value
+
+    def visit_Name(self, node: ast.Name | ast.Attribute) -> ast.AST:
+        if isinstance(node.ctx, ast.Load) and (meaning := self._meanings.get(ast.unparse(node))) is not None:
+            return ast.copy_location(copy.deepcopy(meaning), node)
+        return self.generic_visit(node)
+
+    visit_Attribute = visit_Name
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        self.generic_visit(node)
+        function = self._functions.get(id(node))
+        if function is None:
+            return node
+        before = dict(self._meanings)
+        self.spell(function.body)
+        self._meanings = before
+        value = _returned(function.body)
+        if value is None or not (self._foresight.mentions(value) and value in self._foresight):
+            return node
+        for part in ast.walk(value):
+            ast.copy_location(part, node)
+        return value
+
+
+def always(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:
+    """Yield these statements, and the statements inside a `with` block in place of the block."""
+    for node in body:
+        if isinstance(node, (ast.With, ast.AsyncWith)):
+            yield from always(node.body)
+        else:
+            yield node
+
+
+def _assigned(statement: ast.stmt) -> Iterator[tuple[ast.expr, ast.expr]]:
+    """Yield the names and attributes that a statement assigns, with their values."""
+    match statement:
+        case ast.AnnAssign(target, _, ast.expr() as value):
+            yield target, value
+        case ast.Assign([ast.Tuple(targets)], ast.Tuple(values)) if len(targets) == len(values):
+            yield from zip(targets, values, strict=True)
+        case ast.Assign([target], value):
+            yield target, value
+
+
+def _returned(body: Sequence[ast.stmt]) -> ast.expr | None:
+    """Return the value of a function as one expression; None if the function does more than that."""
+    for index, statement in enumerate(body):
+        match statement:
+            case ast.Return(value):
+                return value or ast.copy_location(ast.Constant(None), statement)
+            case ast.If(test, inside, otherwise) if not any(map(_assigns, [*inside, *otherwise])):
+                rest = body[index + 1 :]
+                holds = _returned([*inside, *rest])
+                fails = None if holds is None else _returned([*otherwise, *rest])
+                if holds is None or fails is None:
+                    return None
+                return ast.copy_location(ast.IfExp(test, holds, fails), test)
+            case ast.Expr(ast.Constant()) | ast.Assign([ast.Name()]) | ast.AnnAssign(ast.Name()):
+                continue  # a text, or a variable that is spelled out below
+            case _:
+                return None
+    return ast.copy_location(ast.Constant(None), body[0]) if body else None
+
+
+def _assigns(statement: ast.stmt) -> bool:
+    return isinstance(statement, (ast.Assign, ast.AnnAssign))

@@ -1,0 +1,28 @@
+"""Milestones of a loop in a test, as the gate reads them when the loop asks for its numbers."""
+
+import re
+import sys
+
+import pytest
+
+from skipgs_plug.core.pace.loop_range import line_of
+from skipgs_plug.core.pace.milestones import read_loop
+
+NUMBERS = range(50, 100)
+
+
+def found(loop, pure=(), known=None):
+    """Milestones of a function; its loop must run over `stop(names)`, which stands where a `LoopRange` is asked."""
+    caught = {}
+
+    class Stopped(Exception):
+        pass
+
+    def stop(**names):
+        code = sys._getframe(1).f_code
+        caught.update(read_loop(code, line_of(code), {**loop.__globals__, **names}, pure, known).milestones(NUMBERS))
+        raise Stopped
+
+    with pytest.raises(Stopped):
+        loop(stop)
+    return {re.sub(r"^line \d+: ", "", reason): sorted(numbers) for reason, numbers in caught.items() if numbers}
