@@ -92,7 +92,9 @@ ROWS = {
         "Octree-GS",
         "city-super/Octree-GS",
         "Octree-GS",
-        f"{_ANCHORS}--test_iterations -1 --update_interval 50 --appearance_dim 0 --visible_threshold 0.9",
+        # It ignores --images, and reads the folder of the factor --ds.
+        f"{_ANCHORS.replace('--images images_{factor}', '--ds {factor}')}--test_iterations -1 --update_interval 50 "
+        "--appearance_dim 0 --visible_threshold 0.9",
         pictures=True,
     ),
     "dash_gaussian": Row(
