@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
-import sysconfig
 from pathlib import Path
 from types import FunctionType, ModuleType
 
-STANDARD = frozenset(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib"))
-INSTALLED = frozenset({"site-packages", "dist-packages"})  # names of folders that hold installed packages
+from skipgs_plug.core.pace.project import INSTALLED, STANDARD, import_folder
+
 # Packages from which trainers derive classes, and that do not belong to them.
 BASES = frozenset({"builtins", "torch"})
 
@@ -32,7 +31,7 @@ class TrainerCode:
         Python's and PyTorch's own classes are not added.
         """
         for one in part.__mro__ if isinstance(part, type) else (part,):
-            folder = import_folder(one)
+            folder = folder_of(one)
             if package(one) in BASES or folder in STANDARD:
                 continue
             self._packages.add(package(one))
@@ -40,7 +39,7 @@ class TrainerCode:
                 self._folders.add(folder)
 
     def __contains__(self, part: Part) -> bool:
-        return package(part) in self._packages or import_folder(part) in self._folders
+        return package(part) in self._packages or folder_of(part) in self._folders
 
 
 def package(part: Part) -> str:
@@ -48,7 +47,7 @@ def package(part: Part) -> str:
     return _module(part).partition(".")[0]
 
 
-def import_folder(part: Part) -> Path | None:
+def folder_of(part: Part) -> Path | None:
     """Return the folder that holds the top-level package of a function, class or module; None without a file."""
     file: str | None
     if isinstance(part, FunctionType):
@@ -57,9 +56,7 @@ def import_folder(part: Part) -> Path | None:
         file = getattr(part if isinstance(part, ModuleType) else sys.modules.get(part.__module__), "__file__", None)
     if not file or not Path(file).is_file():
         return None
-    path = Path(file).resolve()
-    depth = _module(part).count(".") + (path.name == "__init__.py")
-    return path.parents[depth] if depth < len(path.parents) else None
+    return import_folder(Path(file).resolve(), _module(part))
 
 
 def _module(part: Part) -> str:

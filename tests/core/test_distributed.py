@@ -23,12 +23,12 @@ import torch.distributed as dist
 # step. A group that exists by then lives until the interpreter's end, and its threads can abort the process there.
 import torch.distributed.nn
 import torch.multiprocessing as mp
-from skipgs_plug.core.pace.policy import RefinementPolicy
 
 from skipgs_plug import Decision, SkipGate, SkipGSError
 from skipgs_plug.core import decision, distributed
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.pace.phased import Phased
+from skipgs_plug.core.pace.refinement_policy import RefinementPolicy
 from skipgs_plug.core.policy import SkipPolicy
 
 STEPS = 300

@@ -9,8 +9,9 @@ from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
 
-_LIBRARIES = [Path(__file__).resolve().parents[2], Path(sysconfig.get_path("stdlib")).resolve()]
-_INSTALLED = frozenset({"site-packages", "dist-packages"})  # names of folders that hold installed packages
+STANDARD = frozenset(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib"))
+INSTALLED = frozenset({"site-packages", "dist-packages"})  # names of folders that hold installed packages
+_LIBRARIES = STANDARD | {Path(__file__).resolve().parents[2]}
 
 
 class Project:
@@ -27,15 +28,26 @@ class Project:
     def __init__(self, code: CodeType, names: Mapping[str, Any]) -> None:
         # A module that runs as a script (`python -m package.train`) has its name in its specification only.
         module = getattr(names.get("__spec__"), "name", None) or str(names.get("__name__", ""))
-        above = Path(code.co_filename).resolve().parents
-        self._folder = above[min(module.count("."), len(above) - 1)]
+        path = Path(code.co_filename).resolve()
+        self._folder = import_folder(path, module) or path.parent
 
     def __contains__(self, function: FunctionType) -> bool:
         return _is_below(function.__code__.co_filename, self._folder)
 
 
+def import_folder(file: Path, module: str) -> Path | None:
+    """Return the folder that holds the top-level package of a module; None if the file is not that deep.
+
+    Args:
+        file: File of the module, without links.
+        module: Its full name.
+    """
+    depth = module.count(".") + (file.name == "__init__.py")
+    return file.parents[depth] if depth < len(file.parents) else None
+
+
 @functools.cache
 def _is_below(file: str, folder: Path) -> bool:
     path = Path(file).resolve()
-    library = not _INSTALLED.isdisjoint(path.parts) or any(one in path.parents for one in _LIBRARIES)
+    library = not INSTALLED.isdisjoint(path.parts) or not _LIBRARIES.isdisjoint(path.parents)
     return folder in path.parents and not library
