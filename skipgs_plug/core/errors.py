@@ -28,8 +28,8 @@ class BrokenTrainingError(SkipGSError):
     """The training itself cannot go on, for example because another process has ended. It is raised at any time."""
 
 
-class ReleaseError(SkipGSError):
-    """The gate is of no use to this training. It is released at any time, and refuses nothing."""
+class DivergedError(SkipGSError):
+    """Losses stay non-finite. It ends a loop of the user's own, and releases a gate that an adapter attached."""
 
 
 class GateOrderError(SkipGSError):

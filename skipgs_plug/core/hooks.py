@@ -71,7 +71,7 @@ class Hooks(LoopHooks):
         self._giving_up.undoes(self.restore)
         # Refusals come with the first iteration, when nothing is lost yet.
         self._giving_up.refuses = lambda: max(self._iterations, self._backwards) <= 1
-        self._giving_up.in_script = in_script
+        self._giving_up.in_script, self._giving_up.attached = in_script, True
         self._guarded = self._giving_up.guarded(lambda: self._iteration.step)
         self._ready = False
         self.script_globals: dict[str, Any] = {}

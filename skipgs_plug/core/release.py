@@ -12,7 +12,7 @@ import torch
 from skipgs_plug.core import decision, distributed
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.decision import Decision
-from skipgs_plug.core.errors import BrokenTrainingError, GateOrderError, ReleaseError, SkipGSError
+from skipgs_plug.core.errors import BrokenTrainingError, DivergedError, GateOrderError, SkipGSError
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +35,7 @@ class Release:
         reason: The sentence of the warning; None while the gate is attached.
         refuses: The argument.
         in_script: Whether the trainer is a script, whose user has no gate to call.
+        attached: Whether an adapter attached the gate to a trainer. Otherwise the loop is the user's own.
     """
 
     def __init__(self, enabled: bool, refuses: Callable[[], bool]) -> None:
@@ -42,7 +43,7 @@ class Release:
         self._undo: list[Callable[[], None]] = []
         self.reason: str | None = None
         self.refuses = refuses
-        self.in_script = False
+        self.in_script = self.attached = False
 
     def undoes(self, undo: Callable[[], None]) -> None:
         """Add a function that undoes a part of the attachment when the gate is released."""
@@ -78,7 +79,9 @@ class Release:
         """
         if isinstance(error, (BrokenTrainingError, GateOrderError)):
             return True
-        if not self._enabled or isinstance(error, ReleaseError) or not isinstance(error, SkipGSError):
+        if isinstance(error, DivergedError):
+            return not self.attached
+        if not self._enabled or not isinstance(error, SkipGSError):
             return False
         return refuses and self.refuses()
 
@@ -115,7 +118,7 @@ class Release:
         answer = distributed.agree(own, device)
         if answer is not None:
             return own, answer
-        self.release(ReleaseError("the gate of another process is released; see its output"), step)
+        self.release(SkipGSError("the gate of another process is released; see its output"), step)
         return decision.INACTIVE, decision.INACTIVE
 
     def let_go(self, reason: str) -> None:

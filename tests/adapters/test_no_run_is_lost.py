@@ -1,5 +1,7 @@
 """Whatever code of the gate fails, wherever it is called: training finishes, and one warning says so."""
 
+import math
+
 import pytest
 from cases import CASES, alone
 from lookalikes.splats import log, new_log
@@ -159,3 +161,21 @@ def test_a_rank_whose_code_fails_raises_if_the_others_do_not_fail(monkeypatch):
     with SkipGate(trainer) as gate, pytest.raises(ZeroDivisionError, match="of moved"):
         train()
     assert gate.patched == [] and log.now == case.start - 3
+
+
+@pytest.mark.parametrize("mode", ["skip", "pass"])
+def test_losses_that_stay_non_finite_release_the_gate_and_no_run_ends(mode, monkeypatch, recwarn):
+    case = next(case for case in cases if case.name == "inria")
+    plain = alone(case)
+    new_log()
+    trainer, train = case.make()
+    original = case.module.photo_loss
+
+    def poisoned(*args):
+        return original(*args) * (math.nan if case.start <= log.now < case.start + 12 else 1.0)
+
+    monkeypatch.setattr(case.module, "photo_loss", poisoned)
+    with SkipGate(trainer, on_nonfinite=mode) as gate:
+        train()
+    assert "Loss is nan in iteration 29" in gate.released and "like the 9 losses before it" in gate.released
+    assert gate.patched == [] and log.backwards[-30:] == plain.backwards[-30:]
