@@ -8,11 +8,10 @@ set -euo pipefail
 folder=$(realpath -m "$1") source=$(realpath "$(dirname "$0")/..")
 shift
 [ $# -gt 0 ] || set -- tests/fallback_raster/test_{against_reference,optimizer,loss,thread_pool,threads,safety}.py
-root=$folder/root python=$folder/python
-export QEMU_LD_PREFIX=$root
+root=$folder/root site=$folder/root/usr/lib/python3/dist-packages python=$folder/python
 
 if ! [ -e "$python" ]; then
-    mkdir -p "$folder"/{debs,wheels} "$root/site"
+    mkdir -p "$folder"/{debs,wheels} "$site"
     dpkg --add-architecture arm64
     apt-get update -qq
     apt-get install -y -qq qemu-user-static unzip >/dev/null
@@ -27,13 +26,13 @@ if ! [ -e "$python" ]; then
         --platform manylinux_2_34_aarch64 --platform manylinux2014_aarch64 \
         torch==2.7.1 numpy "warp-lang>=1.19" gsplat packaging pytest pytest-timeout hypothesis attrs pluggy iniconfig \
         pygments sortedcontainers typing_extensions sympy mpmath networkx jinja2 markupsafe fsspec filelock
-    for wheel in "$folder"/wheels/*.whl; do unzip -qo "$wheel" -d "$root/site"; done
+    for wheel in "$folder"/wheels/*.whl; do unzip -qo "$wheel" -d "$site"; done
     # Tests start children with sys.executable, and the kernel of this machine runs no program for aarch64 by itself.
-    echo 'import os, sys; sys.executable = os.environ["EMULATED_PYTHON"]' >"$root/site/sitecustomize.py"
-    printf '#!/bin/sh\nexec qemu-aarch64-static %s/usr/bin/python3.11 "$@"\n' "$root" >"$python"
+    echo 'import os, sys; sys.executable = os.environ["EMULATED_PYTHON"]' >"$site/sitecustomize.py"
+    printf '#!/bin/sh\nexec qemu-aarch64-static -L %s %s/usr/bin/python3.11 "$@"\n' "$root" "$root" >"$python"
     chmod +x "$python"
 fi
-export EMULATED_PYTHON=$python PYTHONPATH=$source:$root/site PYTHONDONTWRITEBYTECODE=1 WARP_CACHE_PATH=$folder/kernels
+export EMULATED_PYTHON=$python PYTHONPATH=$source PYTHONDONTWRITEBYTECODE=1 WARP_CACHE_PATH=$folder/kernels
 cd "$source"
 "$python" -c 'import platform; print(platform.machine())'
 exec "$python" -m pytest -q -p no:cacheprovider --timeout 100000 "$@"

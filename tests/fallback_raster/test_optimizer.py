@@ -325,7 +325,10 @@ def test_it_leaves_torchs_compiler_alone() -> None:
 
 @pytest.mark.parametrize("eps", [1e-15, 0.0])
 def test_numbers_that_never_had_a_gradient_are_torchs(eps: float) -> None:
-    """They do not change, not even negative zeros. Without `eps` all become NaN, 0 / 0."""
+    """They do not change, not even negative zeros. Without `eps` all become NaN, 0 / 0.
+
+    Others may differ in the last bit: torch rounds otherwise on ARM.
+    """
     generator = torch.Generator().manual_seed(4)
     values = torch.randn(200, 16, generator=generator)
     values[::3] = -0.0
@@ -342,6 +345,8 @@ def test_numbers_that_never_had_a_gradient_are_torchs(eps: float) -> None:
         found.append(param.detach())
     ours, torchs = found
     assert torch.equal(ours.isnan(), torchs.isnan())
-    assert torch.equal(ours.nan_to_num().view(torch.int32), torchs.nan_to_num().view(torch.int32))
+    torch.testing.assert_close(ours, torchs, rtol=1e-6, atol=1e-7, equal_nan=True)
     untrained = ours[~trained]
+    bits = [one[~trained].nan_to_num().view(torch.int32) for one in (ours, torchs)]
+    assert torch.equal(*bits)
     assert untrained.isnan().all() if eps == 0 else torch.equal(untrained, values[~trained])
