@@ -26,7 +26,7 @@ from skipgs_plug.adapters.unknown_forks import BY_HAND, CALLS, Unrecognised, beg
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
-from skipgs_plug.core.pace.called import undecorated
+from skipgs_plug.core.source.functions import undecorated
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 from skipgs_plug.core.views import view_key
 
