@@ -60,7 +60,7 @@ def scope_inside(function: ast.FunctionDef, scope: Scope) -> Scope:
 
 
 def learn_names(statement: ast.stmt, scope: Scope) -> None:
-    """Keep what names stand for that a statement assigns, and their values."""
+    """Record the names that a statement assigns, with their values and the expressions that they stand for."""
     match statement:
         case ast.Assign([ast.Tuple(targets)], ast.Tuple(values)) if len(targets) == len(values):
             pairs = [*zip(targets, values, strict=True)]

@@ -1,4 +1,4 @@
-"""What a gate asks of an adapter, and what the adapter has in its hands while it attaches."""
+"""The interface between a gate and an adapter: the questions of the gate, and the hooks with which adapters attach."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Adapter(Protocol):
 
 
 class Hooks(LoopHooks):
-    """Reports to a gate what a trainer does: iterations, views, backward passes, structural changes.
+    """Reports the iterations, views, backward passes and structural changes of a trainer to a gate.
 
     The first training backward pass of an iteration is gated. Any further one runs and counts as a mismatch.
     """

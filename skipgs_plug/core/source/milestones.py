@@ -36,7 +36,7 @@ from skipgs_plug.core.source.run_options import PURE, RunOptions
 from skipgs_plug.core.source.substitution import Substitution
 
 
-class LoopCode:
+class TrainingLoop:
     """One `for` statement of a function, whose target is the iteration's number.
 
     Args:
@@ -257,7 +257,7 @@ def read_loop(
     names: Mapping[str, Any],
     pure: Iterable[str] = (),
     known: Mapping[str, Any] | None = None,
-) -> LoopCode:
+) -> TrainingLoop:
     """Return the loop that asks for its numbers.
 
     Args:
@@ -289,7 +289,7 @@ def read_loop(
             and isinstance(node.target, ast.Name)
             and node.lineno <= line - first + 1 <= (node.iter.end_lineno or node.lineno)
         ):
-            return LoopCode(node, tree, code, {**names, **known}, known, frozenset(pure))
+            return TrainingLoop(node, tree, code, {**names, **known}, known, frozenset(pure))
     found = f"Line {line} of {code.co_filename} is not in a loop over one number"
     raise SkipGSError(
         f"{found}; write the loop as: for step in gate.iterations(range(...)).",
