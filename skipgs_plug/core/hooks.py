@@ -292,7 +292,7 @@ class Hooks(LoopHooks):
     def _release_moved(self, names: list[str]) -> None:
         self.release(
             f"The loop moved {', '.join(names)} in iteration {self._iteration.step}, whose backward was skipped, by "
-            f"code that adapter {self._adapter.name!r} does not know. The gate is detached, and training goes on "
+            f"code that adapter {self._adapter.name!r} does not know. The gate is released, and training goes on "
             "without it. Gate this loop by hand with SkipGate(start_iter=...)."
         )
 

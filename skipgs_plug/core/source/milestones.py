@@ -76,7 +76,7 @@ class TrainingLoop:
         assigned = Counter([*own.assigned, *inlined.assigned])
         Substitution(functions.by_call, self._evaluator, lambda text: assigned[text] == 1).apply(self._body)
         self._all = list(conditions_in(self._body, functions.by_call))
-        self._said: set[str] = set()  # conditions that warnings have named
+        self._warned_of: set[str] = set()  # conditions that warnings have named
 
     def milestones(self, numbers: range) -> dict[str, set[int]]:
         """Return the iterations that must run, by the condition that names them.
@@ -98,7 +98,7 @@ class TrainingLoop:
         """
         file = self._code.co_filename
         by_itself = [f"{_line(leaf, self._code)} of {file} ({ast.unparse(leaf)})" for leaf in self._counted_by_itself()]
-        for place in self._unsaid(by_itself):
+        for place in self._without_warning(by_itself):
             caution(
                 f"Line {place} counts the iterations that run, so it holds less often if others are left out. Decide "
                 f"by {self._target} if that matters."
@@ -114,7 +114,7 @@ class TrainingLoop:
             if not certain:
                 code = self._code_of(condition)
                 uncertain.append(f"line {_line(condition.test, code)} of {code.co_filename} ({text})")
-        uncertain = self._unsaid(uncertain)
+        uncertain = self._without_warning(uncertain)
         if uncertain:
             caution(
                 "Conditions on the iteration's number depend on functions that the loop calls and cannot be evaluated "
@@ -214,10 +214,10 @@ class TrainingLoop:
     def _code_of(self, condition: Condition) -> CodeType:
         return self._code if condition.function is None else condition.function.code
 
-    def _unsaid(self, places: list[str]) -> list[str]:
+    def _without_warning(self, places: list[str]) -> list[str]:
         """Return the conditions that no warning has named; they are evaluated for each phase."""
-        found = [place for place in dict.fromkeys(places) if place not in self._said]
-        self._said.update(found)
+        found = [place for place in dict.fromkeys(places) if place not in self._warned_of]
+        self._warned_of.update(found)
         return found
 
 
