@@ -38,9 +38,9 @@ COMMANDS = {
     "doctor": Command("say which backends and extras work here, and how to get the rest", "full"),
 }
 DESCRIPTION = "skipgs-plug COMMAND --help describes its options; --debug shows the traceback of an error."
-BAD_INPUT = 2
-INTERRUPTED = 130
-TERMINATED = 143
+# Exit codes: 2 as argparse uses it, and 128 plus the number of the signal, as shells count.
+BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143
+# Classes of errors whose message is all that a user needs. They are known by name, so that torch need not be loaded.
 OURS = ("SkipGSError", "InputError", "WriteError")
 
 

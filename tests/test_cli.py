@@ -160,7 +160,7 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = json.loads((out / "share=auto" / "skipgs.json").read_text())
     assert report["settings"]["share"] == "auto" and int(rows["share=auto"][3]) == report["iterations"]
     with Image.open(out / "comparison.png") as comparison:
-        assert comparison.size == (2 * 32 * 7, 2 * 24 * 2 + 20)  # 7 columns, 2 views, doubled, below a title line
+        assert comparison.size == (2 * 32 * 7, 2 * 24 * 2 + 16)  # 7 columns, 2 views, doubled, below a title line
     with Image.open(out / "refinement.png") as plot:
         assert plot.width > 500
     for name in names:

@@ -58,6 +58,12 @@ def test_a_part_knows_only_those_below_it(name: str) -> None:
     assert {part(wanted) for wanted in others} <= MAY_IMPORT[name]
 
 
+def test_reading_source_code_knows_nothing_of_the_pace() -> None:
+    own = {module for module in IMPORTS if module.startswith("skipgs_plug.core.source.")}
+    assert own
+    assert not {wanted for module in own for wanted in IMPORTS[module] if wanted.startswith("skipgs_plug.core.pace")}
+
+
 def reachable(module: str) -> set[str]:
     seen: set[str] = set()
     waiting = [module]

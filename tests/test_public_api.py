@@ -161,7 +161,7 @@ def test_gate_verbs_and_their_signatures() -> None:
 
 
 def test_what_adapters_are_written_with() -> None:
-    assert set(adapters.__all__) == {"AbstractAdapter", "Hooks", "TrainerInfo", "register_adapter"}
+    assert set(adapters.__all__) == {"AbstractAdapter", "Densification", "Hooks", "TrainerInfo", "register_adapter"}
     assert signatures(AbstractAdapter) == ADAPTER
     assert AbstractAdapter.__abstractmethods__ == {"attach", "matches"}
     assert set(AbstractAdapter.__annotations__) == {

@@ -6,9 +6,9 @@ from typing import Any
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.registry import register_adapter
 from skipgs_plug.core.hooks import Hooks
-from skipgs_plug.core.trainer_info import TrainerInfo
+from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
-__all__ = ["AbstractAdapter", "Hooks", "TrainerInfo", "register_adapter"]
+__all__ = ["AbstractAdapter", "Densification", "Hooks", "TrainerInfo", "register_adapter"]
 
 _RENAMED = {"TrainerFacts": TrainerInfo}  # names of 0.1
 

@@ -26,14 +26,12 @@ from skipgs_plug.adapters.unknown_forks import BY_HAND, CALLS, Unrecognised, beg
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
-from skipgs_plug.core.pace.called import undecorated
+from skipgs_plug.core.source.functions import undecorated
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 from skipgs_plug.core.views import view_key
 
 # Modules of a checkout. The script imports them.
 RENDERER, MODEL = "gaussian_renderer", "scene.gaussian_model"
-
-
 # Effect of `share` on trainers that accumulate gradients after densification; see `Phased`.
 GROWS_WHOLE = "If steps accumulate gradients after densification, it runs whole."
 
@@ -47,7 +45,7 @@ class InriaFamily(AbstractAdapter):
         structural: Methods of `GaussianModel` that make losses jump.
         scenes: Possible names of the loop's variable for its Scene.
         changes: Further methods that change the model. The gate begins after the last call of these and `structural`.
-        pausing: Methods that the trainer calls after the gate has begun, too. Each change of theirs pauses the gate.
+        pausing: Methods in `changes` that the trainer also calls after the gate has begun. Each call pauses the gate.
         calls: Further names that the adapter knows beyond those of Inria's loop: methods of the model, functions that
             draw noise, methods that change a tensor in place.
         arguments: Arguments of the renderer that the adapter knows, beyond those of Inria's.
@@ -269,9 +267,7 @@ class InriaFamily(AbstractAdapter):
     def _refuse_fork(self, code: LoopCode) -> None:
         own, family = type(self), [one for one in registry.builtin_adapters() if issubclass(one, InriaFamily)]
         asked = family if own in family else [own, *family]
-        right = next(
-            one for one in asked if one.recognises(code.names)
-        )  # `inria`, the last one, recognises every script
+        right = next(one for one in asked if one.recognises(code.names))  # the last, `inria`, recognises every script
         if right is not own:
             raise AdapterMismatchError(
                 f"Adapter {self.name!r} is for {self.checked}, but {code.source} "

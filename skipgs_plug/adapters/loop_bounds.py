@@ -28,7 +28,7 @@ from skipgs_plug.adapters.loop_names import (
     without,
 )
 from skipgs_plug.adapters.trainer_code import Part, TrainerCode
-from skipgs_plug.core.pace.called import called, syntax_of, undecorated
+from skipgs_plug.core.source.functions import called_function, syntax_of, undecorated
 
 NUMBER = "iteration"  # variable that holds the iteration's number in every loop of the Inria family
 ASSIGNED = "data ="  # represents an assignment to a tensor's `data` among the names of calls
@@ -141,7 +141,7 @@ class CallReader:
     def _follow(self, name: str, call: ast.Call, scope: Scope, end: int | None) -> None:
         if name in self._stops:
             return
-        function = called(call.func, scope.values, lambda place: value_of(place, scope), scope.code)
+        function = called_function(call.func, scope.values, lambda place: value_of(place, scope), scope.code)
         plain = undecorated(function)
         syntax = None if plain is None or plain not in self.trainer else syntax_of(plain)
         if syntax is None:

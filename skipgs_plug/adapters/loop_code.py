@@ -23,7 +23,7 @@ class LoopCode(NamedTuple):
         source: File of the script, or name of the module, for sentences.
         names: Global names of the script, and every global and attribute that its function `training` uses.
         functions: Names of its functions and classes.
-        backward: Names of those that call `backward`.
+        backward: Names of its functions that call `backward`.
         used: Every global and attribute that `training` and the functions that it calls use. Empty if there is no
             function `training`.
         repeated: The subset of `used` inside the loop itself and in functions that the loop calls.

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from types import CodeType
 from typing import Any, NamedTuple
 
-from skipgs_plug.core.pace.settled import is_plain, only_holds
+from skipgs_plug.core.source.run_options import is_namespace, is_plain
 
 # Functions that conditions may call while they are evaluated, because the functions change nothing.
 PURE = {name: getattr(builtins, name) for name in ("abs", "int", "float", "len", "max", "min", "round")}
@@ -60,7 +60,7 @@ def scope_inside(function: ast.FunctionDef, scope: Scope) -> Scope:
 
 
 def learn_names(statement: ast.stmt, scope: Scope) -> None:
-    """Keep what names stand for that a statement assigns, and their values."""
+    """Record the names that a statement assigns, with their values and the expressions that they stand for."""
     match statement:
         case ast.Assign([ast.Tuple(targets)], ast.Tuple(values)) if len(targets) == len(values):
             pairs = [*zip(targets, values, strict=True)]
@@ -103,7 +103,7 @@ def is_option(node: ast.expr, scope: Scope) -> bool:
             return name in scope.own - scope.varying and name in scope.values and is_plain(scope.values[name])
         case ast.Attribute(place, name) if ast.unparse(node) not in scope.varying:
             holder = value_of(place, scope)
-            holds = only_holds(holder) or dataclasses.is_dataclass(holder)
+            holds = is_namespace(holder) or dataclasses.is_dataclass(holder)
             return holds and hasattr(holder, name) and is_plain(getattr(holder, name))
         case ast.BoolOp() | ast.BinOp() | ast.UnaryOp() | ast.Compare() | ast.IfExp() | ast.Tuple() | ast.List():
             return all(is_option(part, scope) for part in ast.iter_child_nodes(node) if isinstance(part, ast.expr))

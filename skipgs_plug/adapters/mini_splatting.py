@@ -12,7 +12,7 @@ class MiniSplatting(InriaFamily):
     """Both simplifications change the model after the backward of their iteration, and make a new optimizer.
 
     So does ms_d/train.py in iteration `densify_until_iter`. Gaussians that views show blurred are gathered like
-    gradients, until the next event. Points are made anew from depths every 5,000 iterations, with `share` too. The
+    gradients, until the next event. Points are recreated from depths every 5,000 iterations, with `share` too. The
     adapter counts iterations itself, since `update_learning_rate` gets shifted numbers.
     """
 

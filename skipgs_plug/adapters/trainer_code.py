@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from types import FunctionType, ModuleType
 
-from skipgs_plug.core.pace.project import INSTALLED, STANDARD, import_folder
+from skipgs_plug.core.source.project import INSTALLED, STANDARD, import_folder
 
 # Packages from which trainers derive classes, and that do not belong to them.
 BASES = frozenset({"builtins", "torch"})

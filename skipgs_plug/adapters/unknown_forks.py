@@ -14,7 +14,7 @@ from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Adapter
-from skipgs_plug.core.pace.called import undecorated
+from skipgs_plug.core.source.functions import undecorated
 
 # Functions that draw random numbers.
 NOISE = frozenset({"randn", "randn_like", "normal"})

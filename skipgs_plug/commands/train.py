@@ -69,12 +69,12 @@ def run(args: Args) -> int:
         )
         code = Session(args.session, folder, trainer, gate, curve).run()
     if args.sfm and not code:
-        share(folder, trainer)
+        write_small_file(folder, trainer)
     return code
 
 
-def share(folder: RunFolder, trainer: Trainer) -> None:
-    """Write the model as a small file, and print the command that opens it and the file to share."""
+def write_small_file(folder: RunFolder, trainer: Trainer) -> None:
+    """Write the model as a file that is small enough to send, and print how to open it, and its name."""
     path = folder.root / f"{folder.root.resolve().name}.spz"
     local = {name: parameter.detach().cpu() for name, parameter in trainer.splats.items()}
     data = to_spz(trainer.scene.frame.dataset_splats(local), trainer.config.antialiased)

@@ -1,4 +1,4 @@
-"""What a gate asks of an adapter, and what the adapter has in its hands while it attaches."""
+"""The interface between a gate and an adapter: the questions of the gate, and the hooks with which adapters attach."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Adapter(Protocol):
 
 
 class Hooks(LoopHooks):
-    """Reports to a gate what a trainer does: iterations, views, backward passes, structural changes.
+    """Reports the iterations, views, backward passes and structural changes of a trainer to a gate.
 
     The first training backward pass of an iteration is gated. Any further one runs and counts as a mismatch.
     """
@@ -292,7 +292,7 @@ class Hooks(LoopHooks):
     def _release_moved(self, names: list[str]) -> None:
         self.release(
             f"The loop moved {', '.join(names)} in iteration {self._iteration.step}, whose backward was skipped, by "
-            f"code that adapter {self._adapter.name!r} does not know. The gate is detached, and training goes on "
+            f"code that adapter {self._adapter.name!r} does not know. The gate is released, and training goes on "
             "without it. Gate this loop by hand with SkipGate(start_iter=...)."
         )
 

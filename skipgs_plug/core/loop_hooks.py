@@ -1,4 +1,4 @@
-"""What an adapter tells a gate about the training loop, so that whole iterations can be left out of it."""
+"""Facts about the training loop that an adapter passes to a gate, so that the gate can leave out whole iterations."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, LEAST_WATCHED
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.files import write_aside
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 1  # of skipgs.json
 # The entries of skipgs.json about whole iterations, for a gate that leaves out none.
 NO_REFINEMENT: dict[str, Any] = {
     "refine_share": None,

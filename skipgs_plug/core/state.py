@@ -10,6 +10,7 @@ from typing import Any, TypedDict
 from skipgs_plug import schema
 from skipgs_plug.core.errors import SkipGSError
 
+# Versions of the two formats of state. Version 1 of the policy's is that of the authors' controller.
 POLICY_VERSION = 2
 GATE_VERSION = 2
 

@@ -1,4 +1,4 @@
-"""Explain an error of a script that uses what a CPU stand-in does not have."""
+"""Explains errors of scripts that use a name, an argument or an output that the CPU stand-ins lack."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("skipgs_plug.compat", "skipgs_plug.fallback_raster")  # hold the stand-ins and the rasterizer behind them
+PACKAGES = ("skipgs_plug.compat", "skipgs_plug.fallback_raster")  # of the stand-ins, and of their rasterizer
 FOLDERS = tuple(Path(__file__).parents[1] / package.rpartition(".")[2] for package in PACKAGES)
-# Begins the message of a `TypeError` of a call with other arguments than the function has.
+# Beginning of the message of a `TypeError`, if a call has other arguments than the function.
 SIGNATURE = re.compile(r"([\w.]+)\(\) (got|takes|missing) ")
 
 
 def stand_in_hint(error: BaseException) -> str | None:
-    """Return a sentence that explains an error of a script that uses what a CPU stand-in does not have.
+    """Return a sentence that explains the error of a script that needs more than the CPU stand-ins have.
 
-    That can be a name, an argument or an output, or an option that the stand-in refuses.
+    A stand-in can lack a name, an argument or an output, or refuse an option.
 
     Returns:
         The sentence; None for any other error.
@@ -30,7 +30,7 @@ def stand_in_hint(error: BaseException) -> str | None:
         return text
     if isinstance(error, AttributeError):
         lacks = is_stand_in(error.obj)
-    elif isinstance(error, ImportError) and error.name:  # of a name, or of a module inside a stand-in
+    elif isinstance(error, ImportError) and error.name:  # a stand-in lacks a name or a module
         lacks = any(is_stand_in(sys.modules.get(name)) for name in (error.name, error.name.rpartition(".")[0]))
         text = text.partition(" (")[0]
     elif isinstance(error, TypeError) and (call := SIGNATURE.match(text)):

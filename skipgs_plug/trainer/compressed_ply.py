@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from skipgs_plug.trainer.sh0 import sh0_of
+
 CHUNK = 256  # Gaussians that share one set of bounds, as the format says
-SH_C0 = 0.28209479177387814
 Columns = dict[str, np.ndarray]
 XYZ, RGB = ("x", "y", "z"), ("r", "g", "b")
 
@@ -51,7 +52,7 @@ def decompress(
     for i, name in enumerate(RGB):
         values = (packed["color"] >> np.uint32(24 - 8 * i) & np.uint32(255)) / 255.0
         colour = between(values, name) if f"min_{name}" in chunks else values
-        result[f"f_dc_{i}"] = (colour - 0.5) / SH_C0
+        result[f"f_dc_{i}"] = sh0_of(colour)
     result["opacity"] = logits((packed["color"] & np.uint32(255)) / 255.0)
     for name, values in sh.items():
         result[name] = (np.asarray(values, dtype=np.float64) + 0.5) / 256 * 8 - 4

@@ -6,10 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-WINDOW = 11
-SIGMA = 1.5
-C1 = 0.01**2
-C2 = 0.03**2
+from skipgs_plug.trainer.ssim import C1, C2, RADIUS, SIGMA
+
+WINDOW = 2 * RADIUS + 1  # pixels along each side
 
 
 def l1_ssim_loss(image: Tensor, target: Tensor, ssim_lambda: float = 0.2) -> Tensor:

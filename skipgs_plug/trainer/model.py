@@ -13,9 +13,9 @@ from skipgs_plug.trainer.near_plane import before_a_lens
 from skipgs_plug.trainer.row_order import morton_order, take
 from skipgs_plug.trainer.scene import Scene
 from skipgs_plug.trainer.selective_adam import SelectiveAdam
+from skipgs_plug.trainer.sh0 import sh0_of
 
-SH_C0 = 0.28209479177387814  # constant spherical-harmonics basis function
-ADAM_EPS = 1e-15
+ADAM_EPS = 1e-15  # as in gsplat's and Inria's trainers: the root of a second moment can be far below torch's 1e-8
 
 
 def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near: float = 0.0) -> nn.ParameterDict:
@@ -56,7 +56,7 @@ def one_per_point(scene: Scene, config: TrainConfig) -> dict[str, Tensor]:
         "scales": torch.log(distance * config.recipe.init_scale)[:, None].repeat(1, 3),
         "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float32).repeat(n, 1),
         "opacities": torch.logit(torch.full((n,), config.recipe.init_opa, dtype=torch.float32)),
-        "sh0": ((rgb - 0.5) / SH_C0)[:, None, :],
+        "sh0": sh0_of(rgb)[:, None, :],
         "shN": torch.zeros(n, (config.sh_degree + 1) ** 2 - 1, 3, dtype=torch.float32),
     }
 

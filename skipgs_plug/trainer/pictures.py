@@ -15,6 +15,10 @@ from skipgs_plug.trainer.scene import View
 ERROR_GAIN = 4.0  # factor on absolute errors: at 1, an error of 0.05 would look black
 ROWS = 3  # views to show, at most
 ZOOM = 2  # side of one pixel of the render in the picture, in pixels
+# Width of a column, as a multiple of its title's height. The title stays legible where a page shrinks the picture, and
+# "share=auto error x4" is the longest one.
+COLUMN_WIDTH = 10
+LEAST_HEIGHT = 11  # of a title, in pixels: titles of narrow columns overlap before they are too small to read
 SMOOTH = 0.95  # decay of the running mean of losses per iteration: about the mean of the last 20
 
 
@@ -41,7 +45,7 @@ def save_comparison(path: Path, views: list[View], renders: Mapping[str, Sequenc
         views: Held-out views with their photographs.
         renders: Renders of these views by name of the run, each [H, W, 3] in [0, 1].
     """
-    from PIL import Image, ImageDraw
+    from PIL import Image, ImageDraw, ImageFont
 
     picked = np.linspace(0, len(views) - 1, min(ROWS, len(views))).round().astype(int)
     lines = []
@@ -51,12 +55,14 @@ def save_comparison(path: Path, views: list[View], renders: Mapping[str, Sequenc
         errors = [(ERROR_GAIN * np.abs(image - truth)).clip(0, 1) for image in images]
         lines.append(np.concatenate([truth, *images, *errors], axis=1))
     pixels = np.rint(np.concatenate(lines) * 255).astype(np.uint8).repeat(ZOOM, axis=0).repeat(ZOOM, axis=1)
-    header = 20
+    titles = ("truth", *renders, *(f"{name} error x{ERROR_GAIN:g}" for name in renders))
+    column = pixels.shape[1] // len(titles)
+    size = max(LEAST_HEIGHT, column // COLUMN_WIDTH)
+    header = size + size // 2
     sheet = Image.new("RGB", (pixels.shape[1], pixels.shape[0] + header), "white")
     sheet.paste(Image.fromarray(pixels), (0, header))
-    titles = ("truth", *renders, *(f"{name} error x{ERROR_GAIN:g}" for name in renders))
     for k, title in enumerate(titles):
-        ImageDraw.Draw(sheet).text((k * pixels.shape[1] // len(titles) + 6, 4), title, fill="black")
+        ImageDraw.Draw(sheet).text((k * column + 6, size // 8), title, fill="black", font=ImageFont.load_default(size))
     with write_aside(path) as temporary:
         sheet.save(temporary, format="PNG")
 

@@ -13,12 +13,13 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.install import next_command
-from skipgs_plug.trainer.compressed_ply import SH_C0, decompress, is_compressed
+from skipgs_plug.trainer.compressed_ply import decompress, is_compressed
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.frame import FAR
 from skipgs_plug.trainer.lfs import HINT, is_pointer
 from skipgs_plug.trainer.scene import check_points
+from skipgs_plug.trainer.sh0 import colours_of_sh0
 
 log = logging.getLogger(__name__)
 
@@ -28,9 +29,8 @@ F_REST_COUNTS = (0, 9, 24, 45)  # numbers of f_rest properties of SH degrees 0 t
 MAX_LOG_SCALE = 80.0  # largest logarithm of a scale in a file: float32 overflows at e^88
 MAX_LOGIT = 20.0  # opacity logit that stands for infinity in a file: its opacity is 1 in float32
 MIN_LOG_SCALE = -40.0  # smallest logarithm of a scale: the square of e^-40 is still a normal float32
-MAX_HEADER = (
-    1 << 16
-)  # bytes of a header, at most: 3DGS headers take about 2 KB, and a damaged file may have no end_header
+# Most bytes of a header: those of 3DGS files have about 2 KB, and a damaged file may have no end_header.
+MAX_HEADER = 1 << 16
 COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 BRIGHTEST = 2.0  # float colours up to this value have a range of 0 to 1; in a range of 0 to 255 they would be black
 PACKED_COLOURS = ("rgb", "rgba")  # format of the Point Cloud Library: one number with bytes 0xAARRGGBB
@@ -217,7 +217,7 @@ def colours_of(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
             colours = colours / 257
         return np.rint(colours.clip(0, 255)).astype(np.uint8)
     if {"f_dc_0", "f_dc_1", "f_dc_2"} <= set(vertices):
-        colours = 0.5 + SH_C0 * columns(path, vertices, ["f_dc_0", "f_dc_1", "f_dc_2"])
+        colours = colours_of_sh0(columns(path, vertices, ["f_dc_0", "f_dc_1", "f_dc_2"]))
         return np.rint(colours.clip(0, 1) * 255).astype(np.uint8)
     log.warning("%s has no colours (red, green and blue): its points are grey.", path)
     return np.full((len(vertices["x"]), 3), 128, dtype=np.uint8)

@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-SIGMA = 1.5
-RADIUS = 5  # the window has 11 pixels a side
-C1, C2 = 0.01**2, 0.03**2  # SSIM's constants for values in [0, 1]
-
-
+# Of SSIM's Gaussian window, in pixels, as in its paper (Wang et al. 2004): 11 pixels along each side.
+SIGMA, RADIUS = 1.5, 5
+# They keep quotients finite where an image is flat, for values in [0, 1], as in the paper.
+C1, C2 = 0.01**2, 0.03**2
 BAND = 1 << 18  # pixels of an image that are measured together: all planes of a photograph of 12 megapixels take 7 GiB
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.model import SH_C0
+from skipgs_plug.trainer.sh0 import colours_of_sh0
 
 HALF_MAX = 65_504.0  # largest float16: viser sends covariances in half precision
 
@@ -40,6 +40,6 @@ def to_gaussians(splats: Mapping[str, Tensor], unit: float) -> Gaussians:
     return Gaussians(
         (raw["means"] * unit).numpy(),
         (halves @ halves.mT).clamp(-HALF_MAX, HALF_MAX).numpy(),
-        (0.5 + SH_C0 * raw["sh0"][:, 0]).clamp(0, 1).numpy(),
+        colours_of_sh0(raw["sh0"][:, 0]).clamp(0, 1).numpy(),
         torch.sigmoid(raw["opacities"])[:, None].numpy(),
     )

@@ -19,7 +19,7 @@ from torch import Tensor
 from skipgs_plug.trainer.ply import sh_degree
 from skipgs_plug.trainer.row_order import morton_order
 
-VERSION = 2
+VERSION = 2  # of the format that is written
 STEPS = (1 << 16) - 1  # steps from the lowest position to the highest: a coordinate has 16 bits
 LEVELS = 256  # levels of a codebook: a number has one byte
 ROUNDS = 8  # rounds of k-means; later ones change little

@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.compressed_ply import SH_C0, logits
+from skipgs_plug.trainer.compressed_ply import logits
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.ply import renderable
+from skipgs_plug.trainer.sh0 import sh0_of
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
@@ -41,7 +42,7 @@ def read_splat(path: Path) -> dict[str, Tensor]:
         "scales": scales,
         "quats": quats,
         "opacities": logits(rows["rgba"][:, 3] / 255.0),
-        "sh0": ((rows["rgba"][:, :3] / 255.0 - 0.5) / SH_C0)[:, None],
+        "sh0": sh0_of(rows["rgba"][:, :3] / 255.0)[:, None],
         "shN": np.zeros((len(rows), 0, 3)),
     }
     splats = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in values.items()}

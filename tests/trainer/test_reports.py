@@ -338,7 +338,7 @@ def test_images_that_no_file_lists_are_counted(tmp_path: Path, tiny_scene: Scene
         (listed.parent / name).parent.mkdir(exist_ok=True)
         Image.open(listed).save(listed.parent / name, format="PNG")
     load_scene(root)
-    assert "2 of its images are no " in caplog.text
+    assert "2 of its images are not among the " in caplog.text
     assert "later.JPG" in caplog.text
 
 

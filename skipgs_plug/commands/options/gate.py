@@ -42,9 +42,9 @@ class GateOptions:
     """Iterations that always run. Replaces the numbers that are read from the loop's conditions."""
     tolerance: Annotated[Optional[float], shown("FLOAT", "0.05")] = None
     """With auto: refinement ends when the rest of it is worth less than this, in decibels."""
-    compensate: Annotated[Optional[bool], shown("True|False", "with --refine-share only")] = None
+    compensate: Annotated[Optional[bool], shown("True|False", "True with --share or --refine-share")] = None
     """Make up for left-out iterations with larger, shrinking steps."""
-    rate_peak: Annotated[Optional[float], shown("FLOAT", "by the share that runs and what views show")] = None
+    rate_peak: Annotated[Optional[float], shown("FLOAT", "by the shares that run and that a view shows")] = None
     """Factor on learning rates when refinement begins. It falls to 0."""
 
     def given(self) -> dict[str, Any]:

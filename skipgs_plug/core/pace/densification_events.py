@@ -11,25 +11,25 @@ from skipgs_plug.core.pace.needs import LEAST_GROWING_SHARE
 from skipgs_plug.core.pace.visibility import VISIBLE
 from skipgs_plug.core.trainer_info import Densification
 
-# Iterations that a densification event needs if a view shows almost none of the Gaussians. With more of them visible,
-# an event needs fewer: times (1 - visible) to the power `POWER_OF_HIDDEN`. A run of fewer iterations is less far at
-# each event than the trainer's own, so more gradients exceed the threshold. With every event kept, a tenth of 15,000
-# iterations ends with 170 % of the Gaussians on bonsai, where a view shows a third of them, and with 190 % on a
-# ray-traced scene, where it shows three quarters. Where it shows nearly all, as on Lego and fern, the number of
-# events limits growth: with every second event they end with half to three quarters. The two numbers are fitted: for
-# as many Gaussians as in the own run, bonsai needs about 47 iterations per event, the ray-traced scene 32, fern at
-# most 40 and Lego at most 10.
+# Number of iterations that a densification event needs if a view shows almost none of the Gaussians. It needs fewer if
+# a view shows more: this number times (1 - visible) to the power `POWER_OF_HIDDEN`. A run of fewer iterations is less
+# far at each event than the trainer's own, so more gradients exceed the threshold. With every event kept, a tenth of
+# 15,000 iterations ends with 170 % of the Gaussians on bonsai, where a view shows a third of them, and with 190 % on a
+# ray-traced scene, where it shows three quarters. Where it shows nearly all, as on Lego and fern, the number of events
+# limits growth: with every second event they end with half to three quarters. The two numbers are fitted: for as many
+# Gaussians as in the own run, bonsai needs about 47 iterations per event, the ray-traced scene 32, fern at most 40 and
+# Lego at most 10.
 STEPS_BEHIND = 55.0
 POWER_OF_HIDDEN = 0.4
 # A larger share than a tenth has more iterations between two events, which would all run otherwise: on the ray-traced
 # scene they end with 106 % of the Gaussians with a tenth of 15,000 iterations, but with 118 % with a quarter of 3,000.
 # So an event needs more, by a power of the share: this number times the square of the share that a view shows. Where a
-# view shows a third, as on bonsai, the number of Gaussians is right without, and with a power of 1/3 images of 798x531
-# pixels end 0.2 dB lower.
+# view shows a third of the Gaussians, as on bonsai, their number is right without this factor, and with a power of 1/3
+# images of 798x531 pixels end 0.2 dB lower.
 POWER_OF_SHARE = 0.5
-# Least number of events that a shortened phase keeps, whatever they need; a schedule with fewer keeps all. An event
-# at most doubles the Gaussians. With 7 or 8 of 13 events, scripts on bonsai at 100x67 ended with half of their
-# Gaussians and 0.011 less SSIM.
+# Least number of events that run in a shortened phase, even if they need more iterations. A schedule with fewer events
+# keeps all of them. An event at most doubles the number of Gaussians. With 7 or 8 of 13 events, scripts on bonsai at
+# 100x67 ended with half of their Gaussians and 0.011 less SSIM.
 LEAST_EVENTS = 16
 
 
@@ -113,8 +113,8 @@ class DensificationEvents:
         Args:
             number: Iteration with an event.
             visible: Share of the Gaussians that a view shows; None if unknown.
-            share: Share of the iterations that runs.
-            length: Iterations of the phase, whether they run or not.
+            share: Share of the iterations that runs, in (0, 1].
+            length: Number of iterations of the phase, left-out ones included.
             sooner: In a scene with many new Gaussians, the factor by which the event needs fewer iterations, at least
                 1; a larger share asks for no more there. None in other scenes.
         """

@@ -29,10 +29,10 @@ STEPS_PER_EVENT = 14
 # make the following ones come sooner, with more iterations: bonsai that grows from 3,000 points to 97,000 in 30,000
 # iterations lost 2.5 dB with a tenth of them. From all its points bonsai adds 0 to 3 % per event.
 GROWTH_PER_EVENT = 0.03
-# Largest growth per event, as a share of the Gaussians, at which the following event needs as many iterations as
-# ever. These decide on the number of Gaussians. With 0.03 bonsai that grows from 3,000 points ended with 95 % of its
-# Gaussians, 0.20 dB and 0.007 SSIM below its own run, with 0.025 it ends with 105 %, level. From 8,000 points it was
-# 91 %, and is 101 % and 0.1 dB more. With 0.02 it was 116 %.
+# Largest growth per event, as a share of the Gaussians, at which the following event still needs its usual number of
+# iterations. That number decides how many Gaussians the scene gets. With 0.03, bonsai that grows from 3,000 points
+# ended with 95 % of its Gaussians, 0.20 dB and 0.007 SSIM below its own run. With 0.025 it ends level, with 105 %. From
+# 8,000 points it ends with 101 % instead of 91 %, and 0.1 dB higher. With 0.02 it ended with 116 %.
 GROWTH_BEFORE_EVENTS_COME_SOONER = 0.025
 # How much a share is raised for Gaussians that are new: by a part of the logarithm of their number, as a multiple of
 # the number at the beginning. Up to e times as many need nothing more.
@@ -48,7 +48,7 @@ MOST_RAISED_SHARE = 0.4
 ENOUGH_STEPS = 2100
 # Largest factor on `ENOUGH_STEPS` in a scene that grows to many times its Gaussians. New Gaussians have a long way to
 # go in few iterations. On bonsai that grows from 8,000 to 200,000 Gaussians, 6,001 of 30,000 iterations end at 30.52 dB
-# without, at 30.83 with 2 and at 30.64 with 3. From 3,000 points it is 29.11, 29.53 and 29.43 dB.
+# without a factor, at 30.83 dB with 2 and at 30.64 dB with 3; from 3,000 points at 29.11, 29.53 and 29.43 dB.
 MOST_FOR_NEW_GAUSSIANS = 2.0
 # Largest factor on rates while the scene grows. On two seeds of 6,000 iterations Lego ends with 108 and 118 % of its
 # Gaussians with a factor of 4, with 99 and 105 % with 3, and 0.1 to 0.25 dB lower with 2.5.

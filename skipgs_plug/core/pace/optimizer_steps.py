@@ -1,4 +1,4 @@
-"""The steps of one optimizer: the trainer's settings while a step is under way, and which settings a step reads."""
+"""Steps of one optimizer with changed settings: restores the trainer's settings, and judges which settings it reads."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SQUARES_KEPT = 0.98
 
 
 class OptimizerSteps:
-    """The steps of one optimizer: facts about its groups, and the trainer's settings while a step is under way.
+    """Facts about the groups of one optimizer, and the trainer's settings while one of its steps is under way.
 
     Args:
         optimizer: The optimizer.

@@ -9,17 +9,17 @@ from skipgs_plug.core.caution import caution
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.base import Always, Known, Pace, Source, nothing_always, nothing_known
-from skipgs_plug.core.pace.display import Bars
 from skipgs_plug.core.pace.growing import Growing
 from skipgs_plug.core.pace.loop_finder import LoopFinder
 from skipgs_plug.core.pace.loop_range import LoopRange, line_of, require_planned
-from skipgs_plug.core.pace.milestones import read_loop
 from skipgs_plug.core.pace.phase import Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refinement_policy import RefinementPolicy
 from skipgs_plug.core.pace.refining import Refining
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.release import Release
+from skipgs_plug.core.source.milestones import read_loop
+from skipgs_plug.core.source.progress_bars import Bars
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
 

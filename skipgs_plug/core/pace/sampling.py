@@ -70,7 +70,7 @@ class Sampling:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.share = float(state["share"])
         self.run, self.left_out, self._due = int(state["run"]), int(state["left_out"]), int(state["due"])
-        asked, due = state.get("since", (0, 0))  # absent from states of before
+        asked, due = state.get("since", (0, 0))  # earlier states do not have it
         self._since = (int(asked), int(due))
 
 

@@ -1,4 +1,4 @@
-"""PyTorch's learning-rate schedulers in loops with left-out iterations: schedulers count calls, not iterations."""
+"""Keeps PyTorch's learning-rate schedulers in step: they count calls, which left-out iterations do not make."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def catch_up_schedulers(patches: Patches, pace: Pace) -> None:
 class _Steps:
     """The steps that one scheduler lacks because iterations were left out.
 
-    A scheduler that steps in an iteration that no condition of the loop names steps in every iteration. Until then, it
-    may be one that steps in every hundredth iteration, for instance. It lacks nothing, since those are not left out.
+    A scheduler steps in every iteration if it steps in one that no condition of the loop names. Until then it may step
+    in every hundredth iteration, for example. Such a scheduler lacks no step, because its iterations are not left out.
     """
 
     def __init__(self) -> None:

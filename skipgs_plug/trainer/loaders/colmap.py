@@ -18,8 +18,8 @@ from skipgs_plug.trainer.loaders.colmap_text import content_lines, image_records
 from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.loaders.paths import find_images, relative_name, subfolder
 from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, find_mask, load_photograph, lost_angle, model_name
-from skipgs_plug.trainer.loaders.said import say_bare, say_what_is_unlisted
 from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
+from skipgs_plug.trainer.loaders.unused_files import warn_of_missing_masks, warn_of_unlisted_images
 from skipgs_plug.trainer.ply import read_points
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene, split_views
 
@@ -65,8 +65,8 @@ def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStor
         )
     if unplaced:
         log.warning("%s: %d of %d images have no pose and are left out.", model, unplaced, unplaced + len(views))
-    say_what_is_unlisted(folder, [*paths, *(folder / name for name in called)], "image of the model")
-    say_bare(masks, found_masks)
+    warn_of_unlisted_images(folder, [*paths, *(folder / name for name in called)], "images of the model")
+    warn_of_missing_masks(masks, found_masks)
     return assemble(path, model, views, reconstruction, test_every, cloud)
 
 

@@ -15,8 +15,8 @@ from skipgs_plug.trainer.loaders.camera_keys import read_camera, values_of
 from skipgs_plug.trainer.loaders.json_file import opencv_viewmat, read_object, read_pose, read_string
 from skipgs_plug.trainer.loaders.paths import find_image, find_images, inside, relative_name, subfolder
 from skipgs_plug.trainer.loaders.photograph import PINHOLE_MODELS, find_mask, load_photograph, lost_angle, model_name
-from skipgs_plug.trainer.loaders.said import say_bare, say_what_is_unlisted
 from skipgs_plug.trainer.loaders.undistorted_cache import UndistortedCache
+from skipgs_plug.trainer.loaders.unused_files import warn_of_missing_masks, warn_of_unlisted_images
 from skipgs_plug.trainer.ply import read_points
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene, split_views
 
@@ -55,8 +55,8 @@ def load_nerfstudio(
     if distorted:
         log.warning("%s: lens distortion (%s) is removed; the result is cached.", source, ", ".join(sorted(distorted)))
     for folder in sorted({path / full.relative_to(path).parts[0] for full in paths} - set(paths)):
-        say_what_is_unlisted(folder, paths, f"frame of {FILE}")
-    say_bare(subfolder(path, "masks"), masks)
+        warn_of_unlisted_images(folder, paths, f"frames of {FILE}")
+    warn_of_missing_masks(subfolder(path, "masks"), masks)
     if len({repr(frame.get("time")) for frame in frames}) > 1:
         log.warning("%s: the frames have different times; objects that move will be blurred.", source)
     train, test = own_split(content, views, path, source) or split_views(views, test_every)

@@ -11,9 +11,8 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.scene import is_text
 
-SETTLED = (
-    2_000_000_000  # nanoseconds after a change until a folder's listing is cached: file systems have coarse clocks
-)
+# Nanoseconds after a change until a folder's listing is cached. The clocks of file systems have steps of up to 2 s.
+SETTLED = 2_000_000_000
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
 
 

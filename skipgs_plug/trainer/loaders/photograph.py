@@ -20,7 +20,7 @@ from skipgs_plug.trainer.loaders.undistorted_cache import Straight, UndistortedC
 from skipgs_plug.trainer.scene import View
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
-MAX_SIDE = 1 << 20
+MAX_SIDE = 1 << 20  # most pixels along a side: a larger number comes from a damaged file
 
 
 def load_photograph(

@@ -1,4 +1,4 @@
-"""Parts of a loop's conditions whose value is known before the loop begins and stays the same in it."""
+"""Options of a run: parts of a loop's conditions that have one value, before the loop and in all its iterations."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ import torch
 # Built-in functions that conditions may call. They change nothing.
 PURE = frozenset({"abs", "all", "any", "bool", "divmod", "float", "frozenset", "getattr", "int", "isinstance", "len"})
 PURE |= {"list", "max", "min", "range", "round", "set", "sorted", "sum", "tuple"}
-_UNKNOWN = object()
-# Containers whose length an option may be.
+_UNKNOWN = object()  # stands for a value that is not known; None is a value
+# Containers whose length can be an option.
 _CONTAINERS = (deque, dict, frozenset, list, range, set, tuple, torch.utils.data.DataLoader, torch.utils.data.Dataset)
 
 
-class Settled:
+class RunOptions:
     """Recognises the options of a run: names that a function has before its loop and that the loop does not assign.
 
     Only plain values count (numbers, text, flags, None and collections of them), in variables of the function itself,
@@ -50,7 +50,7 @@ class Settled:
         declared = (node.names for node in ast.walk(source) if isinstance(node, (ast.Global, ast.Nonlocal)))
         # A module's own variables are its names.
         self._own = {*code.co_varnames, *code.co_cellvars} if code.co_flags & inspect.CO_NEWLOCALS else {*code.co_names}
-        of_module = switched(code.co_filename).difference(code.co_varnames, code.co_cellvars)
+        of_module = assigned_globals(code.co_filename).difference(code.co_varnames, code.co_cellvars)
         self._shared = of_module.union(code.co_freevars, shared, *declared)
         self._names, self._changing, self._pure = names, changing, pure
 
@@ -120,14 +120,14 @@ class Settled:
         return _UNKNOWN
 
 
-def switched(file: str) -> set[str]:
+def assigned_globals(file: str) -> set[str]:
     """Return the global names of a source file that its functions may assign."""
     declared = re.findall(r"\bglobal\s+(\w+(?:\s*,\s*\w+)*)", "".join(linecache.getlines(file)))
     return {name.strip() for names in declared for name in names.split(",")}
 
 
 def _attribute(holder: Any, name: str, default: Any) -> Any:
-    return vars(holder).get(name, default) if only_holds(holder) else _UNKNOWN
+    return vars(holder).get(name, default) if is_namespace(holder) else _UNKNOWN
 
 
 def _item(holder: Any, key: Any, default: Any) -> Any:
@@ -141,7 +141,7 @@ def is_plain(value: Any) -> bool:
     return value is None or isinstance(value, (bool, int, float, str, range))
 
 
-def only_holds(value: Any) -> bool:
+def is_namespace(value: Any) -> bool:
     """Whether an object, such as a namespace of options, holds values and has no public methods."""
     kind = type(value)
     return hasattr(value, "__dict__") and not any(

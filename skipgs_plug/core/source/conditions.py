@@ -1,4 +1,4 @@
-"""Syntax of conditions: where the statements of a loop have them, and the conditions under which they are reached."""
+"""Conditions in the source of a loop, each with the conditions under which the loop reaches it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import ast
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from skipgs_plug.core.pace.in_place import InPlace
+from skipgs_plug.core.source.inlining import InlinedFunction
 
-_POINT = (ast.Eq, ast.NotEq, ast.In, ast.NotIn, ast.Is, ast.IsNot)
-_ENDS = (ast.Return, ast.Continue, ast.Break, ast.Raise)
-Guards = tuple[ast.expr, ...]
+# Comparisons that hold for single numbers. The others hold for a range of numbers.
+_PICKS = (ast.Eq, ast.NotEq, ast.In, ast.NotIn, ast.Is, ast.IsNot)
+_ENDS = (ast.Return, ast.Continue, ast.Break, ast.Raise)  # statements that end an iteration or a function
+Guards = tuple[ast.expr, ...]  # conditions that all hold where a statement is reached
 
 
 class Condition(NamedTuple):
@@ -24,17 +25,20 @@ class Condition(NamedTuple):
 
     test: ast.expr
     guards: Guards
-    function: InPlace | None
+    function: InlinedFunction | None
 
 
 def conditions_in(
-    body: Sequence[ast.stmt], functions: Mapping[int, InPlace], guards: Guards = (), function: InPlace | None = None
+    body: Sequence[ast.stmt],
+    functions: Mapping[int, InlinedFunction],
+    guards: Guards = (),
+    function: InlinedFunction | None = None,
 ) -> Iterator[Condition]:
     """Yield all conditions in statements, and in the functions that they call.
 
     Args:
         body: The statements.
-        functions: Called functions by the id of the call.
+        functions: Inlined functions by the id of the call.
         guards: Conditions under which the statements run.
         function: The function that the statements are of; None for the loop.
     """
@@ -75,9 +79,9 @@ def leaves(node: ast.expr) -> Iterator[ast.expr]:
 
 
 def is_point(leaf: ast.expr) -> bool:
-    """Whether a part picks single numbers, by equality, membership, a remainder or the result of a function."""
+    """Whether a part of a condition picks single numbers: by equality, membership, a remainder or a called function."""
     if isinstance(leaf, ast.Compare):
-        return any(isinstance(operator, _POINT) for operator in leaf.ops) or any(
+        return any(isinstance(operator, _PICKS) for operator in leaf.ops) or any(
             isinstance(part, ast.Mod) for part in ast.walk(leaf)
         )
     if isinstance(leaf, ast.IfExp):
@@ -85,6 +89,15 @@ def is_point(leaf: ast.expr) -> bool:
         return any(is_point(part) for part in parts if not isinstance(part, ast.Constant))
     # The training backward of a user's own loop receives the number too, but is not a milestone.
     return not (isinstance(leaf, ast.Call) and isinstance(leaf.func, ast.Attribute) and leaf.func.attr == "backward")
+
+
+def unconditional(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:
+    """Yield these statements, and the statements inside a `with` block in place of the block."""
+    for statement in body:
+        if isinstance(statement, (ast.With, ast.AsyncWith)):
+            yield from unconditional(statement.body)
+        else:
+            yield statement
 
 
 def is_inside(node: ast.stmt | ast.expr, outer: ast.stmt) -> bool:

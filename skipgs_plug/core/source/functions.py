@@ -1,4 +1,4 @@
-"""The function that a call in the source of a trainer names, and the source of that function."""
+"""Finds the function that a call in a trainer's source names, and the syntax of that function."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from types import CodeType, FunctionType, MethodType
 from typing import Any
 
 
-def called(
+def called_function(
     function: ast.expr, names: Mapping[str, Any], value: Callable[[ast.expr], Any], code: CodeType | None = None
 ) -> Any:
     """Return the function that an expression names; None if it is unknown. Properties are not evaluated.

@@ -1,4 +1,4 @@
-"""What the statements of a loop assign and change."""
+"""Names and objects that the statements of a loop assign and change."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import ast
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
-from skipgs_plug.core.pace.in_place import PLACES, comprehended
-from skipgs_plug.core.pace.spelled_out import always
+from skipgs_plug.core.source.conditions import unconditional
+from skipgs_plug.core.source.inlining import PLACES, comprehended
 
 # Methods that change lists, sets and queues, so that an object can differ from iteration to iteration.
 CHANGES = frozenset({"add", "append", "appendleft", "clear", "discard", "extend", "insert", "pop", "popleft", "remove"})
@@ -15,13 +15,14 @@ CHANGES = frozenset({"add", "append", "appendleft", "clear", "discard", "extend"
 CHANGES_OPTIONS = frozenset({"popitem", "setdefault", "update"})
 
 
-class Stores(NamedTuple):
-    """What statements assign and change, as source text.
+class Assignments(NamedTuple):
+    """Names and objects that statements assign and change, as source text.
 
     Attributes:
         assigned: Names, attributes and entries that they assign, once for each assignment.
-        changed: Those, and objects of which they call one of `CHANGES`.
-        options: Lists and dictionaries whose entries they assign, and objects of which they call `CHANGES_OPTIONS`.
+        changed: The same, and objects whose methods in `CHANGES` they call.
+        options: Lists and dictionaries whose entries they assign, and objects whose methods in `CHANGES_OPTIONS` they
+            call.
     """
 
     assigned: list[str]
@@ -29,8 +30,8 @@ class Stores(NamedTuple):
     options: set[str]
 
 
-def stores(body: Iterable[ast.stmt]) -> Stores:
-    """Return what these statements assign and change."""
+def assignments_in(body: Iterable[ast.stmt]) -> Assignments:
+    """Return the names and objects that these statements assign and change."""
     parts = [node for one in body for node in ast.walk(one)]
     inner = set(map(id, comprehended(parts)))
     stored = [node for node in parts if isinstance(node, PLACES) and not isinstance(node.ctx, ast.Load)]
@@ -39,11 +40,11 @@ def stores(body: Iterable[ast.stmt]) -> Stores:
     changed = {ast.unparse(method.value) for method in called if method.attr in CHANGES}
     options = {ast.unparse(method.value) for method in called if method.attr in CHANGES_OPTIONS}
     options |= {ast.unparse(node.value) for node in stored if isinstance(node, ast.Subscript)}
-    return Stores(assigned, changed.union(assigned), options)
+    return Assignments(assigned, changed.union(assigned), options)
 
 
-def counted(body: list[ast.stmt]) -> Iterator[str]:
+def counters(body: list[ast.stmt]) -> Iterator[str]:
     """Yield the names and attributes to which these statements add a constant in every iteration."""
-    for node in always(body):
+    for node in unconditional(body):
         if isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add) and isinstance(node.value, ast.Constant):
             yield ast.unparse(node.target)

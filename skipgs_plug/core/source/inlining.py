@@ -1,4 +1,4 @@
-"""Functions of the project that a loop calls with its number, read as if their statements stood in its place."""
+"""Inlining: functions of the project that a loop calls with its number, read as if they were written in the loop."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from types import CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
-from skipgs_plug.core.pace.called import called, closure, read_syntax, undecorated
-from skipgs_plug.core.pace.project import Project
-from skipgs_plug.core.pace.settled import switched
+from skipgs_plug.core.source.functions import called_function, closure, read_syntax, undecorated
+from skipgs_plug.core.source.project import Project
+from skipgs_plug.core.source.run_options import assigned_globals
 
-# Largest depth of nested calls that are read, as from a loop to a trainer, a logger and its file.
+# Largest depth of nested calls that are read: a loop calls its trainer, which calls a logger, which opens a file.
 MAX_DEPTH = 3
-PLACES = (ast.Name, ast.Attribute, ast.Subscript)
+PLACES = (ast.Name, ast.Attribute, ast.Subscript)  # syntax that holds a value, and that an assignment may have
+# Syntax that changes nothing and may be evaluated several times.
 _READS = (
     *(*PLACES, ast.BinOp, ast.BoolOp, ast.Compare, ast.Constant, ast.List, ast.Tuple, ast.UnaryOp),
     *(ast.boolop, ast.cmpop, ast.expr_context, ast.operator, ast.unaryop),
 )
 _DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+# Further syntax that gives a name to a value; names that are assigned are `ast.Name`.
 _BINDS_NAME = (*_DEFINITIONS, ast.ExceptHandler, ast.MatchAs, ast.MatchStar)
 _ABSENT = object()
 
 
-class InPlace(NamedTuple):
-    """A function that is read in place of a call.
+class InlinedFunction(NamedTuple):
+    """A function whose statements are read in place of a call.
 
     Attributes:
         body: Its statements, in the names of the loop. Parameters are replaced by the arguments, and names that the
@@ -39,7 +41,7 @@ class InPlace(NamedTuple):
     code: CodeType
 
 
-class CalledFunctions:
+class InlinedFunctions:
     """The functions that a loop calls with its number, and the functions that they call with it.
 
     Only functions of the user's own project are read, and methods of objects that exist before the loop.
@@ -53,7 +55,7 @@ class CalledFunctions:
         pure: Names of functions that are evaluated and not read.
 
     Attributes:
-        in_place: The functions, by the id of the call in the syntax tree.
+        by_call: The functions, by the id of the call in the syntax tree.
         unknown: The argument, and variables of the functions whose values are not known before the loop.
         counted: Variables of the functions that begin with the number and are assigned again.
         shared: Added names that other functions may change.
@@ -68,7 +70,7 @@ class CalledFunctions:
         unknown: Collection[str],
         pure: Collection[str],
     ) -> None:
-        self.in_place: dict[int, InPlace] = {}
+        self.by_call: dict[int, InlinedFunction] = {}
         self.unknown, self.counted, self.shared = set(unknown), set[str](), set[str]()
         self._names, self._target, self._pure = names, target, pure
         self._project = Project(code, names)
@@ -77,7 +79,7 @@ class CalledFunctions:
 
     def __iter__(self) -> Iterator[ast.stmt]:
         """Iterate over the statements of all functions."""
-        return (statement for function in self.in_place.values() for statement in function.body)
+        return (statement for function in self.by_call.values() for statement in function.body)
 
     def _follow(self, body: list[ast.stmt], numbers: set[str]) -> None:
         """Read the functions that statements call with the number.
@@ -93,7 +95,7 @@ class CalledFunctions:
         holders = {text.rpartition(".")[0] for text in numbers}
         for node in nodes:
             if isinstance(node, ast.Call) and self._receives(node, numbers, holders):
-                function = called(node.func, self._names, self._value, self._open[-1])
+                function = called_function(node.func, self._names, self._value, self._open[-1])
                 plain = undecorated(function)
                 if plain is not None and plain.__code__ not in self._open and plain in self._project:
                     self._read(node, function, plain, numbers)
@@ -144,7 +146,7 @@ class CalledFunctions:
             return
         renamed = _Renamed(self._meanings(call, function, plain, syntax, numbers))
         body = [renamed.visit(statement) for statement in syntax.body]
-        self.in_place[id(call)] = InPlace(body, plain.__code__)
+        self.by_call[id(call)] = InlinedFunction(body, plain.__code__)
         self._open.append(plain.__code__)
         self._follow(body, set(numbers))
         self._open.pop()
@@ -153,7 +155,7 @@ class CalledFunctions:
         self, call: ast.Call, function: Any, plain: FunctionType, syntax: ast.FunctionDef, numbers: Collection[str]
     ) -> dict[str, ast.expr]:
         """Return the expressions, in names of the loop, that the names in a function stand for."""
-        times = sum(one.code.co_name == syntax.name for one in self.in_place.values())
+        times = sum(one.code.co_name == syntax.name for one in self.by_call.values())
         prefix = f"{syntax.name}{times + 1}" if times else syntax.name  # each call has local variables of its own
         given, defaults = self._given(call, function, plain, syntax.args, prefix)
         bound = _bound(syntax)
@@ -185,7 +187,7 @@ class CalledFunctions:
         elif name in plain.__globals__:
             value, own = plain.__globals__[name], f"{plain.__module__}.{name}"
             same = plain.__module__ == self._names.get("__name__")
-            changes = name in switched(plain.__code__.co_filename)
+            changes = name in assigned_globals(plain.__code__.co_filename)
         else:
             return {}  # a built-in function
         if same and name != self._target and self._names.get(name, _ABSENT) is value:

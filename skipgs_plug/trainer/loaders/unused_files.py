@@ -11,16 +11,26 @@ from skipgs_plug.trainer.loaders.paths import unlisted_images
 log = logging.getLogger(__name__)
 
 
-def say_what_is_unlisted(folder: Path, listed: Sequence[Path], what: str) -> None:
-    """Warn about images of a folder that `what` does not list: they were not placed, or were added later."""
+def warn_of_unlisted_images(folder: Path, listed: Sequence[Path], kind: str) -> None:
+    """Warn about images of a folder that the scene does not list: they were not placed, or were added later.
+
+    Args:
+        folder: Folder of the images.
+        listed: Images of the folder that the scene lists.
+        kind: Entries of the scene for images, such as "frames of transforms.json".
+    """
     others = unlisted_images(folder, listed)
     if others:
         log.warning(
-            "%s: %d of its images are no %s and are left out, such as %s.", folder, len(others), what, others[0]
+            "%s: %d of its images are not among the %s and are left out, such as %s.",
+            folder,
+            len(others),
+            kind,
+            others[0],
         )
 
 
-def say_bare(masks: Path, found: Sequence[Path | None]) -> None:
+def warn_of_missing_masks(masks: Path, found: Sequence[Path | None]) -> None:
     """Warn about views without a mask if others have one, and about masks without a view."""
     if not masks.is_dir():
         return

@@ -1,4 +1,4 @@
-"""Conditions of a loop evaluated for numbers that the loop has not reached."""
+"""Evaluates conditions of a loop for iterations that the loop has not reached."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skipgs_plug.core.pace.conditions import Guards, is_point, leaves
-from skipgs_plug.core.pace.in_place import PLACES, comprehended
-from skipgs_plug.core.pace.settled import Settled
+from skipgs_plug.core.source.conditions import Guards, is_point, leaves
+from skipgs_plug.core.source.inlining import PLACES, comprehended
+from skipgs_plug.core.source.run_options import RunOptions
 
-Numbers = npt.NDArray[np.bool_]  # a truth for each number of a range
-_NUMBERS = "numbers of the loop"  # no name in any source
-
-
-class Unforeseeable(Exception):
-    """A condition on the number depends on values that the loop computes."""
+Truths = npt.NDArray[np.bool_]  # one truth value for each number of a range
+_NUMBERS = "numbers of the loop"  # with spaces, so that no name in a source is the same
 
 
-class Foresight:
-    """Tells which expressions of a loop can be evaluated ahead, for any number.
+class DependsOnLoop(Exception):
+    """A condition on the number depends on values that the loop changes."""
+
+
+class Evaluator:
+    """Evaluates conditions for any number, and tells which expressions can be evaluated before the loop.
 
     Args:
         target: Name of the loop's number.
         counted: Other names that hold the number, and that the loop changes.
         names: Names and values before the loop.
         changing: Names and attributes that the loop assigns or changes.
-        settled: Recognises the options of the run.
+        options: Recognises the options of the run.
 
     Attributes:
         target, names: The arguments.
@@ -43,48 +43,49 @@ class Foresight:
         counted: Collection[str],
         names: Mapping[str, Any],
         changing: Collection[str],
-        settled: Settled,
+        options: RunOptions,
     ) -> None:
         self.target, self.names = target, names
         self._numbers = {target, *counted}
-        self._changing, self._settled = changing, settled
+        self._changing, self._options = changing, options
 
-    def __contains__(self, node: ast.expr) -> bool:
+    def is_known(self, node: ast.expr) -> bool:
         """Whether the values of an expression in all iterations are known before the loop."""
         if self.mentions(node):
             return not self.depends_on_loop(node)
-        return node in self._settled or self._settled.keeps_value(node)
+        return node in self._options or self._options.keeps_value(node)
 
     def mentions(self, node: ast.AST) -> bool:
         """Whether the number occurs in this part of the source."""
         return any(isinstance(part, ast.Name) and part.id in self._numbers for part in ast.walk(node))
 
-    def is_known(self, leaf: ast.expr) -> bool:
-        """Whether a part of a condition that does not mention the number is the same in all iterations."""
-        return leaf in self._settled
-
     def depends_on_loop(self, node: ast.expr) -> bool:
-        """Whether an expression depends on the number and on values that the loop computes."""
+        """Whether an expression depends on the number and on values that the loop changes."""
         if not self.mentions(node):
             return False
         parts = list(ast.walk(node))
         inner = {name.id for name in comprehended(parts)}
         read = {ast.unparse(part) for part in parts if isinstance(part, PLACES)} - inner
-        reads = all(self._settled.only_reads(part) for part in parts if isinstance(part, ast.Call))
+        reads = all(self._options.only_reads(part) for part in parts if isinstance(part, ast.Call))
         return not reads or not read.isdisjoint(self._changing)
+
+    def is_option(self, node: ast.expr) -> bool:
+        """Whether an expression consists of options of the run."""
+        return node in self._options
 
     def is_off(self, test: ast.expr) -> bool:
         """Whether a condition never holds because an option is off."""
         parts = test.values if isinstance(test, ast.BoolOp) and isinstance(test.op, ast.And) else [test]
-        return any(part in self._settled and not eval(_compiled(part), dict(self.names)) for part in parts)
+        return any(self.is_option(part) and not eval(_compiled(part), dict(self.names)) for part in parts)
 
     def branches(self, numbers: range, test: ast.expr, guards: Guards) -> Iterator[tuple[set[int], set[int]]]:
-        """Yield the numbers for which a condition holds, and those for which it does not, of those that reach it.
+        """Yield two sets: the numbers that reach a condition and for which it holds, and for which it does not hold.
 
-        There is one pair for each assumed value of the parts that do not depend on the number.
+        Parts of the condition that do not depend on the number are assumed to be true for the first pair of sets, and
+        false for the second pair.
 
         Raises:
-            Unforeseeable: The condition depends on a value that the loop changes.
+            DependsOnLoop: The condition depends on a value that the loop changes.
         """
         return _Evaluation(self, test, guards, numbers).branches()
 
@@ -92,8 +93,8 @@ class Foresight:
 class _Evaluation:
     """Evaluates one condition, and the guards in front of it, for all numbers at once."""
 
-    def __init__(self, foresight: Foresight, test: ast.expr, guards: Guards, numbers: range) -> None:
-        self._foresight, self._test, self._guards, self._numbers = foresight, test, guards, numbers
+    def __init__(self, evaluator: Evaluator, test: ast.expr, guards: Guards, numbers: range) -> None:
+        self._evaluator, self._test, self._guards, self._numbers = evaluator, test, guards, numbers
 
     def branches(self) -> Iterator[tuple[set[int], set[int]]]:
         reached = np.ones(len(self._numbers), dtype=bool)
@@ -104,30 +105,30 @@ class _Evaluation:
             holds = self._holds(self._test, reached, assumed)
             yield set(numbers[holds].tolist()), set(numbers[reached & ~holds].tolist())
 
-    def _holds(self, node: ast.expr, reached: Numbers, assumed: bool) -> Numbers:
-        """Return where a part of a condition holds, of the numbers that reach it."""
+    def _holds(self, node: ast.expr, reached: Truths, assumed: bool) -> Truths:
+        """Return for which of the numbers that reach a part of a condition the part holds."""
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
             return reached & ~self._holds(node.operand, reached, not assumed)
         if isinstance(node, ast.BoolOp):
             is_and = isinstance(node.op, ast.And)
             undecided = reached
-            for part in sorted(node.values, key=self._is_unforeseeable):  # because other parts may decide alone
+            for part in sorted(node.values, key=self._depends_on_loop):  # other parts may decide alone
                 holds = self._holds(part, undecided, assumed)
                 undecided = holds if is_and else undecided & ~holds
             return undecided if is_and else reached & ~undecided
-        if self._foresight.depends_on_loop(node):
+        if self._evaluator.depends_on_loop(node):
             if reached.any() and is_point(node) and any(leaf is node for leaf in leaves(self._test)):
-                raise Unforeseeable
-        elif self._foresight.mentions(node) or self._foresight.is_known(node):
+                raise DependsOnLoop
+        elif self._evaluator.mentions(node) or self._evaluator.is_option(node):
             return reached & self._values(node, assumed)
         return reached & assumed
 
-    def _is_unforeseeable(self, part: ast.expr) -> bool:
-        return any(self._foresight.depends_on_loop(leaf) for leaf in leaves(part))
+    def _depends_on_loop(self, part: ast.expr) -> bool:
+        return any(self._evaluator.depends_on_loop(leaf) for leaf in leaves(part))
 
-    def _values(self, node: ast.expr, assumed: bool) -> Numbers:
+    def _values(self, node: ast.expr, assumed: bool) -> Truths:
         """Return the truth of a part for all numbers; `assumed` where an error shows that it is not known yet."""
-        names, target = dict(self._foresight.names), self._foresight.target
+        names, target = dict(self._evaluator.names), self._evaluator.target
         names[_NUMBERS] = self._numbers
         each = ast.comprehension(ast.Name(target, ast.Store()), ast.Name(_NUMBERS, ast.Load()), [], 0)
         truth = ast.UnaryOp(ast.Not(), ast.UnaryOp(ast.Not(), node))

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from skipgs_plug import SkipGate
 from skipgs_plug.core.pace.loop_range import line_of
-from skipgs_plug.core.pace.milestones import read_loop
+from skipgs_plug.core.source.milestones import read_loop
 
 NUMBERS = range(1, 101)
 

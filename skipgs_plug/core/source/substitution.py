@@ -1,4 +1,4 @@
-"""Names of a loop, and calls of functions without effects, replaced by the expressions that they stand for."""
+"""Replaces names in a loop, and calls of functions without effects, by the expressions that they stand for."""
 
 from __future__ import annotations
 
@@ -6,44 +6,44 @@ import ast
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from skipgs_plug.core.pace.foresight import Foresight
-from skipgs_plug.core.pace.in_place import InPlace
+from skipgs_plug.core.source.evaluator import Evaluator
+from skipgs_plug.core.source.inlining import InlinedFunction
 
 
-class SpelledOut(ast.NodeTransformer):
+class Substitution(ast.NodeTransformer):
     """Replaces names and calls in statements by expressions of the number and of options. It changes the statements.
 
     Examples are `index = step % len(views)`, and `is_due(step)` for a function that returns `step % 100 == 0`. A name
-    is replaced after its assignment only; before it, the value is the previous iteration's.
+    is replaced after its assignment only. Before the assignment, its value is the previous iteration's.
 
     Args:
-        functions: Called functions by the id of the call. Their statements are changed, too.
-        foresight: Tells which expressions have values that are known before the loop.
+        functions: Inlined functions by the id of the call. Their statements are changed too.
+        evaluator: Tells which expressions have values that are known before the loop.
         assigned_once: Returns whether the loop assigns a name or attribute in one place only.
     """
 
     def __init__(
         self,
-        functions: Mapping[int, InPlace],
-        foresight: Foresight,
+        functions: Mapping[int, InlinedFunction],
+        evaluator: Evaluator,
         assigned_once: Callable[[str], bool],
     ) -> None:
-        self._functions, self._foresight, self._assigned_once = functions, foresight, assigned_once
+        self._functions, self._evaluator, self._assigned_once = functions, evaluator, assigned_once
         self._meanings: dict[str, ast.expr] = {}
 
-    def spell(self, body: Sequence[ast.stmt]) -> None:
+    def apply(self, body: Sequence[ast.stmt]) -> None:
         """Replace names and calls in these statements."""
         for statement in body:
             if isinstance(statement, (ast.With, ast.AsyncWith)):
                 for item in statement.items:
                     self.visit(item)
-                self.spell(statement.body)
+                self.apply(statement.body)
                 continue
             self.visit(statement)
             for target, value in _assigned(statement):
                 name = ast.unparse(target)
                 once = isinstance(target, (ast.Name, ast.Attribute)) and self._assigned_once(name)
-                if once and value in self._foresight:
+                if once and self._evaluator.is_known(value):
                     self._meanings[name] = value
 
     def visit_Name(self, node: ast.Name | ast.Attribute) -> ast.AST:
@@ -59,23 +59,14 @@ class SpelledOut(ast.NodeTransformer):
         if function is None:
             return node
         before = dict(self._meanings)
-        self.spell(function.body)
+        self.apply(function.body)
         self._meanings = before
         value = _returned(function.body)
-        if value is None or not (self._foresight.mentions(value) and value in self._foresight):
+        if value is None or not (self._evaluator.mentions(value) and self._evaluator.is_known(value)):
             return node
         for part in ast.walk(value):
             ast.copy_location(part, node)
         return value
-
-
-def always(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:
-    """Yield these statements, and the statements inside a `with` block in place of the block."""
-    for node in body:
-        if isinstance(node, (ast.With, ast.AsyncWith)):
-            yield from always(node.body)
-        else:
-            yield node
 
 
 def _assigned(statement: ast.stmt) -> Iterator[tuple[ast.expr, ast.expr]]:
@@ -103,7 +94,7 @@ def _returned(body: Sequence[ast.stmt]) -> ast.expr | None:
                     return None
                 return ast.copy_location(ast.IfExp(test, holds, fails), test)
             case ast.Expr(ast.Constant()) | ast.Assign([ast.Name()]) | ast.AnnAssign(ast.Name()):
-                continue  # a text, or a variable that is spelled out below
+                continue  # a docstring, or a variable that is replaced below
             case _:
                 return None
     return ast.copy_location(ast.Constant(None), body[0]) if body else None

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from skipgs_plug.core.pace.loop_range import line_of
-from skipgs_plug.core.pace.milestones import read_loop
+from skipgs_plug.core.source.milestones import read_loop
 
 NUMBERS = range(50, 100)
 

@@ -19,16 +19,24 @@ from typing import Any
 
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.pace.conditions import Condition, conditions_in, is_inside, is_point, leaves, position
-from skipgs_plug.core.pace.display import Moves, moves, only_shows
-from skipgs_plug.core.pace.foresight import Foresight, Unforeseeable
-from skipgs_plug.core.pace.in_place import PLACES, CalledFunctions
-from skipgs_plug.core.pace.settled import PURE, Settled
-from skipgs_plug.core.pace.spelled_out import SpelledOut, always
-from skipgs_plug.core.pace.stores import counted, stores
+from skipgs_plug.core.source.assignments import assignments_in, counters
+from skipgs_plug.core.source.conditions import (
+    Condition,
+    conditions_in,
+    is_inside,
+    is_point,
+    leaves,
+    position,
+    unconditional,
+)
+from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator
+from skipgs_plug.core.source.inlining import PLACES, InlinedFunctions
+from skipgs_plug.core.source.progress_bars import Moves, moves, only_shows
+from skipgs_plug.core.source.run_options import PURE, RunOptions
+from skipgs_plug.core.source.substitution import Substitution
 
 
-class LoopCode:
+class TrainingLoop:
     """One `for` statement of a function, whose target is the iteration's number.
 
     Args:
@@ -52,23 +60,23 @@ class LoopCode:
         assert isinstance(statement.target, ast.Name)
         self._code, self._body, self._names = code, statement.body, dict(names)
         self._target = target = statement.target.id
-        own = stores(statement.body)
-        self._counters = {text for text in counted(statement.body) if own.assigned.count(text) == 1}
-        functions = CalledFunctions(
+        own = assignments_in(statement.body)
+        self._counters = {text for text in counters(statement.body) if own.assigned.count(text) == 1}
+        functions = InlinedFunctions(
             statement.body, code, self._names, target, set(own.assigned).difference(known), pure | PURE
         )
-        called = stores(functions)
+        inlined = assignments_in(functions)
         by_loop = own.changed.difference(known)
-        changing = by_loop.union(functions.unknown, called.changed).difference(known)
-        options = changing.union({target}, own.options, called.options)
-        settled = Settled(code, around, self._names, options, functions.shared, pure | PURE)
-        self._foresight = Foresight(target, functions.counted, self._names, changing, settled)
-        self._foresight_of_loop = Foresight(target, (), self._names, by_loop, settled)
+        changing = by_loop.union(functions.unknown, inlined.changed).difference(known)
+        no_options = changing.union({target}, own.options, inlined.options)
+        options = RunOptions(code, around, self._names, no_options, functions.shared, pure | PURE)
+        self._evaluator = Evaluator(target, functions.counted, self._names, changing, options)
+        self._evaluator_of_loop = Evaluator(target, (), self._names, by_loop, options)
         self._bar_ifs = _outermost_bar_ifs(statement.body, names, around)
-        assigned = Counter([*own.assigned, *called.assigned])
-        SpelledOut(functions.in_place, self._foresight, lambda text: assigned[text] == 1).spell(self._body)
-        self._all = list(conditions_in(self._body, functions.in_place))
-        self._said: set[str] = set()  # conditions that warnings have named
+        assigned = Counter([*own.assigned, *inlined.assigned])
+        Substitution(functions.by_call, self._evaluator, lambda text: assigned[text] == 1).apply(self._body)
+        self._all = list(conditions_in(self._body, functions.by_call))
+        self._warned_of: set[str] = set()  # conditions that warnings have named
 
     def milestones(self, numbers: range) -> dict[str, set[int]]:
         """Return the iterations that must run, by the condition that names them.
@@ -90,7 +98,7 @@ class LoopCode:
         """
         file = self._code.co_filename
         by_itself = [f"{_line(leaf, self._code)} of {file} ({ast.unparse(leaf)})" for leaf in self._counted_by_itself()]
-        for place in self._unsaid(by_itself):
+        for place in self._without_warning(by_itself):
             caution(
                 f"Line {place} counts the iterations that run, so it holds less often if others are left out. Decide "
                 f"by {self._target} if that matters."
@@ -106,7 +114,7 @@ class LoopCode:
             if not certain:
                 code = self._code_of(condition)
                 uncertain.append(f"line {_line(condition.test, code)} of {code.co_filename} ({text})")
-        uncertain = self._unsaid(uncertain)
+        uncertain = self._without_warning(uncertain)
         if uncertain:
             caution(
                 "Conditions on the iteration's number depend on functions that the loop calls and cannot be evaluated "
@@ -126,7 +134,7 @@ class LoopCode:
 
     def bar_moves(self, numbers: range) -> list[Moves]:
         """Return how the loop advances progress bars by hand, in iterations that need not run for them."""
-        found = [Moves(bar, by, numbers) for bar, by in moves(list(always(self._body)), self._names)]
+        found = [Moves(bar, by, numbers) for bar, by in moves(list(unconditional(self._body)), self._names)]
         for condition in self._conditions():
             bar_if = self._bar_if_of(condition)
             if bar_if is not None and position(condition.test) == position(bar_if.test):
@@ -143,12 +151,12 @@ class LoopCode:
         Raises:
             SkipGSError: The loop itself changes a value in its condition.
         """
-        hits = _rarer(self._foresight, condition, numbers)
+        hits = _rarer(self._evaluator, condition, numbers)
         if hits is not None:
             return hits, True
         if condition.function is not None:
             return None, False
-        hits = _rarer(self._foresight_of_loop, condition, numbers)
+        hits = _rarer(self._evaluator_of_loop, condition, numbers)
         if hits is None:
             text, line = ast.unparse(condition.test), _line(condition.test, self._code)
             raise SkipGSError(
@@ -161,14 +169,14 @@ class LoopCode:
     def _only_numbers(self, condition: Condition, numbers: range) -> set[int] | None:
         """Return the numbers for which a condition holds; None if it also depends on other values."""
         try:
-            (first, _), (second, _) = self._foresight.branches(numbers, condition.test, condition.guards)
-        except Unforeseeable:
+            (first, _), (second, _) = self._evaluator.branches(numbers, condition.test, condition.guards)
+        except DependsOnLoop:
             return None
         return first if first == second else None
 
     def _conditions(self) -> Iterator[Condition]:
         """Yield all conditions that hold for single numbers, not for a range of numbers."""
-        mentions = self._foresight.mentions
+        mentions = self._evaluator.mentions
         for condition in self._all:
             if mentions(condition.test) and any(is_point(leaf) and mentions(leaf) for leaf in leaves(condition.test)):
                 yield condition
@@ -176,12 +184,12 @@ class LoopCode:
     def _counted_by_itself(self) -> Iterator[ast.expr]:
         """Yield all conditions on a counter of the loop's own, which does not count left-out iterations."""
         for condition in self._all:
-            if condition.function is not None or any(self._foresight.is_off(guard) for guard in condition.guards):
+            if condition.function is not None or any(self._evaluator.is_off(guard) for guard in condition.guards):
                 continue
             for leaf in leaves(condition.test):
                 read = {ast.unparse(part) for part in ast.walk(leaf) if isinstance(part, PLACES)}
                 picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and is_point(leaf)
-                if picks and read & self._counters and not self._foresight.mentions(leaf):
+                if picks and read & self._counters and not self._evaluator.mentions(leaf):
                     yield leaf
 
     def _lists(self) -> Iterator[ast.expr]:
@@ -206,23 +214,23 @@ class LoopCode:
     def _code_of(self, condition: Condition) -> CodeType:
         return self._code if condition.function is None else condition.function.code
 
-    def _unsaid(self, places: list[str]) -> list[str]:
+    def _without_warning(self, places: list[str]) -> list[str]:
         """Return the conditions that no warning has named; they are evaluated for each phase."""
-        found = [place for place in dict.fromkeys(places) if place not in self._said]
-        self._said.update(found)
+        found = [place for place in dict.fromkeys(places) if place not in self._warned_of]
+        self._warned_of.update(found)
         return found
 
 
-def _rarer(foresight: Foresight, condition: Condition, numbers: range) -> set[int] | None:
+def _rarer(evaluator: Evaluator, condition: Condition, numbers: range) -> set[int] | None:
     """Return the numbers of the rarer of a condition's two branches, whatever else the condition depends on.
 
     The result is None if the condition depends on a value that the loop changes.
     """
     found: set[int] = set()
     try:
-        for holds, others in foresight.branches(numbers, condition.test, condition.guards):
+        for holds, others in evaluator.branches(numbers, condition.test, condition.guards):
             found |= holds if len(holds) <= len(others) else others
-    except Unforeseeable:
+    except DependsOnLoop:
         return None
     return found
 
@@ -249,7 +257,7 @@ def read_loop(
     names: Mapping[str, Any],
     pure: Iterable[str] = (),
     known: Mapping[str, Any] | None = None,
-) -> LoopCode:
+) -> TrainingLoop:
     """Return the loop that asks for its numbers.
 
     Args:
@@ -281,7 +289,7 @@ def read_loop(
             and isinstance(node.target, ast.Name)
             and node.lineno <= line - first + 1 <= (node.iter.end_lineno or node.lineno)
         ):
-            return LoopCode(node, tree, code, {**names, **known}, known, frozenset(pure))
+            return TrainingLoop(node, tree, code, {**names, **known}, known, frozenset(pure))
     found = f"Line {line} of {code.co_filename} is not in a loop over one number"
     raise SkipGSError(
         f"{found}; write the loop as: for step in gate.iterations(range(...)).",
