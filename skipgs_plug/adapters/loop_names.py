@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 from skipgs_plug.core.pace.settled import is_plain, only_holds
 
 # Functions that conditions may call while they are evaluated, because the functions change nothing.
-PURE = {name: getattr(builtins, name) for name in ("abs", "int", "float", "len", "max", "min", "round")}
+_NAMES = ("abs", "float", "int", "len", "list", "max", "min", "range", "round", "set", "sorted", "tuple")
+PURE = {name: getattr(builtins, name) for name in _NAMES}
 NOTHING: dict[str, Any] = {}  # of a scope before its function is read
 
 
