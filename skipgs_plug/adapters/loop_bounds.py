@@ -181,7 +181,11 @@ class CallReader:
             return
         function = called(call.func, scope.values, lambda place: value_of(place, scope), scope.code)
         plain = undecorated(function)
-        syntax = None if plain is None or plain not in self.trainer else syntax_of(plain)
+        if plain is None or plain not in self.trainer:
+            return
+        if plain.__name__ != name:  # the loop has a name of its own for it: `prune = gaussians.prune_points`
+            self.note(plain.__name__, end)
+        syntax = None if plain.__name__ in self._stops else syntax_of(plain)
         if syntax is None:
             return
         self.read(function, *self._arguments(call, function, syntax, scope), end)

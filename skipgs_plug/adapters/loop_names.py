@@ -118,6 +118,8 @@ def offset_of(node: ast.expr, scope: Scope) -> int | None:
     match node:
         case ast.Name(name) if name in scope.meanings:
             return offset_of(scope.meanings[name], without(name, scope))
+        case ast.NamedExpr(_, value):
+            return offset_of(value, scope)
         case ast.BinOp(place, ast.Add() | ast.Sub() as sign, ast.Constant(int(by))):
             before = offset_of(place, scope)
             return None if before is None else before + by * (1 if isinstance(sign, ast.Add) else -1)

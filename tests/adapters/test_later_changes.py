@@ -32,7 +32,7 @@ PRUNE = "gaussians.prune_points(torch.zeros(30, dtype=torch.bool))"
 
 BEFORE = f"""pruned, stages = False, {{24: "a", 28: "b"}}
     hooks = [lambda step: {PRUNE} if step < 30 else None]
-    trimmer = Trimmer(gaussians, opt)"""
+    trimmer, trim = Trimmer(gaussians, opt), gaussians.prune_points"""
 FUNCTIONS = """
 def is_due(step, opt):
     if step > opt.prune_until_iter: return False
@@ -70,6 +70,8 @@ class Trimmer:
         (f"match iteration:\n                case n if n < opt.prune_until_iter: {PRUNE}", 30),
         ("for hook in hooks: hook(iteration)", 30),
         ("trimmer(iteration)", 29),
+        ("if iteration < 30: trim(torch.zeros(30, dtype=torch.bool))", 30),
+        (f"if (step := iteration) < 30 and step % 2: {PRUNE}", 30),
     ],
 )
 def test_bounds_are_read_through_names_and_options(extra, start, tmp_path):
