@@ -28,9 +28,8 @@ from skipgs_plug.adapters.loop_names import (
     without,
 )
 from skipgs_plug.adapters.trainer_code import Part, TrainerCode
-from skipgs_plug.core.pace.called import called, closure, syntax_of, undecorated
+from skipgs_plug.core.pace.called import callbacks, called, closure, syntax_of, undecorated
 from skipgs_plug.core.pace.conditions import case_test
-from skipgs_plug.core.pace.settled import is_plain
 from skipgs_plug.core.pace.spelled_out import returned
 
 NUMBER = "iteration"  # variable that holds the iteration's number in every loop of the Inria family
@@ -163,8 +162,8 @@ class CallReader:
 
     def _each(self, loop: ast.For, scope: Scope, end: int | None) -> bool:
         """Read a loop over known functions or objects, such as callbacks, for each; return whether it is one."""
-        match loop.target, value_of(loop.iter, scope):
-            case ast.Name(name), [*held] if name in scope.once and not is_plain(held):
+        match loop.target, callbacks(value_of(loop.iter, scope)):
+            case ast.Name(name), [_, *_] as held if name in scope.once:
                 self._calls(loop.iter, scope, end)
                 for scope.known[name] in held:
                     self._body(loop.body, scope, end)

@@ -7,9 +7,19 @@ import contextlib
 import functools
 import inspect
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import CodeType, FunctionType, MethodType
 from typing import Any
+
+from skipgs_plug.core.pace.settled import is_plain
+
+# Largest number of objects that are read one by one. Lists of callbacks are shorter, and lists of cameras longer.
+MOST_CALLBACKS = 16
+
+
+def callbacks(held: Any) -> Sequence[Any]:
+    """Return the entries of a short list of functions or objects; nothing for any other value."""
+    return held if isinstance(held, (list, tuple)) and len(held) <= MOST_CALLBACKS and not is_plain(held) else ()
 
 
 def called(

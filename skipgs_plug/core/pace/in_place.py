@@ -10,9 +10,9 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from types import CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
-from skipgs_plug.core.pace.called import called, closure, read_syntax, undecorated
+from skipgs_plug.core.pace.called import callbacks, called, closure, read_syntax, undecorated
 from skipgs_plug.core.pace.project import Project
-from skipgs_plug.core.pace.settled import is_plain, switched
+from skipgs_plug.core.pace.settled import switched
 
 # Largest depth of nested calls that are read, as from a loop to a trainer, a logger and its file.
 MAX_DEPTH = 3
@@ -101,10 +101,7 @@ class CalledFunctions:
 
     def _held(self, loop: ast.For) -> list[ast.expr]:
         """Return names for what a loop over functions or objects runs with, such as callbacks; none if unknown."""
-        held = self._value(loop.iter) if isinstance(loop.iter, PLACES) else None
-        if not isinstance(held, (list, tuple)) or is_plain(held):
-            return []
-        place = ast.unparse(loop.iter)
+        held, place = callbacks(self._value(loop.iter)), ast.unparse(loop.iter)
         return [self._named(f"{place}[{index}]", one) for index, one in enumerate(held)]
 
     def _receives(self, call: ast.Call, numbers: Collection[str], holders: Collection[str]) -> bool:

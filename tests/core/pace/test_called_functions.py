@@ -91,6 +91,16 @@ def test_each_of_several_callbacks_is_read():
     assert numbers(loop) == [66, 71, 80]
 
 
+def test_a_long_list_of_objects_is_no_list_of_callbacks():
+    def loop(stop):
+        views = [Every(40)] * 17
+        for step in stop(views=views):
+            for view in views:
+                view(step)
+
+    assert numbers(loop) == []
+
+
 def test_result_of_a_function_in_a_condition():
     def loop(stop):
         for step in stop():
