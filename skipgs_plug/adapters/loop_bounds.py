@@ -165,7 +165,8 @@ class CallReader:
         match loop.target, callbacks(value_of(loop.iter, scope)):
             case ast.Name(name), [_, *_] as held if name in scope.once:
                 self._calls(loop.iter, scope, end)
-                for scope.known[name] in held:
+                for one in held:
+                    scope.known[name] = one
                     self._body(loop.body, scope, end)
                 return True
         return False

@@ -67,6 +67,7 @@ class Trimmer:
         (f"iteration <= opt.prune_until_iter and {PRUNE}", 31),
         (f"while iteration < opt.prune_until_iter:\n                {PRUNE}\n                break", 30),
         (f"match iteration:\n                case 22 | 26: {PRUNE}", 27),
+        (f"match iteration:\n                case 22 | _: {PRUNE}", 20),
         (f"match iteration:\n                case n if n < opt.prune_until_iter: {PRUNE}", 30),
         ("for hook in hooks: hook(iteration)", 30),
         ("trimmer(iteration)", 29),

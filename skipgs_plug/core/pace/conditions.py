@@ -92,13 +92,15 @@ def is_point(leaf: ast.expr) -> bool:
 
 def case_test(subject: ast.expr, case: ast.match_case) -> ast.expr:
     """Return a condition that holds if a case of a `match` is taken; true if its pattern has no values."""
-    captured = {part.name for part in ast.walk(case.pattern) if isinstance(part, ast.MatchAs)}
+    names = [part for part in ast.walk(case.pattern) if isinstance(part, ast.MatchAs)]
     values = [part.value for part in ast.walk(case.pattern) if isinstance(part, ast.MatchValue)]
-    parts: list[ast.expr] = [ast.Compare(subject, [ast.Eq()], [value]) for value in values] or [ast.Constant(True)]
-    if len(parts) > 1:
+    parts: list[ast.expr] = [ast.Compare(subject, [ast.Eq()], [value]) for value in values]
+    if not values or any(one.pattern is None for one in names):  # a name alone, and `_`, take every value
+        parts = [ast.Constant(True)]
+    elif len(parts) > 1:
         parts = [ast.BoolOp(ast.Or(), parts)]
     if case.guard is not None:
-        parts.append(_Captured(captured, subject).visit(copy.deepcopy(case.guard)))
+        parts.append(_guard(case.pattern, case.guard, subject))
     test = parts[0] if len(parts) == 1 else ast.BoolOp(ast.And(), parts)
     return ast.fix_missing_locations(ast.copy_location(test, case.pattern))
 
@@ -142,12 +144,17 @@ def _ends_early(body: Sequence[ast.stmt]) -> ast.expr | None:
 
 def _cases(statement: ast.Match) -> Iterator[ast.expr]:
     for case in statement.cases:
-        captured = {part.name for part in ast.walk(case.pattern) if isinstance(part, ast.MatchAs)}
         for part in ast.walk(case.pattern):
             if isinstance(part, ast.MatchValue):
                 yield ast.copy_location(ast.Compare(statement.subject, [ast.Eq()], [part.value]), part.value)
         if case.guard is not None:
-            yield _Captured(captured, statement.subject).visit(copy.deepcopy(case.guard))
+            yield _guard(case.pattern, case.guard, statement.subject)
+
+
+def _guard(pattern: ast.pattern, guard: ast.expr, subject: ast.expr) -> ast.expr:
+    """Return the guard of a case, with the subject in place of the names that the pattern gives to it."""
+    names = {part.name for part in ast.walk(pattern) if isinstance(part, ast.MatchAs)}
+    return _Captured(names, subject).visit(copy.deepcopy(guard))
 
 
 class _Captured(ast.NodeTransformer):
