@@ -12,7 +12,7 @@ import textwrap
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from types import CodeType
+from types import CodeType, FunctionType
 from typing import Any
 
 from skipgs_plug.adapters.loop_names import (
@@ -28,7 +28,9 @@ from skipgs_plug.adapters.loop_names import (
     without,
 )
 from skipgs_plug.adapters.trainer_code import Part, TrainerCode
-from skipgs_plug.core.source.functions import called_function, syntax_of, undecorated
+from skipgs_plug.core.source.conditions import case_test
+from skipgs_plug.core.source.functions import callbacks, called_function, closure, syntax_of, undecorated
+from skipgs_plug.core.source.substitution import returned
 
 NUMBER = "iteration"  # variable that holds the iteration's number in every loop of the Inria family
 ASSIGNED = "data ="  # represents an assignment to a tensor's `data` among the names of calls
@@ -52,7 +54,8 @@ class CallReader:
     A call has an end if an `if` around it bounds the iteration's number from above by a value that is known when the
     loop begins, as in `iteration < opt.prune_until_iter`, `iteration == 300` or `iteration in args.prune_iterations`. A
     guard before the call has the same effect: `if step >= self.stop: return`. An option that is off ends all calls
-    behind it. A name that is assigned once stands for its expression: `late = iteration in (300, 600)`, `if late`.
+    behind it. A name that is assigned once stands for its expression: `late = iteration in (300, 600)`, `if late`. So
+    does a call of a function that only returns a condition.
 
     Args:
         stops: Names of functions that are not read.
@@ -85,14 +88,20 @@ class CallReader:
         syntax = None if plain is None else syntax_of(plain)
         if plain is None or syntax is None or plain.__code__ in self._open or len(self._open) == MAX_DEPTH:
             return
+        self._open.append(plain.__code__)
+        self._body(syntax.body, self._scope(function, plain, syntax, numbers, values), end)
+        self._open.pop()
+
+    @staticmethod
+    def _scope(
+        function: Any, plain: FunctionType, syntax: ast.FunctionDef, numbers: Collection[str], values: Mapping[str, Any]
+    ) -> Scope:
+        """Return the scope at the beginning of a function; arguments as for `read`."""
         owner = getattr(function, "__self__", None)
         if owner is not None and syntax.args.args:
             values = {syntax.args.args[0].arg: owner, **values}
-        self._open.append(plain.__code__)
-        names = ChainMap(dict(values), plain.__globals__)
-        scope = scope_inside(syntax, Scope(frozenset(numbers), names, plain.__code__))
-        self._body(syntax.body, scope, end)
-        self._open.pop()
+        names = ChainMap({**closure(plain), **values}, plain.__globals__)
+        return scope_inside(syntax, Scope(frozenset(numbers), names, plain.__code__))
 
     def read_loops(self, function: ast.FunctionDef, scope: Scope) -> None:
         """Read the loops of a function, or all of it if it has none."""
@@ -104,34 +113,63 @@ class CallReader:
         if end == 0:  # the body is never reached
             return
         for statement in body:
-            if isinstance(statement, ast.If):
+            if isinstance(statement, (ast.If, ast.While)):
                 self._calls(statement.test, scope, end)
                 inside = _sooner(end, self._end(statement.test, scope))
                 after = _sooner(end, self._end(statement.test, scope, holds=False))
                 self._body(statement.body, scope, inside)
                 self._body(statement.orelse, scope, after)
-                if isinstance(statement.body[-1], (ast.Return, ast.Continue)):
+                if isinstance(statement, ast.If) and isinstance(statement.body[-1], (ast.Return, ast.Continue)):
                     end = after
+                continue
+            if isinstance(statement, ast.Match):
+                self._calls(statement.subject, scope, end)
+                for case in statement.cases:
+                    test = case_test(statement.subject, case)
+                    self._body(case.body, scope, _sooner(end, self._end(test, scope)))
+                continue
+            if isinstance(statement, ast.For) and self._each(statement, scope, end):
                 continue
             blocks = [block for field in ("body", "orelse", "finalbody") for block in getattr(statement, field, [])]
             blocks += [inner for handler in getattr(statement, "handlers", []) for inner in handler.body]
-            blocks += [inner for case in getattr(statement, "cases", []) for inner in case.body]
             learn_names(statement, scope)
             self._calls(statement, scope, end, {id(node) for block in blocks for node in ast.walk(block)})
             self._body(blocks, scope, end)
 
     def _calls(self, part: ast.AST, scope: Scope, end: int | None, but: Collection[int] = ()) -> None:
         """Record the calls in a statement or expression, except the nodes `but`, and read the called functions."""
-        for node in ast.walk(part):
-            if id(node) in but:
-                continue
-            if isinstance(node, ast.Attribute) and node.attr == "data" and isinstance(node.ctx, ast.Store):
-                self.note(ASSIGNED, end)
-            elif isinstance(node, ast.Call):
-                name = getattr(node.func, "attr", getattr(node.func, "id", None))
-                if name is not None:
-                    self.note(name, end)
-                    self._follow(name, node, scope, end)
+        if id(part) in but or end == 0:
+            return
+        if isinstance(part, ast.BoolOp):
+            for value in part.values:
+                self._calls(value, scope, end)
+                end = _sooner(end, self._end(value, scope, holds=isinstance(part.op, ast.And)))
+            return
+        if isinstance(part, ast.IfExp):
+            self._calls(part.test, scope, end)
+            self._calls(part.body, scope, _sooner(end, self._end(part.test, scope)))
+            self._calls(part.orelse, scope, _sooner(end, self._end(part.test, scope, holds=False)))
+            return
+        if isinstance(part, ast.Attribute) and part.attr == "data" and isinstance(part.ctx, ast.Store):
+            self.note(ASSIGNED, end)
+        elif isinstance(part, ast.Call):
+            name = getattr(part.func, "attr", getattr(part.func, "id", None))
+            if name is not None:
+                self.note(name, end)
+                self._follow(name, part, scope, end)
+        for child in ast.iter_child_nodes(part):
+            self._calls(child, scope, end, but)
+
+    def _each(self, loop: ast.For, scope: Scope, end: int | None) -> bool:
+        """Read a loop over known functions or objects, such as callbacks, for each; return whether it is one."""
+        match loop.target, callbacks(value_of(loop.iter, scope)):
+            case ast.Name(name), [_, *_] as held if name in scope.once:
+                self._calls(loop.iter, scope, end)
+                for one in held:
+                    scope.known[name] = one
+                    self._body(loop.body, scope, end)
+                return True
+        return False
 
     def note(self, name: str, end: int | None) -> None:
         """Record a call that the loop no longer makes from iteration `end` on; None if the call has no end."""
@@ -143,9 +181,19 @@ class CallReader:
             return
         function = called_function(call.func, scope.values, lambda place: value_of(place, scope), scope.code)
         plain = undecorated(function)
-        syntax = None if plain is None or plain not in self.trainer else syntax_of(plain)
+        if plain is None or plain not in self.trainer:
+            return
+        if plain.__name__ != name:  # the loop has a name of its own for it: `prune = gaussians.prune_points`
+            self.note(plain.__name__, end)
+        syntax = None if plain.__name__ in self._stops else syntax_of(plain)
         if syntax is None:
             return
+        self.read(function, *self._arguments(call, function, syntax, scope), end)
+
+    def _arguments(
+        self, call: ast.Call, function: Any, syntax: ast.FunctionDef, scope: Scope
+    ) -> tuple[set[str], dict[str, Any]]:
+        """Return the expressions that hold the number inside a called function, and known values of its arguments."""
         owner = getattr(function, "__self__", None)
         parameters = [one.arg for one in syntax.args.args][owner is not None :]
         given = [*zip(parameters, call.args, strict=False), *((one.arg, one.value) for one in call.keywords if one.arg)]
@@ -153,7 +201,7 @@ class CallReader:
         # Attributes of the object have the same name in all of its methods.
         numbers |= {text for text in scope.numbers if text.startswith("self.") and owner is scope.values.get("self")}
         values = {parameter: value_of(value, scope) for parameter, value in given if parameter not in numbers}
-        self.read(function, numbers, {text: value for text, value in values.items() if value is not None}, end)
+        return numbers, {text: value for text, value in values.items() if value is not None}
 
     def _end(self, test: ast.expr, scope: Scope, holds: bool = True) -> int | None:
         """Return the first iteration from which a condition stays false (true, unless `holds`); None if unknown."""
@@ -182,7 +230,31 @@ class CallReader:
                 if ast.unparse(number) not in scope.numbers or not isinstance(start, int) or not isinstance(end, int):
                     return None
                 return 0 if start < 0 else end if end >= 0 else None
+            case ast.Call(ast.Attribute(place, "get"), [number]) if holds:
+                return _end_of_one(number, ast.In(), place, scope)
+            case ast.NamedExpr(_, value):
+                return self._end(value, scope, holds)
+            case ast.IfExp(choice, one, other):
+                chosen = ast.BoolOp(ast.And(), [choice, one])
+                left = ast.BoolOp(ast.And(), [ast.UnaryOp(ast.Not(), choice), other])
+                return self._end(ast.BoolOp(ast.Or(), [chosen, left]), scope, holds)
+            case ast.Call():
+                return self._end_of_result(test, scope, holds)
         return None
+
+    def _end_of_result(self, call: ast.Call, scope: Scope, holds: bool) -> int | None:
+        """Return the same for the result of a function of the trainer that only returns a condition."""
+        function = called_function(call.func, scope.values, lambda place: value_of(place, scope), scope.code)
+        plain = undecorated(function)
+        syntax = None if plain is None or plain not in self.trainer else syntax_of(plain)
+        result = None if syntax is None else returned(syntax.body)
+        if plain is None or syntax is None or result is None or plain.__code__ in self._open:
+            return None
+        numbers, values = self._arguments(call, function, syntax, scope)
+        self._open.append(plain.__code__)
+        end = self._end(result, self._scope(function, plain, syntax, numbers, values), holds)
+        self._open.pop()
+        return end
 
 
 def last_calls(
@@ -229,7 +301,7 @@ def _end_of_one(left: ast.expr, operator: ast.cmpop, right: ast.expr, scope: Sco
     offset, limit = offset_of(left, scope), value_of(right, scope)
     if offset is None:
         return None
-    if isinstance(operator, ast.In) and isinstance(limit, (list, tuple, set, frozenset, range)):
+    if isinstance(operator, ast.In) and isinstance(limit, Collection) and not isinstance(limit, (str, bytes)):
         return max((int(number) - offset for number in limit), default=0) + 1
     if isinstance(limit, bool) or not isinstance(limit, (int, float)) or not math.isfinite(limit):
         return None

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 from skipgs_plug.core.source.run_options import is_namespace, is_plain
 
 # Functions that conditions may call while they are evaluated, because the functions change nothing.
-PURE = {name: getattr(builtins, name) for name in ("abs", "int", "float", "len", "max", "min", "round")}
+_NAMES = ("abs", "float", "int", "len", "list", "max", "min", "range", "round", "set", "sorted", "tuple")
+PURE = {name: getattr(builtins, name) for name in _NAMES}
 NOTHING: dict[str, Any] = {}  # of a scope before its function is read
 
 
@@ -117,6 +118,8 @@ def offset_of(node: ast.expr, scope: Scope) -> int | None:
     match node:
         case ast.Name(name) if name in scope.meanings:
             return offset_of(scope.meanings[name], without(name, scope))
+        case ast.NamedExpr(_, value):
+            return offset_of(value, scope)
         case ast.BinOp(place, ast.Add() | ast.Sub() as sign, ast.Constant(int(by))):
             before = offset_of(place, scope)
             return None if before is None else before + by * (1 if isinstance(sign, ast.Add) else -1)

@@ -30,6 +30,21 @@ def test_a_known_change_of_a_fork_is_waited_for_by_every_adapter(name, tmp_path)
 PRUNE = "gaussians.prune_points(torch.zeros(30, dtype=torch.bool))"
 
 
+BEFORE = f"""pruned, stages = False, {{24: "a", 28: "b"}}
+    hooks = [lambda step: {PRUNE} if step < 30 else None]
+    trimmer, trim = Trimmer(gaussians, opt), gaussians.prune_points"""
+FUNCTIONS = """
+def is_due(step, opt):
+    if step > opt.prune_until_iter: return False
+    return step % 3 == 0
+
+class Trimmer:
+    def __init__(self, gaussians, opt): self.gaussians, self.stages = gaussians, {24, 28}
+    def __call__(self, step):
+        if step in self.stages: self.gaussians.prune_points(torch.zeros(30, dtype=torch.bool))
+"""
+
+
 @pytest.mark.parametrize(
     ("extra", "start"),
     [
@@ -45,10 +60,23 @@ PRUNE = "gaussians.prune_points(torch.zeros(30, dtype=torch.bool))"
         (f"if opt.changed_late and iteration < 30: {PRUNE}\n            opt.changed_late = True", 30),
         (f"if pruned and iteration < 30: {PRUNE}\n            pruned = iteration > 3", 30),
         (f"if iteration < opt.iterations: {PRUNE}", 20),  # until the end: each prune pauses the gate
+        (f"if iteration in range(22, 28, 2): {PRUNE}", 27),
+        (f"if stages.get(iteration): {PRUNE}", 29),
+        (f"if is_due(iteration, opt): {PRUNE}", 31),
+        (f"{PRUNE} if iteration <= opt.prune_until_iter else None", 31),
+        (f"iteration <= opt.prune_until_iter and {PRUNE}", 31),
+        (f"while iteration < opt.prune_until_iter:\n                {PRUNE}\n                break", 30),
+        (f"match iteration:\n                case 22 | 26: {PRUNE}", 27),
+        (f"match iteration:\n                case 22 | _: {PRUNE}", 20),
+        (f"match iteration:\n                case n if n < opt.prune_until_iter: {PRUNE}", 30),
+        ("for hook in hooks: hook(iteration)", 30),
+        ("trimmer(iteration)", 29),
+        ("if iteration < 30: trim(torch.zeros(30, dtype=torch.bool))", 30),
+        (f"if (step := iteration) < 30 and step % 2: {PRUNE}", 30),
     ],
 )
 def test_bounds_are_read_through_names_and_options(extra, start, tmp_path):
-    fork = unknown_fork(extra=extra, before="pruned = False", file=tmp_path / "train.py")
+    fork = unknown_fork(extra=extra, before=BEFORE, helper=FUNCTIONS, file=tmp_path / "train.py")
     with SkipGate(fork, policy=SkipAlways()) as gate:
         if start > 20:
             with pytest.warns(RuntimeWarning, match=rf"prune_points\(\) until iteration {start - 1}"):

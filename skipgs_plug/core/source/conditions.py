@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator, Mapping, Sequence
+import copy
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from skipgs_plug.core.source.inlining import InlinedFunction
@@ -60,7 +61,9 @@ def conditions_in(
             for block in _blocks(statement):
                 yield from conditions_in(block, functions, guards, function)
             for part in ast.iter_child_nodes(statement):
-                if isinstance(part, ast.expr):
+                if isinstance(statement, ast.Expr) and isinstance(part, ast.BoolOp):
+                    yield Condition(_deciding(part), guards, function)
+                elif isinstance(part, ast.expr):
                     yield from (Condition(*found, function) for found in _values(part, guards))
         ends = _ends_early([statement])
         if ends is not None:
@@ -98,6 +101,21 @@ def unconditional(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:
             yield from unconditional(statement.body)
         else:
             yield statement
+
+
+def case_test(subject: ast.expr, case: ast.match_case) -> ast.expr:
+    """Return a condition that holds if a case of a `match` is taken; true if its pattern has no values."""
+    names = [part for part in ast.walk(case.pattern) if isinstance(part, ast.MatchAs)]
+    values = [part.value for part in ast.walk(case.pattern) if isinstance(part, ast.MatchValue)]
+    parts: list[ast.expr] = [ast.Compare(subject, [ast.Eq()], [value]) for value in values]
+    if not values or any(one.pattern is None for one in names):  # a name alone, and `_`, take every value
+        parts = [ast.Constant(True)]
+    elif len(parts) > 1:
+        parts = [ast.BoolOp(ast.Or(), parts)]
+    if case.guard is not None:
+        parts.append(_guard(case.pattern, case.guard, subject))
+    test = parts[0] if len(parts) == 1 else ast.BoolOp(ast.And(), parts)
+    return ast.fix_missing_locations(ast.copy_location(test, case.pattern))
 
 
 def is_inside(node: ast.stmt | ast.expr, outer: ast.stmt) -> bool:
@@ -138,9 +156,34 @@ def _ends_early(body: Sequence[ast.stmt]) -> ast.expr | None:
 
 
 def _cases(statement: ast.Match) -> Iterator[ast.expr]:
-    for part in (part for case in statement.cases for part in ast.walk(case.pattern)):
-        if isinstance(part, ast.MatchValue):
-            yield ast.copy_location(ast.Compare(statement.subject, [ast.Eq()], [part.value]), part.value)
+    for case in statement.cases:
+        for part in ast.walk(case.pattern):
+            if isinstance(part, ast.MatchValue):
+                yield ast.copy_location(ast.Compare(statement.subject, [ast.Eq()], [part.value]), part.value)
+        if case.guard is not None:
+            yield _guard(case.pattern, case.guard, statement.subject)
+
+
+def _guard(pattern: ast.pattern, guard: ast.expr, subject: ast.expr) -> ast.expr:
+    """Return the guard of a case, with the subject in place of the names that the pattern gives to it."""
+    names = {part.name for part in ast.walk(pattern) if isinstance(part, ast.MatchAs)}
+    return _Captured(names, subject).visit(copy.deepcopy(guard))
+
+
+class _Captured(ast.NodeTransformer):
+    """Puts the subject of a `match` in place of the names that a pattern gives to it."""
+
+    def __init__(self, names: Collection[str | None], subject: ast.expr) -> None:
+        self._names, self._subject = names, subject
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        return ast.copy_location(copy.deepcopy(self._subject), node) if node.id in self._names else node
+
+
+def _deciding(expression: ast.BoolOp) -> ast.expr:
+    """Return the part of a statement `a and b and f()` that decides whether `f()` is called."""
+    parts = expression.values[:-1]
+    return parts[0] if len(parts) == 1 else ast.copy_location(ast.BoolOp(expression.op, parts), expression)
 
 
 def _values(node: ast.AST, guards: Guards) -> Iterator[tuple[ast.expr, Guards]]:
@@ -151,9 +194,20 @@ def _values(node: ast.AST, guards: Guards) -> Iterator[tuple[ast.expr, Guards]]:
         yield node.test, guards
         yield from _values(node.body, (*guards, node.test))
         yield from _values(node.orelse, (*guards, _not(node.test)))
+    elif isinstance(node, (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)):
+        yield from ((condition, guards) for condition in _filters(node.generators))
     else:
         for child in ast.iter_child_nodes(node):
             yield from _values(child, guards)
+
+
+def _filters(generators: Sequence[ast.comprehension]) -> Iterator[ast.expr]:
+    """Yield the conditions of a comprehension, each as a condition on its values: `any(v == step for v in saves)`."""
+    for index, last in enumerate(generators):
+        for test in last.ifs:
+            one = ast.GeneratorExp(test, [*generators[:index], ast.comprehension(last.target, last.iter, [], 0)])
+            anywhere = ast.Call(ast.Name("any", ast.Load()), [one], [])
+            yield ast.fix_missing_locations(ast.copy_location(anywhere, test))
 
 
 def _calls(node: ast.AST, guards: Guards) -> Iterator[tuple[ast.Call, Guards]]:

@@ -7,9 +7,19 @@ import contextlib
 import functools
 import inspect
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import CodeType, FunctionType, MethodType
 from typing import Any
+
+from skipgs_plug.core.source.run_options import is_plain
+
+# Largest number of objects that are read one by one. Lists of callbacks are shorter, and lists of cameras longer.
+MOST_CALLBACKS = 16
+
+
+def callbacks(held: Any) -> Sequence[Any]:
+    """Return the entries of a short list of functions or objects; nothing for any other value."""
+    return held if isinstance(held, (list, tuple)) and len(held) <= MOST_CALLBACKS and not is_plain(held) else ()
 
 
 def called_function(
@@ -17,12 +27,22 @@ def called_function(
 ) -> Any:
     """Return the function that an expression names; None if it is unknown. Properties are not evaluated.
 
+    For an object that can be called, this is its method `__call__`.
+
     Args:
         function: The expression before the brackets of the call.
         names: Names and values where the call is.
         value: Returns the value of an expression there; None if it is unknown.
         code: Code of the function that makes the call, for `super()`; None outside of methods.
     """
+    found = _named(function, names, value, code)
+    own = inspect.getattr_static(type(found), "__call__", None)
+    return MethodType(own, found) if isinstance(own, FunctionType) else found
+
+
+def _named(
+    function: ast.expr, names: Mapping[str, Any], value: Callable[[ast.expr], Any], code: CodeType | None
+) -> Any:
     match function:
         case ast.Name(name):
             return names.get(name)
@@ -74,13 +94,40 @@ def closure(function: Any) -> dict[str, Any]:
 
 
 def read_syntax(function: FunctionType) -> ast.FunctionDef | None:
-    """Return the syntax of a function, whose first line is line 1; None if there is no source."""
+    """Return the syntax of a function, whose first line is line 1; None if there is no source.
+
+    A lambda is returned as a function that returns its expression.
+    """
+    if function.__name__ == "<lambda>":
+        return _lambda_syntax(function)
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError, ValueError, SyntaxError):
         return None
     name = function.__code__.co_name
     return next((node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name), None)
+
+
+def _lambda_syntax(function: FunctionType) -> ast.FunctionDef | None:
+    """Return the syntax of a lambda; None if there is no source, or if another one with these parameters is beside."""
+    first, parameters = function.__code__.co_firstlineno, [*inspect.signature(function).parameters]
+    try:
+        tree = ast.parse("".join(inspect.findsource(function)[0]))
+    except (OSError, SyntaxError):
+        return None
+    lambdas = [node for node in ast.walk(tree) if isinstance(node, ast.Lambda) and node.lineno == first]
+    found = [node for node in lambdas if [one.arg for one in _parameters(node.args)] == parameters]
+    if len(found) != 1:
+        return None
+    body: list[ast.stmt] = [ast.copy_location(ast.Return(found[0].body), found[0].body)]
+    syntax = ast.copy_location(ast.FunctionDef("lambda", found[0].args, body, []), found[0])
+    return ast.increment_lineno(syntax, 1 - first)
+
+
+def _parameters(arguments: ast.arguments) -> list[ast.arg]:
+    starred = ([arguments.vararg], arguments.kwonlyargs, [arguments.kwarg])
+    further = [one for part in starred for one in part if one is not None]
+    return [*arguments.posonlyargs, *arguments.args, *further]
 
 
 syntax_of = functools.lru_cache(maxsize=1024)(read_syntax)  # the same tree each time, which nobody may change

@@ -6,11 +6,11 @@ import ast
 import copy
 import inspect
 import itertools
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from types import CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
-from skipgs_plug.core.source.functions import called_function, closure, read_syntax, undecorated
+from skipgs_plug.core.source.functions import callbacks, called_function, closure, read_syntax, undecorated
 from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.run_options import assigned_globals
 
@@ -75,6 +75,7 @@ class InlinedFunctions:
         self._names, self._target, self._pure = names, target, pure
         self._project = Project(code, names)
         self._open = [code]  # code of the loop and of the functions that are being read, outermost first
+        _Repeated(self._held).visit_all(body)
         self._follow(body, {target})
 
     def __iter__(self) -> Iterator[ast.stmt]:
@@ -99,6 +100,11 @@ class InlinedFunctions:
                 plain = undecorated(function)
                 if plain is not None and plain.__code__ not in self._open and plain in self._project:
                     self._read(node, function, plain, numbers)
+
+    def _held(self, loop: ast.For) -> list[ast.expr]:
+        """Return names for what a loop over functions or objects runs with, such as callbacks; none if unknown."""
+        held, place = callbacks(self._value(loop.iter)), ast.unparse(loop.iter)
+        return [self._named(f"{place}[{index}]", one) for index, one in enumerate(held)]
 
     def _receives(self, call: ast.Call, numbers: Collection[str], holders: Collection[str]) -> bool:
         """Whether a function receives the number, or an object that holds it in an attribute."""
@@ -146,6 +152,7 @@ class InlinedFunctions:
             return
         renamed = _Renamed(self._meanings(call, function, plain, syntax, numbers))
         body = [renamed.visit(statement) for statement in syntax.body]
+        _Repeated(self._held).visit_all(body)
         self.by_call[id(call)] = InlinedFunction(body, plain.__code__)
         self._open.append(plain.__code__)
         self._follow(body, set(numbers))
@@ -204,7 +211,8 @@ class InlinedFunctions:
         hidden = len(values) < len(call.args) or any(keyword.arg is None for keyword in call.keywords)
         if isinstance(function, MethodType):
             owner = call.func.value if isinstance(call.func, ast.Attribute) else call.func
-            if not self._is_plain(owner) or owner is call.func:  # super().name(...), or a name of the bound method
+            # super().name(...), a name of the bound method, or an object that is called itself
+            if not self._is_plain(owner) or self._value(owner) is not function.__self__ or owner is call.func:
                 own = self._names.get("self") is function.__self__
                 owner = ast.Name("self", ast.Load()) if own else self._named(f"{prefix}.self", function.__self__)
             values.insert(0, owner)
@@ -236,6 +244,24 @@ class _Renamed(ast.NodeTransformer):
         if isinstance(meaning, ast.Name):
             return ast.copy_location(ast.Name(meaning.id, node.ctx), node)
         return ast.copy_location(copy.deepcopy(meaning), node)
+
+
+class _Repeated(ast.NodeTransformer):
+    """Puts the statements of a loop over known objects there once for each object, with its name."""
+
+    def __init__(self, held: Callable[[ast.For], list[ast.expr]]) -> None:
+        self._held = held
+
+    def visit_all(self, body: list[ast.stmt]) -> None:
+        """Change these statements."""
+        body[:] = self.visit(ast.Module(body, [])).body
+
+    def visit_For(self, node: ast.For) -> ast.stmt | list[ast.stmt]:
+        held = self._held(node) if isinstance(node.target, ast.Name) else []
+        if not held:
+            return self.generic_visit(node)  # type: ignore[return-value]
+        name = ast.unparse(node.target)
+        return [_Renamed({name: one}).visit(copy.deepcopy(part)) for one in held for part in node.body]
 
 
 def comprehended(nodes: Iterable[ast.AST]) -> Iterator[ast.Name]:

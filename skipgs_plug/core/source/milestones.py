@@ -90,8 +90,9 @@ class TrainingLoop:
             Conditions that only advance a progress bar are not included; see `bar_moves`.
 
         Warns:
-            RuntimeWarning: A condition depends on a counter of the loop's own, so it holds less often if iterations are
-                left out; or a condition cannot be evaluated ahead because of a function that the loop calls.
+            RuntimeWarning: A condition depends on a counter of the loop's own, or compares the number with a limit that
+                it moves, so it holds less often if iterations are left out; or a condition cannot be evaluated ahead
+                because of a function that the loop calls.
 
         Raises:
             SkipGSError: A condition cannot be evaluated ahead because of the loop itself.
@@ -102,6 +103,12 @@ class TrainingLoop:
             caution(
                 f"Line {place} counts the iterations that run, so it holds less often if others are left out. Decide "
                 f"by {self._target} if that matters."
+            )
+        by_limit = [f"{_line(leaf, self._code)} of {file} ({ast.unparse(leaf)})" for leaf in self._moving_limits()]
+        for place in self._without_warning(by_limit):
+            caution(
+                f"Line {place} moves its own limit, so it can hold later and less often if iterations are left out; "
+                "name the iterations that must run (--always, always=)."
             )
         found: dict[str, set[int]] = {}
         uncertain: list[str] = []
@@ -191,6 +198,17 @@ class TrainingLoop:
                 picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and is_point(leaf)
                 if picks and read & self._counters and not self._evaluator.mentions(leaf):
                     yield leaf
+
+    def _moving_limits(self) -> Iterator[ast.expr]:
+        """Yield all comparisons as in `if step >= next_save: next_save += 100`."""
+        for node in (part for statement in self._body for part in ast.walk(statement)):
+            if not isinstance(node, ast.If):
+                continue
+            moved = assignments_in(node.body).changed
+            for leaf in leaves(node.test):
+                read = {ast.unparse(part) for part in ast.walk(leaf) if isinstance(part, PLACES)}
+                if isinstance(leaf, ast.Compare) and self._evaluator.mentions(leaf) and not is_point(leaf):
+                    yield from [leaf] if read & moved else []
 
     def _lists(self) -> Iterator[ast.expr]:
         """Yield names that are passed to a function together with the number, and may be lists of iterations."""

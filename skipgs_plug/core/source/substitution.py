@@ -53,6 +53,14 @@ class Substitution(ast.NodeTransformer):
 
     visit_Attribute = visit_Name
 
+    def visit_NamedExpr(self, node: ast.NamedExpr) -> ast.AST:
+        self.generic_visit(node)
+        name, value = node.target.id, node.value
+        if not (self._assigned_once(name) and self._evaluator.is_known(value)):
+            return node
+        self._meanings[name] = value
+        return value
+
     def visit_Call(self, node: ast.Call) -> ast.AST:
         self.generic_visit(node)
         function = self._functions.get(id(node))
@@ -61,7 +69,7 @@ class Substitution(ast.NodeTransformer):
         before = dict(self._meanings)
         self.apply(function.body)
         self._meanings = before
-        value = _returned(function.body)
+        value = returned(function.body)
         if value is None or not (self._evaluator.mentions(value) and self._evaluator.is_known(value)):
             return node
         for part in ast.walk(value):
@@ -76,11 +84,14 @@ def _assigned(statement: ast.stmt) -> Iterator[tuple[ast.expr, ast.expr]]:
             yield target, value
         case ast.Assign([ast.Tuple(targets)], ast.Tuple(values)) if len(targets) == len(values):
             yield from zip(targets, values, strict=True)
+        case ast.Assign([ast.Tuple([whole, rest])], ast.Call(ast.Name("divmod"), [number, by], [])):
+            yield whole, ast.copy_location(ast.BinOp(number, ast.FloorDiv(), by), statement.value)
+            yield rest, ast.copy_location(ast.BinOp(number, ast.Mod(), by), statement.value)
         case ast.Assign([target], value):
             yield target, value
 
 
-def _returned(body: Sequence[ast.stmt]) -> ast.expr | None:
+def returned(body: Sequence[ast.stmt]) -> ast.expr | None:
     """Return the value of a function as one expression; None if the function does more than that."""
     for index, statement in enumerate(body):
         match statement:
@@ -88,8 +99,8 @@ def _returned(body: Sequence[ast.stmt]) -> ast.expr | None:
                 return value or ast.copy_location(ast.Constant(None), statement)
             case ast.If(test, inside, otherwise) if not any(map(_assigns, [*inside, *otherwise])):
                 rest = body[index + 1 :]
-                holds = _returned([*inside, *rest])
-                fails = None if holds is None else _returned([*otherwise, *rest])
+                holds = returned([*inside, *rest])
+                fails = None if holds is None else returned([*otherwise, *rest])
                 if holds is None or fails is None:
                     return None
                 return ast.copy_location(ast.IfExp(test, holds, fails), test)

@@ -2,6 +2,7 @@
 
 import importlib.util
 import random
+from types import SimpleNamespace
 
 import project_helpers
 import pytest
@@ -50,6 +51,54 @@ def test_methods_of_objects_that_exist_before_the_loop():
 
     assert numbers(loop) == [66, 80, 99]
     assert numbers(Trainer().train) == [50, 60, 75, 77, 90]
+
+
+class Every:
+    """Saves every so many steps, when it is called."""
+
+    def __init__(self, every):
+        self.every = every
+
+    def __call__(self, step):
+        if step % self.every == 0:
+            print("save")
+
+
+def test_objects_that_are_called_and_lambdas():
+    def loop(stop):
+        save, due = Every(40), lambda step: step % 33 == 0
+        trainer = SimpleNamespace(save=Every(47), by=Saver(49).step)
+        for step in stop(save=save, due=due, trainer=trainer):
+            save(step)
+            trainer.save(step)
+            trainer.by(step)
+            if due(step):
+                print("due")
+
+    assert numbers(loop) == [66, 80, 94, 98, 99]
+
+
+def test_each_of_several_callbacks_is_read():
+    def loop(stop):
+        hooks, savers = [Every(40), lambda step: step == 71 and print("save")], (Saver(33), Saver(49))
+        for step in stop(hooks=hooks, savers=savers):
+            for hook in hooks:
+                hook(step)
+            if step < 90:
+                for saver in savers:
+                    saver.step(step)
+
+    assert numbers(loop) == [66, 71, 80]
+
+
+def test_a_long_list_of_objects_is_no_list_of_callbacks():
+    def loop(stop):
+        views = [Every(40)] * 17
+        for step in stop(views=views):
+            for view in views:
+                view(step)
+
+    assert numbers(loop) == []
 
 
 def test_result_of_a_function_in_a_condition():

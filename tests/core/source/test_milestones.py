@@ -105,6 +105,32 @@ def test_cases_of_the_number():
     assert found(loop) == {"step % 40 == 0": [80], "step % 40 == 13": [53, 93]}
 
 
+def test_guards_of_cases():
+    def loop(stop):
+        for step in stop():
+            match step:
+                case n if n % 45 == 0:
+                    print("save")
+                case _:
+                    print("as ever")
+
+    assert found(loop) == {"step % 45 == 0": [90]}
+
+
+def test_conditions_without_an_if():
+    def loop(stop):
+        for step in stop():
+            step % 45 or print("save")
+            step == 77 and print("evaluate")
+            [print(one) for one in (60, 99) if one == step]
+
+    assert found(loop) == {
+        "step % 45": [90],
+        "step == 77": [77],
+        "any((one == step for one in (60, 99)))": [60, 99],
+    }
+
+
 def test_every_way_to_give_a_name_to_the_number():
     def loop(stop):
         for i in stop():
@@ -112,12 +138,22 @@ def test_every_way_to_give_a_name_to_the_number():
                 step = i + 1
                 rest: int = step % 30
                 epoch, place = step // 45, step % 45
+                turn, view = divmod(i, 47)
+            if view == 0:
+                print("of a division", turn)
+            if (left := i % 49) == 0 or left > 60:
+                print("in a condition")
             if rest == 0:
                 print("of a name with a type, which stands for another name")
             if place == 0:
                 print("of several at once", epoch)
 
-    assert found(loop) == {"(i + 1) % 30 == 0": [59, 89], "(i + 1) % 45 == 0": [89]}
+    assert found(loop) == {
+        "i % 47 == 0": [94],
+        "i % 49 == 0 or i % 49 > 60": [98],
+        "(i + 1) % 30 == 0": [59, 89],
+        "(i + 1) % 45 == 0": [89],
+    }
 
 
 def test_a_name_that_is_given_below_is_of_the_iteration_before():
@@ -272,6 +308,22 @@ def test_what_the_loop_counts_by_itself_is_warned_of():
     for loop, condition in ((counting, "images % 20"), (attribute, "run.done in (10, 20)")):
         with pytest.warns(RuntimeWarning, match=rf"Line \d+ of .*\({re.escape(condition)}\) counts the iterations"):
             found(loop)
+
+
+def test_a_limit_that_a_condition_moves_is_warned_of():
+    def loop(stop):
+        due, saves, best = 60, [70, 80], 1.0
+        for step in stop(due=due, saves=saves, best=best):
+            if step >= due:
+                due += 20
+            if saves and saves[0] <= step:
+                saves.pop(0)
+            if step > 55 and best > 0.5:
+                best = 1 / step
+
+    with pytest.warns(RuntimeWarning, match="moves its own limit") as said:
+        assert found(loop) == {}
+    assert [str(one.message).partition("(")[2].partition(")")[0] for one in said] == ["step >= due", "saves[0] <= step"]
 
 
 def test_gathering_over_a_few_iterations_is_nothing_to_warn_of():
