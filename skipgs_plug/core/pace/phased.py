@@ -226,12 +226,8 @@ class Phased(Pace):
         grown = self.growing.numbers(number, min(self._start, end))
         refined = self.refining.numbers(max(self._start, number), end)
         grows = bool(grown) and number < self._start
-        if grows and self._densification is None and self._config.share is None:
-            sentence = (
-                "grow_share leaves out iterations of densification, but the densification events of this trainer are "
-                "not known; remove grow_share"
-            )
-            raise SkipGSError(f"{sentence}, or give events= to gate.iterations().", in_script=f"{sentence}.")
+        if grows:
+            self._require_events()
         if loop.source is not None and self._config.always is None:
             code, names = loop.source
             read = read_loop(code, line_of(code), names, self._pure, self._known(names))
@@ -241,7 +237,7 @@ class Phased(Pace):
             self._conditions, self._bars = [{}, {}], Bars([])
         loop.source = None
         last = loop.numbers[-1] if self._last is None else self._last
-        if grown:
+        if grown:  # also after the phase, whose length the refining phase must know in a resumed run
             plan = self._plan(grown, self._conditions[0], last, Phase())
             known = self._densification is not None and self.growing.begin(plan)
             self._grows = self.growing if known else Phase()
@@ -270,6 +266,19 @@ class Phased(Pace):
             self._densification,
             self._accumulates,
         )
+
+    def _require_events(self) -> None:
+        """Refuse `grow_share` if the densification events are not known. With `share`, densification runs whole then.
+
+        Raises:
+            SkipGSError: They are not known.
+        """
+        if self._densification is None and self._config.share is None:
+            sentence = (
+                "grow_share leaves out iterations of densification, but the densification events of this trainer are "
+                "not known; remove grow_share"
+            )
+            raise SkipGSError(f"{sentence}, or give events= to gate.iterations().", in_script=f"{sentence}.")
 
     def _why_no_event(self) -> str:
         """Return why no densification event is known, as a sentence after a space; empty if there is nothing to add."""
