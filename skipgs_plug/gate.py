@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Iterable
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from skipgs_plug.adapters.registry import find_adapter
 from skipgs_plug.core import distributed
-from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.config import FIELDS, SkipConfig, settings_of
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
 from skipgs_plug.core.hooks import Adapter, Hooks
-from skipgs_plug.core.intercept import Original
-from skipgs_plug.core.optimizers import has_pending_gradient, listed
-from skipgs_plug.core.pace.base import EveryNumber
+from skipgs_plug.core.own_loop import OwnLoop
 from skipgs_plug.core.pace.loop_range import LoopRange
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.report import build_report, counters, summarise
 from skipgs_plug.core.trace import TraceRow
 from skipgs_plug.core.trainer_info import TrainerInfo
-from skipgs_plug.core.views import NOT_READ, view_key
 
 
 class SkipGate:
@@ -94,7 +87,7 @@ class SkipGate:
         record_trace: bool = False,
         **config_fields: Any,
     ) -> None:
-        settings = _settings(config, config_fields)
+        settings = settings_of(config, config_fields)
         if not (policy is None or isinstance(policy, Policy)):
             raise SkipGSError(
                 f"{type(policy).__name__} is not a policy; derive it from skipgs_plug.core.policy.Policy."
@@ -105,16 +98,13 @@ class SkipGate:
             found = find_adapter(trainer, adapter) if adapter is None or isinstance(adapter, str) else adapter
             self._adapter = found
             self._engine = Engine(settings, policy, record_trace, found.must_run, found.saved_state)
-            self._attach(trainer, found, _FIELDS if config is not None else frozenset(config_fields))
+            self._attach(trainer, found, FIELDS if config is not None else frozenset(config_fields))
         elif settings.start_iter is None and policy is None and settings.enabled:
             raise SkipGSError("SkipGate needs a trainer, or start_iter=, the iteration at which densification ends.")
         else:
             self._engine = Engine(settings, policy, record_trace)
             self._engine.configure(TrainerInfo(0 if policy is None else policy.start_iter))
-        self._iteration = iteration = self._engine.iteration
-        self._giving_up = self._engine.giving_up
-        # Wraps the gate's own code in a verb. An error there releases the gate, and the loop continues.
-        self._guarded = self._giving_up.guarded(lambda: iteration.step)
+        self._loop = OwnLoop(self._engine)
 
     # Verbs for a loop of your own.
 
@@ -136,7 +126,8 @@ class SkipGate:
         number of the iteration instead.
 
         Args:
-            numbers: All iterations of the run, or all remaining ones, as a range with step 1.
+            numbers: All iterations of the run, or all remaining ones, as a range with step 1. A run may have several
+                parts, one after the other; the part in which refinement begins then goes on to the last iteration.
             always: Iterations that always run. They replace the iterations that the conditions of the loop name, and
                 the iterations that an adapter names are added.
             views: Keys of all training views. `share="auto"` and `refine_share="auto"` need them.
@@ -145,8 +136,8 @@ class SkipGate:
 
         Raises:
             SkipGSError: `numbers` is not a range with step 1. Before training has begun, the gate also raises it if
-                `numbers` goes beyond an earlier call, or if a condition of the loop cannot be evaluated in advance.
-                During training, these two problems release the gate.
+                `numbers` goes beyond the plan of an earlier call, or if a condition of the loop cannot be evaluated
+                in advance. During training, these two problems release the gate.
 
         Examples:
             Four of ten iterations run after densification, which ends here at iteration 10. The last one always runs.
@@ -156,18 +147,11 @@ class SkipGate:
             >>> list(gate.iterations(range(20), always=[15]))
             [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 15, 19]
         """
-        if not isinstance(numbers, range) or numbers.step != 1:
-            raise SkipGSError("iterations() takes a range that goes up by one, such as range(30_000).")
-        if isinstance(views, str):
-            raise SkipGSError(f"views= takes a list of all names of training views, not the one name {views!r}.")
         source = None
         if always is None:
             frame = sys._getframe(1)
             source = (frame.f_code, {**frame.f_globals, **frame.f_locals})
-        with self._guarded:
-            keys = None if views is None else list(dict.fromkeys(view_key(view) for view in views))
-            return self._engine.pace.follow(numbers, source, always or (), keys, events)
-        return LoopRange(numbers, EveryNumber(lambda: None))
+        return self._loop.iterations(numbers, source, always or (), views, events)
 
     def backward(self, loss: Any, view: Any, step: int, *, signal: Any = None) -> bool:
         """Run `loss.backward()`, or skip it; return True when gradients were computed.
@@ -201,21 +185,7 @@ class SkipGate:
             tensor([2., 2.])
         """
         self._require_manual("backward")
-        self._check_losses(loss, view)
-        now, step = self._iteration, int(step)
-        run = Original(_backward_of_sum if isinstance(view, list) else loss.backward)
-        if self._giving_up.reason is None:
-            try:
-                return self._gated_backward(loss, view, step, loss if signal is None else signal, run)
-            except Exception as error:
-                if run.failed:
-                    raise  # the error comes from the loop's own backward pass
-                self._giving_up.on_error(error, step)
-        now.begin(step, gated=False)
-        now.ran = True
-        if not run.made:
-            run(*([loss] if isinstance(view, list) else ()))
-        return True
+        return self._loop.backward(loss, view, step, loss if signal is None else signal)
 
     def step(self, optimizer: Any, *args: Any) -> bool:
         """Call `optimizer.step(*args)` if a gradient is pending; return True when it stepped.
@@ -231,20 +201,8 @@ class SkipGate:
         Raises:
             GateOrderError: `backward` was not called first in this iteration, or the optimizer has stepped in it.
         """
-        self._require_backward_before("step")
-        optimizers = stepping = listed(optimizer)
-        if self._giving_up.reason is None:
-            stepped = self._iteration.stepped
-            for one in optimizers:
-                if id(one) in stepped:
-                    raise GateOrderError("step() was called twice for one optimizer in this iteration.")
-            stepped.update(map(id, optimizers))
-            if self._engine.config.enabled:  # a disabled gate lets every optimizer step
-                with self._guarded:
-                    stepping = [one for one in optimizers if has_pending_gradient(one)]
-        for one in stepping:
-            one.step(*args)
-        return bool(stepping)
+        self._require_manual("step")
+        return self._loop.step(optimizer, *args)
 
     def update(self) -> None:
         """End the iteration and free the graph of a skipped backward pass.
@@ -255,10 +213,8 @@ class SkipGate:
         Raises:
             GateOrderError: `backward` was not called first in this iteration.
         """
-        self._require_backward_before("update")
-        self._iteration.ended = True
-        with self._guarded:
-            self._engine.free_skipped()
+        self._require_manual("update")
+        self._loop.update()
 
     def notify_event(self, kind: str, step: int | None = None) -> None:
         """Report a structural change. The gate then skips no backward pass for a while and keeps the means as they are.
@@ -272,10 +228,10 @@ class SkipGate:
         """
         if self.released is not None:
             return
-        step = self._iteration.step if step is None else int(step)
+        step = self._engine.iteration.step if step is None else int(step)
         if step is None or self._engine.policy is None:
             raise GateOrderError("notify_event() came before the first iteration; give its step.")
-        with self._guarded:
+        with self._loop.guarded:
             self._engine.notify_event(kind, step)
 
     # Counts and settings.
@@ -283,12 +239,12 @@ class SkipGate:
     @property
     def released(self) -> str | None:
         """Why the gate released a run, which then trained on without it; None if it did not."""
-        return self._giving_up.reason
+        return self._engine.giving_up.reason
 
     @property
     def skipped(self) -> bool:
         """Whether the backward pass of the current iteration was skipped."""
-        return self._iteration.skipped
+        return self._engine.skipped
 
     @property
     def config(self) -> SkipConfig:
@@ -429,91 +385,9 @@ class SkipGate:
             self._hooks.restore()
             raise
 
-    @staticmethod
-    def _check_losses(loss: Any, view: Any) -> None:
-        batch = isinstance(view, list)
-        if batch and not isinstance(loss, (list, tuple)) and not (isinstance(loss, Tensor) and loss.dim()):
-            raise SkipGSError(f"{len(view)} view keys came with one loss; give one loss per view.")
-        for one in loss if batch else (loss,):
-            if not hasattr(one, "backward"):
-                raise SkipGSError(f"backward() needs the loss itself, a tensor, not {type(one).__name__}.")
-
-    def _gated_backward(self, loss: Any, view: Any, step: int, signal: Any, run: Original) -> bool:
-        """Do the work of `backward` while the gate is not released; `run` is the loop's own backward pass."""
-        engine, now = self._engine, self._iteration
-        if step != now.step:
-            engine.open_iteration(step)
-        elif now.ended or now.stepped:
-            verb = "update" if now.ended else "step"
-            raise GateOrderError(
-                f"backward() was called after {verb}() in iteration {step}; call backward() for all views of an "
-                "iteration first, and give each iteration its own step number."
-            )
-        if isinstance(view, list):
-            return self._backward_batch(loss, view, signal, run)
-        return engine.gate(self._new_in_iteration(view), signal, run, loss)
-
-    def _backward_batch(self, losses: Any, views: list[Any], signals: Any, run: Original) -> bool:
-        if not len(losses) == len(views) == len(signals):
-            raise SkipGSError(f"{len(views)} view keys came with {len(losses)} losses; give one loss per view.")
-        keys = [self._new_in_iteration(view) for view in views]
-        answers = [self._engine.decide(key, signal) for key, signal in zip(keys, signals, strict=True)]
-        kept = [loss for loss, answer in zip(losses, answers, strict=True) if not answer.skip]
-        if kept:
-            run(kept)
-            self._iteration.ran = True
-            self._engine.rates.ran()
-        self._engine.clock.mark()
-        return bool(kept)
-
-    def _new_in_iteration(self, view: Any) -> str:
-        """Return the key of a view that has had no backward pass in this iteration.
-
-        Before `start_iter` an index on a device is not read: reading it would wait for the device.
-        """
-        keys = self._iteration.keys
-        if isinstance(view, Tensor) and not self._iteration.gated and _is_index_on_device(view):
-            keys.add(NOT_READ)
-            return NOT_READ
-        key = view_key(view)
-        if key in keys:
-            raise GateOrderError(
-                f"backward() was called twice for view {key!r} in iteration {self._iteration.step}; "
-                "give each iteration its own step number."
-            )
-        keys.add(key)
-        return key
-
     def _require_manual(self, verb: str) -> None:
         if self._adapter is not None:
             raise GateOrderError(
                 f"{verb}() is for loops of your own; this gate is attached by adapter {self._adapter.name!r}, "
                 f"so leave out the call of {verb}()."
             )
-
-    def _require_backward_before(self, verb: str) -> None:
-        self._require_manual(verb)
-        if self._giving_up.reason is None and (self._iteration.ended or not self._iteration.keys):
-            raise GateOrderError(f"{verb}() was called before backward() in this iteration.")
-
-
-def _is_index_on_device(view: Tensor) -> bool:
-    return view.numel() == 1 and not view.is_floating_point() and not view.is_cpu
-
-
-def _backward_of_sum(losses: Iterable[Tensor]) -> None:
-    torch.stack(list(losses)).sum().backward()
-
-
-_FIELDS = frozenset(field.name for field in dataclasses.fields(SkipConfig))
-
-
-def _settings(config: SkipConfig | None, fields: dict[str, Any]) -> SkipConfig:
-    unknown = sorted(set(fields) - _FIELDS)
-    if unknown:
-        raise SkipGSError(f"There is no setting {unknown[0]!r}; the settings are {', '.join(sorted(_FIELDS))}.")
-    if config is None:
-        return SkipConfig(**fields)
-    if fields:
-        raise SkipGSError(f"Give either config= or {', '.join(fields)}, not both.")
-    return config

@@ -146,3 +146,26 @@ def _check_count(name: str, value: Any, unit: str = "iterations") -> None:
 def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise SkipGSError(f"{name} must be one of {', '.join(choices)}, not {value!r}.")
+
+
+FIELDS = frozenset(field.name for field in dataclasses.fields(SkipConfig))
+
+
+def settings_of(config: SkipConfig | None, fields: dict[str, Any]) -> SkipConfig:
+    """Return the settings that are given as one object or as single fields.
+
+    Args:
+        config: All settings; None to take the fields.
+        fields: Fields of `SkipConfig` by name.
+
+    Raises:
+        SkipGSError: A field does not exist or is out of range, or both arguments are given.
+    """
+    unknown = sorted(set(fields) - FIELDS)
+    if unknown:
+        raise SkipGSError(f"There is no setting {unknown[0]!r}; the settings are {', '.join(sorted(FIELDS))}.")
+    if config is None:
+        return SkipConfig(**fields)
+    if fields:
+        raise SkipGSError(f"Give either config= or {', '.join(fields)}, not both.")
+    return config

@@ -88,7 +88,7 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
     """
     if not config.enabled:
         return f"SkipGS: off, {counted['iterations']:,} backwards seen."
-    if counted["refine_share"] is not None:
+    if config.leaves_out:
         return _summarise_refinement(config, counted)
     gated, skipped, reasons = counted["gated_iterations"], counted["backwards_skipped"], counted["reasons"]
     floor = counted["min_bwd_ratio_effective"]
@@ -116,7 +116,7 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
             "length of the steps"
         )
     wanted, ran_for = counted["refine_share"], counted["ran_for"]
-    if run > wanted * (run + skipped) + 1:
+    if wanted is not None and run > wanted * (run + skipped) + 1:
         lines.append(
             f"  this is more than the share of {wanted:.2f}: {ran_for['share']:,} ran for the share, "
             f"{ran_for['conditions']:,} for conditions of the loop, "

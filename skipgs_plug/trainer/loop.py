@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,43 +15,22 @@ from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend, single_precision
 from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.config import TrainConfig
-from skipgs_plug.trainer.densification import densify
+from skipgs_plug.trainer.densifier import Densifier
 from skipgs_plug.trainer.errors import InputError
+from skipgs_plug.trainer.evaluation import evaluate
 from skipgs_plug.trainer.exposure import Exposure
-from skipgs_plug.trainer.image_store import ReadAhead, one_by_one
-from skipgs_plug.trainer.mask import leave_out
-from skipgs_plug.trainer.mcmc import Mcmc
-from skipgs_plug.trainer.model import create_optimizers, create_splats
-from skipgs_plug.trainer.near_plane import far_plane, near_plane
-from skipgs_plug.trainer.order import ViewOrder, derive_seed
+from skipgs_plug.trainer.image_store import ReadAhead
+from skipgs_plug.trainer.iteration import Iteration
+from skipgs_plug.trainer.model import create_optimizers, create_splats, step_optimizers
+from skipgs_plug.trainer.near_plane import near_plane
+from skipgs_plug.trainer.order import ViewOrder
 from skipgs_plug.trainer.photographs import Photographs
 from skipgs_plug.trainer.ply import write_ply
-from skipgs_plug.trainer.row_order import sort_rows, sorts_rows
+from skipgs_plug.trainer.rendering import ViewRenderer
 from skipgs_plug.trainer.scene import Scene, View
 from skipgs_plug.trainer.state import Stateful
-from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
 
 MEANS_LR_END = 0.01  # learning rate of positions at the end of the schedule, as a share of the first; 3DGS's value
-DRAWING = threading.Lock()  # held while a trainer draws random numbers: gsplat uses one generator for all threads
-
-
-class Iteration(NamedTuple):
-    """Facts about one iteration, for `Trainer.on_step`."""
-
-    step: int
-    since: int  # number right after the previous iteration; below `step` if a gate left out iterations between
-    view: str
-    loss: float
-    image: Tensor  # [H, W, 3], detached
-    target: Tensor  # [H, W, 3] uint8
-
-    def passes(self, every: int) -> bool:
-        """Whether this iteration, or a left-out iteration right before it, is a multiple of `every`."""
-        return self.step // every > (self.since - 1) // every
-
-    def completes(self, every: int) -> bool:
-        """Whether this iteration completes a multiple of `every` iterations, left-out ones included."""
-        return (self.step + 1) // every > self.since // every
 
 
 class Trainer:
@@ -94,18 +71,13 @@ class Trainer:
         self.backend = backend or resolve_backend(config.backend)
         self.max_steps = config.max_steps
         self.near_plane = near_plane(config, scene)
-        self.far_plane = far_plane(config, scene)
         self.step = self.ran = 0
         self._since: int | None = None  # number after the previous iteration, set by `train`
         self._splats = create_splats(scene, config, self.backend.device, self.near_plane)
         self._optimizers = create_optimizers(self._splats, config, scene.scene_scale, self.backend)
-        self.mcmc = Mcmc(config, scene.scene_scale) if config.strategy == "mcmc" else None
-        self.strategy: Any = None
-        self.strategy_state: dict[str, Any] = {}
-        if self.mcmc is None:
-            self.strategy = create_strategy(config)
-            self.strategy.check_sanity(self._splats, self._optimizers)
-            self.strategy_state = self.strategy.initialize_state(scene_scale=scene.scene_scale)
+        self._densifier = Densifier(config, scene.scene_scale, self.backend, self._splats, self._optimizers)
+        self.mcmc, self.strategy = self._densifier.mcmc, self._densifier.strategy
+        self.strategy_state = self._densifier.state
         self.refine_stop_iter = config.scaled(config.recipe.refine_stop_iter)
         self.view_names = [view.name for view in scene.train]
         self.clock = TrainClock(self.backend.device)
@@ -117,14 +89,13 @@ class Trainer:
         self.stop_requested = False
         self._order = ViewOrder(len(scene.train), config.seed)
         self._read_ahead = ReadAhead(scene.train, config.seed)
-        self._recipe = config.recipe
         self._sh_interval = config.scaled(config.sh_degree_interval)
         self._warm = False
         self._photographs = Photographs(scene.train, self.backend.device)
         self._value: HostCopy | None = None  # loss of the present iteration
-        self._colour: Tensor | None = None  # background [3]; None for black
-        if any(scene.background):
-            self._colour = torch.tensor(scene.background, dtype=torch.float32, device=self.backend.device)
+        self._renderer = ViewRenderer(
+            config, scene, self.backend, self._splats, self._optimizers, self.exposure, self.near_plane
+        )
 
     @property
     def splats(self) -> nn.ParameterDict:
@@ -221,27 +192,24 @@ class Trainer:
         if not self._warm:
             self._warm_up(view)
         densifying = step < self.refine_stop_iter
-        strategy = self.strategy if densifying else None
         self.set_learning_rate(step)
 
         self.clock.start()
-        with_rows = strategy is not None or self.config.visible_adam
-        image, target, info = self._forward(view, self.active_sh_degree(step), step, with_rows)
+        with_rows = (densifying and self.mcmc is None) or self.config.visible_adam
+        image, target, info = self._renderer.forward(view, self.active_sh_degree(step), step, with_rows)
         self.clock.mark("forward")
-        if strategy is not None:
-            strategy.step_pre_backward(self._splats, self._optimizers, self.strategy_state, step, info)
-        loss = self._loss(image, target)
+        self._densifier.before_backward(step, info)
+        loss = self._renderer.loss(image, target)
         self._value = HostCopy(loss)
         self.clock.mark("loss")
         self.backward(loss, view.name, step)
         self.clock.mark("backward")
-        updated = self._optimizer_step(info)
+        # A gate may leave out or postpone the update.
+        updated = step_optimizers(self._splats, self._optimizers, info if self.config.visible_adam else None)
+        if self.exposure is not None:
+            self.exposure.step()
         self.clock.mark("optimizer")
-        if self.mcmc is not None:
-            self._move(self.mcmc, step, updated)
-        # A gate may have left this iteration without gradients, which densification averages.
-        elif strategy is not None and info["means2d"].grad is not None:
-            self._densify(strategy, step, info)
+        self._densifier.after_update(step, info, updated)
         self.clock.mark("strategy")
         self.clock.stop(after_densification=not densifying)
         value = self._value.value()
@@ -309,9 +277,7 @@ class Trainer:
         Args:
             view: Camera and size of the image. A training view gets its exposure.
         """
-        degree = self.active_sh_degree(max(self.step - 1, 0))
-        image, _ = self._rasterize(view, degree, self._background())
-        return self._exposed(image, view)
+        return self._renderer.render(view, self.active_sh_degree(max(self.step - 1, 0)))
 
     @single_precision()
     def evaluate(
@@ -339,21 +305,14 @@ class Trainer:
         self.clock.settle()
         wanted = metrics.chosen(lpips_net, fitted=self.exposure is not None and split == "test")
         with self.backend.exclusive_cores():
-            rows = []
-            for i, view in enumerate(one_by_one(views)):
-                render = self.render(view)
-                if keep is not None:
-                    keep(i, view, render)
-                image, target = leave_out(render, self._target(view).float() / 255.0, view.mask)
-                rows.append(metrics.measure(wanted, image, target, view.mask))
-        means = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
+            means, per_view = evaluate(views, wanted, self.render, self._renderer.target, keep)
         return {
             **means,
             "num_GS": self.num_gaussians,
             "step": self.step,
             "split": split,
             "views": len(views),
-            "per_view": [{"view": view.name, **row} for view, row in zip(views, rows, strict=True)],
+            "per_view": per_view,
             **{f"{metric.name}_flavour": metric.flavour for metric in wanted},
         }
 
@@ -409,114 +368,9 @@ class Trainer:
         """
         state.load_checkpoint(self, path)
 
-    def _forward(self, view: View, degree: int, step: int, with_rows: bool) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        background = self._background()
-        if self.config.random_bkgd:
-            generator = torch.Generator().manual_seed(derive_seed(self.config.seed, step))
-            background = torch.rand(3, generator=generator, dtype=torch.float32).to(self.backend.device)
-        image, info = self._rasterize(view, degree, background, with_rows)
-        return (*leave_out(self._exposed(image, view), self._target(view), view.mask), info)
-
-    def _exposed(self, image: Tensor, view: View) -> Tensor:
-        return image if self.exposure is None else self.exposure.apply(image, view.name)
-
-    def _rasterize(
-        self, view: View, degree: int, background: Tensor | None, with_rows: bool = False
-    ) -> tuple[Tensor, dict[str, Any]]:
-        return self.backend.render(
-            self._splats,
-            view.viewmat,
-            view.K,
-            background,
-            antialiased=self.config.antialiased,
-            with_rows=with_rows,
-            width=view.width,
-            height=view.height,
-            sh_degree=degree,
-            near_plane=self.near_plane,
-            far_plane=self.far_plane,
-            absgrad=self.config.absgrad,
-            optimizers=self._optimizers,
-        )
-
-    def _background(self) -> Tensor | None:
-        """Return the scene's background [3]; None for black, which needs no compositing."""
-        return self._colour
-
-    def _target(self, view: View) -> Tensor:
-        return view.image.to(self.backend.device)
-
-    def _loss(self, image: Tensor, target: Tensor) -> Tensor:
-        loss = self.backend.loss(image, target, self.config.ssim_lambda)
-        recipe = self._recipe
-        if recipe.opacity_reg > 0.0:
-            loss = loss + recipe.opacity_reg * torch.sigmoid(self._splats["opacities"]).mean()
-        if recipe.scale_reg > 0.0:
-            loss = loss + recipe.scale_reg / self.scene.scene_scale * torch.exp(self._splats["scales"]).mean()
-        return loss
-
-    def _optimizer_step(self, info: dict[str, Any]) -> bool:
-        """Step all optimizers. Return whether positions were updated: a gate may leave out or postpone the update."""
-        pending = self._splats["means"].grad is not None
-        for optimizer in self._optimizers.values():
-            if self.config.visible_adam:
-                optimizer.step(self._visible(info))  # type: ignore[call-overload]
-            else:
-                optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-        if self.exposure is not None:
-            self.exposure.step()
-        return pending and self._splats["means"].grad is None
-
-    def _visible(self, info: dict[str, Any]) -> Tensor:
-        """Return which Gaussians the image shows [N]."""
-        if info["gaussian_ids"] is None:
-            return (info["radii"] > 0).all(dim=-1).any(dim=0)  # type: ignore[no-any-return]
-        visible = torch.zeros(self.num_gaussians, dtype=torch.bool, device=self.backend.device)
-        visible[info["gaussian_ids"]] = True
-        return visible
-
-    def _densify(self, strategy: Any, step: int, info: dict[str, Any]) -> None:
-        args = (self._splats, self._optimizers, self.strategy_state, step)
-        if step % strategy.refine_every:
-            strategy.step_post_backward(*args, info, packed=info["gaussian_ids"] is not None)
-        else:
-            self._catch_up()
-            with self._seeded(step):
-                densify(strategy, *args, info, in_order=sorts_rows(strategy, step))
-        reset_opacity_if_missed(strategy, *args)
-
-    def _move(self, mcmc: Mcmc, step: int, updated: bool) -> None:
-        # The noise belongs to the update: without an update it is a random walk.
-        moves = mcmc.moves(step)
-        if moves:
-            self.backend.release_memory()  # gsplat copies all rows
-            self._catch_up()
-        if updated or moves:
-            rate = self._optimizers["means"].param_groups[0]["lr"] if updated else 0.0
-            with self._seeded(step):
-                mcmc.after_update(self._splats, self._optimizers, step, rate)
-        if sorts_rows(mcmc, step):
-            sort_rows(self.splats, self.optimizers, self.strategy_state)
-
     def _catch_up(self) -> None:
         """Apply the missed updates of Gaussians that the last views did not show, before other code reads them."""
         self.backend.catch_up(self._optimizers)
-
-    @contextmanager
-    def _seeded(self, step: int) -> Iterator[None]:
-        """Seed the global generator, which gsplat uses, for this iteration, so that a resumed run is the same run.
-
-        The caller's random state is restored.
-        """
-        with DRAWING, torch.random.fork_rng(devices=self._random_devices):
-            torch.manual_seed(derive_seed(self.config.seed, step))
-            yield
-
-    @property
-    def _random_devices(self) -> list[torch.device]:
-        """Devices whose random state is restored. Without a list, PyTorch would initialise every GPU."""
-        return [] if self.backend.device.type == "cpu" else [self.backend.device]
 
     def _warm_up(self, view: View) -> None:
         """Compile kernels before the clock runs, by a forward and backward of each kind. Gradients are dropped.
@@ -524,8 +378,8 @@ class Trainer:
         Densification and refinement use the same kernels, except for the adjoint with absolute gradients.
         """
         for with_rows in {True, not self.config.absgrad}:
-            image, target, _ = self._forward(view, self.config.sh_degree, 0, with_rows)
-            self._loss(image, target).backward()
+            image, target, _ = self._renderer.forward(view, self.config.sh_degree, 0, with_rows)
+            self._renderer.loss(image, target).backward()
             for optimizer in self.all_optimizers:
                 optimizer.zero_grad(set_to_none=True)
         self._warm = True

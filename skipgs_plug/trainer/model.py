@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -89,3 +91,33 @@ def create_optimizers(
             for name, rate in rates.items()
         }
     return {name: backend.create_adam(name, splats[name], rate, ADAM_EPS) for name, rate in rates.items()}
+
+
+def step_optimizers(
+    splats: nn.ParameterDict, optimizers: dict[str, torch.optim.Optimizer], visible_in: dict[str, Any] | None
+) -> bool:
+    """Step all optimizers and drop the gradients. Return whether positions had a gradient that is used now.
+
+    Args:
+        splats: Parameters by name.
+        optimizers: One optimizer per parameter, by the same names.
+        visible_in: Dictionary of the rasterizer, to update only the Gaussians that its image shows; None for all.
+    """
+    means = splats["means"]
+    pending = means.grad is not None
+    for optimizer in optimizers.values():
+        if visible_in is None:
+            optimizer.step()
+        else:
+            optimizer.step(_visible(visible_in, means))  # type: ignore[call-overload]
+        optimizer.zero_grad(set_to_none=True)
+    return pending and splats["means"].grad is None
+
+
+def _visible(info: dict[str, Any], means: Tensor) -> Tensor:
+    """Return which Gaussians an image shows [N]."""
+    if info["gaussian_ids"] is None:
+        return (info["radii"] > 0).all(dim=-1).any(dim=0)  # type: ignore[no-any-return]
+    visible = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+    visible[info["gaussian_ids"]] = True
+    return visible

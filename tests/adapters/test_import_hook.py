@@ -118,7 +118,7 @@ def test_a_script_that_is_warned_gets_no_advice_to_call_a_gate(script, recwarn):
         run(gate)
     assert gate.released is None
     assert [str(one.message).partition("known, so ")[2] for one in recwarn] == [
-        "its densification runs whole, and iterations are left out after it."
+        "all of these iterations run, and only later ones are left out."
     ]
 
 

@@ -85,7 +85,7 @@ def test_optimizers_that_cannot_be_read_step_all_the_same(monkeypatch, recwarn):
             raise AttributeError("param_groups")
         return has_pending_gradient(optimizer)
 
-    monkeypatch.setattr("skipgs_plug.gate.has_pending_gradient", fails)
+    monkeypatch.setattr("skipgs_plug.core.own_loop.has_pending_gradient", fails)
     gate = SkipGate(start_iter=0, min_bwd_ratio=1.0)
     assert loop.train(gate, range(LAST)).stepped == list(range(LAST))
     assert [str(one.message) for one in recwarn] == [gate.released] and "param_groups" in gate.released

@@ -148,7 +148,7 @@ def test_sums_add_up_for_the_rows_of_an_image_only() -> None:
 def test_a_run_moves_its_rows_once_at_every_densification(
     tiny_config: TrainConfig, tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from skipgs_plug.trainer import loop
+    from skipgs_plug.trainer import densifier
 
     at: list[int] = []
     sizes: list[int] = []
@@ -160,7 +160,7 @@ def test_a_run_moves_its_rows_once_at_every_densification(
     def look(iteration: Iteration) -> None:
         sizes.append(trainer.num_gaussians)
 
-    monkeypatch.setattr(loop, "densify", noted)
+    monkeypatch.setattr(densifier, "densify", noted)
     trainer = Trainer(tiny_config, tiny_scene)
     trainer.on_step = look
     trainer.train(until=30, progress=False)

@@ -11,6 +11,7 @@ import torch
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.config import REFERENCE_STEPS
 from skipgs_plug.trainer.order import ViewOrder
+from skipgs_plug.trainer.seeded import seeded
 from skipgs_plug.trainer.strategy import reset_interval, reset_opacity_if_missed
 
 
@@ -170,14 +171,14 @@ def test_densification_initialises_no_gpu(trainer: Trainer, monkeypatch: pytest.
     assert trainer.num_gaussians != start and not asked
 
 
-def test_trainers_in_other_threads_wait_while_one_draws(trainer: Trainer) -> None:
+def test_trainers_in_other_threads_wait_while_one_draws() -> None:
     def draw(step: int) -> torch.Tensor:
-        with trainer._seeded(step):
+        with seeded(step, torch.device("cpu")):
             return torch.rand(3)
 
     alone, drawn = draw(5), []
     other = threading.Thread(target=lambda: drawn.append(draw(9)))
-    with trainer._seeded(5):
+    with seeded(5, torch.device("cpu")):
         other.start()
         other.join(0.2)
         assert torch.equal(torch.rand(3), alone) and not drawn

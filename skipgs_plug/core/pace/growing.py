@@ -75,7 +75,7 @@ class Growing(Phase):
         return range(number if self._first is None else self._first, end)
 
     def begin(self, plan: PhasePlan) -> bool:
-        """Receive the facts that are known when the loop begins; return False if no densification event is found.
+        """Receive the facts that are known when a loop begins; return False if it has no densification event.
 
         Raises:
             SkipGSError: "auto" needs the number of views, and it is unknown.
@@ -100,12 +100,12 @@ class Growing(Phase):
                 events |= hits
             elif hits:
                 others[reason] = hits
+        before, self.events = self._events_state, DensificationEvents(events, densification)
+        if before is not None:
+            self.events.load_state_dict(before)
         if marks and not any(mark in reason for reason in found for mark in marks):
             return False
         self.always = {**others, NAMED_FOR_TRAINER: named} if named else others
-        self.events = DensificationEvents(events, densification)
-        if self._saved_events is not None:
-            self.events.load_state_dict(self._saved_events)
         # A condition can name the iteration of an event that is left out. The iteration runs all the same if the
         # condition holds less often than events happen. If it holds as often, such as for a line in a log, it holds
         # again soon.
@@ -143,7 +143,8 @@ class Growing(Phase):
         self._must |= {number}
 
     def end(self) -> None:
-        self._rates.visibility.restart()  # the grown scene decides how long steps are in refinement
+        if self._first is not None:
+            self._rates.visibility.restart()  # the grown scene decides how long steps are in refinement
 
     def runs(self, number: int) -> bool:
         assert self.events is not None and self._first is not None
@@ -237,16 +238,18 @@ class Growing(Phase):
         bound, events = self._config.max_gaussians, self.events
         return bound is not None and events is not None and events.rows + events.grown > bound
 
-    def report(self) -> dict[str, Any]:
-        """Return the entries of skipgs.json about this phase.
+    def report(self) -> dict[str, Any] | None:
+        """Return the entries of skipgs.json about this phase; None if it has not begun.
 
         `share`, `iterations_run`, `iterations_skipped`, `events_run`, `events_skipped`, `rate_factor`,
         `opacity_rate_factor`, `times_grown` (Gaussians at the last event, as a multiple of those at the first; None if
         unknown), `always_run`.
         """
+        if self._first is None:
+            return None
         events = self.events
         known = self.share is not None and self._config.compensates
-        factor, parts = self._factors(self._first or 0) if known else (None, None)
+        factor, parts = self._factors(self._first) if known else (None, None)
         return {
             "share": self.share,
             "iterations_run": self.sampling.run,
@@ -259,23 +262,31 @@ class Growing(Phase):
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
         }
 
-    def state_dict(self) -> dict[str, Any]:
+    @property
+    def _events_state(self) -> dict[str, Any] | None:
+        return self._saved_events if self.events is None else self.events.state_dict()
+
+    def state_dict(self) -> dict[str, Any] | None:
+        if self._first is None:
+            return None
         return {
             "asked": self._config.growing,
             "share": self.share,
             "first": self._first,
             "views": self._epoch,
+            "must_shares": list(self._must_shares),
             "gaussians_shown": [self._visible, self._visible_now],
             "share_now": self._share_now,
             "gaussians_at_first": self._rows_at_first,
             "measuring": self._measuring,
             "sampling": self.sampling.state_dict(),
-            "events": self._saved_events if self.events is None else self.events.state_dict(),
+            "events": self._events_state,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.share, self._first = state["share"], state["first"]
-        self._must_shares = 1.0, 1.0
+        until, after = state.get("must_shares", (1.0, 1.0))
+        self._must_shares = until, after
         self._epoch = state["views"]
         self._measuring = state["measuring"]
         self._share_now, self._rows_at_first = state.get("share_now"), state.get("gaussians_at_first", 0)

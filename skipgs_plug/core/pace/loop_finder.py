@@ -1,4 +1,4 @@
-"""Finds the training loop among all loops that count with `range`."""
+"""Finds the training loop among all loops that count with `range`. A run may have several, one after the other."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ class LoopFinder:
     """Finds the loop whose numbers are those of the trainer's iterations.
 
     Attributes:
-        found: The training loop; None until it is known.
-        expected: Number with which the loop of a resumed run continues; None in a new run.
+        found: The present training loop; None until it is known, and after it has ended.
+        expected: Number with which the next loop continues, also in a resumed run; None in a new run.
     """
 
     def __init__(self) -> None:
@@ -26,8 +26,8 @@ class LoopFinder:
 
     def asks(self, loop: LoopRange, number: int) -> bool:
         """Take note that a loop asks about a number; return whether it is the training loop."""
-        if self.found is None and number == self.expected:
-            self.found = loop
+        if self.found is None and number == self.expected == loop.numbers.start:
+            self._find(loop)
         if loop is not self.found:
             if self.found is None and loop not in self._candidates:
                 self._candidates.append(loop)
@@ -47,9 +47,10 @@ class LoopFinder:
         """
         if self.found is not None:
             return False
-        self.found = next((loop for loop in self._candidates if loop.current == step), None)
+        loop = next((loop for loop in self._candidates if loop.current == step), None)
         self._candidates.clear()
-        if self.found is not None:
+        if loop is not None:
+            self._find(loop)
             self.expected = step + 1
             return True
         self._without += needed
@@ -62,3 +63,15 @@ class LoopFinder:
                 f"{sentence}, or write the loop as: for step in gate.iterations(range(...)).", in_script=f"{sentence}."
             )
         return False
+
+    def ended(self, loop: LoopRange) -> bool:
+        """Take note that a loop is over, or was left early; return whether it was the training loop."""
+        if loop in self._candidates:
+            self._candidates.remove(loop)
+        if loop is not self.found:
+            return False
+        self.found = None
+        return True
+
+    def _find(self, loop: LoopRange) -> None:
+        self.found, self._without = loop, 0

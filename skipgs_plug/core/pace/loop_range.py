@@ -20,7 +20,7 @@ class Owner(Protocol):
 
     @property
     def wants_loop(self) -> bool:
-        """Whether the training loop is not known yet."""
+        """Whether no training loop is running, so that the next loop may be one."""
         ...
 
     def runs(self, loop: LoopRange, number: int) -> bool:
@@ -89,14 +89,14 @@ class LoopRange:
 def require_planned(numbers: range, last: int) -> None:
     """Raise SkipGSError if a loop continues after the iteration at which steps have shrunk to zero."""
     if numbers and numbers[-1] > last:
+        sentence = f"Iterations up to {numbers[-1]} come after a plan that ends with {last}"
         raise SkipGSError(
-            f"Iterations up to {numbers[-1]} come after a plan that ends with {last}; "
-            "give gate.iterations() all iterations of the run at once."
+            f"{sentence}; give gate.iterations() all iterations of the run at once.", in_script=f"{sentence}."
         )
 
 
 def replace_range(patches: Patches, names: dict[str, Any], functions: tuple[str, ...], owner: Owner) -> None:
-    """Give functions of a module that call `range(a, b)` a `LoopRange`, until the training loop is known.
+    """Give functions of a module that call `range(a, b)` a `LoopRange`, except while the training loop is running.
 
     Args:
         patches: List of replacements, to which this one is added.
@@ -115,7 +115,7 @@ def replace_range(patches: Patches, names: dict[str, Any], functions: tuple[str,
             return numbers
         if numbers.step != 1 or not is_looped_over(frame.f_code, frame.f_lineno):
             return numbers
-        # The training loop has not begun, so these names hold no iteration's tensors.
+        # No training loop is running. Tensors of an earlier loop's last iteration are kept until this loop is read.
         return LoopRange(numbers, owner, (frame.f_code, {**frame.f_globals, **frame.f_locals}))
 
     def undo() -> None:

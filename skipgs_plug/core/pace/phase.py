@@ -40,8 +40,9 @@ class PhasePlan(NamedTuple):
 class Phase:
     """A phase in which every iteration runs, and learning rates do not change. Other phases derive from this one.
 
-    `begin` is called once, when the loop begins, and again after a state is loaded inside the loop. Then `runs` is the
-    one question about each iteration of the phase. It also sets the learning rates of an iteration that runs.
+    `begin` is called when a training loop begins, and again after a state is loaded inside the loop. A run may have
+    several loops, one after the other. Then `runs` is the one question about each iteration of the phase. It also sets
+    the learning rates of an iteration that runs.
 
     Attributes:
         leaves_out: Whether iterations of the phase may be left out.
@@ -61,7 +62,7 @@ class Phase:
         return range(0)
 
     def begin(self, plan: PhasePlan) -> bool:
-        """Receive the facts that are known when the loop begins; return False if all iterations of the phase must run.
+        """Receive the facts that are known when a loop begins; return False if its part of the phase must run whole.
 
         Raises:
             SkipGSError: A fact that this phase needs is unknown.

@@ -46,6 +46,7 @@ class Phased(Pace):
         self._giving_up = giving_up
         self.refining = Refining(config, rates)
         self.growing: Phase = Phase() if config.growing is None else Growing(config, rates)
+        self._grows = self.growing  # phase of the iterations before `_start` in the present loop
         self._finder = LoopFinder()
         self._densification: Densification | None = None
         self._accumulates = False
@@ -59,13 +60,13 @@ class Phased(Pace):
         self._known: Known = nothing_known
         self._required: set[int] = set()
         # Iterations that the loop's conditions name, by condition: of the growing phase, and of the refining phase.
-        self._conditions: list[dict[str, set[int]]] | None = None
+        self._conditions: list[dict[str, set[int]]] = [{}, {}]
+        self._planned: LoopRange | None = None  # loop whose conditions were read; nothing in it is refused after that
         self._left_out = 0
         self._bars = Bars([])
         self._attached = False  # by an adapter
         self._asked = False  # whether the user was told, in the first iteration, that the loop is not known
         self._configured = self._removed = False
-        self._planned = False  # whether the loop's conditions were read; nothing is refused after that
 
     # Facts about the trainer.
 
@@ -94,8 +95,7 @@ class Phased(Pace):
         self.growing.require(number)
 
     def is_named(self, number: int) -> bool:
-        phase = self.growing if number < self._start else self.refining
-        return number in self._required or phase.is_named(number)
+        return number in self._required or self._phase(number).is_named(number)
 
     def follow(
         self,
@@ -133,7 +133,7 @@ class Phased(Pace):
 
     def begin(self, step: int, policy: Policy | None) -> None:
         # An adapter's loop is searched for from the first iteration on, so that a refusal comes before any training.
-        needed = self._attached or self.growing.leaves_out or step >= self._start
+        needed = self._attached or self._grows.leaves_out or step >= self._start
         if not self._attached and self.number is None and not self._removed:
             self._ask_for_loop(needed)
         self._asked = True
@@ -144,7 +144,7 @@ class Phased(Pace):
 
     @property
     def wants_loop(self) -> bool:
-        """Whether the training loop is not known yet."""
+        """Whether no training loop is running, so that the next loop may be one."""
         return self._finder.found is None
 
     def runs(self, loop: LoopRange, number: int) -> bool:
@@ -152,14 +152,14 @@ class Phased(Pace):
 
         Raises:
             SkipGSError: The loop's conditions cannot be evaluated ahead. It is raised at the first number that could be
-                left out, never later.
+                left out, never later, and before any training.
         """
         if self._removed:
             return True
         try:
             return self._runs(loop, number)
         except Exception as error:
-            self._giving_up.on_error(error, number, refuses=not self._planned)
+            self._giving_up.on_error(error, number, refuses=self._planned is not loop)
             return True
 
     def _runs(self, loop: LoopRange, number: int) -> bool:
@@ -167,12 +167,9 @@ class Phased(Pace):
             self._go_on(number)
         if not self._finder.asks(loop, number) or not self._configured:
             return True
-        if self._conditions is None or loop.source is not None:
-            self._planned = False
+        if self._planned is not loop:
             self._read(loop, number)
-            self._planned = True
-        phase = self.growing if number < self._start else self.refining
-        runs = phase.runs(number)
+        runs = self._phase(number).runs(number)
         if runs:
             self.gap, self._left_out = self._left_out, 0
             if self.gap:
@@ -182,18 +179,22 @@ class Phased(Pace):
             self._bars.left_out(number)
         return runs
 
+    def _phase(self, number: int) -> Phase:
+        return self._grows if number < self._start else self.refining
+
     def expected(self, loop: LoopRange) -> int:
         """Return the number of iterations that the loop will run, as far as it is known."""
         numbers = loop.numbers
         if self._removed:
             return len(numbers)
         before = len(range(numbers.start, min(max(self._start, numbers.start), numbers.stop)))
-        grown, refined = self.growing.share or 1.0, self.refining.share or 1.0
+        grown, refined = self._grows.share or 1.0, self.refining.share or 1.0
         return round(before * grown) + round((len(numbers) - before) * refined)
 
     def ended(self, loop: LoopRange) -> None:
         """Leave rates alone once the loop is over, or was left early: later optimizer steps are not part of it."""
-        if loop is self._finder.found:
+        if self._finder.ended(loop):
+            self._planned = None
             self._rates.pause()
 
     def _ask_for_loop(self, needed: bool) -> None:
@@ -213,36 +214,52 @@ class Phased(Pace):
             caution(f"refine_share leaves out iterations from {self._start} on, {how}")
 
     def _read(self, loop: LoopRange, number: int) -> None:
-        """Read the loop's conditions, at the first number that can be left out. Nothing is refused later."""
-        self._require_events()
-        if self._last is None:
-            self._last = loop.numbers[-1]
+        """Plan the rest of the run by the loop's conditions, at the loop's first number that can be left out.
+
+        Loops that follow each other are read one after the other, and each plan takes the place of the one before.
+        """
+        if self.refining.begun and self._last is not None:
+            require_planned(loop.numbers, self._last)
         # On resume, include iterations that are done already, because conditions are judged by how often they hold.
         # A trainer that is trained in parts, such as train(until=1000), has more numbers than its first loop.
-        end = loop.numbers.stop if loop.source is not None else max(loop.numbers.stop, self._last + 1)
+        end = loop.numbers.stop if self._last is None else max(loop.numbers.stop, self._last + 1)
         grown = self.growing.numbers(number, min(self._start, end))
         refined = self.refining.numbers(max(self._start, number), end)
+        grows = bool(grown) and number < self._start
+        if grows:
+            self._require_events()
         if loop.source is not None and self._config.always is None:
             code, names = loop.source
             read = read_loop(code, line_of(code), names, self._pure, self._known(names))
             self._conditions = [read.milestones(numbers) if numbers else {} for numbers in (grown, refined)]
             self._bars = Bars(read.bar_moves(loop.numbers))
-        elif self._conditions is None:  # they are known if a state is loaded inside this loop
-            self._conditions = [{}, {}]
+        elif self._planned is not loop:  # they are known if a state is loaded inside this loop
+            self._conditions, self._bars = [{}, {}], Bars([])
         loop.source = None
-        if grown and not self.growing.begin(self._plan(grown, self._conditions[0], Phase())):
-            self._grow_whole(self._why_no_event())
-        self.refining.begin(self._plan(refined, self._conditions[1], self.growing))
+        last = loop.numbers[-1] if self._last is None else self._last
+        if grown:  # also after the phase, whose length the refining phase must know in a resumed run
+            plan = self._plan(grown, self._conditions[0], last, Phase())
+            known = self._densification is not None and self.growing.begin(plan)
+            self._grows = self.growing if known else Phase()
+            if grows and not known:
+                until = min(grown.stop, loop.numbers.stop) - 1
+                caution(
+                    f"The densification events of iterations {number} to {until} are not known, so all of these "
+                    f"iterations run, and only later ones are left out.{self._why_no_event()}"
+                )
+        if refined:
+            self._last = last  # settled, because steps shrink until then
+            self.refining.begin(self._plan(refined, self._conditions[1], last, self.growing))
+        self._planned = loop
 
-    def _plan(self, numbers: range, conditions: dict[str, set[int]], before: Phase) -> PhasePlan:
-        assert self._last is not None
+    def _plan(self, numbers: range, conditions: dict[str, set[int]], last: int, before: Phase) -> PhasePlan:
         named = {n for n in (*self._always(numbers), *self._chosen, *self._required) if n in numbers}
         epoch = self._epoch or (None if self._views is None else len(self._views))
         return PhasePlan(
             numbers,
             conditions,
             named,
-            self._last,
+            last,
             before,
             self._views,
             epoch,
@@ -250,38 +267,27 @@ class Phased(Pace):
             self._accumulates,
         )
 
-    def _why_no_event(self) -> str:
-        assert self._densification is not None
-        marks = ", ".join(self._densification.marks)
-        if self._config.always is None:
-            return f"No condition of the loop that names {marks} holds before iteration {self._start}."
-        return f"The numbers given as always replace the loop's conditions, also those that name {marks}."
-
     def _require_events(self) -> None:
-        """Let the growing phase run whole if its densification events are not known.
+        """Refuse `grow_share` if the densification events are not known. With `share`, densification runs whole then.
 
         Raises:
-            SkipGSError: `grow_share` was given, which needs them.
+            SkipGSError: They are not known.
         """
-        if not self.growing.leaves_out or self._densification is not None or self._start == 0:
-            return
-        if self._config.share is None:
+        if self._densification is None and self._config.share is None:
             sentence = (
                 "grow_share leaves out iterations of densification, but the densification events of this trainer are "
                 "not known; remove grow_share"
             )
             raise SkipGSError(f"{sentence}, or give events= to gate.iterations().", in_script=f"{sentence}.")
-        if self._giving_up.in_script:
-            self._grow_whole()
-        else:
-            self._grow_whole("In a loop of your own give events= to gate.iterations().")
 
-    def _grow_whole(self, *reasons: str) -> None:
-        caution(
-            "The densification events of this trainer are not known, so its densification runs whole, and iterations "
-            + " ".join(("are left out after it.", *reasons))
-        )
-        self.growing = Phase()
+    def _why_no_event(self) -> str:
+        """Return why no densification event is known, as a sentence after a space; empty if there is nothing to add."""
+        if self._densification is None:
+            return "" if self._giving_up.in_script else " In a loop of your own give events= to gate.iterations()."
+        marks = ", ".join(self._densification.marks)
+        if self._config.always is None:
+            return f" No condition of the loop that names {marks} holds before iteration {self._start}."
+        return f" The numbers given as always replace the loop's conditions, also those that name {marks}."
 
     # State and report.
 
@@ -289,7 +295,7 @@ class Phased(Pace):
         return {
             **self.refining.report(),
             "gaussians_shown": self._rates.visibility.visible,
-            "growing": self.growing.report(),
+            "growing": self.growing.report(),  # None, too, if the phase runs whole
         }
 
     def state_dict(self) -> dict[str, Any]:
@@ -315,14 +321,12 @@ class Phased(Pace):
             )
         self._required = set(state["required"])
         self.refining.load_state_dict(state["refining"])
-        if growing is None:
-            self.growing = Phase()
-        else:
+        if growing is not None:
             self.growing.load_state_dict(growing)
         self._finder.expected = state["next"]
         # The loop asks about its first number before the trainer reports its facts.
         if not self._configured:
             self._start, self._last, self._accumulates = state["start"], state["last"], state["keeps_rates"]
             self._configured = True
-        if self._finder.found is not None and self._conditions is not None:
-            self._read(self._finder.found, max(self._start, state["next"] or 0))
+        if self._planned is not None:
+            self._read(self._planned, max(self._start, state["next"] or 0))

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -37,8 +38,8 @@ class Loop:
             self.optimizer.load_state_dict(moments)
         self.ran, self.grown, self.saved, self.rates = [], [], [], {}
 
-    def train(self, gate, until=LAST, events=range(INTERVAL, START, INTERVAL), **options):
-        for step in gate.iterations(range(self.begin, LAST), views=VIEWS, events=events, **options):
+    def train(self, gate, until=LAST, events=range(INTERVAL, START, INTERVAL), end=LAST, **options):
+        for step in gate.iterations(range(self.begin, end), views=VIEWS, events=events, **options):
             self.ran.append(step)
             loss = (self.means - step % 3).square().sum()
             if gate.backward(loss, view=VIEWS[step % 4], step=step):
@@ -186,15 +187,35 @@ def test_interrupted_and_resumed_leaves_out_the_same():
         assert torch.equal(other.means, whole.means)
 
 
+def test_a_loop_in_parts_counts_its_iterations_and_events_through():
+    loop = Loop()
+    with SkipGate(start_iter=START, share=0.25) as gate:
+        for loop.begin, end in ((0, 101), (101, START), (START, LAST)):
+            loop.train(gate, end=end)
+    assert gate.released is None and loop.saved == list(range(0, LAST, 60)) and loop.ran[-1] == LAST - 1
+    grown, report = [n for n in loop.ran if n < START], gate.report()["growing"]
+    assert (report["iterations_run"], report["iterations_skipped"]) == (len(grown), START - len(grown))
+    assert len(grown) == pytest.approx(START / 4, abs=3)
+    assert report["events_run"] == len(loop.grown)
+    assert report["events_run"] + report["events_skipped"] == len(range(INTERVAL, START, INTERVAL))
+
+
 def test_a_run_whose_densification_runs_whole_is_resumed():
-    with SkipGate(start_iter=START, share=0.25) as gate, pytest.warns(RuntimeWarning, match="runs whole"):
+    with (
+        SkipGate(start_iter=START, share=0.25) as gate,
+        pytest.warns(RuntimeWarning, match="events of iterations 0 to 399"),
+    ):
         whole = Loop().train(gate, events=None)
     assert whole.ran[:START] == list(range(START)) and len(whole.ran) < START + 60
     for until in (100, whole.ran[-20]):
-        with SkipGate(start_iter=START, share=0.25) as first, pytest.warns(RuntimeWarning, match="runs whole"):
+        with (
+            SkipGate(start_iter=START, share=0.25) as first,
+            pytest.warns(RuntimeWarning, match="events of iterations 0 to 399"),
+        ):
             one = Loop().train(first, until, events=None)
             state = json.loads(json.dumps(first.state_dict()))
-        with SkipGate(start_iter=START, share=0.25) as second:
+        again = pytest.warns(RuntimeWarning, match="iterations 101 to 399") if until < START else nullcontext()
+        with SkipGate(start_iter=START, share=0.25) as second, again:
             second.load_state_dict(state)
             other = Loop(one.ran[-1] + 1, one.means.detach(), one.optimizer.state_dict()).train(second, events=None)
         assert one.ran + other.ran == whole.ran

@@ -52,6 +52,19 @@ def test_a_share_of_the_iterations_runs_with_all_that_hangs_on_numbers():
     assert "17 of 60 iterations run (28.3 %)" in gate.summary()
 
 
+@pytest.mark.parametrize("refine_share", [0.25, "auto"])
+@pytest.mark.parametrize("options", [{}, {"always": range(0, 2000, 25)}], ids=["conditions", "always"])
+def test_parts_before_refinement_leave_out_the_same_as_one_loop(refine_share, options):
+    with SkipGate(start_iter=40, refine_share=refine_share) as gate:
+        whole = Loop(end=2000).train(gate, views=VIEWS, **options)
+    loop = Loop()
+    with SkipGate(start_iter=40, refine_share=refine_share) as gate:
+        for loop.begin, loop.end in ((0, 20), (20, 30), (30, 2000)):
+            loop.train(gate, views=VIEWS, **options)
+    assert gate.released is None and len(whole.ran) < 2000
+    assert (loop.ran, loop.saved) == (whole.ran, whole.saved) and torch.equal(loop.value, whole.value)
+
+
 def test_without_larger_steps_they_are_spread_evenly():
     with SkipGate(start_iter=40, refine_share=0.25, compensate=False) as gate:
         loop = Loop().train(gate)

@@ -1,0 +1,197 @@
+"""The verbs of a training loop of the user's own: iterations, backward, step and update."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from skipgs_plug.core.engine import Engine
+from skipgs_plug.core.errors import GateOrderError, SkipGSError
+from skipgs_plug.core.intercept import Original
+from skipgs_plug.core.optimizers import has_pending_gradient, listed
+from skipgs_plug.core.pace.base import EveryNumber, Source
+from skipgs_plug.core.pace.loop_range import LoopRange
+from skipgs_plug.core.views import NOT_READ, view_key
+
+
+class OwnLoop:
+    """Drives an engine by the verbs that a user's loop calls; see the methods of `SkipGate` with these names.
+
+    An error of the gate's own code releases the gate, and the verbs then do the work of a loop without a gate.
+
+    Args:
+        engine: Engine of the gate.
+
+    Attributes:
+        guarded: A block of the gate's own code. An error in it releases the gate, and the loop continues.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self._iteration = iteration = engine.iteration
+        self._giving_up = engine.giving_up
+        self.guarded = self._giving_up.guarded(lambda: iteration.step)
+
+    def iterations(
+        self,
+        numbers: range,
+        source: Source | None,
+        always: Iterable[int],
+        views: Iterable[Any] | None,
+        events: Iterable[int] | None,
+    ) -> LoopRange:
+        """Return the iterations that run.
+
+        Args:
+            numbers: Iterations of the loop.
+            source: Code in which the loop's conditions are read; None to read no conditions.
+            always: Iterations that must run.
+            views: Keys of all training views; None if they are unknown.
+            events: Iterations that densify; None if they are unknown.
+
+        Raises:
+            SkipGSError: See `SkipGate.iterations`.
+        """
+        if not isinstance(numbers, range) or numbers.step != 1:
+            raise SkipGSError("iterations() takes a range that goes up by one, such as range(30_000).")
+        if isinstance(views, str):
+            raise SkipGSError(f"views= takes a list of all names of training views, not the one name {views!r}.")
+        with self.guarded:
+            keys = None if views is None else list(dict.fromkeys(view_key(view) for view in views))
+            return self._engine.pace.follow(numbers, source, always, keys, events)
+        return LoopRange(numbers, EveryNumber(lambda: None))
+
+    def backward(self, loss: Any, view: Any, step: int, signal: Any) -> bool:
+        """Run `loss.backward()`, or skip it; return True when gradients were computed.
+
+        Args:
+            loss: Scalar loss of the view, or a list of losses with a list of keys as `view`.
+            view: Stable key of the view.
+            step: Number of the iteration.
+            signal: Value, or list of values, to decide by.
+
+        Raises:
+            GateOrderError: The verbs were called out of order.
+            SkipGSError: See `SkipGate.backward`.
+        """
+        _check_losses(loss, view)
+        step = int(step)
+        run = Original(_backward_of_sum if isinstance(view, list) else loss.backward)
+        if self._giving_up.reason is None:
+            try:
+                return self._gated_backward(loss, view, step, signal, run)
+            except Exception as error:
+                if run.failed:
+                    raise  # the error comes from the loop's own backward pass
+                self._giving_up.on_error(error, step)
+        self._iteration.begin(step, gated=False)
+        self._iteration.ran = True
+        if not run.made:
+            run(*([loss] if isinstance(view, list) else ()))
+        return True
+
+    def step(self, optimizer: Any, *args: Any) -> bool:
+        """Call `optimizer.step(*args)` if a gradient is pending; return True when it stepped.
+
+        Args:
+            optimizer: One optimizer, or a list or dict of all that step together.
+            *args: Arguments of `optimizer.step`.
+
+        Raises:
+            GateOrderError: `backward` was not called first in this iteration, or the optimizer has stepped in it.
+        """
+        self._require_backward_before("step")
+        optimizers = stepping = listed(optimizer)
+        if self._giving_up.reason is None:
+            stepped = self._iteration.stepped
+            for one in optimizers:
+                if id(one) in stepped:
+                    raise GateOrderError("step() was called twice for one optimizer in this iteration.")
+            stepped.update(map(id, optimizers))
+            if self._engine.config.enabled:  # a disabled gate lets every optimizer step
+                with self.guarded:
+                    stepping = [one for one in optimizers if has_pending_gradient(one)]
+        for one in stepping:
+            one.step(*args)
+        return bool(stepping)
+
+    def update(self) -> None:
+        """End the iteration and free the graph of a skipped backward pass.
+
+        Raises:
+            GateOrderError: `backward` was not called first in this iteration.
+        """
+        self._require_backward_before("update")
+        self._iteration.ended = True
+        with self.guarded:
+            self._engine.free_skipped()
+
+    def _gated_backward(self, loss: Any, view: Any, step: int, signal: Any, run: Original) -> bool:
+        """Do the work of `backward` while the gate is not released; `run` is the loop's own backward pass."""
+        engine, now = self._engine, self._iteration
+        if step != now.step:
+            engine.open_iteration(step)
+        elif now.ended or now.stepped:
+            verb = "update" if now.ended else "step"
+            raise GateOrderError(
+                f"backward() was called after {verb}() in iteration {step}; call backward() for all views of an "
+                "iteration first, and give each iteration its own step number."
+            )
+        if isinstance(view, list):
+            return self._backward_batch(loss, view, signal, run)
+        return engine.gate(self._new_in_iteration(view), signal, run, loss)
+
+    def _backward_batch(self, losses: Any, views: list[Any], signals: Any, run: Original) -> bool:
+        if not len(losses) == len(views) == len(signals):
+            raise SkipGSError(f"{len(views)} view keys came with {len(losses)} losses; give one loss per view.")
+        keys = [self._new_in_iteration(view) for view in views]
+        answers = [self._engine.decide(key, signal) for key, signal in zip(keys, signals, strict=True)]
+        kept = [loss for loss, answer in zip(losses, answers, strict=True) if not answer.skip]
+        if kept:
+            run(kept)
+            self._iteration.ran = True
+            self._engine.rates.ran()
+        self._engine.clock.mark()
+        return bool(kept)
+
+    def _new_in_iteration(self, view: Any) -> str:
+        """Return the key of a view that has had no backward pass in this iteration.
+
+        Before `start_iter` an index on a device is not read: reading it would wait for the device.
+        """
+        keys = self._iteration.keys
+        if isinstance(view, Tensor) and not self._iteration.gated and _is_index_on_device(view):
+            keys.add(NOT_READ)
+            return NOT_READ
+        key = view_key(view)
+        if key in keys:
+            raise GateOrderError(
+                f"backward() was called twice for view {key!r} in iteration {self._iteration.step}; "
+                "give each iteration its own step number."
+            )
+        keys.add(key)
+        return key
+
+    def _require_backward_before(self, verb: str) -> None:
+        if self._giving_up.reason is None and (self._iteration.ended or not self._iteration.keys):
+            raise GateOrderError(f"{verb}() was called before backward() in this iteration.")
+
+
+def _check_losses(loss: Any, view: Any) -> None:
+    batch = isinstance(view, list)
+    if batch and not isinstance(loss, (list, tuple)) and not (isinstance(loss, Tensor) and loss.dim()):
+        raise SkipGSError(f"{len(view)} view keys came with one loss; give one loss per view.")
+    for one in loss if batch else (loss,):
+        if not hasattr(one, "backward"):
+            raise SkipGSError(f"backward() needs the loss itself, a tensor, not {type(one).__name__}.")
+
+
+def _is_index_on_device(view: Tensor) -> bool:
+    return view.numel() == 1 and not view.is_floating_point() and not view.is_cpu
+
+
+def _backward_of_sum(losses: Iterable[Tensor]) -> None:
+    torch.stack(list(losses)).sum().backward()
