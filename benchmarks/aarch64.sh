@@ -28,7 +28,7 @@ if ! [ -e "$python" ]; then
         pygments sortedcontainers typing_extensions sympy mpmath networkx jinja2 markupsafe fsspec filelock
     for wheel in "$folder"/wheels/*.whl; do unzip -qo "$wheel" -d "$site"; done
     # Tests start children with sys.executable, and the kernel of this machine runs no program for aarch64 by itself.
-    echo 'import os, sys; sys.executable = os.environ["EMULATED_PYTHON"]' >"$site/sitecustomize.py"
+    echo 'import os, sys; sys.executable = os.environ.get("EMULATED_PYTHON", sys.executable)' >"$site/emulated.pth"
     printf '#!/bin/sh\nexec qemu-aarch64-static -L %s %s/usr/bin/python3.11 "$@"\n' "$root" "$root" >"$python"
     chmod +x "$python"
 fi
