@@ -20,6 +20,7 @@ from skipgs_plug.adapters.loop_names import (
     evaluated,
     is_option,
     learn_names,
+    named,
     offset_of,
     outermost_loops,
     scope_inside,
@@ -29,7 +30,14 @@ from skipgs_plug.adapters.loop_names import (
 )
 from skipgs_plug.adapters.trainer_code import Part, TrainerCode
 from skipgs_plug.core.source.conditions import case_test
-from skipgs_plug.core.source.functions import callbacks, called_function, closure, syntax_of, undecorated
+from skipgs_plug.core.source.functions import (
+    callbacks,
+    called_function,
+    closure,
+    syntax_of,
+    undecorated,
+    without_partial,
+)
 from skipgs_plug.core.source.substitution import returned
 
 NUMBER = "iteration"  # variable that holds the iteration's number in every loop of the Inria family
@@ -179,7 +187,8 @@ class CallReader:
     def _follow(self, name: str, call: ast.Call, scope: Scope, end: int | None) -> None:
         if name in self._stops:
             return
-        function = called_function(call.func, scope.values, lambda place: value_of(place, scope), scope.code)
+        found = called_function(call.func, scope.values, lambda place: value_of(place, scope), scope.code)
+        call, function = without_partial(call, found, lambda own, value: named(own, value, scope))
         plain = undecorated(function)
         if plain is None or plain not in self.trainer:
             return
@@ -244,7 +253,8 @@ class CallReader:
 
     def _end_of_result(self, call: ast.Call, scope: Scope, holds: bool) -> int | None:
         """Return the same for the result of a function of the trainer that only returns a condition."""
-        function = called_function(call.func, scope.values, lambda place: value_of(place, scope), scope.code)
+        found = called_function(call.func, scope.values, lambda place: value_of(place, scope), scope.code)
+        call, function = without_partial(call, found, lambda own, value: named(own, value, scope))
         plain = undecorated(function)
         syntax = None if plain is None or plain not in self.trainer else syntax_of(plain)
         result = None if syntax is None else returned(syntax.body)

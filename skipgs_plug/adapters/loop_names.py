@@ -77,6 +77,12 @@ def learn_names(statement: ast.stmt, scope: Scope) -> None:
             scope.meanings[target.id] = value
 
 
+def named(name: str, value: Any, scope: Scope) -> ast.expr:
+    """Give a value a name, and return the name as an expression."""
+    scope.known[name] = value
+    return ast.Name(name, ast.Load())
+
+
 def value_of(node: ast.expr, scope: Scope) -> Any:
     """Return the value of an expression of names, attributes, constants, operators and `PURE` functions; else None."""
     unknown = scope.numbers | scope.varying.difference(scope.known)

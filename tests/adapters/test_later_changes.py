@@ -32,11 +32,17 @@ PRUNE = "gaussians.prune_points(torch.zeros(30, dtype=torch.bool))"
 
 BEFORE = f"""pruned, stages = False, {{24: "a", 28: "b"}}
     hooks = [lambda step: {PRUNE} if step < 30 else None]
-    trimmer, trim = Trimmer(gaussians, opt), gaussians.prune_points"""
+    trimmer, trim = Trimmer(gaussians, opt), gaussians.prune_points
+    trim_twice = functools.partial(trim_at, gaussians, others=(26,), opt=opt)"""
 FUNCTIONS = """
+import functools
+
 def is_due(step, opt):
     if step > opt.prune_until_iter: return False
     return step % 3 == 0
+
+def trim_at(gaussians, step, opt, others):
+    if step in others or step == opt.prune_until_iter: gaussians.prune_points(torch.zeros(30, dtype=torch.bool))
 
 class Trimmer:
     def __init__(self, gaussians, opt): self.gaussians, self.stages = gaussians, {24, 28}
@@ -71,6 +77,7 @@ class Trimmer:
         (f"match iteration:\n                case n if n < opt.prune_until_iter: {PRUNE}", 30),
         ("for hook in hooks: hook(iteration)", 30),
         ("trimmer(iteration)", 29),
+        ("trim_twice(iteration)", 31),
         ("if iteration < 30: trim(torch.zeros(30, dtype=torch.bool))", 30),
         (f"if (step := iteration) < 30 and step % 2: {PRUNE}", 30),
     ],

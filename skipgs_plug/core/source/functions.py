@@ -40,6 +40,30 @@ def called_function(
     return MethodType(own, found) if isinstance(own, FunctionType) else found
 
 
+def without_partial(call: ast.Call, function: Any, named: Callable[[str, Any], ast.expr]) -> tuple[ast.Call, Any]:
+    """Return the call that a `functools.partial` makes, and its function; another function and its call as they are.
+
+    Args:
+        call: The call in the source.
+        function: The function that it names.
+        named: Gives a value a name, and returns the name as an expression.
+    """
+    if not isinstance(function, functools.partial):
+        return call, function
+    place, given = ast.unparse(call.func), {keyword.arg for keyword in call.keywords}
+
+    def at_call(part: str, value: Any) -> ast.expr:
+        return ast.copy_location(named(f"{place}.{part}", value), call)
+
+    first = [at_call(f"args[{index}]", value) for index, value in enumerate(function.args)]
+    further = [
+        ast.keyword(name, at_call(f"keywords[{name!r}]", value))
+        for name, value in function.keywords.items()
+        if name not in given
+    ]
+    return ast.Call(call.func, [*first, *call.args], [*call.keywords, *further]), function.func
+
+
 def _named(
     function: ast.expr, names: Mapping[str, Any], value: Callable[[ast.expr], Any], code: CodeType | None
 ) -> Any:

@@ -10,7 +10,14 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from types import CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
-from skipgs_plug.core.source.functions import callbacks, called_function, closure, read_syntax, undecorated
+from skipgs_plug.core.source.functions import (
+    callbacks,
+    called_function,
+    closure,
+    read_syntax,
+    undecorated,
+    without_partial,
+)
 from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.run_options import assigned_globals
 
@@ -96,10 +103,16 @@ class InlinedFunctions:
         holders = {text.rpartition(".")[0] for text in numbers}
         for node in nodes:
             if isinstance(node, ast.Call) and self._receives(node, numbers, holders):
-                function = called_function(node.func, self._names, self._value, self._open[-1])
+                found = called_function(node.func, self._names, self._value, self._open[-1])
+                call, function = without_partial(node, found, self._named)
                 plain = undecorated(function)
                 if plain is not None and plain.__code__ not in self._open and plain in self._project:
-                    self._read(node, function, plain, numbers)
+                    read = self._read(call, function, plain, numbers)
+                    if read is not None:
+                        self.by_call[id(node)] = InlinedFunction(read, plain.__code__)
+                        self._open.append(plain.__code__)
+                        self._follow(read, set(numbers))
+                        self._open.pop()
 
     def _held(self, loop: ast.For) -> list[ast.expr]:
         """Return names for what a loop over functions or objects runs with, such as callbacks; none if unknown."""
@@ -146,17 +159,17 @@ class InlinedFunctions:
                 return held.get(key) if isinstance(held, dict) else None
         return None
 
-    def _read(self, call: ast.Call, function: Any, plain: FunctionType, numbers: set[str]) -> None:
+    def _read(
+        self, call: ast.Call, function: Any, plain: FunctionType, numbers: Collection[str]
+    ) -> list[ast.stmt] | None:
+        """Return the statements of a function, in names of the loop; None if they cannot be read, or lie too deep."""
         syntax = read_syntax(plain) if len(self._open) <= MAX_DEPTH else None
         if syntax is None:
-            return
+            return None
         renamed = _Renamed(self._meanings(call, function, plain, syntax, numbers))
         body = [renamed.visit(statement) for statement in syntax.body]
         _Repeated(self._held).visit_all(body)
-        self.by_call[id(call)] = InlinedFunction(body, plain.__code__)
-        self._open.append(plain.__code__)
-        self._follow(body, set(numbers))
-        self._open.pop()
+        return body
 
     def _meanings(
         self, call: ast.Call, function: Any, plain: FunctionType, syntax: ast.FunctionDef, numbers: Collection[str]

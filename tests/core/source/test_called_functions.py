@@ -1,5 +1,6 @@
 """Conditions in functions that a loop calls with its number are those of the loop, if the functions are the user's."""
 
+import functools
 import importlib.util
 import random
 from types import SimpleNamespace
@@ -76,6 +77,20 @@ def test_objects_that_are_called_and_lambdas():
                 print("due")
 
     assert numbers(loop) == [66, 80, 94, 98, 99]
+
+
+def test_partial_functions():
+    def save(folder, every, step):
+        if step % every == 0:
+            print(folder)
+
+    def loop(stop):
+        often, rarely = functools.partial(save, "out", 40), functools.partial(save, "out", every=60)
+        for step in stop(often=often, rarely=rarely):
+            often(step)
+            rarely(step=step)
+
+    assert numbers(loop) == [60, 80]
 
 
 def test_each_of_several_callbacks_is_read():
