@@ -16,6 +16,7 @@ import torch
 from torch.overrides import TorchFunctionMode
 
 from skipgs_plug.compat.stand_ins import stand_ins
+from skipgs_plug.scripts.threads import also_in_threads
 
 
 class HostEvent:
@@ -73,12 +74,21 @@ REPLACED: dict[str, Any] = {
 
 @contextmanager
 def cuda_on_cpu() -> Iterator[None]:
-    """Redirect CUDA to the CPU inside the block, in this thread."""
-    # Optimizers import dynamo, which lists the functions of torch.cuda once and fails if they are replaced by then.
+    """Redirect CUDA to the CPU inside the block, and in threads that are started there."""
+    # `_in_one_thread` first: it imports dynamo, which lists the functions of torch.cuda and fails if they are replaced.
+    with (
+        _in_one_thread(),
+        stand_ins([*_places(), (torch, "load", _load_on_cpu(torch.load))]),
+        also_in_threads(_in_one_thread),
+    ):
+        yield
+
+
+@contextmanager
+def _in_one_thread() -> Iterator[None]:
     dynamo = importlib.import_module("torch._dynamo")
-    replaced = [*_places(), (torch, "load", _load_on_cpu(torch.load))]
     # The compiler would ask CUDA for its random state. Uncompiled functions give the same results.
-    with stand_ins(replaced), _CpuPlacement(), dynamo.config.patch(disable=True):
+    with _CpuPlacement(), dynamo.config.patch(disable=True):
         yield
 
 
