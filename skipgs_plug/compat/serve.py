@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import ModuleType
 
+from .child_processes import also_in_children
 from .nvidia_smi import one_free_gpu
 from .packages import usable
 
@@ -61,8 +63,8 @@ _WITHOUT_TORCHVISION: _Source = {"lpips": (".lpips", ("LPIPS",)), "lpipsPyTorch"
 def serve(family: str) -> Iterator[None]:
     """Serve the extension modules of one family of trainers with the CPU rasterizer, inside the `with` statement.
 
-    If torchvision cannot be imported, the few functions of it that these trainers call are served too. Modules of the
-    same names that were imported before are restored at the end.
+    Processes that are spawned there are served too. If torchvision cannot be imported, the few functions of it that
+    these trainers call are also served. Modules of the same names that were imported before are restored at the end.
 
     Args:
         family: A key of `FAMILIES`.
@@ -82,7 +84,8 @@ def serve(family: str) -> Iterator[None]:
         # `_extras` first: it imports torchmetrics, which must not find the served part of torchvision.
         with _extras(family):
             sys.modules.update(served)
-            yield
+            with also_in_children(functools.partial(serve, family)):
+                yield
     finally:
         for name, module in before.items():
             if module is None:

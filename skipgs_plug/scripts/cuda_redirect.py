@@ -15,7 +15,9 @@ from typing import Any
 import torch
 from torch.overrides import TorchFunctionMode
 
+from skipgs_plug.compat.child_processes import also_in_children
 from skipgs_plug.compat.stand_ins import stand_ins
+from skipgs_plug.scripts.threads import also_in_threads
 
 
 class HostEvent:
@@ -73,12 +75,22 @@ REPLACED: dict[str, Any] = {
 
 @contextmanager
 def cuda_on_cpu() -> Iterator[None]:
-    """Redirect CUDA to the CPU inside the block, in this thread."""
-    # Optimizers import dynamo, which lists the functions of torch.cuda once and fails if they are replaced by then.
+    """Redirect CUDA to the CPU inside the block, and in threads and processes that are started there."""
+    # `_in_one_thread` first: it imports dynamo, which lists the functions of torch.cuda and fails if they are replaced.
+    with (
+        _in_one_thread(),
+        stand_ins([*_places(), (torch, "load", _load_on_cpu(torch.load))]),
+        also_in_threads(_in_one_thread),
+        also_in_children(cuda_on_cpu),
+    ):
+        yield
+
+
+@contextmanager
+def _in_one_thread() -> Iterator[None]:
     dynamo = importlib.import_module("torch._dynamo")
-    replaced = [*_places(), (torch, "load", _load_on_cpu(torch.load))]
     # The compiler would ask CUDA for its random state. Uncompiled functions give the same results.
-    with stand_ins(replaced), _CpuPlacement(), dynamo.config.patch(disable=True):
+    with _CpuPlacement(), dynamo.config.patch(disable=True):
         yield
 
 
@@ -97,7 +109,8 @@ def exclusive_cores() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        yield
+        with also_in_children(exclusive_cores):
+            yield
     finally:
         torch.set_num_threads(before)
 

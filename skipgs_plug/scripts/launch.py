@@ -53,7 +53,7 @@ def run_in_script(
 def _run(
     program: _Program, attach: Attach | None, instead: Callable[[str, dict[str, Any]], None] | None, on_cpu: bool
 ) -> int:
-    with _as_main_program(program), _whole_checkpoints():
+    with _as_main_program(program), _known_to_processes(), _whole_checkpoints():
         try:
             names = {} if attach is None else attach()
             if instead is None:
@@ -177,6 +177,22 @@ def _as_main_program(program: _Program) -> Iterator[None]:
             yield
     finally:
         sys.argv, sys.stdout = argv, stdout
+
+
+@contextmanager
+def _known_to_processes() -> Iterator[None]:
+    """Let the script take objects of its own classes from processes that it spawned.
+
+    These processes call the script `__mp_main__`. In this process, that name would mean skipgs-plug's own main module.
+    """
+    script = types.ModuleType("__mp_main__")
+    vars(script)["__getattr__"] = lambda name: getattr(sys.modules["__main__"], name)
+    before = sys.modules["__mp_main__"]
+    sys.modules["__mp_main__"] = script
+    try:
+        yield
+    finally:
+        sys.modules["__mp_main__"] = before
 
 
 @contextmanager

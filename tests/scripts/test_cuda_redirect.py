@@ -1,5 +1,7 @@
 """CUDA requests land on the CPU inside the block, and nothing is left of it outside."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import torch
 
@@ -90,6 +92,17 @@ def test_compiled_functions_run_uncompiled():
 
     with cuda_on_cpu():
         assert doubled(torch.ones(2, device="cuda")).tolist() == [2.0, 2.0]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # PyTorch's own, on loading its compiler
+def test_threads_are_redirected_too():
+    def train():
+        leaf = torch.ones(2, device="cuda", requires_grad=True)
+        torch.compile(lambda: leaf.cuda().sum())().backward()
+        return leaf.grad.tolist()
+
+    with cuda_on_cpu(), ThreadPoolExecutor(1) as pool:
+        assert pool.submit(train).result() == [1.0, 1.0]
 
 
 def resolved(name: str, default: object) -> object:

@@ -71,6 +71,23 @@ def test_traceback_starts_in_the_script(checkout, capfd):
     assert "runpy" not in error and "launch.py" not in error
 
 
+def test_objects_of_the_scripts_classes_come_back_from_its_processes(checkout, capfd):
+    script = write(
+        checkout,
+        "import multiprocessing\n"
+        "from concurrent.futures import ProcessPoolExecutor\n"
+        "class View:\n"
+        "    number = 3\n"
+        "if __name__ == '__main__':\n"
+        "    with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as pool:\n"
+        "        print(type(pool.submit(View).result(timeout=60)) is View)\n",
+    )
+    before = sys.modules["__mp_main__"]
+    assert run_script([script]) == 0
+    assert capfd.readouterr().out == "True\n"
+    assert sys.modules["__mp_main__"] is before
+
+
 def test_our_own_errors_pass_through(checkout):
     script = write(checkout, "from skipgs_plug.core.errors import SkipGSError\nraise SkipGSError('wrong')\n")
     with pytest.raises(SkipGSError, match="wrong"):
