@@ -42,7 +42,10 @@ class NonFiniteGuard:
         if self._mode == "raise":
             raise BrokenTrainingError(f"{what}: the trainer computed this value; check that image and camera.")
         if self.in_a_row >= max(MIN_IN_A_ROW, n_views):
-            raise DivergedError(f"{what}, like the {self.in_a_row - 1} losses before it")
+            raise DivergedError(
+                f"{what}, like the {self.in_a_row - 1} losses before it; "
+                "if they stay so, resume from a checkpoint with lower learning rates"
+            )
         if view not in self._warned:
             self._warned.add(view)
             then = "its backward is skipped" if self._mode == "skip" else "its backward runs all the same"

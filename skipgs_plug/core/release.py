@@ -87,8 +87,8 @@ class Release:
 
     def release(self, error: Exception, step: int | None) -> None:
         """Release the gate after an error of which all processes know, and warn with its message."""
-        foreseen = isinstance(error, SkipGSError)
-        why = str(error) if foreseen else f"{type(error).__name__}: {error}; report it to the project skipgs_plug"
+        expected = isinstance(error, SkipGSError)
+        why = str(error) if expected else f"{type(error).__name__}: {error}; report it to the project skipgs_plug"
         where = "" if step is None else f" in iteration {step}"
         log.debug("The error that releases the gate:", exc_info=error)
         self.let_go(f"The gate is released{where}, and training goes on without it, in all its iterations ({why})")
