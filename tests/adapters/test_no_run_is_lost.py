@@ -13,7 +13,6 @@ from skipgs_plug.core import caution, drift_check
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.pace.optimizer_steps import OptimizerSteps
 from skipgs_plug.core.pace.phased import Phased
-from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.policy import SkipPolicy
 from tests.entries import ENTRIES
 
@@ -64,7 +63,7 @@ def test_an_error_at_any_entry_point_releases_the_gate_once(case, entry, monkeyp
     assert max(log.values) == case.module.LAST and log.other_backwards == plain.other_backwards
 
 
-WAYS = {"number": (Phased, "_runs"), "step": (ScaledRates, "_scale"), "end of a step": (OptimizerSteps, "end")}
+WAYS = {"number": (Phased, "_runs"), "step": (OptimizerSteps, "begin"), "end of a step": (OptimizerSteps, "end")}
 
 
 @pytest.mark.parametrize("way", WAYS)

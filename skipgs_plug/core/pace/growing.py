@@ -19,7 +19,7 @@ from skipgs_plug.core.pace.needs import (
     positions_part,
     share_factor,
 )
-from skipgs_plug.core.pace.parts import GrowingParts
+from skipgs_plug.core.pace.parts import UNCHANGED, GrowingParts
 from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.sampling import Sampling
@@ -29,7 +29,6 @@ MEASURED = 20
 # Number of these steps after each event that ran. The share falls as the scene grows, on bonsai from 46 % to 30 %. A
 # few steps are precise enough to count visits, and each measured step can cost a read of the GPU.
 MEASURED_AGAIN = 8
-UNCHANGED = 1.0, GrowingParts(1.0, 1.0)  # factor and parts of the trainer's own steps
 
 
 class Growing(Phase):
@@ -220,7 +219,7 @@ class Growing(Phase):
         """Return the factor on learning rates in iteration `number`, and the parts of opacities and positions."""
         events = self.events
         if self.share is None or self._visible is None or events is None or not self._config.compensates:
-            return UNCHANGED
+            return 1.0, UNCHANGED
         assert self._first is not None
         ends = number >= self._first + self._length  # whether only prunes and terms of the loss follow
         share = max(self._share_now or self.share, self._must_shares[ends])

@@ -21,6 +21,9 @@ OPACITIES = ("opacity", "opacities")
 # Largest factor on the rate of parameters without a row for each Gaussian (exposures, poses, networks). They must not
 # follow a model that is far off for a while.
 OTHERS_AT_MOST = 0.25
+# Largest beta2 of Adam during a longer step. The gradient of a single view can move a parameter by its rate divided by
+# the root of 1 - beta2: 32 times the rate at the usual 0.999, which is too far with larger rates, 7 times at 0.98.
+SQUARES_KEPT = 0.98
 GAUSSIAN_SHAPES = ((), (1,), (2,), (3,), (4,))  # shapes of one Gaussian's parameters, except colours [K, 3]
 
 
@@ -116,15 +119,10 @@ class GroupInfo:
         """Whether a parameter has a gradient."""
         return any(param.grad is not None for param in self._params)
 
-    def shorter(self, betas: Any, second: float) -> Any:
-        """Return the betas of a longer step.
-
-        Args:
-            betas: The trainer's betas.
-            second: Largest value of the second of them.
-        """
+    def shorter(self, betas: Any) -> Any:
+        """Return the betas of a longer step, given the trainer's."""
         first, squares, *others = betas
-        self.betas, self.short = betas, (first, min(squares, second), *others)
+        self.betas, self.short = betas, (first, min(squares, SQUARES_KEPT), *others)
         return self.short
 
 
@@ -148,12 +146,30 @@ class GrowingParts(NamedTuple):
     """How two kinds of parameters share in longer steps while the scene grows.
 
     Attributes:
-        opacities: Multiple of their rate that opacities take.
+        opacities: Multiple of their rate that opacities take, at least 1.
         positions: Multiple of the common factor that positions take.
     """
 
     opacities: float
     positions: float
+
+
+UNCHANGED = GrowingParts(1.0, 1.0)  # with a factor of 1, the trainer's own steps
+
+
+class Division(NamedTuple):
+    """How groups share in the factor on learning rates, as far as it is the same for all optimizers.
+
+    Attributes:
+        rows: Number of Gaussians; 0 if it is not known. Only parameters with as many rows take larger steps.
+        growing: While the scene grows, the parts of opacities and positions. Parameters without a row for each Gaussian
+            then keep their rates. None in refinement, in which opacities are never raised.
+        raised: Whether the factor is larger than 1 while the scene grows. True in refinement.
+    """
+
+    rows: int
+    growing: GrowingParts | None
+    raised: bool
 
 
 class OptimizerInfo:
@@ -169,10 +185,10 @@ class OptimizerInfo:
         positions: Parameters that may be positions [N, 3].
         known_positions: Positions [N, 3], if a name says so, which tell the number of Gaussians; else None.
         scaled: The groups that are scaled; see `divide`.
-        rows, growing: The arguments of `divide` that `scaled` was found for.
+        division: The argument of `divide` that `scaled` was found for.
     """
 
-    __slots__ = ("_only", "groups", "growing", "known_positions", "name", "positions", "rows", "scaled")
+    __slots__ = ("_only", "division", "groups", "known_positions", "name", "positions", "scaled")
 
     def __init__(self, optimizer: torch.optim.Optimizer, name: str | None) -> None:
         self.name = name
@@ -181,8 +197,7 @@ class OptimizerInfo:
         named = [param for group in self.groups if group.named_positions for param in group.positions]
         self.known_positions = named[0] if len(named) == 1 else None
         self.scaled: list[ScaledGroup] = []
-        self.rows: int | None = None
-        self.growing: GrowingParts | None = None
+        self.division: Division | None = None
         self._only = self.groups[0] if len(self.groups) == 1 and self.groups[0].first is not None else None
 
     def fits(self, optimizer: torch.optim.Optimizer) -> bool:
@@ -193,23 +208,21 @@ class OptimizerInfo:
             return groups[0] is only.group and len(now) == 1 and now[0] is only.first
         return len(groups) == len(self.groups) and all(map(_is_about, self.groups, groups))
 
-    def divide(self, rows: int, growing: GrowingParts | None) -> None:
-        """Find `scaled`.
-
-        Args:
-            rows: Number of Gaussians; 0 if it is not known. Only parameters with as many rows take larger steps.
-            growing: While the scene grows, the parts of opacities and positions. Parameters without a row for each
-                Gaussian then keep their rates. None in refinement, in which opacities are never raised.
-        """
-        self.rows, self.growing = rows, growing
-        self.scaled = [one for info in self.groups if (one := _scaled(info, rows, growing)) is not None]
+    def divide(self, division: Division) -> None:
+        """Find the groups that are scaled, and their shares."""
+        self.division = division
+        self.scaled = [one for info in self.groups if (one := _scaled(info, division)) is not None]
 
 
-def _scaled(info: GroupInfo, rows: int, growing: GrowingParts | None) -> ScaledGroup | None:
+def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
+    rows, growing, raised = division
     if not info.of_gaussians(rows):
         return ScaledGroup(info.group, OTHERS_AT_MOST, 1.0, None) if growing is None else None
     if info.part is None:
-        return ScaledGroup(info.group, 1.0 if growing is None else growing.opacities, 1.0, info)
+        times = 1.0 if growing is None else growing.opacities
+        return ScaledGroup(info.group, times, 1.0, info) if growing is None or times > 1.0 else None
+    if not raised:
+        return None
     part = info.part if growing is None or not info.named_positions else growing.positions
     return ScaledGroup(info.group, part, math.inf, info)
 

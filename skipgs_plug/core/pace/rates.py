@@ -15,9 +15,8 @@ from torch.utils.hooks import RemovableHandle
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.optimizers import Optimizers, with_names
-from skipgs_plug.core.pace.optimizer_steps import SQUARES_KEPT, OptimizerSteps
-from skipgs_plug.core.pace.parts import GrowingParts, OptimizerInfo
-from skipgs_plug.core.pace.step_reads import shorter_memory
+from skipgs_plug.core.pace.optimizer_steps import OptimizerSteps
+from skipgs_plug.core.pace.parts import UNCHANGED, Division, GrowingParts, OptimizerInfo, ScaledGroup
 from skipgs_plug.core.pace.visibility import VISIBLE, Visibility
 
 # Least share of the iterations that steps are made longer for. With a smaller share, steps that conserve the whole path
@@ -80,8 +79,7 @@ class ScaledRates:
         self.visibility = Visibility()
         self.on_error: Callable[[Exception], None] | None = None
         self._factor: float | None = None
-        self._growing: GrowingParts | None = None
-        self._only_look = False
+        self._division = Division(0, None, True)
         self._rows = self._rows_now = 0  # number of Gaussians in the previous and in this iteration; 0 if unknown
         self._thread = get_ident()
         self._under_way: list[OptimizerSteps] = []  # each was called by the step before it in the list
@@ -97,8 +95,7 @@ class ScaledRates:
         Raises:
             SkipGSError: Another gate scales the same steps; see `scale`.
         """
-        self.scale(1.0)
-        self._only_look = True
+        self.scale(1.0, UNCHANGED)
 
     def scale(self, factor: float, growing: GrowingParts | None = None) -> None:
         """Scale the next steps in the thread that calls this, which is the training thread; see `group_part`.
@@ -106,7 +103,7 @@ class ScaledRates:
         Args:
             factor: Factor on learning rates.
             growing: While the scene grows, the parts of opacities and positions. `factor` is at least 1 then, and
-                parameters without a row for each Gaussian keep their rates. None in refinement.
+                parameters that it does not make longer steps for keep their settings. None in refinement.
 
         Raises:
             SkipGSError: Another gate scales steps in this thread, and one of the two does not know its own optimizers.
@@ -122,8 +119,9 @@ class ScaledRates:
                     "Another gate makes steps larger in this thread, and each gate would scale the steps of both: "
                     "detach() it first, or train in separate threads."
                 )
-        self._factor, self._growing, self._only_look, self._thread = factor, growing, False, thread
+        self._factor, self._thread = factor, thread
         self._rows, self._rows_now = self._rows_now or self._rows, 0
+        self._divide(self._rows, growing, growing is None or factor != 1.0)
         if not self._handles:
             _hooked.append(self)
             self._handles = [register_optimizer_step_pre_hook(self._before_step)]
@@ -177,10 +175,22 @@ class ScaledRates:
             return
         try:
             step = self._steps.get(id(optimizer)) or self._begin_with(optimizer)
-            if step is not None:
-                step.depth += 1
-                if step.depth == 1:  # a step can call the step of its base class
-                    self._scale(optimizer, step, factor)
+            if step is None:
+                return
+            step.depth += 1
+            if step.depth > 1:  # a step can call the step of its base class
+                return
+            if self._under_way:
+                self._pass_on(optimizer)
+            info = step.info
+            if not info.fits(optimizer):
+                info = step.info = OptimizerInfo(optimizer, info.name)
+            if info.positions:
+                self._count(info)
+            if info.division is not self._division:
+                info.divide(self._division)
+            self._unstepped = 0
+            step.begin(optimizer, self._not_begun(info.scaled) if self._under_way else info.scaled, factor)
         except Exception as error:
             self._failed(error)
 
@@ -190,47 +200,25 @@ class ScaledRates:
             raise error
         self.on_error(error)
 
-    def _scale(self, optimizer: torch.optim.Optimizer, step: OptimizerSteps, factor: float) -> None:
-        under_way = self._under_way
-        if under_way:
-            self._pass_on(optimizer)
-        info = step.info
-        if not info.fits(optimizer):
-            info = step.info = OptimizerInfo(optimizer, info.name)
-        self._unstepped = 0
+    def _count(self, info: OptimizerInfo) -> None:
+        """Count the Gaussians, and those that the view shows, in positions that are about to step."""
         if not self.visibility.complete:
             self.visibility.see(info.positions)
         if info.known_positions is not None:
-            rows = self._rows = self._rows_now = info.known_positions.shape[0]
+            self._rows = self._rows_now = info.known_positions.shape[0]
         else:  # in groups without names, positions of cameras have the shape of positions of Gaussians, but fewer rows
-            for param in info.positions:
-                if param.shape[0] > self._rows_now:
-                    self._rows_now = param.shape[0]
-            rows = self._rows_now if self._rows_now > self._rows else self._rows
-        if info.rows != rows or info.growing != self._growing:
-            info.divide(rows, self._growing)
-        scaled = [] if self._only_look else info.scaled
-        if factor == 1.0 and self._growing is not None:  # only opacities, which have no part, are scaled
-            scaled = [one for one in scaled if one.longer is not None and one.longer.part is None]
-        if under_way:  # an optimizer can wrap another one that has the same groups
-            begun = {id(group) for other in under_way for group, _, _ in other.before}
-            scaled = [one for one in scaled if id(one.group) not in begun]
-        under_way.append(step)
-        before = step.before
-        for group, part, most, longer in scaled:
-            times = part * (factor if factor < most else most)
-            rate, betas = group.get("lr"), group.get("betas")
-            before.append((group, rate, betas))
-            if betas is not None and longer is not None:
-                group["betas"] = longer.short if betas is longer.betas else longer.shorter(betas, SQUARES_KEPT)
-                if step.memory_stays:
-                    times = max(min(times, 1.0), times * shorter_memory(betas, SQUARES_KEPT))
-            if rate is not None:
-                group["lr"] = rate * times
-            if not step.judged and longer is not None and times != 1.0 and longer.has_gradient():
-                step.longer.append(group)
-        if step.longer or step.literal is not None:
-            step.prepare(optimizer)
+            self._rows_now = max(self._rows_now, *(param.shape[0] for param in info.positions))
+        self._divide(max(self._rows_now, self._rows), self._division.growing, self._division.raised)
+
+    def _divide(self, rows: int, growing: GrowingParts | None, raised: bool) -> None:
+        """Set the division; an equal one stays the same object, so that optimizers compare it fast."""
+        if (rows, growing, raised) != self._division:
+            self._division = Division(rows, growing, raised)
+
+    def _not_begun(self, scaled: list[ScaledGroup]) -> list[ScaledGroup]:
+        """Leave out groups of steps that are under way: an optimizer can wrap another one that has the same groups."""
+        begun = {id(group) for other in self._under_way for group, _, _ in other.before}
+        return [one for one in scaled if id(one.group) not in begun]
 
     def _begin_with(self, optimizer: torch.optim.Optimizer) -> OptimizerSteps | None:
         """Create `OptimizerSteps` for an optimizer that steps for the first time; None if it is not scaled."""
@@ -252,10 +240,9 @@ class ScaledRates:
 
     def _pass_on(self, optimizer: torch.optim.Optimizer) -> None:
         """Stop watching outer steps that share groups with this optimizer, which steps inside them."""
-        own = {id(group) for group in optimizer.param_groups}
         for other in self._under_way:
-            if other.watched is not None and any(id(one) in own or id(one.group) in own for one in other.watched):
-                other.stop_watching()
+            if other.own is not None and other.own.shares_groups(optimizer.param_groups):
+                other.own.stop_watching()
 
     def _watch(self, optimizer: torch.optim.Optimizer, step: OptimizerSteps) -> list[RemovableHandle]:
         """Add the hooks that restore the trainer's settings before other code reads them."""

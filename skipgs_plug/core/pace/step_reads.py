@@ -11,6 +11,8 @@ from typing import Any
 
 import torch
 
+from skipgs_plug.core.pace.parts import SQUARES_KEPT
+
 MISSING = object()
 
 
@@ -92,16 +94,15 @@ def is_torchs(optimizer: torch.optim.Optimizer) -> bool:
     return str(getattr(inspect.unwrap(type(optimizer).step), "__module__", "")).startswith("torch.optim")
 
 
-def shorter_memory(betas: tuple[Any, ...], second: float) -> float:
-    """Return the factor on the rate that bounds a step as a lower beta2 does, for an optimizer that keeps its beta2.
+def shorter_memory(betas: tuple[Any, ...]) -> float:
+    """Return the factor on the rate that bounds a step as `SQUARES_KEPT` does, for an optimizer that keeps its beta2.
 
     The gradient of one view moves a parameter by its rate divided by the root of 1 - beta2 at most.
 
     Args:
         betas: The optimizer's betas.
-        second: The lower beta2.
     """
-    return min(1.0, math.sqrt((1.0 - betas[1]) / (1.0 - second))) if betas[1] > second else 1.0
+    return min(1.0, math.sqrt((1.0 - betas[1]) / (1.0 - SQUARES_KEPT))) if betas[1] > SQUARES_KEPT else 1.0
 
 
 class LiteralBetas:
@@ -113,16 +114,14 @@ class LiteralBetas:
 
     Args:
         optimizer: The optimizer.
-        betas: The pair that its step passes.
-        second: The new second number.
+        betas: The pair that its step passes. The second number becomes `SQUARES_KEPT`.
 
     Attributes:
         replaced: Number of calls so far in which the pair was replaced.
     """
 
-    def __init__(self, optimizer: torch.optim.Optimizer, betas: tuple[float, float], second: float) -> None:
+    def __init__(self, optimizer: torch.optim.Optimizer, betas: tuple[float, float]) -> None:
         self._betas = (float(betas[0]), float(betas[1]))
-        self._second = second
         self.replaced = 0
         step = inspect.unwrap(type(optimizer).step)
         self._globals: dict[str, Any] = getattr(step, "__globals__", {})
@@ -143,10 +142,10 @@ class LiteralBetas:
         given = list(args)
         for index, value in enumerate(args):
             if isinstance(value, tuple) and value[:2] == self._betas:
-                given[index] = (value[0], self._second, *value[2:])
+                given[index] = (value[0], SQUARES_KEPT, *value[2:])
                 break
             if _is_number(value) and (value, *args[index + 1 : index + 2]) == self._betas:
-                given[index + 1] = self._second
+                given[index + 1] = SQUARES_KEPT
                 break
         else:
             return function(*args, **kwargs)
