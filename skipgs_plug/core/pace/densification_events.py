@@ -93,9 +93,9 @@ class DensificationEvents:
         else:
             self._behind += 1
 
-    def skipped(self, number: int) -> None:
-        """Count an iteration that is left out, with its event if it has one."""
-        self.left_out += number in self._known
+    def skipped(self) -> None:
+        """Count an event that is left out."""
+        self.left_out += 1
 
     @property
     def grown(self) -> int:

@@ -146,29 +146,26 @@ class Growing(Phase):
             self._rates.visibility.restart()  # the grown scene decides how long steps are in refinement
 
     def runs(self, number: int) -> bool:
-        assert self.events is not None and self._first is not None
+        events = self.events
+        assert events is not None
         self._settle()
-        assert self.share is not None
-        if number in self.events:
-            self.events.rows = distributed.largest(self._rates.rows)  # ranks leave out the same events
-            self._rows_at_first = self._rows_at_first or self.events.rows
-            if self._auto and self._visible is not None:
-                wanted = min(1.0, LEAST_GROWING_SHARE * share_factor(self.events.growth) * self.stretch)
-                self._share_now = max(self.share, wanted) if self._has_room(number) else self.share
-        must, barred, needed = number in self._must, False, 0
-        if number in self.events and not must:
-            needed = self._needed(number)
-            must = self.events.behind >= needed and not self._full()
-            barred = not must
+        event, must, needed = number in events, number in self._must, 0
+        if event:
+            self._count_gaussians(number)
+            if not must:
+                needed = self._needed(number)
+                must = events.behind >= needed and not self._full()
         if self._share_now is None:
+            assert self.share is not None
             self.sampling.share = self.share
         else:
             self.sampling.set_share(self._share_now)
-        if not self.sampling.runs(must, barred):
-            self.events.skipped(number)
+        if not self.sampling.runs(must, barred=event and not must):
+            if event:
+                events.skipped()
             return False
-        self.events.ran(number, needed)
-        if self._visible is not None and number in self.events and not self._all_must:
+        events.ran(number, needed)
+        if event and self._visible is not None and not self._all_must:
             self._measuring = True
             self._rates.visibility.restart()
         factor, parts = self._factors(number)
@@ -179,6 +176,16 @@ class Growing(Phase):
         else:
             self._rates.pause()
         return True
+
+    def _count_gaussians(self, number: int) -> None:
+        """Count the Gaussians at the event in iteration `number`; with "auto" they decide on the present share."""
+        events = self.events
+        assert events is not None and self.share is not None
+        events.rows = distributed.largest(self._rates.rows)  # ranks leave out the same events
+        self._rows_at_first = self._rows_at_first or events.rows
+        if self._auto and self._visible is not None:
+            wanted = min(1.0, LEAST_GROWING_SHARE * share_factor(events.growth) * self.stretch)
+            self._share_now = max(self.share, wanted) if self._has_room(number) else self.share
 
     def _has_room(self, number: int) -> bool:
         """Whether more iterations than `share` can run from `number` on, by `MOST_RAISED_SHARE` of the phase."""

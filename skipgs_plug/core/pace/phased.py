@@ -163,7 +163,7 @@ class Phased(Pace):
             return True
 
     def _runs(self, loop: LoopRange, number: int) -> bool:
-        if self.wants_loop and number == loop.numbers.start > 0:
+        if number == loop.numbers.start > 0 and self.wants_loop:
             self._go_on(number)
         if not self._finder.asks(loop, number) or not self._configured:
             return True

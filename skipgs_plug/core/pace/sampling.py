@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 
@@ -53,7 +54,8 @@ class Sampling:
             return False
         if 0.0 < self.share < 1.0:
             asked, due = self._since
-            while (self._due - due + _position(self._due)) / self.share < self.asked - asked + 1:
+            number = self.asked - asked + 1  # of this iteration, counted from the change of the share
+            while (self._due - due + _position(self._due)) / self.share < number:
                 self._due += 1
             must = must or self.run < self._due
         else:
@@ -74,6 +76,7 @@ class Sampling:
         self._since = (int(asked), int(due))
 
 
+@functools.lru_cache(maxsize=1)  # every iteration of a slot asks
 def _position(slot: int) -> float:
     """Return the position in a slot, in [0, 1), by SplitMix64's finaliser: repeatable, and without a period."""
     mixed = (slot * 0x9E3779B97F4A7C15 + 0x9E3779B97F4A7C15) % (1 << 64)

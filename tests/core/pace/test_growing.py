@@ -279,7 +279,7 @@ def kept(needs, visible, every, numbers=range(100, 2001, 100), share=0.1, length
                 found.append(number)
                 events.ran(number, needed)
             else:
-                events.skipped(number)
+                events.skipped()
         elif number % every == 0:
             events.ran(number)
     return found
@@ -442,7 +442,7 @@ def test_surplus_iterations_count_for_the_following_event_alone():
     assert gaps == {100, 200}  # without the surplus, every second event
     events = DensificationEvents(range(100, 1001, 100), Densification())
     for number in range(1, 400):
-        events.ran(number) if number % 100 else events.skipped(number)
+        events.ran(number) if number % 100 else events.skipped()
     needed = events.needed(400, 0.75, 0.1, 1_000_000)
     assert needed == 31 and events.behind > 10 * needed
     events.ran(400, needed)
