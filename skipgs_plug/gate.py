@@ -239,7 +239,7 @@ class SkipGate:
     @property
     def released(self) -> str | None:
         """Why the gate released a run, which then trained on without it; None if it did not."""
-        return self._engine.giving_up.reason
+        return self._engine.release.reason
 
     @property
     def skipped(self) -> bool:
@@ -358,7 +358,7 @@ class SkipGate:
         """Restore everything that was replaced. Counters and summary stay readable."""
         if self._hooks is not None:
             self._hooks.restore()
-        self._engine.release()
+        self._engine.remove()
 
     def __enter__(self) -> SkipGate:
         return self
@@ -380,7 +380,7 @@ class SkipGate:
                 adapter.attach(self._hooks)
         except BaseException as error:
             if isinstance(error, Exception) and not isinstance(error, SkipGSError):
-                self._engine.giving_up.on_error(error, None)  # not foreseen, so the trainer runs without a gate
+                self._engine.release.on_error(error, None)  # not foreseen, so the trainer runs without a gate
                 return
             self._hooks.restore()
             raise

@@ -51,6 +51,7 @@ class Engine:
         start: First iteration that may be skipped.
         iteration: Facts about the present iteration.
         stats, clock: Counts, seconds.
+        release: Releases the gate after an error.
         rates: Scales learning rates, for the pace.
         pace: Decides which iterations run, and scales learning rates.
         trace: Rows of gated decisions; None if they are not recorded.
@@ -72,18 +73,18 @@ class Engine:
         self.clock = GateClock()
         iteration = self.iteration
         # A refusal in the first iteration loses nothing.
-        self.giving_up = Release(config.enabled, lambda: iteration.opened <= 1)
+        self.release = Release(config.enabled, lambda: iteration.opened <= 1)
         own = weakref.ref(self)  # PyTorch holds the hooks of the rates, which must not keep a dropped gate alive
 
         def taken_back() -> None:
             if (engine := own()) is not None:
-                engine.release()
+                engine.remove()
 
-        self.giving_up.undoes(taken_back)
+        self.release.undoes(taken_back)
         self.rates = ScaledRates()
-        giving_up = self.giving_up
-        self.rates.on_error = lambda error: giving_up.on_error(error, iteration.step)
-        self.pace = pace_of(config, self.rates, self._go_on_from_saved, giving_up)
+        release = self.release
+        self.rates.on_error = lambda error: release.on_error(error, iteration.step)
+        self.pace = pace_of(config, self.rates, self._go_on_from_saved, release)
         self.trace: list[TraceRow] | None = [] if record_trace else None
         self._skipped: list[weakref.ref[Tensor]] = []  # losses of this iteration whose backwards were skipped
         self._accumulates = False
@@ -133,7 +134,7 @@ class Engine:
         if self._pending_state is not None:
             self.load_state_dict(self._pending_state)
 
-    def release(self) -> None:
+    def remove(self) -> None:
         """Let go of loops and optimizers; counts stay readable."""
         self.pace.remove()
         self.rates.remove()
@@ -243,7 +244,7 @@ class Engine:
         try:
             skip = self.decide(view, copy).skip
         except SkipGSError as error:
-            if self.giving_up.ends(error):
+            if self.release.ends(error):
                 drop_gradients(loss)
             raise
         if skip:
@@ -263,7 +264,7 @@ class Engine:
         now = self.iteration
         assert now.step is not None
         self.stats.iterations += 1
-        if not now.gated or self.giving_up.reason is not None:
+        if not now.gated or self.release.reason is not None:
             now.decision = decision.INACTIVE
             return now.decision
         mean = None if self.trace is None else self.mean(view)
@@ -367,7 +368,7 @@ class Engine:
                 self._ranks_checked = True
             return self._own(view, loss, step)
         device = signal.device if isinstance(signal, Tensor) else None
-        own, answer = self.giving_up.agreed(lambda: self._own(view, loss, step), step, device)
+        own, answer = self.release.agreed(lambda: self._own(view, loss, step), step, device)
         if answer is not own:
             assert self.policy is not None
             self.policy.overrule(own, answer)

@@ -67,12 +67,12 @@ class Hooks(LoopHooks):
         super().__init__(engine, adapter.optimizers, Patches(self._expectation, self._failed))
         self._adapter = adapter
         self._given = given
-        self._giving_up = engine.giving_up
-        self._giving_up.undoes(self.restore)
+        self._release = engine.release
+        self._release.undoes(self.restore)
         # Refusals come with the first iteration, when nothing is lost yet.
-        self._giving_up.refuses = lambda: max(self._iterations, self._backwards) <= 1
-        self._giving_up.in_script, self._giving_up.attached = in_script, True
-        self._guarded = self._giving_up.guarded(lambda: self._iteration.step)
+        self._release.refuses = lambda: max(self._iterations, self._backwards) <= 1
+        self._release.in_script, self._release.attached = in_script, True
+        self._guarded = self._release.guarded(lambda: self._iteration.step)
         self._ready = False
         self.script_globals: dict[str, Any] = {}
         self._iteration = engine.iteration
@@ -95,7 +95,7 @@ class Hooks(LoopHooks):
         with self.guarded():
             self._engine.configure(info, self._given)
             if self._engine.config.compensates:
-                self.on_detach("torch.optim.Optimizer.step (hooks)", self._engine.release)
+                self.on_detach("torch.optim.Optimizer.step (hooks)", self._engine.remove)
             self._ready = True
 
     # Reports during training.
@@ -114,7 +114,7 @@ class Hooks(LoopHooks):
         if self.released:
             return
         step = int(step)  # a NumPy number would get into saved states
-        with self._giving_up.guarded(lambda: step):
+        with self._release.guarded(lambda: step):
             if not self._ready:
                 raise self._mismatch("the trainer iterates before it said when densification ends")
             if self._iterations == CHECKED_ITERATIONS:
@@ -123,8 +123,8 @@ class Hooks(LoopHooks):
                 self._release_moved(moved)
                 return
             before = self._iteration.step
-            if before is not None and step < before and (self._giving_up.in_script or not self._engine.config.enabled):
-                self._giving_up.let_go(
+            if before is not None and step < before and (self._release.in_script or not self._engine.config.enabled):
+                self._release.let_go(
                     f"The gate is released: iterations went back from {before} to {step}, as in a second training run "
                     "of one process. Training goes on without it, in all its iterations"
                 )
@@ -325,7 +325,7 @@ class Hooks(LoopHooks):
     @property
     def released(self) -> bool:
         """Whether the gate was released, so that training continues without it."""
-        return self._giving_up.reason is not None
+        return self._release.reason is not None
 
     def guarded(self) -> AbstractContextManager[None]:
         """Return a block for an adapter's own code. An error in it releases the gate, and the code after it runs.
@@ -344,10 +344,10 @@ class Hooks(LoopHooks):
         Args:
             reason: One sentence about the cause, which the user reads as a warning.
         """
-        self._giving_up.let_go(reason)
+        self._release.let_go(reason)
 
     def _failed(self, error: Exception) -> None:
-        self._giving_up.on_error(error, self._iteration.step)
+        self._release.on_error(error, self._iteration.step)
 
     def restore(self) -> None:
         """Restore every replaced name."""

@@ -32,8 +32,8 @@ class OwnLoop:
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._iteration = iteration = engine.iteration
-        self._giving_up = engine.giving_up
-        self.guarded = self._giving_up.guarded(lambda: iteration.step)
+        self._release = engine.release
+        self.guarded = self._release.guarded(lambda: iteration.step)
 
     def iterations(
         self,
@@ -80,13 +80,13 @@ class OwnLoop:
         _check_losses(loss, view)
         step = int(step)
         run = Original(_backward_of_sum if isinstance(view, list) else loss.backward)
-        if self._giving_up.reason is None:
+        if self._release.reason is None:
             try:
                 return self._gated_backward(loss, view, step, signal, run)
             except Exception as error:
                 if run.failed:
                     raise  # the error comes from the loop's own backward pass
-                self._giving_up.on_error(error, step)
+                self._release.on_error(error, step)
         self._iteration.begin(step, gated=False)
         self._iteration.ran = True
         if not run.made:
@@ -105,7 +105,7 @@ class OwnLoop:
         """
         self._require_backward_before("step")
         optimizers = stepping = listed(optimizer)
-        if self._giving_up.reason is None:
+        if self._release.reason is None:
             stepped = self._iteration.stepped
             for one in optimizers:
                 if id(one) in stepped:
@@ -176,7 +176,7 @@ class OwnLoop:
         return key
 
     def _require_backward_before(self, verb: str) -> None:
-        if self._giving_up.reason is None and (self._iteration.ended or not self._iteration.keys):
+        if self._release.reason is None and (self._iteration.ended or not self._iteration.keys):
             raise GateOrderError(f"{verb}() was called before backward() in this iteration.")
 
 

@@ -12,15 +12,15 @@ from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.release import Release
 
 
-def pace_of(config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None], giving_up: Release) -> Pace:
+def pace_of(config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None], release: Release) -> Pace:
     """Return the pace for these settings.
 
     Args:
         config: Settings that the user gave.
         rates: Scales learning rates.
         go_on: Receives the first iteration of a resumed run, and loads the state of its checkpoint, if there is one.
-        giving_up: Receives errors, and raises them or releases the gate.
+        release: Receives errors, and raises them or releases the gate.
     """
     if config.leaves_out:
-        return Phased(config, rates, go_on, giving_up)
+        return Phased(config, rates, go_on, release)
     return Compensated(config, rates) if config.compensates else Pace()

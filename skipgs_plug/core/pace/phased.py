@@ -30,20 +30,18 @@ class Phased(Pace):
         config: Settings with `leaves_out`.
         rates: Scales learning rates.
         go_on: Receives the first iteration of a resumed run, and loads the state of its checkpoint, if there is one.
-        giving_up: Receives errors, and raises them or releases the gate.
+        release: Receives errors, and raises them or releases the gate.
 
     Attributes:
         refining: The phase after densification.
         growing: The phase before the end of densification.
     """
 
-    def __init__(
-        self, config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None], giving_up: Release
-    ) -> None:
+    def __init__(self, config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None], release: Release) -> None:
         self._config = config
         self._rates = rates
         self._go_on = go_on
-        self._giving_up = giving_up
+        self._release = release
         self.refining = Refining(config, rates)
         self.growing: Phase = Phase() if config.growing is None else Growing(config, rates)
         self._grows = self.growing  # phase of the iterations before `_start` in the present loop
@@ -159,7 +157,7 @@ class Phased(Pace):
         try:
             return self._runs(loop, number)
         except Exception as error:
-            self._giving_up.on_error(error, number, refuses=self._planned is not loop)
+            self._release.on_error(error, number, refuses=self._planned is not loop)
             return True
 
     def _runs(self, loop: LoopRange, number: int) -> bool:
@@ -204,7 +202,7 @@ class Phased(Pace):
             SkipGSError: The present iteration could have been left out.
         """
         how = "so the gate must count them; write the loop as for step in gate.iterations(range(...))."
-        if needed or self._giving_up.in_script:
+        if needed or self._release.in_script:
             leaves_out = "share and refine_share leave out iterations"
             raise SkipGSError(
                 f"{leaves_out}, {how}",
@@ -283,7 +281,7 @@ class Phased(Pace):
     def _why_no_event(self) -> str:
         """Return why no densification event is known, as a sentence after a space; empty if there is nothing to add."""
         if self._densification is None:
-            return "" if self._giving_up.in_script else " In a loop of your own give events= to gate.iterations()."
+            return "" if self._release.in_script else " In a loop of your own give events= to gate.iterations()."
         marks = ", ".join(self._densification.marks)
         if self._config.always is None:
             return f" No condition of the loop that names {marks} holds before iteration {self._start}."
