@@ -102,6 +102,7 @@ FACTS = (
     "(start_iter: 'int | None', *, settled_iter: 'int | None' = None, view_names: 'Iterable[str] | None' = None, "
     "epoch: 'int | None' = None, max_steps: 'int | None' = None, world_size: 'int | None' = None, "
     "gradients_read_until: 'int | None' = None, accumulates: 'bool' = False, "
+    "steps_each: 'bool' = False, "
     "densification: 'Densification | None' = None, defaults: 'Mapping[str, Any]' = <factory>) -> None"
 )
 POLICY = {
@@ -177,7 +178,7 @@ def test_what_adapters_are_written_with() -> None:
         "stand_ins",
     }
     assert signatures(Hooks) == HOOKS
-    assert properties(Hooks) == {"gap", "patched", "released", "state", "trained"}
+    assert properties(Hooks) == {"gap", "lengthens_steps", "patched", "released", "state", "trained"}
     assert str(inspect.signature(TrainerInfo)) == FACTS
     assert str(inspect.signature(adapters.register_adapter)) == (
         "(adapter: 'type[AbstractAdapter]') -> 'type[AbstractAdapter]'"

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from skipgs_plug.adapters.inria import GROWS_WHOLE, InriaFamily
+from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.trainer_info import Densification
 
-# Constants of `optimizer_step`: iterations after which it steps every 32nd, then every 64th iteration.
+# Constants of `optimizer_step`: iterations after which it steps every 32nd, then every 64th iteration. Before that, one
+# optimizer steps in each iteration and the one of higher bands in each 16th, so both step in iteration 16.
 ACCUMULATES_FROM = 15_000
 SLOWER_FROM = 20_000
+BOTH_STEP = 16
 
 
 class FastGS(InriaFamily):
-    """`optimizer_step(iteration)` stays untouched: it applies the gradients gathered since its last step.
+    """`optimizer_step(iteration)` applies the gradients gathered since its last step, in the paper's gate as upstream.
 
-    It is called in skipped iterations too, and may apply gradients of earlier iterations there. In schedules of 30,000
-    iterations densification is nearly all of the training: 15,000 of 15,312 steps of the optimizer. With half of its
-    iterations bonsai (100x67, 255 views) loses 0.3 dB and 0.008 SSIM, so all of them run.
+    It is called in skipped iterations too, and may apply gradients of earlier iterations there. With `share` or
+    `refine_share` few iterations of refinement run, and `optimizer_step` gets a number with which both optimizers step
+    in each of them. In schedules of 30,000 iterations, 15,000 of FastGS' 15,312 steps are in densification, so half of
+    its iterations run.
     """
 
     name = "fastgs"
@@ -25,10 +30,13 @@ class FastGS(InriaFamily):
     project = "[FastGS](https://github.com/fastgs/FastGS)"
     gated = "From `densify_until_iter` on. The prunes at 18,000, 21,000, 24,000 and 27,000 pause the gate."
     left_alone = (
-        "`optimizer_step(iteration)` steps every 16th, 32nd or 64th iteration with the gradients gathered since, even "
-        "in a skipped iteration."
+        "In the paper's gate, `optimizer_step(iteration)` steps every 16th, 32nd or 64th iteration with the gradients "
+        "gathered since, even in a skipped iteration."
     )
-    with_share = GROWS_WHOLE
+    with_share = (
+        "Both optimizers step in each iteration of refinement that runs. Half of densification runs if the script "
+        "accumulates gradients after it."
+    )
     stand_ins = "fastgs"
     mark = "render_fastgs"
     changes = (*InriaFamily.changes, "densify_and_prune_fastgs")
@@ -36,18 +44,43 @@ class FastGS(InriaFamily):
     calls = ("optimizer_step",)
     arguments = ("get_flag", "metric_map")
     renders = ("render_fastgs",)
+    pure = ("optimizer_step",)
+    # Each event caps opacities at 0.8 and replaces their moments.
+    densification = Densification(marks=("densification_interval",), clears_moments=True)
+
+    def __init__(self, trainer: Any = None) -> None:
+        super().__init__(trainer)
+        self._each = False  # whether both optimizers step in each iteration of refinement that runs
+
+    def _attach_to_model(self, hooks: Hooks, names: dict[str, Any]) -> None:
+        super()._attach_to_model(hooks, names)
+        self._each = hooks.lengthens_steps
+        if not self._each:
+            return
+
+        def stepped(original: Callable[..., Any], model: Any, iteration: int) -> Any:
+            return original(model, BOTH_STEP if iteration > ACCUMULATES_FROM else iteration)
+
+        hooks.wrap(names["GaussianModel"], "optimizer_step", stepped)
 
     def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
+        return not self._each and self._few_steps(opt, loop)
+
+    def steps_each(self, opt: Any, loop: Mapping[str, Any]) -> bool:
+        return self._each and self._few_steps(opt, loop)
+
+    def _few_steps(self, opt: Any, loop: Mapping[str, Any]) -> bool:
+        """Whether the script's own refinement accumulates gradients, from its first iteration on."""
         default = getattr(opt, "optimizer_type", "default") == "default"
         return default and self.start_iter(opt, loop) >= ACCUMULATES_FROM
 
     def always_run(self, numbers: range) -> Iterable[int]:
         """Return the iterations in which `optimizer_step` steps with gathered gradients."""
-        return (n for n in numbers if n % interval(n) == 0)
+        return () if self._each else (n for n in numbers if n % interval(n) == 0)
 
 
 def interval(iteration: int) -> int:
     """Return the number of iterations between two steps with gathered gradients."""
     if iteration <= ACCUMULATES_FROM:
-        return 16
+        return BOTH_STEP
     return 32 if iteration <= SLOWER_FROM else 64

@@ -50,6 +50,7 @@ class InriaFamily(AbstractAdapter):
             draw noise, methods that change a tensor in place.
         arguments: Arguments of the renderer that the adapter knows, beyond those of Inria's.
         densification: How to recognise its densification events; None if all iterations of densification must run.
+        pure: Functions and methods that depend on the iteration, and need no iteration besides those of `always_run`.
         known_names: Values of names that the loop assigns, if they are known before it. `begin` fills them.
     """
 
@@ -61,6 +62,7 @@ class InriaFamily(AbstractAdapter):
     pausing: ClassVar[tuple[str, ...]] = ()
     calls: ClassVar[tuple[str, ...]] = ()
     arguments: ClassVar[tuple[str, ...]] = ()
+    pure: ClassVar[tuple[str, ...]] = ()
     # Statistics are means over visits, so some events may be left out if the others have enough visits.
     densification: ClassVar[Densification | None] = Densification(marks=("densification_interval",))
 
@@ -142,6 +144,10 @@ class InriaFamily(AbstractAdapter):
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
         """Return the first iteration whose gradients only the optimizers read. Arguments as for `start_iter`."""
         return int(opt.densify_until_iter)
+
+    def steps_each(self, opt: Any, loop: Mapping[str, Any]) -> bool:
+        """Whether optimizers would accumulate, but step in each iteration that runs; see `TrainerInfo.steps_each`."""
+        return False
 
     def accumulates(self, opt: Any, loop: Mapping[str, Any]) -> bool:
         """Whether optimizers step at certain iterations, with gathered gradients. Arguments as for `start_iter`."""
@@ -240,7 +246,9 @@ class InriaFamily(AbstractAdapter):
     def _attach_to_loop(self, hooks: Hooks, script: dict[str, Any]) -> None:
         """Attach to the loop's backward and to its range."""
         hooks.gate_tensor_backward(LOOP)
-        hooks.loop(script, LOOP, always=self.always_run, densification=self.densification, known=self._known)
+        hooks.loop(
+            script, LOOP, always=self.always_run, pure=self.pure, densification=self.densification, known=self._known
+        )
 
     def _known(self, names: Mapping[str, Any]) -> Mapping[str, Any]:
         """Read the run before its conditions: the loop of a resumed run needs them before its first iteration."""
@@ -309,6 +317,7 @@ class InriaFamily(AbstractAdapter):
                 max_steps=opt.iterations,
                 gradients_read_until=self.gradients_read_until(opt, loop),
                 accumulates=self.accumulates(opt, loop),
+                steps_each=self.steps_each(opt, loop),
             )
         )
 

@@ -310,6 +310,11 @@ class Hooks(LoopHooks):
         """Object with `state_dict` and `load_state_dict`, for trainers that save the state of other objects too."""
         return self._engine
 
+    @property
+    def lengthens_steps(self) -> bool:
+        """Whether the gate leaves out iterations, and makes the steps of the others longer."""
+        return self._engine.pace.leaves_out and self._engine.config.compensates
+
     # Questions of the gate.
 
     @property

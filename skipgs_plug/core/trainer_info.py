@@ -23,12 +23,16 @@ class Densification:
             suits growth by a budget or by a constant share per event.
         resets: Whether opacities are reset now and then, so that few iterations run between two resets, or it is not
             known. Without resets, longer steps are tolerated in schedules of any length (3DGS-MCMC).
+        clears_moments: Whether every event clears Adam's moments of opacities, but not its count of steps. Adam's steps
+            are several times as long after that, which lets opacities recover from resets, but only with the trainer's
+            beta2. Opacities keep it then.
     """
 
     marks: tuple[str, ...] = ()
     numbers: Callable[[range], Iterable[int]] | None = None
     needs: Literal["visits", "iterations", "nothing"] = "visits"
     resets: bool = True
+    clears_moments: bool = False
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,9 @@ class TrainerInfo:
             of steps does not change when iterations are left out. Each step has fewer gradients then, so steps of
             refinement are longer by the root of their share only, and shrink. With `share`, densification runs whole,
             since few steps follow it.
+        steps_each: The trainer's own schedule accumulates, but the adapter makes optimizers step in each iteration of
+            refinement that runs, if iterations are left out and steps are longer. With `share`, half of densification
+            runs then: the trainer's own run takes nearly all of its steps there, and a tenth of them is not enough.
         densification: How to find the densification events, so that fewer iterations can run before densification
             ends; None if all of them must run.
         defaults: Settings that suit this trainer. They are used where the user gave no value.
@@ -66,5 +73,6 @@ class TrainerInfo:
     world_size: int | None = None
     gradients_read_until: int | None = None
     accumulates: bool = False
+    steps_each: bool = False
     densification: Densification | None = None
     defaults: Mapping[str, Any] = dataclasses.field(default_factory=dict)

@@ -1,17 +1,21 @@
-"""FastGS and Taming: gradients of earlier iterations are applied in iterations that are skipped themselves."""
+"""FastGS, Improved-GS and Taming: steps on gradients that are accumulated over several iterations."""
 
 import pytest
 import torch
 from cases import SkipAlways, run, script
-from lookalikes import fastgs, taming
+from lookalikes import fastgs, improved_gs, taming
 from lookalikes.splats import Log, SplatModel, log
 
 from skipgs_plug.adapters import fastgs as adapter
 from skipgs_plug.adapters.fastgs import FastGS
+from skipgs_plug.adapters.improved_gs import ImprovedGS
 from skipgs_plug.core import decision
+from skipgs_plug.core.pace import growing
+from skipgs_plug.core.pace.rates import path_factor
 from skipgs_plug.core.trainer_info import Densification
 
 CASES = {"fastgs": script("fastgs", fastgs), "taming": script("taming", taming, sh_lower=True)}
+CASES["improved_gs"] = script("improved_gs", improved_gs)
 
 
 class SkipWhenDue(SkipAlways):
@@ -60,10 +64,9 @@ def test_growth_without_an_event_that_the_loop_tells_runs_whole(monkeypatch):
 
 @pytest.mark.parametrize("settings", [{"share": 0.4}, {"grow_share": 0.4}])
 def test_densification_runs_whole_before_steps_with_accumulated_gradients(monkeypatch, settings):
-    shorter, _ = run(CASES["fastgs"], **settings)
-    monkeypatch.setattr(adapter, "ACCUMULATES_FROM", 20)
-    monkeypatch.setattr(adapter, "interval", lambda iteration: 8)
-    gated, gate = run(CASES["fastgs"], **settings)
+    shorter, _ = run(CASES["improved_gs"], **settings)
+    monkeypatch.setattr(ImprovedGS, "accumulates_from", 20)
+    gated, gate = run(CASES["improved_gs"], **settings)
     grown, before = ([step for step in one.backwards if step < 20] for one in (gated, shorter))
     assert len(before) < 16
     assert grown == list(range(1, 20)) if "share" in settings else len(grown) < 16  # the user asked for it
@@ -72,10 +75,8 @@ def test_densification_runs_whole_before_steps_with_accumulated_gradients(monkey
         assert "18 of 18 iterations run (100.0 %) until densification ends" in gate.summary()
 
 
-@pytest.mark.parametrize("compensate", [None, False])
-def test_steps_with_fewer_gradients_are_longer_and_shrink(monkeypatch, compensate):
-    monkeypatch.setattr(adapter, "ACCUMULATES_FROM", 20)
-    monkeypatch.setattr(adapter, "interval", lambda iteration: 8)
+def factors_of(case, lookalike, monkeypatch, **settings):
+    """Run a look-alike; return its log, its gate, and the factor on each rate by iteration and group."""
     factors = {}
 
     class Adam(torch.optim.Adam):
@@ -84,14 +85,58 @@ def test_steps_with_fewer_gradients_are_longer_and_shrink(monkeypatch, compensat
                 factors[log.now, group["name"]] = group["lr"] / SplatModel.rates[group["name"]]
             return super().step(closure)
 
-    monkeypatch.setattr(fastgs.GaussianModel, "adam", Adam)
-    monkeypatch.setattr(fastgs.GaussianModel, "update_learning_rate", lambda self, iteration: None)
-    gated, gate = run(CASES["fastgs"], refine_share=0.25, compensate=compensate)
-    # All steps of the own run happen: every 8th but the last; 32 is a prune, whose new parameters have no gradient.
-    assert [step for step in gated.steps if step > 20] == [24, 40, 48, 56]
+    monkeypatch.setattr(lookalike.GaussianModel, "adam", Adam)
+    monkeypatch.setattr(lookalike.GaussianModel, "update_learning_rate", lambda self, iteration: None)
+    gated, gate = run(case, **settings)
+    return gated, gate, factors
+
+
+@pytest.mark.parametrize("compensate", [None, False])
+def test_steps_with_fewer_gradients_are_longer_and_shrink(monkeypatch, compensate):
+    monkeypatch.setattr(ImprovedGS, "accumulates_from", 20)
+    settings = {"refine_share": 0.25, "compensate": compensate}
+    gated, gate, factors = factors_of(CASES["improved_gs"], improved_gs, monkeypatch, **settings)
+    # All steps of the own run happen but the last: every 4th iteration, then every 8th.
+    assert sorted({step for step in gated.steps if step > 20}) == [24, 28, 32, 36, 40, 48, 56]
     for step in (24, 40, 48, 56):
         shrunk = 2.0 / 0.25**0.5 * (1.0 - (step - 20) / 45)  # refinement has 45 iterations
         assert factors[step, "rotation"] == pytest.approx(1.0 if compensate is False else shrunk)
         assert factors[step, "opacity"] == pytest.approx(1.0 if compensate is False else min(shrunk, 1.0))
     assert factors[19, "rotation"] == 1.0
     assert gate.report()["gaussians_shown"] is None  # several views stand behind a gradient
+
+
+def test_fastgs_steps_in_each_iteration_of_refinement_that_runs(monkeypatch):
+    monkeypatch.setattr(adapter, "ACCUMULATES_FROM", 20)
+    gated, gate, factors = factors_of(CASES["fastgs"], fastgs, monkeypatch, refine_share=0.25)
+    ran = [step for step in gated.backwards if 20 < step < 64 and step not in fastgs.PRUNES]
+    assert set(ran) == {step for step in gated.steps if 20 < step < 64} and 8 < len(ran) < 16
+    assert any(step % fastgs.STEP_EVERY for step in ran)  # the script alone would not step there
+    assert gate.report()["gaussians_shown"] > 0.5  # it is measured, since one view stands behind a gradient
+    for step in ran:
+        assert factors[step, "rotation"] > path_factor(0.25, (step - 20) / 45)  # the factor of a third of the Gaussians
+        assert factors[step, "f_rest"] == pytest.approx(4.0 * factors[step, "rotation"])
+
+
+def test_fastgs_accumulates_if_steps_stay_as_they_are(monkeypatch):
+    monkeypatch.setattr(adapter, "ACCUMULATES_FROM", 20)
+    monkeypatch.setattr(adapter, "interval", lambda iteration: 8)
+    gated, _ = run(CASES["fastgs"], refine_share=0.25, compensate=False)
+    # 32 is a prune, whose new parameters have no gradient.
+    assert [step for step in gated.steps if step > 20] == [24, 40, 48, 56]
+
+
+def test_opacities_of_fastgs_keep_their_beta2_while_the_scene_grows(monkeypatch):
+    betas = {}
+
+    class Adam(torch.optim.Adam):
+        def step(self, closure=None):
+            for group in self.param_groups:
+                betas.setdefault((group["name"], log.now < 20), set()).add(group["betas"][1])
+            return super().step(closure)
+
+    monkeypatch.setattr(fastgs.GaussianModel, "adam", Adam)
+    monkeypatch.setattr(growing, "MEASURED", 2)
+    run(CASES["fastgs"], share=0.5)
+    assert betas["opacity", True] == {0.999} and betas["opacity", False] == {0.98}
+    assert 0.98 in betas["xyz", True]

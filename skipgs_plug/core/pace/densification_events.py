@@ -44,6 +44,7 @@ class DensificationEvents:
 
     Attributes:
         resets: Whether opacities are reset now and then, or it is not known.
+        clears_moments: Whether events clear Adam's moments of opacities; see `Densification`.
         kept, left_out: Numbers of events so far.
         rows: Number of Gaussians now; 0 if it is not known. The caller sets it.
     """
@@ -52,7 +53,7 @@ class DensificationEvents:
         self._numbers = sorted(numbers)
         self._known = frozenset(self._numbers)
         self._needs = densification.needs
-        self.resets = densification.resets
+        self.resets, self.clears_moments = densification.resets, densification.clears_moments
         self.kept = self.left_out = 0
         self._behind = 0  # number of iterations that ran since the last event, and of surplus ones before it
         self.rows = self._rows_before = 0  # now, and before the last event that ran

@@ -10,6 +10,7 @@ from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.densification_events import DensificationEvents
 from skipgs_plug.core.pace.needs import (
     LEAST_GROWING_SHARE,
+    LEAST_SHARE_BEFORE_FEW_STEPS,
     MOST_RAISED_SHARE,
     events_sooner,
     for_new_gaussians,
@@ -63,6 +64,7 @@ class Growing(Phase):
         self._first: int | None = None
         self._length = 0
         self._epoch = 0
+        self._least_share = 0.0
         self._visible: float | None = None  # share that a view shows, in the first measurement; it settles `share`
         self._visible_now: float | None = None  # that share in the latest measurement
         self._share_now: float | None = None  # share of the present iterations; None for `share`
@@ -91,6 +93,7 @@ class Growing(Phase):
             # Refinement on accumulated gradients has few steps: 312 of 15,000 iterations in FastGS. Densification is
             # nearly all of the training then, so all of it runs.
             named = set(numbers)
+        self._least_share = LEAST_SHARE_BEFORE_FEW_STEPS if plan.steps_each else 0.0
         marks = densification.marks
         events = set() if densification.numbers is None else set(densification.numbers(numbers))
         others: dict[str, set[int]] = {}
@@ -220,7 +223,7 @@ class Growing(Phase):
         if self._auto:
             longer = self._config.compensates and self._visible is not None
             events = len(self.events) if self.events.all_run else 0
-            self.share = growing_share(self._length, self._epoch, longer, events)
+            self.share = max(self._least_share, growing_share(self._length, self._epoch, longer, events))
 
     def _factors(self, number: int) -> tuple[float, GrowingParts]:
         """Return the factor on learning rates in iteration `number`, and the parts of opacities and positions."""
@@ -232,7 +235,7 @@ class Growing(Phase):
         share = max(self._share_now or self.share, self._must_shares[ends])
         grown = self._times_grown
         factor = growing_factor(self._length, share, self._visible, events.all_run, grown, events.resets)
-        return factor, GrowingParts(opacity_factor(share), positions_part(factor, events.resets))
+        return factor, GrowingParts(opacity_factor(share), positions_part(factor, events.resets), events.clears_moments)
 
     @property
     def _times_grown(self) -> float | None:

@@ -133,7 +133,7 @@ class ScaledGroup(NamedTuple):
         group: One of an optimizer's `param_groups`.
         times: Multiple of the factor that the group takes.
         most: Bound on the factor, before it is multiplied.
-        longer: Facts about the group if its steps are larger; None if they are at most as long as the trainer's.
+        longer: Facts about the group if its steps are larger and have a smaller beta2; else None.
     """
 
     group: dict[str, Any]
@@ -148,10 +148,12 @@ class GrowingParts(NamedTuple):
     Attributes:
         opacities: Multiple of their rate that opacities take, at least 1.
         positions: Multiple of the common factor that positions take.
+        opacities_remember: Whether opacities keep the trainer's beta2.
     """
 
     opacities: float
     positions: float
+    opacities_remember: bool = False
 
 
 UNCHANGED = GrowingParts(1.0, 1.0)  # with a factor of 1, the trainer's own steps
@@ -220,7 +222,10 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
         return ScaledGroup(info.group, OTHERS_AT_MOST, 1.0, None) if growing is None else None
     if info.part is None:
         times = 1.0 if growing is None else growing.opacities
-        return ScaledGroup(info.group, times, 1.0, info) if growing is None or times > 1.0 else None
+        if growing is None or times > 1.0:
+            remembers = growing is not None and growing.opacities_remember
+            return ScaledGroup(info.group, times, 1.0, None if remembers else info)
+        return None
     if not raised:
         return None
     part = info.part if growing is None or not info.named_positions else growing.positions

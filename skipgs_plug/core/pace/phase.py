@@ -24,6 +24,7 @@ class PhasePlan(NamedTuple):
         epoch: Number of iterations in which every view comes up once; None if unknown.
         densification: How to recognise densification events; None if unknown.
         accumulates: Optimizers step on gradients that are accumulated over several iterations; see `TrainerInfo`.
+        steps_each: Optimizers would do so, but step in each iteration of refinement that runs; see `TrainerInfo`.
     """
 
     numbers: range
@@ -35,6 +36,7 @@ class PhasePlan(NamedTuple):
     epoch: int | None
     densification: Densification | None
     accumulates: bool
+    steps_each: bool = False
 
 
 class Phase:

@@ -47,7 +47,7 @@ class Phased(Pace):
         self._grows = self.growing  # phase of the iterations before `_start` in the present loop
         self._finder = LoopFinder()
         self._densification: Densification | None = None
-        self._accumulates = False
+        self._accumulates = self._steps_each = False
         self._views: list[str] | None = None
         self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
         self._start = 0
@@ -70,7 +70,7 @@ class Phased(Pace):
 
     def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
         self._start, self._last, self._views = start, info.max_steps, views
-        self._accumulates, self._epoch = info.accumulates, info.epoch
+        self._accumulates, self._steps_each, self._epoch = info.accumulates, info.steps_each, info.epoch
         self._densification = info.densification or self._densification
         self._configured = True
 
@@ -263,6 +263,7 @@ class Phased(Pace):
             epoch,
             self._densification,
             self._accumulates,
+            self._steps_each,
         )
 
     def _require_events(self) -> None:
@@ -301,6 +302,7 @@ class Phased(Pace):
             "start": self._start,
             "last": self._last,
             "keeps_rates": self._accumulates,
+            "steps_each": self._steps_each,
             "next": self._finder.expected,
             "required": sorted(self._required),
             "refining": self.refining.state_dict(),
@@ -325,6 +327,7 @@ class Phased(Pace):
         # The loop asks about its first number before the trainer reports its facts.
         if not self._configured:
             self._start, self._last, self._accumulates = state["start"], state["last"], state["keeps_rates"]
+            self._steps_each = state.get("steps_each", False)
             self._configured = True
         if self._planned is not None:
             self._read(self._planned, max(self._start, state["next"] or 0))

@@ -61,6 +61,7 @@ class Refining(Phase):
         self._changed: int | None = None  # iteration of the last change
         self._expected: int | None = None  # iteration in which another change is expected; None if no change is
         self._over = False  # whether refinement has ended, for the present iteration
+        self._steps_each = False
         self._shrinks = False  # whether the steps, as many as in the trainer's own run, shrink with its schedule
         self._before = Phase()
         self._grown_by_few = False
@@ -78,7 +79,8 @@ class Refining(Phase):
         """Receive the facts that are known when the loop begins.
 
         If gradients accumulate, the trainer takes as many steps as in its own run, each with fewer gradients. Steps
-        become longer and shrink with its schedule then.
+        become longer and shrink with its schedule then. So do the steps of a trainer that would accumulate, but steps
+        in each iteration that runs: FastGS prunes four times meanwhile, and must train between its prunes.
 
         Raises:
             SkipGSError: "auto" needs the views and they are unknown, or a loaded state had larger steps and they are
@@ -105,9 +107,10 @@ class Refining(Phase):
         if self._judges and plan.views is not None and self.stopping is None and distributed.group_size() == 1:
             self.watched = watched_views(plan.views, self.share * total)
         # Iterations are spread evenly if gradients accumulate, so that each step gets some.
+        spread = plan.accumulates or plan.steps_each
         scales = self._scales
-        self._shrinks = scales and plan.accumulates
-        if not scales or plan.accumulates:
+        self._shrinks, self._steps_each = scales and spread, plan.steps_each
+        if not scales or spread:
             if self.stopping is not None:
                 raise SkipGSError(
                     "The gate state was saved with larger, shrinking steps, which are off now; continue with the same "
@@ -237,11 +240,14 @@ class Refining(Phase):
         assert self._first is not None and self._last is not None and self.share is not None
         if self.stopping is None:
             if self._shrinks:
-                self._rates.visibility.finish()  # gradients of several views come together
-                # With a share of its gradients a step is noisier by 1 / sqrt(share). Adam shortens the part that views
-                # agree on by as much.
                 progress = (number - self._first) / (self._last + 1 - self._first)
-                self._rates.scale(path_factor(math.sqrt(self.share), progress, self._config.rate_peak))
+                share, visible = self.share, self._rates.visibility.visible
+                if not self._steps_each:
+                    self._rates.visibility.finish()  # gradients of several views come together
+                    # With a share of its gradients a step is noisier by 1 / sqrt(share). Adam shortens the part that
+                    # views agree on by as much.
+                    share, visible = math.sqrt(share), None
+                self._rates.scale(path_factor(share, progress, self._config.rate_peak, visible))
             return
         if self._recovered < self._recovery:
             factor = 1.0 - self._recovered / self._recovery
