@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.adapters.inria import GROWS_WHOLE, InriaFamily
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import Densification
 
@@ -21,8 +21,8 @@ class FastGS(InriaFamily):
 
     It is called in skipped iterations too, and may apply gradients of earlier iterations there. With `share` or
     `refine_share` few iterations of refinement run, and `optimizer_step` gets a number with which both optimizers step
-    in each of them. In schedules of 30,000 iterations, 15,000 of FastGS' 15,312 steps are in densification, so half of
-    its iterations run.
+    in each of them. In schedules of 30,000 iterations, 15,000 of FastGS' 15,312 steps are in densification. All of it
+    runs: with 70 % of its iterations fern (126x94) lost 0.4 dB.
     """
 
     name = "fastgs"
@@ -33,10 +33,7 @@ class FastGS(InriaFamily):
         "In the paper's gate, `optimizer_step(iteration)` steps every 16th, 32nd or 64th iteration with the gradients "
         "gathered since, even in a skipped iteration."
     )
-    with_share = (
-        "Both optimizers step in each iteration of refinement that runs. Half of densification runs if the script "
-        "accumulates gradients after it."
-    )
+    with_share = f"Both optimizers step in each iteration of refinement that runs. {GROWS_WHOLE}"
     stand_ins = "fastgs"
     mark = "render_fastgs"
     changes = (*InriaFamily.changes, "densify_and_prune_fastgs")

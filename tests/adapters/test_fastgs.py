@@ -63,10 +63,12 @@ def test_growth_without_an_event_that_the_loop_tells_runs_whole(monkeypatch):
 
 
 @pytest.mark.parametrize("settings", [{"share": 0.4}, {"grow_share": 0.4}])
-def test_densification_runs_whole_before_steps_with_accumulated_gradients(monkeypatch, settings):
-    shorter, _ = run(CASES["improved_gs"], **settings)
+@pytest.mark.parametrize("name", ["improved_gs", "fastgs"])
+def test_densification_runs_whole_before_steps_with_accumulated_gradients(monkeypatch, name, settings):
+    shorter, _ = run(CASES[name], **settings)
     monkeypatch.setattr(ImprovedGS, "accumulates_from", 20)
-    gated, gate = run(CASES["improved_gs"], **settings)
+    monkeypatch.setattr(adapter, "ACCUMULATES_FROM", 20)
+    gated, gate = run(CASES[name], **settings)
     grown, before = ([step for step in one.backwards if step < 20] for one in (gated, shorter))
     assert len(before) < 16
     assert grown == list(range(1, 20)) if "share" in settings else len(grown) < 16  # the user asked for it

@@ -10,7 +10,6 @@ from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.densification_events import DensificationEvents
 from skipgs_plug.core.pace.needs import (
     LEAST_GROWING_SHARE,
-    LEAST_SHARE_BEFORE_FEW_STEPS,
     MOST_RAISED_SHARE,
     events_sooner,
     for_new_gaussians,
@@ -64,7 +63,6 @@ class Growing(Phase):
         self._first: int | None = None
         self._length = 0
         self._epoch = 0
-        self._least_share = 0.0
         self._visible: float | None = None  # share that a view shows, in the first measurement; it settles `share`
         self._visible_now: float | None = None  # that share in the latest measurement
         self._share_now: float | None = None  # share of the present iterations; None for `share`
@@ -89,11 +87,10 @@ class Growing(Phase):
             )
         numbers, found, densification, named = plan.numbers, plan.conditions, plan.densification, plan.named
         assert densification is not None
-        if plan.accumulates and self._config.grow_share is None:
-            # Refinement on accumulated gradients has few steps: 312 of 15,000 iterations in FastGS. Densification is
-            # nearly all of the training then, so all of it runs.
+        if (plan.accumulates or plan.steps_each) and self._config.grow_share is None:
+            # The trainer's own refinement on accumulated gradients has few steps: 312 of 15,000 iterations in FastGS.
+            # Densification is nearly all of the training then, so all of it runs.
             named = set(numbers)
-        self._least_share = LEAST_SHARE_BEFORE_FEW_STEPS if plan.steps_each else 0.0
         marks = densification.marks
         events = set() if densification.numbers is None else set(densification.numbers(numbers))
         others: dict[str, set[int]] = {}
@@ -223,7 +220,7 @@ class Growing(Phase):
         if self._auto:
             longer = self._config.compensates and self._visible is not None
             events = len(self.events) if self.events.all_run else 0
-            self.share = max(self._least_share, growing_share(self._length, self._epoch, longer, events))
+            self.share = growing_share(self._length, self._epoch, longer, events)
 
     def _factors(self, number: int) -> tuple[float, GrowingParts]:
         """Return the factor on learning rates in iteration `number`, and the parts of opacities and positions."""

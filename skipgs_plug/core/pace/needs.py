@@ -10,10 +10,6 @@ from skipgs_plug.core.pace.parts import GEOMETRY
 # Least share of the iterations that run. A tenth of 15,000 iterations is the least that lost nothing on bonsai and on
 # room. With 8.5 % bonsai ends with three quarters of its Gaussians.
 LEAST_GROWING_SHARE = 0.1
-# Least share in a trainer whose own run takes nearly all of its steps before densification ends, and few after it. With
-# 16 % of its iterations FastGS (bonsai 100x67, 30,000 iterations) ends 0.6 dB and 0.013 SSIM below its own run, with
-# 30 % 0.3 dB and 0.010, with half of them 0.2 dB above and 0.001 below.
-LEAST_SHARE_BEFORE_FEW_STEPS = 0.5
 # Least number of iterations at the trainer's own rates. 750 iterations lost 0.3 dB on Lego and 0.7 dB on bonsai.
 LEAST_GROWING_STEPS = 1200
 # Least number of iterations with longer steps, in a schedule that grows for `SHORT_PHASE` iterations. 450 lost nothing
