@@ -30,10 +30,10 @@ class FastGS(InriaFamily):
     project = "[FastGS](https://github.com/fastgs/FastGS)"
     gated = "From `densify_until_iter` on. The prunes at 18,000, 21,000, 24,000 and 27,000 pause the gate."
     left_alone = (
-        "In the paper's gate, `optimizer_step(iteration)` steps every 16th, 32nd or 64th iteration with the gradients "
-        "gathered since, even in a skipped iteration."
+        "The paper's gate: `optimizer_step(iteration)` steps every 16th, 32nd or 64th iteration with the gradients "
+        "gathered since, even in a skipped one."
     )
-    with_share = f"Both optimizers step in each iteration of refinement that runs. {GROWS_WHOLE}"
+    with_share = f"Refinement steps in each iteration that runs. {GROWS_WHOLE}"
     stand_ins = "fastgs"
     mark = "render_fastgs"
     changes = (*InriaFamily.changes, "densify_and_prune_fastgs")

@@ -33,7 +33,7 @@ from skipgs_plug.core.views import view_key
 # Modules of a checkout. The script imports them.
 RENDERER, MODEL = "gaussian_renderer", "scene.gaussian_model"
 # Effect of `share` on trainers that accumulate gradients after densification; see `Phased`.
-GROWS_WHOLE = "If the script accumulates gradients after densification, densification runs whole."
+GROWS_WHOLE = "If steps accumulate gradients after densification, it runs whole."
 
 
 class InriaFamily(AbstractAdapter):

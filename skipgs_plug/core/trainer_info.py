@@ -57,8 +57,8 @@ class TrainerInfo:
             refinement are longer by the root of their share only, and shrink. With `share`, densification runs whole,
             since few steps follow it.
         steps_each: The trainer's own schedule accumulates, but the adapter makes optimizers step in each iteration of
-            refinement that runs, if iterations are left out and steps are longer. Densification runs whole with `share`,
-            as with `accumulates`: the trainer's own run takes nearly all of its steps there.
+            refinement that runs, if iterations are left out and steps are longer. With `share`, densification runs
+            whole all the same: the trainer's own run takes nearly all of its steps there.
         densification: How to find the densification events, so that fewer iterations can run before densification
             ends; None if all of them must run.
         defaults: Settings that suit this trainer. They are used where the user gave no value.
