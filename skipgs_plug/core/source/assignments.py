@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import NamedTuple
 
-from skipgs_plug.core.source.conditions import unconditional
 from skipgs_plug.core.source.inlining import PLACES, comprehended
 
 # Methods that change lists, sets and queues, so that an object can differ from iteration to iteration.
@@ -41,10 +40,3 @@ def assignments_in(body: Iterable[ast.stmt]) -> Assignments:
     options = {ast.unparse(method.value) for method in called if method.attr in CHANGES_OPTIONS}
     options |= {ast.unparse(node.value) for node in stored if isinstance(node, ast.Subscript)}
     return Assignments(assigned, changed.union(assigned), options)
-
-
-def counters(body: list[ast.stmt]) -> Iterator[str]:
-    """Yield the names and attributes to which these statements add a constant in every iteration."""
-    for node in unconditional(body):
-        if isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add) and isinstance(node.value, ast.Constant):
-            yield ast.unparse(node.target)

@@ -39,7 +39,7 @@ def conditions_in(
 
     Args:
         body: The statements.
-        functions: Inlined functions by the id of the call.
+        functions: Inlined functions by the id of the call, or of the attribute if it is a property.
         guards: Conditions under which the statements run.
         function: The function that the statements are of; None for the loop.
     """
@@ -210,9 +210,9 @@ def _filters(generators: Sequence[ast.comprehension]) -> Iterator[ast.expr]:
             yield ast.fix_missing_locations(ast.copy_location(anywhere, test))
 
 
-def _calls(node: ast.AST, guards: Guards) -> Iterator[tuple[ast.Call, Guards]]:
-    """Yield the calls in an expression, each with the conditions under which it is made."""
-    if isinstance(node, ast.Call):
+def _calls(node: ast.AST, guards: Guards) -> Iterator[tuple[ast.expr, Guards]]:
+    """Yield the calls and attributes in an expression, each with the conditions under which it is reached."""
+    if isinstance(node, (ast.Call, ast.Attribute)):
         yield node, guards
     if isinstance(node, ast.BoolOp):
         for part in node.values:

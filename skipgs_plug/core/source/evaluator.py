@@ -69,6 +69,16 @@ class Evaluator:
         reads = all(self._options.only_reads(part) for part in parts if isinstance(part, ast.Call))
         return not reads or not read.isdisjoint(self._changing)
 
+    def value(self, node: ast.expr) -> Any:
+        """Return the value that a name, attribute or entry has in all iterations; None if it is not known."""
+        parts = [part for part in ast.walk(node) if isinstance(part, ast.expr)]
+        read = {ast.unparse(part) for part in parts if isinstance(part, PLACES)}
+        reads = all(isinstance(part, (*PLACES, ast.Constant)) for part in parts)
+        if reads and read.isdisjoint(self._changing) and not self.mentions(node):
+            with contextlib.suppress(Exception):
+                return eval(_compiled(node), dict(self.names))
+        return None
+
     def is_option(self, node: ast.expr) -> bool:
         """Whether an expression consists of options of the run."""
         return node in self._options

@@ -7,7 +7,7 @@ import contextlib
 import functools
 import inspect
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import CodeType, FunctionType, MethodType
 from typing import Any
 
@@ -20,6 +20,28 @@ MOST_CALLBACKS = 16
 def callbacks(held: Any) -> Sequence[Any]:
     """Return the entries of a short list of functions or objects; nothing for any other value."""
     return held if isinstance(held, (list, tuple)) and len(held) <= MOST_CALLBACKS and not is_plain(held) else ()
+
+
+def value_of(place: ast.expr, names: Mapping[str, Any], unknown: Collection[str]) -> Any:
+    """Return the value that a name, attribute or entry has before the loop and in it; None if unknown.
+
+    Args:
+        place: The syntax of it. Properties are not evaluated.
+        names: Names and values before the loop.
+        unknown: Names and attributes that the loop assigns.
+    """
+    if ast.unparse(place) in unknown:
+        return None
+    match place:
+        case ast.Name(name):
+            return names.get(name)
+        case ast.Attribute(holder, name):
+            found = inspect.getattr_static(value_of(holder, names, unknown), name, None)
+            return None if hasattr(type(found), "__get__") else found
+        case ast.Subscript(holder, ast.Constant(key)):
+            held = value_of(holder, names, unknown)
+            return held.get(key) if isinstance(held, dict) else None
+    return None
 
 
 def called_function(
@@ -38,6 +60,13 @@ def called_function(
     found = _named(function, names, value, code)
     own = inspect.getattr_static(type(found), "__call__", None)
     return MethodType(own, found) if isinstance(own, FunctionType) else found
+
+
+def property_of(owner: Any, name: str) -> MethodType | None:
+    """Return the bound method that computes a property of an object; None if the object has no such property."""
+    found = inspect.getattr_static(type(owner), name, None)
+    getter = found.fget if isinstance(found, property) else None
+    return MethodType(getter, owner) if isinstance(getter, FunctionType) else None
 
 
 def without_partial(call: ast.Call, function: Any, named: Callable[[str, Any], ast.expr]) -> tuple[ast.Call, Any]:

@@ -14,8 +14,10 @@ from skipgs_plug.core.source.functions import (
     callbacks,
     called_function,
     closure,
+    property_of,
     read_syntax,
     undecorated,
+    value_of,
     without_partial,
 )
 from skipgs_plug.core.source.project import Project
@@ -58,11 +60,12 @@ class InlinedFunctions:
         code: Code of the function that holds the loop.
         names: Names and values before the loop. Names of the functions are added.
         target: Name of the loop's number.
+        counters: Names and attributes with which the loop counts by itself. Functions that receive them are read too.
         unknown: Names and attributes that the loop assigns.
         pure: Names of functions that are evaluated and not read.
 
     Attributes:
-        by_call: The functions, by the id of the call in the syntax tree.
+        by_call: The functions, by the id of the call in the syntax tree; for a property, of the attribute.
         unknown: The argument, and variables of the functions whose values are not known before the loop.
         counted: Variables of the functions that begin with the number and are assigned again.
         shared: Added names that other functions may change.
@@ -74,6 +77,7 @@ class InlinedFunctions:
         code: CodeType,
         names: dict[str, Any],
         target: str,
+        counters: Collection[str],
         unknown: Collection[str],
         pure: Collection[str],
     ) -> None:
@@ -83,7 +87,7 @@ class InlinedFunctions:
         self._project = Project(code, names)
         self._open = [code]  # code of the loop and of the functions that are being read, outermost first
         _Repeated(self._held).visit_all(body)
-        self._follow(body, {target})
+        self._follow(body, {target, *counters})
 
     def __iter__(self) -> Iterator[ast.stmt]:
         """Iterate over the statements of all functions."""
@@ -100,19 +104,27 @@ class InlinedFunctions:
         for node in nodes:
             if isinstance(node, ast.Assign) and self._is_of(node.value, numbers):
                 numbers |= {ast.unparse(target) for target in node.targets if isinstance(target, PLACES)}
-        holders = {text.rpartition(".")[0] for text in numbers}
+        holders = {holder for text in numbers for holder in itertools.accumulate(text.split(".")[:-1], "{}.{}".format)}
         for node in nodes:
-            if isinstance(node, ast.Call) and self._receives(node, numbers, holders):
-                found = called_function(node.func, self._names, self._value, self._open[-1])
-                call, function = without_partial(node, found, self._named)
-                plain = undecorated(function)
-                if plain is not None and plain.__code__ not in self._open and plain in self._project:
-                    read = self._read(call, function, plain, numbers)
-                    if read is not None:
-                        self.by_call[id(node)] = InlinedFunction(read, plain.__code__)
-                        self._open.append(plain.__code__)
-                        self._follow(read, set(numbers))
-                        self._open.pop()
+            call, function = self._called(node, numbers, holders)
+            plain = undecorated(function)
+            if call is not None and plain is not None and plain.__code__ not in self._open and plain in self._project:
+                read = self._read(call, function, plain, numbers)
+                if read is not None:
+                    self.by_call[id(node)] = InlinedFunction(read, plain.__code__)
+                    self._open.append(plain.__code__)
+                    self._follow(read, set(numbers))
+                    self._open.pop()
+
+    def _called(self, node: ast.AST, numbers: Collection[str], holders: Collection[str]) -> tuple[ast.Call | None, Any]:
+        """Return the call and the function if a node calls a function with the number, or reads such a property."""
+        if isinstance(node, ast.Call) and self._receives(node, numbers, holders):
+            found = called_function(node.func, self._names, self._value, self._open[-1])
+            return without_partial(node, found, self._named)
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) in holders:
+            getter = property_of(self._value(node.value), node.attr)
+            return ast.copy_location(ast.Call(node, [], []), node), getter
+        return None, None
 
     def _held(self, loop: ast.For) -> list[ast.expr]:
         """Return names for what a loop over functions or objects runs with, such as callbacks; none if unknown."""
@@ -145,19 +157,7 @@ class InlinedFunctions:
         )
 
     def _value(self, place: ast.expr) -> Any:
-        """Return the value that a name or attribute has before the loop and in it; None if unknown."""
-        if ast.unparse(place) in self.unknown:
-            return None
-        match place:
-            case ast.Name(name):
-                return self._names.get(name)
-            case ast.Attribute(holder, name):
-                found = inspect.getattr_static(self._value(holder), name, None)
-                return None if hasattr(type(found), "__get__") else found  # a property is not evaluated
-            case ast.Subscript(holder, ast.Constant(key)):
-                held = self._value(holder)
-                return held.get(key) if isinstance(held, dict) else None
-        return None
+        return value_of(place, self._names, self.unknown)
 
     def _read(
         self, call: ast.Call, function: Any, plain: FunctionType, numbers: Collection[str]

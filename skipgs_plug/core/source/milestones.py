@@ -19,7 +19,7 @@ from typing import Any
 
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.source.assignments import assignments_in, counters
+from skipgs_plug.core.source.assignments import assignments_in
 from skipgs_plug.core.source.conditions import (
     Condition,
     conditions_in,
@@ -29,9 +29,11 @@ from skipgs_plug.core.source.conditions import (
     position,
     unconditional,
 )
+from skipgs_plug.core.source.counters import counters
 from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator
-from skipgs_plug.core.source.inlining import PLACES, InlinedFunctions
+from skipgs_plug.core.source.inlining import PLACES, InlinedFunction, InlinedFunctions
 from skipgs_plug.core.source.progress_bars import Moves, moves, only_shows
+from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.run_options import PURE, RunOptions
 from skipgs_plug.core.source.substitution import Substitution
 
@@ -61,9 +63,15 @@ class TrainingLoop:
         self._code, self._body, self._names = code, statement.body, dict(names)
         self._target = target = statement.target.id
         own = assignments_in(statement.body)
-        self._counters = {text for text in counters(statement.body) if own.assigned.count(text) == 1}
+        self._counters = {*counters(statement.body, self._names, own.assigned, Project(code, self._names))}
         functions = InlinedFunctions(
-            statement.body, code, self._names, target, set(own.assigned).difference(known), pure | PURE
+            statement.body,
+            code,
+            self._names,
+            target,
+            self._counters,
+            set(own.assigned).difference(known),
+            pure | PURE,
         )
         inlined = assignments_in(functions)
         by_loop = own.changed.difference(known)
@@ -76,6 +84,7 @@ class TrainingLoop:
         assigned = Counter([*own.assigned, *inlined.assigned])
         Substitution(functions.by_call, self._evaluator, lambda text: assigned[text] == 1).apply(self._body)
         self._all = list(conditions_in(self._body, functions.by_call))
+        self._functions = [*functions.by_call.values()]
         self._warned_of: set[str] = set()  # conditions that warnings have named
 
     def milestones(self, numbers: range) -> dict[str, set[int]]:
@@ -86,8 +95,9 @@ class TrainingLoop:
 
         Returns:
             Sets of iterations by "line N: condition", or by "line N: list" for a list of iterations that the loop
-            passes to a function together with the number. The set of a condition that holds for no number is empty.
-            Conditions that only advance a progress bar are not included; see `bar_moves`.
+            passes to a function together with the number. A dictionary that is looked up by the number is a condition
+            `number in dictionary`. The set of a condition that holds for no number is empty. Conditions that only
+            advance a progress bar are not included; see `bar_moves`.
 
         Warns:
             RuntimeWarning: A condition depends on a counter of the loop's own, or compares the number with a limit that
@@ -97,15 +107,12 @@ class TrainingLoop:
         Raises:
             SkipGSError: A condition cannot be evaluated ahead because of the loop itself.
         """
-        file = self._code.co_filename
-        by_itself = [f"{_line(leaf, self._code)} of {file} ({ast.unparse(leaf)})" for leaf in self._counted_by_itself()]
-        for place in self._without_warning(by_itself):
+        for place in self._without_warning(map(self._place, self._counted_by_itself())):
             caution(
                 f"Line {place} counts the iterations that run, so it holds less often if others are left out. Decide "
                 f"by {self._target} if that matters."
             )
-        by_limit = [f"{_line(leaf, self._code)} of {file} ({ast.unparse(leaf)})" for leaf in self._moving_limits()]
-        for place in self._without_warning(by_limit):
+        for place in self._without_warning(map(self._place, self._moving_limits())):
             caution(
                 f"Line {place} moves its own limit, so it can hold later and less often if iterations are left out; "
                 "name the iterations that must run (--always, always=)."
@@ -119,8 +126,11 @@ class TrainingLoop:
             if hits is not None:
                 found.setdefault(f"{self._where(condition)}: {text}", set()).update(hits)
             if not certain:
-                code = self._code_of(condition)
-                uncertain.append(f"line {_line(condition.test, code)} of {code.co_filename} ({text})")
+                uncertain.append(f"line {self._place(condition)}")
+        for lookup in self._lookups():
+            hits = _rarer(self._evaluator, lookup, numbers)
+            if hits:
+                found[f"{self._where(lookup)}: {ast.unparse(lookup.test)}"] = hits
         uncertain = self._without_warning(uncertain)
         if uncertain:
             caution(
@@ -188,27 +198,25 @@ class TrainingLoop:
             if mentions(condition.test) and any(is_point(leaf) and mentions(leaf) for leaf in leaves(condition.test)):
                 yield condition
 
-    def _counted_by_itself(self) -> Iterator[ast.expr]:
+    def _counted_by_itself(self) -> Iterator[Condition]:
         """Yield all conditions on a counter of the loop's own, which does not count left-out iterations."""
         for condition in self._all:
-            if condition.function is not None or any(self._evaluator.is_off(guard) for guard in condition.guards):
+            if any(self._evaluator.is_off(guard) for guard in condition.guards):
                 continue
             for leaf in leaves(condition.test):
-                read = {ast.unparse(part) for part in ast.walk(leaf) if isinstance(part, PLACES)}
                 picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and is_point(leaf)
-                if picks and read & self._counters and not self._evaluator.mentions(leaf):
-                    yield leaf
+                if picks and _read(leaf) & self._counters and not self._evaluator.mentions(leaf):
+                    yield condition._replace(test=leaf)
 
-    def _moving_limits(self) -> Iterator[ast.expr]:
+    def _moving_limits(self) -> Iterator[Condition]:
         """Yield all comparisons as in `if step >= next_save: next_save += 100`."""
-        for node in (part for statement in self._body for part in ast.walk(statement)):
+        for function, node in self._nodes():
             if not isinstance(node, ast.If):
                 continue
             moved = assignments_in(node.body).changed
             for leaf in leaves(node.test):
-                read = {ast.unparse(part) for part in ast.walk(leaf) if isinstance(part, PLACES)}
                 if isinstance(leaf, ast.Compare) and self._evaluator.mentions(leaf) and not is_point(leaf):
-                    yield from [leaf] if read & moved else []
+                    yield from [Condition(leaf, (), function)] if _read(leaf) & moved else []
 
     def _lists(self) -> Iterator[ast.expr]:
         """Yield names that are passed to a function together with the number, and may be lists of iterations."""
@@ -217,6 +225,20 @@ class TrainingLoop:
                 given = [*call.args, *(keyword.value for keyword in call.keywords)]
                 if any(isinstance(value, ast.Name) and value.id == self._target for value in given):
                     yield from (value for value in given if isinstance(value, (ast.Name, ast.Attribute)))
+
+    def _lookups(self) -> Iterator[Condition]:
+        """Yield `number in table` for each dictionary in which the loop, or a function, looks up the number."""
+        for function, node in self._nodes():
+            match node:
+                case ast.Subscript(table, key, ast.Load()) | ast.Call(ast.Attribute(table, "get"), [key, *_]):
+                    if self._evaluator.mentions(key) and isinstance(self._evaluator.value(table), dict):
+                        test = ast.copy_location(ast.Compare(key, [ast.In()], [table]), node)
+                        yield Condition(test, (), function)
+
+    def _nodes(self) -> Iterator[tuple[InlinedFunction | None, ast.AST]]:
+        """Yield all nodes of the loop, with None, and of each function that it calls, with the function."""
+        bodies = [(None, self._body), *((one, one.body) for one in self._functions)]
+        return ((one, part) for one, body in bodies for statement in body for part in ast.walk(statement))
 
     def _bar_if_of(self, condition: Condition) -> ast.If | None:
         """Return the outermost `if` that only advances a progress bar and has or contains this condition."""
@@ -232,11 +254,21 @@ class TrainingLoop:
     def _code_of(self, condition: Condition) -> CodeType:
         return self._code if condition.function is None else condition.function.code
 
-    def _without_warning(self, places: list[str]) -> list[str]:
+    def _place(self, condition: Condition) -> str:
+        """Return the number of the line, the file and the text of a condition, as warnings show them."""
+        code = self._code_of(condition)
+        return f"{_line(condition.test, code)} of {code.co_filename} ({ast.unparse(condition.test)})"
+
+    def _without_warning(self, places: Iterable[str]) -> list[str]:
         """Return the conditions that no warning has named; they are evaluated for each phase."""
         found = [place for place in dict.fromkeys(places) if place not in self._warned_of]
         self._warned_of.update(found)
         return found
+
+
+def _read(expression: ast.expr) -> set[str]:
+    """Return the names, attributes and entries that an expression reads."""
+    return {ast.unparse(part) for part in ast.walk(expression) if isinstance(part, PLACES)}
 
 
 def _rarer(evaluator: Evaluator, condition: Condition, numbers: range) -> set[int] | None:

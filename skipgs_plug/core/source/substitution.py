@@ -17,7 +17,8 @@ class Substitution(ast.NodeTransformer):
     is replaced after its assignment only. Before the assignment, its value is the previous iteration's.
 
     Args:
-        functions: Inlined functions by the id of the call. Their statements are changed too.
+        functions: Inlined functions by the id of the call, or of the attribute if it is a property. Their statements
+            are changed too.
         evaluator: Tells which expressions have values that are known before the loop.
         assigned_once: Returns whether the loop assigns a name or attribute in one place only.
     """
@@ -49,7 +50,7 @@ class Substitution(ast.NodeTransformer):
     def visit_Name(self, node: ast.Name | ast.Attribute) -> ast.AST:
         if isinstance(node.ctx, ast.Load) and (meaning := self._meanings.get(ast.unparse(node))) is not None:
             return ast.copy_location(copy.deepcopy(meaning), node)
-        return self.generic_visit(node)
+        return self._result(node)
 
     visit_Attribute = visit_Name
 
@@ -62,6 +63,10 @@ class Substitution(ast.NodeTransformer):
         return value
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
+        return self._result(node)
+
+    def _result(self, node: ast.expr) -> ast.AST:
+        """Return the value that a call or a property has, as an expression; the node itself if it has none."""
         self.generic_visit(node)
         function = self._functions.get(id(node))
         if function is None:
@@ -87,8 +92,8 @@ def _assigned(statement: ast.stmt) -> Iterator[tuple[ast.expr, ast.expr]]:
         case ast.Assign([ast.Tuple([whole, rest])], ast.Call(ast.Name("divmod"), [number, by], [])):
             yield whole, ast.copy_location(ast.BinOp(number, ast.FloorDiv(), by), statement.value)
             yield rest, ast.copy_location(ast.BinOp(number, ast.Mod(), by), statement.value)
-        case ast.Assign([target], value):
-            yield target, value
+        case ast.Assign(targets, value):
+            yield from ((target, value) for target in targets)
 
 
 def returned(body: Sequence[ast.stmt]) -> ast.expr | None:

@@ -1,0 +1,47 @@
+"""Counters of a loop: names and attributes that count the iterations that run, as `images += 1` does."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any
+
+from skipgs_plug.core.source.conditions import unconditional
+from skipgs_plug.core.source.functions import called_function, syntax_of, undecorated, value_of
+from skipgs_plug.core.source.project import Project
+
+
+def counters(
+    body: Sequence[ast.stmt], names: Mapping[str, Any], assigned: Collection[str], project: Project
+) -> Iterator[str]:
+    """Yield the names and attributes to which a loop adds a constant in every iteration.
+
+    They are those of the loop, and those of objects whose methods the loop calls in every iteration: `saver.count()`.
+
+    Args:
+        body: The loop's statements.
+        names: Names and values before the loop.
+        assigned: Names and attributes that the loop assigns, once for each assignment.
+        project: The user's project. Methods of libraries are not read.
+    """
+    yield from (text for text in _counted(body) if [*assigned].count(text) == 1)
+    for method in (part.func for one in unconditional(body) for part in _always_reached(one)):
+        if isinstance(method, ast.Attribute):
+            function = undecorated(called_function(method, names, lambda place: value_of(place, names, assigned)))
+            syntax = None if function is None or function not in project else syntax_of(function)
+            if syntax is not None and syntax.args.args:
+                own, owner = f"{syntax.args.args[0].arg}.", ast.unparse(method.value)
+                counted = (text for text in _counted(syntax.body) if text.startswith(own))
+                yield from (f"{owner}.{text.removeprefix(own)}" for text in counted)
+
+
+def _counted(body: Sequence[ast.stmt]) -> Iterator[str]:
+    for node in unconditional(body):
+        if isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add) and isinstance(node.value, ast.Constant):
+            yield ast.unparse(node.target)
+
+
+def _always_reached(statement: ast.stmt) -> Iterator[ast.Call]:
+    """Yield the calls in a statement that has no block."""
+    if isinstance(statement, (ast.Expr, ast.Assign, ast.AnnAssign)):
+        yield from (part for part in ast.walk(statement) if isinstance(part, ast.Call))
