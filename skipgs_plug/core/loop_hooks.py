@@ -59,7 +59,7 @@ class LoopHooks:
         """
         pace = self._engine.pace
         if isinstance(pace, Phased):
-            pace.describe(always or nothing_always, pure, densification, known or nothing_known)
+            pace.describe(always or nothing_always, pure, densification, known or nothing_known, functions)
             replace_range(self._patches, names, functions, pace)
             catch_up_schedulers(self._patches, pace)
 

@@ -69,7 +69,10 @@ SECOND = """    for iteration in range(first_iter, 31):
 @pytest.mark.parametrize(
     ("head", "sentence"),
     [
-        ("    while iteration < opt.last:\n        iteration += 1\n", r"in iteration 40.*No loop over range\(...\)"),
+        (
+            "    while iteration < opt.last:\n        iteration += 1\n",
+            r"in iteration 40.*No loop over range\(...\) .*\(line \d+ of .*: while iteration < opt.last\), so",
+        ),
         (
             "    for iteration in range(31, opt.last + 1):\n        if iteration == upcoming:\n"
             "            upcoming += 10\n",

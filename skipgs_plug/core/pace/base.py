@@ -95,6 +95,7 @@ class Pace:
         pure: Iterable[str] = (),
         densification: Densification | None = None,
         known: Known = nothing_known,
+        functions: tuple[str, ...] = (),
     ) -> None:
         """Receive facts that the loop's source does not show.
 
@@ -104,6 +105,7 @@ class Pace:
             densification: How to recognise densification events; None if `configure` tells it, or if it is unknown.
             known: Receives all names of the loop's function right before the loop's conditions are read, and returns
                 values of names that the loop assigns, if they are known before.
+            functions: Names of the functions that may hold the loop.
         """
 
     def require(self, number: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.pace.loop_range import LoopRange
+from skipgs_plug.core.source.lines import running_loop
 
 # Number of iterations that could be left out, within which the training loop must be found. It is as small as
 # `CHECKED_ITERATIONS`, so that the user hears of a missing loop within seconds.
@@ -16,11 +17,13 @@ class LoopFinder:
     Attributes:
         found: The present training loop; None until it is known, and after it has ended.
         expected: Number with which the next loop continues, also in a resumed run; None in a new run.
+        functions: Names of the functions that may hold the loop, for sentences.
     """
 
     def __init__(self) -> None:
         self.found: LoopRange | None = None
         self.expected: int | None = None
+        self.functions: tuple[str, ...] = ()
         self._candidates: list[LoopRange] = []
         self._without = 0
 
@@ -56,11 +59,12 @@ class LoopFinder:
         self._without += needed
         if self._without == SEARCHED:
             sentence = (
-                "No loop over range(...) counts the iterations of this trainer, so the gate cannot leave any out; "
-                "use it without share and refine_share"
+                f"No loop over range(...) counts the iterations of this trainer{running_loop(self.functions)}, so the "
+                "gate cannot leave any out; use it without share and refine_share, or write the loop as"
             )
             raise AdapterMismatchError(
-                f"{sentence}, or write the loop as: for step in gate.iterations(range(...)).", in_script=f"{sentence}."
+                f"{sentence}: for step in gate.iterations(range(...)).",
+                in_script=f"{sentence} one over range(...) alone.",
             )
         return False
 

@@ -11,13 +11,14 @@ from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.base import Always, Known, Pace, Source, nothing_always, nothing_known
 from skipgs_plug.core.pace.growing import Growing
 from skipgs_plug.core.pace.loop_finder import LoopFinder
-from skipgs_plug.core.pace.loop_range import LoopRange, line_of, require_planned
+from skipgs_plug.core.pace.loop_range import LoopRange, require_planned
 from skipgs_plug.core.pace.phase import Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refinement_policy import RefinementPolicy
 from skipgs_plug.core.pace.refining import Refining
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.release import Release
+from skipgs_plug.core.source.lines import line_of
 from skipgs_plug.core.source.milestones import read_loop
 from skipgs_plug.core.source.progress_bars import Bars
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
@@ -83,8 +84,10 @@ class Phased(Pace):
         pure: Iterable[str] = (),
         densification: Densification | None = None,
         known: Known = nothing_known,
+        functions: tuple[str, ...] = (),
     ) -> None:
         self._always, self._pure, self._densification, self._known = always, tuple(pure), densification, known
+        self._finder.functions = functions
         self._attached = True
 
     def require(self, number: int) -> None:

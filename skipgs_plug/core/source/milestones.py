@@ -32,6 +32,7 @@ from skipgs_plug.core.source.conditions import (
 from skipgs_plug.core.source.counters import counters
 from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator
 from skipgs_plug.core.source.inlining import PLACES, InlinedFunction, InlinedFunctions
+from skipgs_plug.core.source.lines import head_of
 from skipgs_plug.core.source.progress_bars import Moves, moves, only_shows
 from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.run_options import PURE, RunOptions
@@ -331,19 +332,19 @@ def read_loop(
             f"The source of {code.co_name}() in {code.co_filename} cannot be read ({error}), so the gate cannot know "
             "which iterations must run; gate without share and refine_share, or name them (--always, always=)."
         ) from error
-    first = code.co_firstlineno if function else 1
-    for node in ast.walk(tree):
-        # The head of a loop inside or around it lies on other lines.
-        if (
-            isinstance(node, ast.For)
-            and isinstance(node.target, ast.Name)
-            and node.lineno <= line - first + 1 <= (node.iter.end_lineno or node.lineno)
-        ):
-            return TrainingLoop(node, tree, code, {**names, **known}, known, frozenset(pure))
+    line_in_source = line - (code.co_firstlineno - 1 if function else 0)
+    # The head of a loop inside or around it lies on other lines.
+    heads = (node for node in ast.walk(tree) if isinstance(node, ast.For))
+    loop = next((one for one in heads if one.lineno <= line_in_source <= (one.iter.end_lineno or one.lineno)), None)
+    if loop is not None and isinstance(loop.target, ast.Name):
+        return TrainingLoop(loop, tree, code, {**names, **known}, known, frozenset(pure))
     found = f"Line {line} of {code.co_filename} is not in a loop over one number"
+    if loop is not None:
+        found = f"{found} ({head_of(loop)})"
     raise SkipGSError(
         f"{found}; write the loop as: for step in gate.iterations(range(...)).",
-        in_script=f"{found}; name the iterations that must run (--always).",
+        in_script=f"{found}; write the loop as one over range(...) alone, or name the iterations that must run "
+        "(--always).",
     )
 
 

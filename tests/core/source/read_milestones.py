@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from skipgs_plug.core.pace.loop_range import line_of
+from skipgs_plug.core.source.lines import line_of
 from skipgs_plug.core.source.milestones import read_loop
 
 NUMBERS = range(50, 100)

@@ -281,6 +281,15 @@ def test_a_number_that_no_loop_hands_out_is_refused():
         found(loop)
 
 
+def test_a_loop_over_more_than_the_number_is_named():
+    def loop(stop):
+        for index, step in enumerate(stop()):
+            print(index, step)
+
+    with pytest.raises(SkipGSError, match=r"one number \(for index, step in enumerate\(stop\(\)\)\); write the loop"):
+        found(loop)
+
+
 def test_a_source_that_cannot_be_read_is_refused():
     names = {}
     exec("def loop(stop):\n    for step in stop():\n        pass\n", names)

@@ -8,7 +8,7 @@ import torch
 from tqdm import tqdm
 
 from skipgs_plug import SkipGate
-from skipgs_plug.core.pace.loop_range import line_of
+from skipgs_plug.core.source.lines import line_of
 from skipgs_plug.core.source.milestones import read_loop
 
 NUMBERS = range(1, 101)
