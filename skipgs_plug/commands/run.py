@@ -21,6 +21,7 @@ from skipgs_plug.scripts import spawned
 from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
 from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED
 from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu, exclusive_cores
+from skipgs_plug.scripts.exits import before_os_exit
 from skipgs_plug.scripts.launch import Attach, run_script, source_of
 
 
@@ -107,15 +108,18 @@ def run_gated(
         checkpoints.gate = gates[0]
         return gates[0].script_globals
 
+    def finish() -> None:
+        for gate in gates:
+            gate.detach()
+            if rank == 0:
+                report(gate, adapter)
+
     with cpu_instead_of_cuda(args, command) if args.cpu else contextlib.nullcontext():
         try:
-            with checkpoints.watch():
+            with checkpoints.watch(), before_os_exit(finish):
                 code = execute(attach)
         finally:
-            for gate in gates:
-                gate.detach()
-                if rank == 0:
-                    report(gate, adapter)
+            finish()
     return code, gates[0] if gates else None
 
 

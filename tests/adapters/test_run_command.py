@@ -1,6 +1,7 @@
 """`skipgs-plug run` on a look-alike of Inria's checkout that asks for CUDA and its extension modules."""
 
 import json
+import os
 import sys
 import textwrap
 from pathlib import Path
@@ -179,6 +180,17 @@ def test_inert_and_never_skipping_train_bit_for_bit_alike(checkout, tmp_path):
 def test_failing_script_keeps_its_code_and_leaves_a_report(checkout, tmp_path):
     assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path), "--fail"]) == 3
     assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 4
+
+
+def test_script_that_ends_its_process_leaves_a_report_first(checkout, tmp_path, monkeypatch):
+    def ended(status):
+        assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 60
+        raise SystemExit(status)
+
+    monkeypatch.setattr(os, "_exit", ended)
+    text = Path(checkout).read_text().replace('print("Training complete.")', "__import__('os')._exit(4)")
+    Path(checkout).write_text(text)
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 4
 
 
 def test_script_that_never_trains_keeps_its_code(checkout, tmp_path, capfd):
