@@ -12,6 +12,7 @@ from skipgs_plug.core.clock import Times
 from skipgs_plug.core.drift_check import DriftCheck
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.gaussian_count import GaussianCount
 from skipgs_plug.core.intercept import Around, Original, Patches, intercept_tensor_backward
 from skipgs_plug.core.loop_hooks import LoopHooks
 from skipgs_plug.core.optimizers import Optimizers
@@ -77,6 +78,7 @@ class Hooks(LoopHooks):
         self.script_globals: dict[str, Any] = {}
         self._iteration = engine.iteration
         self._drift: DriftCheck | None = None
+        self._count: GaussianCount | None = None
         self._iterations = 0
         self._backwards = 0
         self._odd_iterations = 0  # iterations with a number of backward passes other than one, so far
@@ -119,6 +121,8 @@ class Hooks(LoopHooks):
                 raise self._mismatch("the trainer iterates before it said when densification ends")
             if self._iterations == CHECKED_ITERATIONS:
                 self._require_one_backward_each()
+            if self._count is not None and self._count.changed():
+                self.event("number of Gaussians")
             if self._drift is not None and (moved := self._drift.moved()):
                 self._release_moved(moved)
                 return
@@ -280,14 +284,16 @@ class Hooks(LoopHooks):
         intercept_tensor_backward(self._patches, callers, self.backward)
 
     def check_drift(self, optimizers: Optimizers) -> None:
-        """Check that nothing moves the parameters of these optimizers in skipped iterations; see `DriftCheck`.
+        """Check that no code of a fork changes the parameters of these optimizers unseen.
 
-        A fork of a trainer can do that. The gate is then released, and training goes on without it.
+        If they move in skipped iterations, the gate is released, and training goes on without it; see `DriftCheck`. A
+        number of Gaussians that changes without a structural change is reported as one.
 
         Args:
             optimizers: Returns the optimizers.
         """
         self._drift = DriftCheck(self._engine, optimizers)
+        self._count = GaussianCount(self._engine.stats, optimizers)
 
     def _release_moved(self, names: list[str]) -> None:
         self.release(

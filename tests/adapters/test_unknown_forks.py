@@ -38,6 +38,10 @@ class GaussianModel(SplatModel):
     def count(self):
         self.counted = True
 
+    def thin(self):
+        for one in self.optimizer.param_groups:
+            one["params"][0] = self.values[one["name"]] = torch.nn.Parameter(one["params"][0].detach()[:-1])
+
 
 def render(camera, gaussians, kernel_size=0.3):
     return draw(camera, gaussians.values)
@@ -107,6 +111,25 @@ def test_further_calls_and_arguments_are_listed():
     with gate:
         train(gate.adapter.trainer)  # nothing moves, so it is gated to the end
     assert gate.report()["backwards_skipped"] == 21
+
+
+@pytest.mark.parametrize(
+    "when",
+    [
+        "iteration / opt.iterations in (0.65, 0.8)",
+        "iteration // 6 == 4 and iteration % 2",
+        "iteration in torch.tensor([26, 32]).tolist()",
+    ],
+)
+def test_gaussians_that_a_fork_removes_unseen_pause_the_gate(when):
+    fork = unknown_fork(extra=f"if {when}: getattr(gaussians, 'th' + 'in')()")
+    with SkipGate(fork, pause_iters=2, warmup=0, min_bwd_ratio=0.0, record_trace=True) as gate:
+        train(fork)
+    changed = [n for n in range(20, 40) if len(log.values[n][0]) != len(log.values[n + 1][0])]
+    assert gate.released is None and len(changed) in (2, 3)
+    paused = {row.step for row in gate.trace if row.reason == "pause"}
+    assert {n + 1 for n in changed} | {n + 2 for n in changed} <= paused
+    assert gate.report()["events"] == {"number of Gaussians": len(changed)}
 
 
 def test_what_moves_the_model_in_skipped_iterations_ends_the_gate_and_not_the_training():
