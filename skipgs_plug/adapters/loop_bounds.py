@@ -187,17 +187,20 @@ class CallReader:
     def _follow(self, name: str, call: ast.Call, scope: Scope, end: int | None) -> None:
         if name in self._stops:
             return
+        call, function, syntax = self._called(call, scope)
+        if syntax is None:
+            return
+        if syntax.name != name:  # the loop has a name of its own for it: `prune = gaussians.prune_points`
+            self.note(syntax.name, end)
+        if syntax.name not in self._stops:
+            self.read(function, *self._arguments(call, function, syntax, scope), end)
+
+    def _called(self, call: ast.Call, scope: Scope) -> tuple[ast.Call, Any, ast.FunctionDef | None]:
+        """Return a call, the function that it calls, and its syntax; None if that is no function of the trainer."""
         found = called_function(call.func, scope.values, lambda place: value_of(place, scope), scope.code)
         call, function = without_partial(call, found, lambda own, value: named(own, value, scope))
         plain = undecorated(function)
-        if plain is None or plain not in self.trainer:
-            return
-        if plain.__name__ != name:  # the loop has a name of its own for it: `prune = gaussians.prune_points`
-            self.note(plain.__name__, end)
-        syntax = None if plain.__name__ in self._stops else syntax_of(plain)
-        if syntax is None:
-            return
-        self.read(function, *self._arguments(call, function, syntax, scope), end)
+        return call, function, None if plain is None or plain not in self.trainer else syntax_of(plain)
 
     def _arguments(
         self, call: ast.Call, function: Any, syntax: ast.FunctionDef, scope: Scope
@@ -253,11 +256,8 @@ class CallReader:
 
     def _end_of_result(self, call: ast.Call, scope: Scope, holds: bool) -> int | None:
         """Return the same for the result of a function of the trainer that only returns a condition."""
-        found = called_function(call.func, scope.values, lambda place: value_of(place, scope), scope.code)
-        call, function = without_partial(call, found, lambda own, value: named(own, value, scope))
-        plain = undecorated(function)
-        syntax = None if plain is None or plain not in self.trainer else syntax_of(plain)
-        result = None if syntax is None else returned(syntax.body)
+        call, function, syntax = self._called(call, scope)
+        plain, result = undecorated(function), None if syntax is None else returned(syntax.body)
         if plain is None or syntax is None or result is None or plain.__code__ in self._open:
             return None
         numbers, values = self._arguments(call, function, syntax, scope)

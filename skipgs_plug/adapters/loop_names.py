@@ -10,11 +10,10 @@ from collections.abc import Iterator, Mapping
 from types import CodeType
 from typing import Any, NamedTuple
 
-from skipgs_plug.core.source.run_options import is_namespace, is_plain
+from skipgs_plug.core.source.run_options import PURE, is_namespace, is_plain
+from skipgs_plug.core.source.substitution import assigned_values
 
-# Functions that conditions may call while they are evaluated, because the functions change nothing.
-_NAMES = ("abs", "float", "int", "len", "list", "max", "min", "range", "round", "set", "sorted", "tuple")
-PURE = {name: getattr(builtins, name) for name in _NAMES}
+_PURE = {name: getattr(builtins, name) for name in PURE}
 NOTHING: dict[str, Any] = {}  # of a scope before its function is read
 
 
@@ -62,14 +61,7 @@ def scope_inside(function: ast.FunctionDef, scope: Scope) -> Scope:
 
 def learn_names(statement: ast.stmt, scope: Scope) -> None:
     """Record the names that a statement assigns, with their values and the expressions that they stand for."""
-    match statement:
-        case ast.Assign([ast.Tuple(targets)], ast.Tuple(values)) if len(targets) == len(values):
-            pairs = [*zip(targets, values, strict=True)]
-        case ast.Assign([target], value) | ast.AnnAssign(target, _, ast.expr() as value):
-            pairs = [(target, value)]
-        case _:
-            return
-    for target, value in pairs:
+    for target, value in assigned_values(statement):
         if isinstance(target, ast.Name) and target.id in scope.once:
             found = value_of(value, scope)
             if found is not None:
@@ -94,7 +86,7 @@ def value_of(node: ast.expr, scope: Scope) -> Any:
 def evaluated(node: ast.expr, scope: Scope, otherwise: Any = None) -> Any:
     """Return the value of an expression, or `otherwise` if it has none."""
     try:
-        return eval(compile(ast.Expression(node), "<condition>", "eval"), {"__builtins__": PURE}, scope.values)
+        return eval(compile(ast.Expression(node), "<condition>", "eval"), {"__builtins__": _PURE}, scope.values)
     except Exception:
         return otherwise
 
@@ -112,6 +104,10 @@ def is_option(node: ast.expr, scope: Scope) -> bool:
             holder = value_of(place, scope)
             holds = is_namespace(holder) or dataclasses.is_dataclass(holder)
             return holds and hasattr(holder, name) and is_plain(getattr(holder, name))
+        case ast.Call(ast.Name("getattr"), [place, ast.Constant(str(name)), *default]):
+            attribute, holder = ast.Attribute(place, name, ast.Load()), value_of(place, scope)
+            absent = bool(default) and holder is not None and not hasattr(holder, name)
+            return is_option(default[0] if absent else attribute, scope)
         case ast.BoolOp() | ast.BinOp() | ast.UnaryOp() | ast.Compare() | ast.IfExp() | ast.Tuple() | ast.List():
             return all(is_option(part, scope) for part in ast.iter_child_nodes(node) if isinstance(part, ast.expr))
     return False
@@ -161,4 +157,10 @@ def _is_plain(part: ast.AST) -> bool:
 
 
 def _places(node: ast.expr) -> Iterator[str]:
-    return (ast.unparse(part) for part in ast.walk(node) if isinstance(part, (ast.Name, ast.Attribute)))
+    """Yield the names and attributes in an expression, also those of `getattr(place, "name")`."""
+    for part in ast.walk(node):
+        match part:
+            case ast.Name() | ast.Attribute():
+                yield ast.unparse(part)
+            case ast.Call(ast.Name("getattr"), [place, ast.Constant(str(name)), *_]):
+                yield f"{ast.unparse(place)}.{name}"

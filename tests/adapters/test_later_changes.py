@@ -63,6 +63,13 @@ class Trimmer:
         (f"if opt.pruned_late and iteration < 30: {PRUNE}", 20),
         (f"if not opt.pruned_late and iteration < 30: {PRUNE}", 30),
         (f"if not opt.pruned_late: continue\n            {PRUNE}", 20),
+        (f"if iteration <= getattr(opt, 'prune_until_iter'): {PRUNE}", 31),
+        (f"if getattr(opt, 'pruned_late', True) and iteration < 30: {PRUNE}", 20),
+        (f"if getattr(opt, 'absent', False) and iteration < 30: {PRUNE}", 20),
+        (f"if getattr(opt, 'absent', True) and iteration < 30: {PRUNE}", 30),
+        (f"if iteration < getattr(opt, 'moved', 25): {PRUNE}\n            opt.moved = 25", 20),
+        (f"end = last = opt.prune_until_iter\n            if iteration < last: {PRUNE}", 30),
+        (f"rounds, rest = divmod(opt.prune_until_iter, 7)\n            if iteration < 7 * rounds: {PRUNE}", 28),
         (f"if opt.changed_late and iteration < 30: {PRUNE}\n            opt.changed_late = True", 30),
         (f"if pruned and iteration < 30: {PRUNE}\n            pruned = iteration > 3", 30),
         (f"if iteration < opt.iterations: {PRUNE}", 20),  # until the end: each prune pauses the gate

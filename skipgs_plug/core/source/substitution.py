@@ -41,7 +41,7 @@ class Substitution(ast.NodeTransformer):
                 self.apply(statement.body)
                 continue
             self.visit(statement)
-            for target, value in _assigned(statement):
+            for target, value in assigned_values(statement):
                 name = ast.unparse(target)
                 once = isinstance(target, (ast.Name, ast.Attribute)) and self._assigned_once(name)
                 if once and self._evaluator.is_known(value):
@@ -82,7 +82,7 @@ class Substitution(ast.NodeTransformer):
         return value
 
 
-def _assigned(statement: ast.stmt) -> Iterator[tuple[ast.expr, ast.expr]]:
+def assigned_values(statement: ast.stmt) -> Iterator[tuple[ast.expr, ast.expr]]:
     """Yield the names and attributes that a statement assigns, with their values."""
     match statement:
         case ast.AnnAssign(target, _, ast.expr() as value):
