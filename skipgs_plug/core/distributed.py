@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import os
 import weakref
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -123,6 +124,22 @@ def largest(value: int) -> int:
     return value if group_size() == 1 else int(_reduced(torch.tensor([value]), dist.ReduceOp.MAX)[0])
 
 
+def united(found: dict[str, set[int]]) -> dict[str, set[int]]:
+    """Return the sets of all ranks, with those of one name united. All ranks must call it together.
+
+    Raises:
+        BrokenTrainingError: Another rank does not answer.
+    """
+    size = group_size()
+    if size == 1:
+        return found
+    of_ranks: list[Any] = [None] * size
+    with _answered():
+        dist.all_gather_object(of_ranks, found, group=None if "cpu" in _devices() else _gloo_group())
+    names = dict.fromkeys(name for one in of_ranks for name in one)
+    return {name: set().union(*(one.get(name, ()) for one in of_ranks)) for name in names}
+
+
 def _lowest(vote: int, device: torch.device | None) -> int:
     at = device if device is not None and device.type in _devices() and "cpu" not in _devices() else "cpu"
     return int(_reduced(torch.tensor([vote], dtype=torch.int32, device=at), dist.ReduceOp.MIN)[0])
@@ -135,10 +152,17 @@ def _reduced(values: Tensor, operation: Any) -> list[float]:
         values = values.cpu()
         if "cpu" not in _devices():
             group = _gloo_group()
-    try:
+    with _answered():  # NCCL reports a missing peer only when the result is read
         dist.all_reduce(values, op=operation, group=group)
         return values.cpu().tolist()  # type: ignore[no-any-return]
-    except RuntimeError as error:  # NCCL reports a missing peer only when the result is read
+
+
+@contextlib.contextmanager
+def _answered() -> Iterator[None]:
+    """Raise BrokenTrainingError if another rank does not answer in the `with` statement."""
+    try:
+        yield
+    except RuntimeError as error:
         raise BrokenTrainingError(
             "Another process of the group did not answer: it ended, or waited longer than the time-out of "
             "init_process_group(); see its output, and resume all from their last checkpoint. PyTorch says: "

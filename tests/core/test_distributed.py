@@ -319,3 +319,30 @@ def test_ranks_agree_on_the_bound_on_gaussians(tmp_path: Path, bound: int | None
     one, two = (json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2))
     # The first event is asked about before any step showed how many there are.
     assert one == two and (one["events"] > 1) == events
+
+
+def save_on_the_first(rank: int, folder: str) -> None:
+    """The first rank alone saves, and its condition on the number names no iteration to the other one."""
+    start(rank, folder, seconds=5)
+    parameter = torch.nn.Parameter(torch.ones(1))
+    parameter.register_hook(lambda grad: (dist.all_reduce(grad := grad.clone()), grad)[1])
+    optimizer = torch.optim.Adam([{"params": [parameter], "lr": 0.01, "name": "means"}])
+    gate = SkipGate(start_iter=20, refine_share=0.3)
+    ran, saved = [], []
+    for step in gate.iterations(range(200), views=["a.png", "b.png"]):
+        ran.append(step)
+        if gate.backward(parameter.square().sum(), view="ab"[step % 2] + ".png", step=step):
+            optimizer.step()
+            optimizer.zero_grad()
+        if rank == 0 and step % 35 == 0:
+            saved.append(step)
+    Path(folder, f"{rank}.json").write_text(json.dumps({"ran": ran, "saved": saved}))
+    dist.destroy_process_group()
+
+
+@pytest.mark.timeout(120)
+def test_ranks_run_the_iterations_that_one_of_them_needs(tmp_path: Path) -> None:
+    mp.spawn(save_on_the_first, args=(str(tmp_path),), nprocs=2)
+    one, two = (json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2))
+    assert one["ran"] == two["ran"] and len(one["ran"]) < 120
+    assert one["saved"] == [0, 35, 70, 105, 140, 175] and two["saved"] == []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from skipgs_plug.core import distributed
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
@@ -12,7 +13,7 @@ from skipgs_plug.core.pace.base import Always, Known, Pace, Source, nothing_alwa
 from skipgs_plug.core.pace.growing import Growing
 from skipgs_plug.core.pace.loop_finder import LoopFinder
 from skipgs_plug.core.pace.loop_range import LoopRange, require_planned
-from skipgs_plug.core.pace.phase import Phase, PhasePlan
+from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refinement_policy import RefinementPolicy
 from skipgs_plug.core.pace.refining import Refining
@@ -254,11 +255,14 @@ class Phased(Pace):
         self._planned = loop
 
     def _plan(self, numbers: range, conditions: dict[str, set[int]], last: int, before: Phase) -> PhasePlan:
-        named = {n for n in (*self._always(numbers), *self._chosen, *self._required) if n in numbers}
+        own = {n for n in (*self._always(numbers), *self._chosen, *self._required) if n in numbers}
+        # A condition may hold on one rank alone, such as `rank == 0 and step % 1000 == 0`.
+        found = distributed.united({**conditions, NAMED_FOR_TRAINER: own})
+        named = found.pop(NAMED_FOR_TRAINER)
         epoch = self._epoch or (None if self._views is None else len(self._views))
         return PhasePlan(
             numbers,
-            conditions,
+            found,
             named,
             last,
             before,
