@@ -60,11 +60,11 @@ class LoopFinder:
         if self._without == SEARCHED:
             sentence = (
                 f"No loop over range(...) counts the iterations of this trainer{running_loop(self.functions)}, so the "
-                "gate cannot leave any out; use it without share and refine_share, or write the loop as"
+                "gate cannot leave any out; use it without share and refine_share, or write one loop over all of them"
             )
             raise AdapterMismatchError(
                 f"{sentence}: for step in gate.iterations(range(...)).",
-                in_script=f"{sentence} one over range(...) alone.",
+                in_script=f"{sentence}: for step in range(...).",
             )
         return False
 
