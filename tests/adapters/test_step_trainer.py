@@ -69,3 +69,21 @@ def test_script_is_reached_through_prepare_trainer(monkeypatch):
     assert gate.report()["iterations"] == 60 and gate.report()["backwards_skipped"] > 0
     assert gate.adapter.output_folder == "out"
     assert not hasattr(prepare.prepare_trainer, "__skipgs_plug__")
+
+
+class Trimmer(step_trainer.TrainerWrapper):
+    """Prunes later than the trainer's bounds, where the adapter does not look."""
+
+    def after_optim_hook(self, loss, out, camera):
+        if self.curr_step == 40:
+            self.model.prune_gaussians(0.2, self.model.values["opacity"])
+
+
+def test_a_later_prune_of_a_users_wrapper_pauses_the_gate():
+    new_log()
+    trainer = Trimmer(step_trainer.make())
+    with SkipGate(trainer, **RULE) as gate:
+        step_trainer.training(trainer, step_trainer.dataset(), 60)
+    assert gate.config.start_iter == 21 and len(log.values[41][0]) < len(log.values[40][0])
+    assert [row.reason for row in gate.trace if row.step in range(41, 45)] == ["pause"] * 4
+    assert gate.report()["events"]["number of Gaussians"] == 1
