@@ -6,6 +6,7 @@ import ast
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
+from skipgs_plug.core.source.assignments import assignments_in
 from skipgs_plug.core.source.conditions import unconditional
 from skipgs_plug.core.source.functions import called_function, syntax_of, undecorated, value_of
 from skipgs_plug.core.source.project import Project
@@ -14,17 +15,17 @@ from skipgs_plug.core.source.project import Project
 def counters(
     body: Sequence[ast.stmt], names: Mapping[str, Any], assigned: Collection[str], project: Project
 ) -> Iterator[str]:
-    """Yield the names and attributes to which a loop adds a constant in every iteration.
+    """Yield the names and attributes to which a loop adds a constant in every iteration, and that it never sets back.
 
     They are those of the loop, and those of objects whose methods the loop calls in every iteration: `saver.count()`.
 
     Args:
         body: The loop's statements.
         names: Names and values before the loop.
-        assigned: Names and attributes that the loop assigns, once for each assignment.
+        assigned: Names and attributes that the loop assigns.
         project: The user's project. Methods of libraries are not read.
     """
-    yield from (text for text in _counted(body) if [*assigned].count(text) == 1)
+    yield from _counted(body)
     for method in (part.func for one in unconditional(body) for part in _always_reached(one)):
         if isinstance(method, ast.Attribute):
             function = undecorated(called_function(method, names, lambda place: value_of(place, names, assigned)))
@@ -36,9 +37,12 @@ def counters(
 
 
 def _counted(body: Sequence[ast.stmt]) -> Iterator[str]:
+    assigned = assignments_in(body).assigned
     for node in unconditional(body):
         if isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add) and isinstance(node.value, ast.Constant):
-            yield ast.unparse(node.target)
+            text = ast.unparse(node.target)
+            if assigned.count(text) == 1:
+                yield text
 
 
 def _always_reached(statement: ast.stmt) -> Iterator[ast.Call]:

@@ -16,7 +16,7 @@ class State:
     """Knows the present step, and decides by it."""
 
     def __init__(self, every=45):
-        self.step = self.count = 0
+        self.step = self.count = self.gathered = 0
         self.every, self.limit, self.saved = every, 60, []
 
     @property
@@ -43,6 +43,11 @@ class State:
 
     def tick(self):
         self.count += 1
+
+    def gather(self):
+        self.gathered += 1
+        if self.gathered == 4:  # of those that run
+            self.gathered = 0
 
     def save_at_limit(self, step):
         if step >= self.limit:
@@ -175,11 +180,20 @@ def test_a_property_on_a_counter_is_warned_of(loop):
         found(loop)
 
 
+def test_gathering_in_an_object_is_nothing_to_warn_of():
+    def loop(stop):
+        state = State()
+        for _step in stop(state=state):
+            state.gather()
+
+    assert found(loop) == {}
+
+
 def test_a_limit_that_an_object_moves_is_warned_of():
     def loop(stop):
         state = State()
         for step in stop(state=state):
             state.save_at_limit(step)
 
-    with pytest.warns(RuntimeWarning, match=r"Line 48 of \S*tables.py \(step >= state.limit\) moves its own limit"):
+    with pytest.warns(RuntimeWarning, match=r"Line 53 of \S*tables.py \(step >= state.limit\) moves its own limit"):
         found(loop)
