@@ -122,8 +122,8 @@ class SkipGate:
 
         Some iterations always run: the last one, and every iteration whose number fulfils a condition of your loop,
         such as `if step % 1000 == 0`. The gate reads the conditions from the source of the loop, and of your own
-        functions that the loop calls with the number. If a scheduler advances by one with each call, set it to the
-        number of the iteration instead.
+        functions that the loop calls with the number. PyTorch's schedulers that the loop steps in this thread are
+        stepped for left-out iterations too. Set a scheduler of your own to the number of the iteration.
 
         Args:
             numbers: All iterations of the run, or all remaining ones, as a range with step 1. A run may have several
@@ -281,6 +281,7 @@ class SkipGate:
     def patched(self) -> list[str]:
         """Every name that was replaced in the trainer and in PyTorch, as "owner.name"; empty after `detach`.
 
+        A loop over `iterations` replaces `step` of PyTorch's schedulers while it runs, which the list does not hold.
         Under `skipgs-plug run` the list also holds the names that are replaced while the script runs: `torch.save`,
         `torch.load` (with `weights_only=False` unless the script sets it) and, with `--cpu`, names of `torch.cuda`.
         """

@@ -14,6 +14,7 @@ from skipgs_plug.core.intercept import Original
 from skipgs_plug.core.optimizers import has_pending_gradient, listed
 from skipgs_plug.core.pace.base import EveryNumber, Source
 from skipgs_plug.core.pace.loop_range import LoopRange
+from skipgs_plug.core.pace.schedulers import schedulers_caught_up
 from skipgs_plug.core.views import NOT_READ, view_key
 
 
@@ -61,7 +62,11 @@ class OwnLoop:
             raise SkipGSError(f"views= takes a list of all names of training views, not the one name {views!r}.")
         with self.guarded:
             keys = None if views is None else list(dict.fromkeys(view_key(view) for view in views))
-            return self._engine.pace.follow(numbers, source, always, keys, events)
+            pace, on_error = self._engine.pace, self._giving_up.on_error
+            loop = pace.follow(numbers, source, always, keys, events)
+            if pace.leaves_out and not self._giving_up.attached:  # adapters step the schedulers of their trainers
+                loop.around = lambda: schedulers_caught_up(pace, lambda error: on_error(error, pace.number))
+            return loop
         return LoopRange(numbers, EveryNumber(lambda: None))
 
     def backward(self, loss: Any, view: Any, step: int, signal: Any) -> bool:

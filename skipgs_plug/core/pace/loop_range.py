@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from types import CodeType
 from typing import Any, Protocol
 
@@ -43,22 +44,25 @@ class LoopRange:
         source: Code of the function that asked, with the names and values that it had; None if its conditions need not
             be read.
         current: The number that was returned last; None before the first and after the last.
+        around: Returns a block that the loop runs in.
     """
 
     def __init__(self, numbers: range, owner: Owner, source: tuple[CodeType, Mapping[str, Any]] | None = None) -> None:
         self.numbers, self.source = numbers, source
         self.current: int | None = None
+        self.around: Callable[[], AbstractContextManager[None]] = nullcontext
         self._owner = owner
 
     def __iter__(self) -> Iterator[int]:
-        try:
-            for number in self.numbers:
-                if self._owner.runs(self, number):
-                    self.current = number
-                    yield number
-        finally:
-            self.current = None
-            self._owner.ended(self)
+        with self.around():
+            try:
+                for number in self.numbers:
+                    if self._owner.runs(self, number):
+                        self.current = number
+                        yield number
+            finally:
+                self.current = None
+                self._owner.ended(self)
 
     def __len__(self) -> int:
         return self._owner.expected(self)

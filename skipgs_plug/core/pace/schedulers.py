@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import weakref
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from threading import Lock, get_ident
+from typing import Any, NamedTuple
 
 from torch.optim.lr_scheduler import ChainedScheduler, CosineAnnealingWarmRestarts, LRScheduler, SequentialLR
 
-from skipgs_plug.core.intercept import Patches
+from skipgs_plug.core.intercept import Original, Patches
 from skipgs_plug.core.pace.base import Pace
 
 # Classes with a `step` of their own that counts its calls.
@@ -16,29 +18,90 @@ COUNTING = (LRScheduler, ChainedScheduler, SequentialLR, CosineAnnealingWarmRest
 
 
 def catch_up_schedulers(patches: Patches, pace: Pace) -> None:
-    """Keep every scheduler that the training loop steps where it would be if all iterations ran.
+    """Keep every scheduler that the training loop of a trainer steps where it would be if all iterations ran.
 
     Args:
         patches: List of replacements, to which `step` of the schedulers is added.
         pace: Leaves out iterations.
     """
-    known: weakref.WeakKeyDictionary[Any, _Steps] = weakref.WeakKeyDictionary()
-    under_way: list[Any] = []  # a scheduler that is made of others steps them itself
-
-    def caught_up(original: Callable[..., Any], scheduler: Any, *args: Any, **kwargs: Any) -> Any:
-        number = pace.number
-        if under_way or number is None:
-            return original(scheduler, *args, **kwargs)
-        under_way.append(scheduler)
-        try:
-            for _ in range(known.setdefault(scheduler, _Steps()).missing(pace, number)):
-                original(scheduler, *args, **kwargs)
-            return original(scheduler, *args, **kwargs)
-        finally:
-            under_way.clear()
-
+    loop = _Schedulers(pace)
     for kind in COUNTING:
-        patches.wrap(kind, "step", caught_up)
+        patches.wrap(kind, "step", loop.step)
+
+
+@contextlib.contextmanager
+def schedulers_caught_up(pace: Pace, on_error: Callable[[Exception], None]) -> Iterator[None]:
+    """Do the same for a loop of the user's own, while it runs in this thread.
+
+    Several such loops may run at a time, in threads or one inside another.
+
+    Args:
+        pace: Leaves out iterations.
+        on_error: Receives errors of the gate's own code, and raises them or releases the gate.
+    """
+    loop = _RunningLoop(get_ident(), _Schedulers(pace), on_error)
+    with _lock:
+        if not _running:
+            for kind in COUNTING:
+                _replaced.wrap(kind, "step", _step_of_running_loop)
+        _running.append(loop)
+    try:
+        yield
+    finally:
+        with _lock:
+            _running.remove(loop)
+            if not _running:
+                _replaced.restore()
+
+
+class _Schedulers:
+    """The schedulers that one training loop steps."""
+
+    def __init__(self, pace: Pace) -> None:
+        self._pace = pace
+        self._known: weakref.WeakKeyDictionary[Any, _Steps] = weakref.WeakKeyDictionary()
+        self._under_way = False  # a scheduler that is made of others steps them itself
+
+    def step(self, original: Callable[..., Any], scheduler: Any, *args: Any, **kwargs: Any) -> Any:
+        """Step a scheduler as often as is missing."""
+        number = self._pace.number
+        if self._under_way or number is None or args or kwargs:  # a step to a given epoch counts nothing
+            return original(scheduler, *args, **kwargs)
+        steps = self._known.setdefault(scheduler, _Steps())
+        self._under_way = True
+        try:
+            for _ in range(steps.due(self._pace, number, scheduler)):
+                original(scheduler)
+        finally:
+            self._under_way = False
+        steps.at = getattr(scheduler, "last_epoch", None)
+
+
+class _RunningLoop(NamedTuple):
+    """A loop of a user's own that runs at present."""
+
+    thread: int
+    schedulers: _Schedulers
+    on_error: Callable[[Exception], None]
+
+
+_running: list[_RunningLoop] = []  # inner loops come last
+_replaced = Patches()
+_lock = Lock()
+
+
+def _step_of_running_loop(original: Original, scheduler: Any, *args: Any, **kwargs: Any) -> Any:
+    """Do the work of `step` of a scheduler, for the innermost loop in this thread."""
+    loop = next((one for one in reversed(_running) if one.thread == get_ident()), None)
+    if loop is None:
+        return original(scheduler, *args, **kwargs)
+    try:
+        return loop.schedulers.step(original, scheduler, *args, **kwargs)
+    except Exception as error:
+        if original.failed:
+            raise
+        loop.on_error(error)
+        return original.result if original.made else original(scheduler, *args, **kwargs)
 
 
 class _Steps:
@@ -46,17 +109,43 @@ class _Steps:
 
     A scheduler steps in every iteration if it steps in one that no condition of the loop names. Until then it may step
     in every hundredth iteration, for example. Such a scheduler lacks no step, because its iterations are not left out.
+
+    A loop of the user's own can make up for left-out iterations itself: by further calls of `step`, which then do
+    nothing here, or by setting the epoch of the scheduler.
+
+    Attributes:
+        at: Epoch of the scheduler after its last step here; None if it has none.
     """
 
     def __init__(self) -> None:
+        self.at: Any = None
         self._in_every_iteration = False
         self._left_out = 0
+        self._made_in: int | None = None  # iteration that made the scheduler, if the loop did
+        self._number: int | None = None  # last iteration with a call
+        self._calls = 0  # calls in that iteration
+        self._ahead = 0  # steps in that iteration that were made before the loop asked for them
+        self._usual = 1  # calls in an iteration that follows on the one before it
 
-    def missing(self, pace: Pace, number: int) -> int:
-        """Return the number of steps that are missing before the step in iteration `number`, the present one."""
-        self._left_out += pace.gap
+    def due(self, pace: Pace, number: int, scheduler: Any) -> int:
+        """Return the number of steps to make at a call in iteration `number`, the present one."""
+        if not hasattr(scheduler, "_last_lr"):  # its first step, which its class makes
+            self._made_in = number
+            return 1
+        gap = 0 if number == self._made_in else pace.gap
+        if number != self._number:
+            self._number, self._calls, self._ahead = number, 0, 0
+        self._calls += 1
+        if not gap:
+            self._usual = max(self._usual, self._calls)
+        elif self._calls > self._usual and self._ahead:
+            self._ahead -= 1
+            return 0
+        moved_by_loop = self.at is not None and scheduler.last_epoch != self.at
+        self._left_out = 0 if moved_by_loop else self._left_out + gap
         self._in_every_iteration = self._in_every_iteration or not pace.is_named(number)
         if not self._in_every_iteration:
-            return 0
+            return 1
         missing, self._left_out = self._left_out, 0
-        return missing
+        self._ahead += missing
+        return 1 + missing
