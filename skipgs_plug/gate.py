@@ -165,12 +165,12 @@ class SkipGate:
                 the loss before an AMP scaler.
 
         Raises:
-            GateOrderError: `backward` was already called for this view in this iteration, `update` or `step` was
-                called before it, or the iteration number decreases.
+            GateOrderError: In the first iteration, `backward` was already called for this view, or `update` or `step`
+                was called before it, or the next number is smaller.
             SkipGSError: The loss is not a tensor, or it is not finite and `on_nonfinite` is "raise". The first
                 iteration also raises it if the key is not usable, or if a share is given and the loop does not run over
-                `iterations`. In later iterations, such an error releases the gate with a warning, like any other error
-                of the gate itself; see `released`. So do losses that stay non-finite, in any iteration.
+                `iterations`. In later iterations, both errors release the gate with a warning, like any other error
+                of the gate itself; see `released`. Losses that stay non-finite are an error in any iteration.
 
         Examples:
             A batch of two views in one iteration:
@@ -199,7 +199,8 @@ class SkipGate:
             *args: Arguments of `optimizer.step`, such as the mask of visible Gaussians for a sparse optimizer.
 
         Raises:
-            GateOrderError: `backward` was not called first in this iteration, or the optimizer has stepped in it.
+            GateOrderError: In the first iteration, `backward` was not called first, or the optimizer has stepped. In
+                later iterations, this releases the gate.
         """
         self._require_manual("step")
         return self._loop.step(optimizer, *args)
@@ -211,7 +212,8 @@ class SkipGate:
         has run by then, so that two graphs are in memory at once.
 
         Raises:
-            GateOrderError: `backward` was not called first in this iteration.
+            GateOrderError: In the first iteration, `backward` was not called first. In later iterations, this releases
+                the gate.
         """
         self._require_manual("update")
         self._loop.update()

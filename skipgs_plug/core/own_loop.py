@@ -62,9 +62,9 @@ class OwnLoop:
             raise SkipGSError(f"views= takes a list of all names of training views, not the one name {views!r}.")
         with self.guarded:
             keys = None if views is None else list(dict.fromkeys(view_key(view) for view in views))
-            pace, on_error = self._engine.pace, self._giving_up.on_error
+            pace, on_error = self._engine.pace, self._release.on_error
             loop = pace.follow(numbers, source, always, keys, events)
-            if pace.leaves_out and not self._giving_up.attached:  # adapters step the schedulers of their trainers
+            if pace.leaves_out and not self._release.attached:  # adapters step the schedulers of their trainers
                 loop.around = lambda: schedulers_caught_up(pace, lambda error: on_error(error, pace.number))
             return loop
         return LoopRange(numbers, EveryNumber(lambda: None))
@@ -114,9 +114,11 @@ class OwnLoop:
             stepped = self._iteration.stepped
             for one in optimizers:
                 if id(one) in stepped:
-                    raise GateOrderError("step() was called twice for one optimizer in this iteration.")
+                    self._refuse(
+                        "step() was called twice for one optimizer in this iteration; call it once, after backward()."
+                    )
             stepped.update(map(id, optimizers))
-            if self._engine.config.enabled:  # a disabled gate lets every optimizer step
+            if self._engine.config.enabled and self._release.reason is None:  # otherwise every optimizer steps
                 with self.guarded:
                     stepping = [one for one in optimizers if has_pending_gradient(one)]
         for one in stepping:
@@ -147,12 +149,12 @@ class OwnLoop:
             )
         if isinstance(view, list):
             return self._backward_batch(loss, view, signal, run)
-        return engine.gate(self._new_in_iteration(view), signal, run, loss)
+        return engine.gate(*self._new_in_iteration([view]), signal, run, loss)
 
     def _backward_batch(self, losses: Any, views: list[Any], signals: Any, run: Original) -> bool:
         if not len(losses) == len(views) == len(signals):
             raise SkipGSError(f"{len(views)} view keys came with {len(losses)} losses; give one loss per view.")
-        keys = [self._new_in_iteration(view) for view in views]
+        keys = self._new_in_iteration(views)
         answers = [self._engine.decide(key, signal) for key, signal in zip(keys, signals, strict=True)]
         kept = [loss for loss, answer in zip(losses, answers, strict=True) if not answer.skip]
         if kept:
@@ -162,27 +164,35 @@ class OwnLoop:
         self._engine.clock.mark()
         return bool(kept)
 
-    def _new_in_iteration(self, view: Any) -> str:
-        """Return the key of a view that has had no backward pass in this iteration.
+    def _new_in_iteration(self, views: list[Any]) -> list[str]:
+        """Return the keys of views that have had no backward pass in this iteration. A batch may hold a view twice.
 
         Before `start_iter` an index on a device is not read: reading it would wait for the device.
         """
-        keys = self._iteration.keys
-        if isinstance(view, Tensor) and not self._iteration.gated and _is_index_on_device(view):
-            keys.add(NOT_READ)
-            return NOT_READ
-        key = view_key(view)
-        if key in keys:
-            raise GateOrderError(
-                f"backward() was called twice for view {key!r} in iteration {self._iteration.step}; "
-                "give each iteration its own step number."
-            )
-        keys.add(key)
-        return key
+        before = self._iteration.keys
+        found: list[str] = []
+        for view in views:
+            if isinstance(view, Tensor) and not self._iteration.gated and _is_index_on_device(view):
+                found.append(NOT_READ)
+                continue
+            key = view_key(view)
+            if key in before:
+                raise GateOrderError(
+                    f"backward() was called twice for view {key!r} in iteration {self._iteration.step}; give each "
+                    "iteration its own step number, and call backward() once for each view (the closure of LBFGS runs "
+                    "several times)."
+                )
+            found.append(key)
+        before.update(found)
+        return found
 
     def _require_backward_before(self, verb: str) -> None:
         if self._release.reason is None and (self._iteration.ended or not self._iteration.keys):
-            raise GateOrderError(f"{verb}() was called before backward() in this iteration.")
+            self._refuse(f"{verb}() was called before backward() in this iteration; call it after backward().")
+
+    def _refuse(self, sentence: str) -> None:
+        """Raise an error of order in the first iteration; in later ones it releases the gate."""
+        self._release.on_error(GateOrderError(sentence), self._iteration.step)
 
 
 def _check_losses(loss: Any, view: Any) -> None:

@@ -77,7 +77,7 @@ class Release:
             error: The error.
             refuses: See `on_error`.
         """
-        if isinstance(error, (BrokenTrainingError, GateOrderError)):
+        if isinstance(error, BrokenTrainingError) or (isinstance(error, GateOrderError) and self.attached):
             return True
         if isinstance(error, DivergedError):
             return not self.attached

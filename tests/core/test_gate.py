@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 
 import numpy as np
 import pytest
@@ -89,6 +90,38 @@ def test_verbs_out_of_order_are_named(calls, message: str) -> None:
     optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))])
     with pytest.raises(GateOrderError, match=message):
         calls(SkipGate(start_iter=0), optimizer)
+
+
+def test_verbs_out_of_order_release_the_gate_of_a_run_under_way(recwarn) -> None:
+    def twice(gate, step) -> None:
+        gate.backward(loss_of(1.0), "a", step)
+
+    def step_twice(gate, step) -> None:
+        gate.step(optimizer)
+        gate.step(optimizer)
+
+    def back(gate, step) -> None:
+        gate.backward(loss_of(1.0), "a", step - 10)
+
+    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))])
+    faults = {"twice for view 'a'": twice, r"step\(\) was called twice": step_twice, "went back from 20 to 10": back}
+    for message, fault in faults.items():
+        gate = SkipGate(start_iter=0, warmup=0, min_bwd_ratio=0.0)
+        for step in range(40):
+            ran = gate.backward(loss_of(1.0), "a", step)
+            assert ran or step <= 20
+            if step == 20:
+                fault(gate, step)
+        assert re.search(f"in iteration [12]0, and training goes on .*{message}", gate.released)
+        assert str(recwarn.pop(RuntimeWarning).message) == gate.released and not recwarn
+
+
+def test_a_batch_may_hold_a_view_twice() -> None:
+    gate = SkipGate(policy=Scripted(False, True, False))
+    losses = [loss_of(1.0), loss_of(2.0), loss_of(3.0)]
+    assert gate.backward(losses, view=["a", "a", "b"], step=0)
+    assert [loss.grad is not None for loss in losses] == [True, False, True]
+    assert [(row["view"], row["visits"], row["skips"]) for row in gate.view_table()] == [("a", 2, 1), ("b", 1, 0)]
 
 
 def test_views_of_a_batch_are_gated_one_by_one() -> None:
