@@ -149,7 +149,8 @@ class OwnLoop:
             )
         if isinstance(view, list):
             return self._backward_batch(loss, view, signal, run)
-        return engine.gate(*self._new_in_iteration([view]), signal, run, loss)
+        [key] = self._new_in_iteration([view])
+        return engine.gate(key, signal, run, loss)
 
     def _backward_batch(self, losses: Any, views: list[Any], signals: Any, run: Original) -> bool:
         if not len(losses) == len(views) == len(signals):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import copy
+import dis
 import inspect
 import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -51,7 +52,7 @@ class InlinedFunction(NamedTuple):
 
 
 class InlinedFunctions:
-    """The functions that a loop calls with its number, and the functions that they call with it.
+    """The functions that a loop calls with its number, or that read its number, and the functions that they call.
 
     Only functions of the user's own project are read, and methods of objects that exist before the loop.
 
@@ -94,7 +95,7 @@ class InlinedFunctions:
         return (statement for function in self.by_call.values() for statement in function.body)
 
     def _follow(self, body: list[ast.stmt], numbers: set[str]) -> None:
-        """Read the functions that statements call with the number.
+        """Read the functions that statements call with the number, or that read it from the loop's variable.
 
         Args:
             body: The statements.
@@ -118,9 +119,10 @@ class InlinedFunctions:
 
     def _called(self, node: ast.AST, numbers: Collection[str], holders: Collection[str]) -> tuple[ast.Call | None, Any]:
         """Return the call and the function if a node calls a function with the number, or reads such a property."""
-        if isinstance(node, ast.Call) and self._receives(node, numbers, holders):
+        if isinstance(node, ast.Call) and self._is_read(node):
             found = called_function(node.func, self._names, self._value, self._open[-1])
-            return without_partial(node, found, self._named)
+            if self._receives(node, numbers, holders) or self._shares_number(undecorated(found)):
+                return without_partial(node, found, self._named)
         if isinstance(node, ast.Attribute) and ast.unparse(node.value) in holders:
             getter = property_of(self._value(node.value), node.attr)
             return ast.copy_location(ast.Call(node, [], []), node), getter
@@ -131,11 +133,25 @@ class InlinedFunctions:
         held, place = callbacks(self._value(loop.iter)), ast.unparse(loop.iter)
         return [self._named(f"{place}[{index}]", one) for index, one in enumerate(held)]
 
+    def _is_read(self, call: ast.Call) -> bool:
+        """Whether a call has a function that is known before the loop, and is not evaluated instead."""
+        name = call.func.id if isinstance(call.func, ast.Name) else None
+        return name not in self._pure and name not in self.unknown
+
+    def _shares_number(self, plain: FunctionType | None) -> bool:
+        """Whether a function reads the variable of the loop that holds the number: a closure, or a global name."""
+        loop = self._open[0]
+        if plain is None:
+            return False
+        if loop.co_flags & inspect.CO_NEWLOCALS:
+            return self._target in plain.__code__.co_freevars and self._target in loop.co_cellvars
+        of_module = plain.__module__ == self._names.get("__name__")
+        return of_module and any(
+            one.opname == "LOAD_GLOBAL" and one.argval == self._target for one in dis.get_instructions(plain)
+        )
+
     def _receives(self, call: ast.Call, numbers: Collection[str], holders: Collection[str]) -> bool:
         """Whether a function receives the number, or an object that holds it in an attribute."""
-        name = call.func.id if isinstance(call.func, ast.Name) else None
-        if name in self._pure or name in self.unknown:
-            return False
         given = [*call.args, *(keyword.value for keyword in call.keywords)]
         if any(self._is_of(value, numbers) for value in given):
             return True
@@ -200,6 +216,8 @@ class InlinedFunctions:
 
     def _from_outside(self, name: str, plain: FunctionType, prefix: str) -> dict[str, ast.expr]:
         """Return the meaning of a name that a function does not assign; nothing if it means the same in the loop."""
+        if name == self._target and self._shares_number(plain):
+            return {}
         surrounding, loop = closure(plain), self._open[0]
         if name in surrounding:
             value, own = surrounding[name], f"{prefix}.{name}"

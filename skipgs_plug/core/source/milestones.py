@@ -337,15 +337,34 @@ def read_loop(
     heads = (node for node in ast.walk(tree) if isinstance(node, ast.For))
     loop = next((one for one in heads if one.lineno <= line_in_source <= (one.iter.end_lineno or one.lineno)), None)
     if loop is not None and isinstance(loop.target, ast.Name):
+        _refuse_to_yield(loop, code)
         return TrainingLoop(loop, tree, code, {**names, **known}, known, frozenset(pure))
     found = f"Line {line} of {code.co_filename} is not in a loop over one number"
     if loop is not None:
         found = f"{found} ({head_of(loop)})"
+    elif not line:
+        found = f"{code.co_name}() of {code.co_filename} has ended, and the loop over its iterations is elsewhere"
     raise SkipGSError(
         f"{found}; write the loop as: for step in gate.iterations(range(...)).",
         in_script=f"{found}; write the loop as one over range(...) alone, or name the iterations that must run "
         "(--always).",
     )
+
+
+def _refuse_to_yield(loop: ast.For, code: CodeType) -> None:
+    """Raise SkipGSError if a loop yields its number: conditions of the code that receives it are not in the loop."""
+    assert isinstance(loop.target, ast.Name)
+    for node in (part for statement in loop.body for part in ast.walk(statement)):
+        if isinstance(node, ast.Yield) and any(
+            isinstance(part, ast.Name) and part.id == loop.target.id for part in ast.walk(node)
+        ):
+            found = f"Line {_line(node, code)} of {code.co_filename} yields the iteration's number to other code"
+            unread = "whose conditions on it cannot be read"
+            raise SkipGSError(
+                f"{found}, {unread}; loop over gate.iterations(range(...)) there, or name the iterations that must run "
+                "(always=).",
+                in_script=f"{found}, {unread}; name the iterations that must run (--always).",
+            )
 
 
 def _is_list(value: Any) -> bool:

@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 import random
+import runpy
 from types import SimpleNamespace
 
 import project_helpers
@@ -11,7 +12,7 @@ import torch
 from project_helpers import Saver, Trainer, is_late, log, switch, while_switched_on
 from read_milestones import found
 
-from skipgs_plug import SkipGate
+from skipgs_plug import SkipGate, SkipGSError
 
 
 def maybe_save(step, saves, model=None):
@@ -309,3 +310,53 @@ def test_run_that_leaves_out_iterations_saves_all_that_its_functions_save():
             ran.append(step)
             saver.step(step)
     assert saver.saved == [0, 25, 50, 75, 100] and len(ran) < 40
+
+
+def test_functions_that_read_the_number_from_the_loops_variable(tmp_path):
+    def loop(stop):
+        def save():
+            if step % 45 == 0:
+                print(step)
+
+        every = lambda count: step % count == 0  # noqa: E731
+        for step in stop(save=save, every=every):
+            save()
+            if every(33):
+                print(step)
+
+    assert numbers(loop) == [66, 90, 99]
+    script = tmp_path / "script.py"
+    script.write_text(SHARED)
+    assert runpy.run_path(str(script))["saved"] == [0, 30, 60, 90]
+
+
+SHARED = """
+from skipgs_plug import SkipGate
+
+def save():
+    if step % 30 == 0:
+        saved.append(step)
+
+saved = []
+for step in SkipGate(start_iter=10, refine_share=0.2).iterations(range(100)):
+    save()
+"""
+
+
+def test_a_loop_that_yields_its_number_is_refused():
+    def steps(gate, **options):
+        for step in gate.iterations(range(100), **options):
+            yield step, None
+
+    with pytest.raises(SkipGSError, match=r"Line \d+ of .* yields the iteration's number to other code"):
+        list(steps(SkipGate(start_iter=10, refine_share=0.2)))
+    assert (30, None) in list(steps(SkipGate(start_iter=10, refine_share=0.2), always=[30]))
+
+
+def test_an_iterator_that_another_function_made_is_refused_with_its_name():
+    def made(gate):
+        return gate.iterations(range(100))
+
+    with pytest.raises(SkipGSError, match=r"^made\(\) of .* has ended"):
+        for _ in made(SkipGate(start_iter=10, refine_share=0.2)):
+            pass
