@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 from skipgs_plug.trainer.errors import InputError
 
 
@@ -10,3 +13,13 @@ def require_names(*given: tuple[str, str]) -> None:
     for option, name in given:
         if not name:
             raise InputError(f"{option} is empty; give the name of a folder.")
+
+
+def require_folder(out: str) -> None:
+    """Raise InputError if a folder cannot be made, before hours of work for it."""
+    folder = Path(out).expanduser().absolute()
+    nearest = next(place for place in (folder, *folder.parents) if place.exists())
+    if not nearest.is_dir():
+        raise InputError(f"--out {out}: {nearest} is a file; give the name of a folder.")
+    if not os.access(nearest, os.W_OK):
+        raise InputError(f"--out {out}: {nearest} cannot be written; change its permissions or give another --out.")

@@ -10,7 +10,7 @@ from typing import Any
 
 from skipgs_plug import SkipConfig, SkipGate
 from skipgs_plug.commands.gate_settings import GateSettings
-from skipgs_plug.commands.names import require_names
+from skipgs_plug.commands.names import require_folder, require_names
 from skipgs_plug.commands.options.sfm import Args as SfmArgs
 from skipgs_plug.commands.options.train import Args
 from skipgs_plug.commands.session import Session
@@ -87,10 +87,12 @@ def check(args: Args, checkpoints: list[Path]) -> None:
     """Refuse options that do not fit, before anything is read.
 
     Raises:
-        InputError: LPIPS cannot be computed, --resume does not fit the content of --out, or --sfm does not fit SCENE.
+        InputError: LPIPS cannot be computed, --out cannot be a folder, --resume does not fit its content, or --sfm does
+            not fit SCENE.
         SkipGSError: A setting of the gate is out of its range.
     """
     require_names(("SCENE", args.scene), ("--out", args.out))
+    require_folder(args.out)
     SkipConfig(**args.gate_options.given())
     given = Path(args.scene).expanduser()
     if args.sfm and not are_photographs(given):

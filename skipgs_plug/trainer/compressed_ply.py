@@ -10,6 +10,7 @@ from skipgs_plug.trainer.sh0 import sh0_of
 
 CHUNK = 256  # Gaussians that share one set of bounds, as the format says
 Columns = dict[str, np.ndarray]
+MAX_LOGIT = 20.0  # opacity logit that stands for infinity in a file: its opacity is 1 in float32
 XYZ, RGB = ("x", "y", "z"), ("r", "g", "b")
 
 
@@ -22,8 +23,6 @@ def decompress(
     vertices: Mapping[str, np.ndarray], chunks: Mapping[str, np.ndarray], sh: Mapping[str, np.ndarray]
 ) -> Columns:
     """Return the columns `x` to `rot_3` [N] float32 from the elements `vertex` [N], `chunk` [ceil(N / 256)] and `sh`.
-
-    Opacity is infinite where alpha is 0 or 1, since alpha has only one byte.
 
     Raises:
         KeyError: A column is missing.
@@ -60,9 +59,9 @@ def decompress(
 
 
 def logits(alpha: np.ndarray) -> np.ndarray:
-    """Return the logits of opacities in [0, 1], infinite at both ends."""
+    """Return the logits of opacities in [0, 1] that were stored as bytes, finite at both ends."""
     with np.errstate(divide="ignore"):
-        return np.log(alpha) - np.log1p(-alpha)  # type: ignore[no-any-return]
+        return (np.log(alpha) - np.log1p(-alpha)).clip(-MAX_LOGIT, MAX_LOGIT)  # type: ignore[no-any-return]
 
 
 def unpack_111011(packed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

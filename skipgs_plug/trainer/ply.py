@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.install import next_command
-from skipgs_plug.trainer.compressed_ply import decompress, is_compressed
+from skipgs_plug.trainer.compressed_ply import MAX_LOGIT, decompress, is_compressed
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.frame import FAR
@@ -27,7 +27,6 @@ HIGHER_COEFFICIENTS = 15  # number of SH coefficients of degrees 1 to 3 for each
 SATURATING = ("opacity", "scale_0", "scale_1", "scale_2")  # may be infinite in a saturated model
 F_REST_COUNTS = (0, 9, 24, 45)  # numbers of f_rest properties of SH degrees 0 to 3
 MAX_LOG_SCALE = 80.0  # largest logarithm of a scale in a file: float32 overflows at e^88
-MAX_LOGIT = 20.0  # opacity logit that stands for infinity in a file: its opacity is 1 in float32
 MIN_LOG_SCALE = -40.0  # smallest logarithm of a scale: the square of e^-40 is still a normal float32
 # Most bytes of a header: those of 3DGS files have about 2 KB, and a damaged file may have no end_header.
 MAX_HEADER = 1 << 16

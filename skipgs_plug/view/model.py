@@ -109,31 +109,32 @@ def open_model(path: str | Path, scene: str | None = None, data_factor: int | No
 
     Raises:
         MissingFileError: The file does not exist, the folder holds no model, or its scene is gone.
-        InputError: A file is damaged.
+        InputError: A file is damaged, or the factor is out of its range.
     """
     path = Path(path).expanduser()
     snapshots = open_snapshots(path)
     config = read_config(path) if path.is_dir() else {}
     source = scene or config.get("data_dir")
-    factor = data_factor or config.get("data_factor", 1)
+    settings = TrainConfig(
+        data_factor=config.get("data_factor", 1) if data_factor is None else data_factor,
+        near_plane=config.get("near_plane"),
+        far_plane=float(config.get("far_plane", TrainConfig.far_plane)),
+    )
     loaded = None
     if source:
         if not scene and not Path(source).exists() and (path / SCENE).is_dir():
             source = path / SCENE  # the run was moved together with it
         if not scene and not Path(source).exists():
             raise MissingFileError(f"{path} was trained on {source}, which does not exist here; add --scene.")
-        loaded = load_scene(source, factor, **{name: config[name] for name in LOADING if name in config})
-    planes = TrainConfig(
-        near_plane=config.get("near_plane"), far_plane=float(config.get("far_plane", TrainConfig.far_plane))
-    )
+        loaded = load_scene(source, settings.data_factor, **{name: config[name] for name in LOADING if name in config})
     return Model(
         path.stem,
         snapshots,
         loaded,
-        near_plane(planes, loaded) if loaded else NEAR_PLANE,
+        near_plane(settings, loaded) if loaded else NEAR_PLANE,
         is_antialiased(path, config),
         bool(config.get("exposure", False)),
-        far_plane(planes, loaded) if loaded else planes.far_plane,
+        far_plane(settings, loaded) if loaded else settings.far_plane,
     )
 
 

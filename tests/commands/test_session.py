@@ -283,13 +283,18 @@ def test_two_processes_do_not_share_a_folder(tmp_path: Path, packed: str, capsys
     assert not (tmp_path / ".owner.json").exists()
 
 
-def test_a_folder_that_cannot_be_written_is_one_sentence(
-    tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("out", ["file", "file/run", "closed/run"])
+def test_a_folder_that_cannot_be_written_is_one_sentence_before_the_scene_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, out: str
 ) -> None:
     (tmp_path / "file").write_text("")
-    assert train(packed, tmp_path / "file/run") == 2
+    (tmp_path / "closed").mkdir()
+    monkeypatch.setattr(os, "access", lambda path, mode: path.name != "closed")  # root may write everywhere
+    assert train("no scene", tmp_path / out) == 2
     error = capsys.readouterr().err
-    assert "cannot be written (Not a directory)" in error and "Traceback" not in error
+    fault = "cannot be written" if out == "closed/run" else "is a file"
+    assert f"{tmp_path / out.split('/')[0]} {fault}" in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "closed/run").exists()
 
 
 def test_a_run_folder_that_vanishes_is_made_anew(
