@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from skipgs_plug.bench.store import flat
@@ -44,6 +44,7 @@ RESULTS = (
     "after densification, s",
     "backwards skipped, %",
 )
+FOLDERS = ("data_dir", "result_dir")  # settings that do not change the model
 PICTURED = 3  # number of held-out views of each run that the page shows, the worst ones
 
 
@@ -59,8 +60,8 @@ def build_page(sources: Sequence[RunSource | BenchSource]) -> str:
 
 def comparison(runs: Sequence[RunSource]) -> Section:
     """Return the section that shows several runs side by side."""
-    blocks: list[Block] = [results("All runs", runs)]
     names = unique_names(runs)
+    blocks: list[Block] = [results("All runs", runs), *different_settings(names)]
     curves = {name: run.curve for name, run in names.items() if run.curve}
     if curves:
         blocks.append(picture(plots.loss_over_time(curves), "Training loss over iterations."))
@@ -69,6 +70,18 @@ def comparison(runs: Sequence[RunSource]) -> Section:
     if views:
         blocks.append(picture(plots.quality_of_views(views), "PSNR of each held-out view; dashed: mean of each run."))
     return Section("Side by side", blocks)
+
+
+def different_settings(runs: Mapping[str, RunSource]) -> list[Block]:
+    """Return a table of the training settings that differ, such as the size of the images; nothing if all are equal."""
+    settings = [dict(flat(run.settings)) for run in runs.values()]
+    known = [one for one in settings if one]
+    rows = [
+        [name, *(rounded(one.get(name)) for one in settings)]
+        for name in (known[0] if known else ())
+        if name not in FOLDERS and all(name in one for one in known) and len({str(one[name]) for one in known}) > 1
+    ]
+    return [Table("Settings that differ", ("", *runs), rows)] if rows else []
 
 
 def unique_names(runs: Sequence[RunSource]) -> dict[str, RunSource]:

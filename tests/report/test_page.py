@@ -110,6 +110,16 @@ def test_browser_shows_the_run_of_an_upstream_script(script_folder, tmp_path, du
     assert body_count(dom, "images") == body_count(dom, "decoded") == 3
 
 
+def test_settings_that_differ_stand_beside_the_comparison(ungated_folder, script_folder, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(ungated_folder, other)
+    settings = (other / "cfg.yml").read_text()
+    (other / "cfg.yml").write_text(settings.replace("data_factor: 1", "data_factor: 4") + "newer: 1\n")
+    page = make_page(tmp_path, ungated_folder, other, script_folder).read_text()
+    assert rows_of(page, "Settings that differ") == [["data_factor", "1", "4", "-"]]
+    assert "Settings that differ" not in make_page(tmp_path, ungated_folder, ungated_folder).read_text()
+
+
 def test_browser_compares_several_runs(train_folder, ungated_folder, script_folder, bench_folder, tmp_path, dump_dom):
     dom = dump_dom(make_page(tmp_path, train_folder, ungated_folder, script_folder, bench_folder))
     table = dom[dom.index("All runs") :]
