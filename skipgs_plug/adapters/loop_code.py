@@ -78,7 +78,7 @@ class LoopCode(NamedTuple):
         if LOOP not in functions:
             return cls(source, frozenset(own), frozenset(functions), frozenset(backward))
         training = functions[LOOP]
-        repeated, stored = _in_loop(training)
+        repeated, stored = _in_loop(training, syntax)
         called = _called(repeated, functions)
         parts = [part for code in (training, *called) for part in _with_inner(code)]
         # The compiler puts the names of keywords together in one constant.
@@ -122,24 +122,36 @@ def _called(used: set[str], functions: Mapping[str, types.CodeType]) -> list[typ
     return list(found.values())
 
 
-def _in_loop(code: types.CodeType) -> tuple[set[str], set[str]]:
+def _in_loop(code: types.CodeType, syntax: ast.FunctionDef | None) -> tuple[set[str], set[str]]:
     """Names used, and attributes assigned, in the loop that calls `backward`; without one, in the whole function."""
-    steps = list(dis.get_instructions(code))
-    backwards = [step.offset for step in steps if step.argval == "backward"]
-    loops = [
-        (step.argval, step.offset)
-        for step in steps
-        if "JUMP" in step.opname and isinstance(step.argval, int) and step.argval < step.offset
-    ]
-    around = [loop for loop in loops if any(loop[0] <= offset <= loop[1] for offset in backwards)]
-    first = min((loop[0] for loop in around), default=0)
-    last = max((loop[1] for loop in around), default=steps[-1].offset)
-    inside = [step for step in steps if first <= step.offset <= last]
+    lines = _loop_lines(code, syntax)
+    line_at = {offset: line for start, end, line in code.co_lines() for offset in range(start, end, 2)}
+    inside = [step for step in dis.get_instructions(code) if not lines or line_at[step.offset] in lines]
     names = {step.argval for step in inside if isinstance(step.argval, str) and step.argval in code.co_names}
     for step in inside:  # comprehensions and inner functions
         if isinstance(step.argval, types.CodeType):
             names |= {name for part in _with_inner(step.argval) for name in part.co_names}
     return names, {step.argval for step in inside if step.opname == "STORE_ATTR"}
+
+
+def _loop_lines(code: types.CodeType, syntax: ast.FunctionDef | None) -> set[int]:
+    """Lines of the statements that a loop with `backward` repeats.
+
+    They are read from the syntax: since Python 3.12, `except` and the end of `with` are compiled to jumps from behind
+    the function's last statement, so jumps do not tell where a loop ends.
+    """
+    if syntax is None:
+        return set()
+    # The source of an imported function begins with line 1.
+    shift = code.co_firstlineno - min(node.lineno for node in (syntax, *syntax.decorator_list))
+    lines: set[int] = set()
+    for loop in ast.walk(syntax):
+        if not isinstance(loop, (ast.For, ast.While)):
+            continue
+        if any(isinstance(node, ast.Attribute) and node.attr == "backward" for node in ast.walk(loop)):
+            first = loop.test if isinstance(loop, ast.While) else loop.body[0]
+            lines |= {*range(first.lineno + shift, (loop.body[-1].end_lineno or first.lineno) + shift + 1)}
+    return lines
 
 
 def _with_inner(code: types.CodeType) -> Iterator[types.CodeType]:

@@ -28,6 +28,7 @@ def training(dataset, opt, pipe):
             gaussians.optimizer.step()
             gaussians.optimizer.zero_grad(set_to_none=True)
             {extra}
+    {after}
 """
 
 
@@ -57,11 +58,11 @@ def from_file(tmp_path):
     return make
 
 
-def unknown_fork(argument="", extra="pass", until="densify_until_iter", before="pass", file=None, helper=""):
+def unknown_fork(argument="", extra="pass", until="densify_until_iter", before="pass", after="", file=None, helper=""):
     module = types.ModuleType("train")
     own = {"GaussianModel": type("GaussianModel", (GaussianModel,), {}), "render": render, "Scene": Scene}
     module.__dict__.update(own, log=log, pick=pick, photo_loss=photo_loss, torch=torch)
-    source = TRAIN.format(argument=argument, extra=extra, until=until, before=before) + helper
+    source = TRAIN.format(argument=argument, extra=extra, until=until, before=before, after=after) + helper
     if file is not None:
         file.write_text(source)
     exec(compile(source, str(file or "train"), "exec"), vars(module))
@@ -171,12 +172,13 @@ def test_noise_for_a_network_is_listed_and_not_refused():
     [
         {"before": "gaussians.values['xyz'].requires_grad_(False).requires_grad_(True)"},
         {"before": "torch.zeros(3).fill_(1.0)"},
+        {"after": "torch.zeros(3).fill_(1.0)"},
         {"extra": "torch.zeros(3).requires_grad_(False)"},
     ],
-    ids=["freeze before", "write before", "freeze"],
+    ids=["freeze before", "write before", "write after", "freeze"],
 )
-def test_what_changes_no_values_in_the_loop_is_not_refused(parts):
-    with SkipGate(unknown_fork(**parts), policy=SkipAlways()) as gate:
+def test_what_changes_no_values_in_the_loop_is_not_refused(from_file, parts):
+    with SkipGate(from_file(**parts), policy=SkipAlways()) as gate:
         train(gate.adapter.trainer)
     assert gate.report()["backwards_skipped"] == 21
 
