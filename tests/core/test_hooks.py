@@ -419,6 +419,7 @@ class Scheduling(Toy):
         hooks.loop(globals(), "train")
 
 
+@pytest.mark.filterwarnings("ignore:The epoch parameter")  # SequentialLR of torch 2.4 passes one itself
 @pytest.mark.parametrize("stop", [None, 50], ids=["whole", "resumed"])
 @pytest.mark.parametrize("kind", SCHEDULERS)
 def test_schedulers_that_count_calls_are_where_they_would_be_if_all_iterations_ran(kind, stop) -> None:

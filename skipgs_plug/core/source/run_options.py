@@ -48,9 +48,10 @@ class RunOptions:
         pure: Collection[str],
     ) -> None:
         declared = (node.names for node in ast.walk(source) if isinstance(node, (ast.Global, ast.Nonlocal)))
+        variables = {*code.co_varnames, *code.co_cellvars} - _of_comprehensions(source)
         # A module's own variables are its names.
-        self._own = {*code.co_varnames, *code.co_cellvars} if code.co_flags & inspect.CO_NEWLOCALS else {*code.co_names}
-        of_module = assigned_globals(code.co_filename).difference(code.co_varnames, code.co_cellvars)
+        self._own = variables if code.co_flags & inspect.CO_NEWLOCALS else {*code.co_names}
+        of_module = assigned_globals(code.co_filename) - variables
         self._shared = of_module.union(code.co_freevars, shared, *declared)
         self._names, self._changing, self._pure = names, changing, pure
 
@@ -124,6 +125,20 @@ def assigned_globals(file: str) -> set[str]:
     """Return the global names of a source file that its functions may assign."""
     declared = re.findall(r"\bglobal\s+(\w+(?:\s*,\s*\w+)*)", "".join(linecache.getlines(file)))
     return {name.strip() for names in declared for name in names.split(",")}
+
+
+def _of_comprehensions(source: ast.AST) -> set[str]:
+    """Names that only comprehensions assign. Since Python 3.12, they are among the variables of the function's code."""
+    nodes = [*ast.walk(source)]
+    targets = [node.target for node in nodes if isinstance(node, ast.comprehension)]
+    inner = {part for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)}
+    others = {
+        node.id
+        for node in nodes
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node not in inner
+    }
+    parameters = {node.arg for node in nodes if isinstance(node, ast.arg)}
+    return {node.id for node in inner} - others - parameters
 
 
 def _attribute(holder: Any, name: str, default: Any) -> Any:

@@ -148,6 +148,7 @@ def loop(stop):
 def test_option_that_any_function_may_change_counts_as_on():
     def loop(stop):
         cfg = {"prune": False}
+        assert [-SAVES for SAVES in range(2)] == [0, -1]  # no variable of the function
         for step in stop(cfg=cfg):
             if SWITCHED and step % 30 == 0:
                 switch()
