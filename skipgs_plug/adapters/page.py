@@ -10,11 +10,11 @@ from skipgs_plug.core.trainer_info import Densification
 
 HEAD = """# Supported trainers
 
-*Made by `python -m skipgs_plug.adapters.page > docs/adapters.md` from the adapters' declarations.*
+*Made by `python -m skipgs_plug.adapters.page`.*
 
 In every trainer, only the training backward pass is gated. Learning rates, SH degree, view order, logging, evaluation,
-saving, prunes and optimizer calls continue in skipped iterations. An optimizer without gradients does nothing. Views
-are known by image name. A gate that would start while densification still reads gradients is refused.
+saving, prunes and optimizer calls continue in skipped iterations. Views are known by image name. A gate that would
+start while densification still reads gradients is refused.
 
 A fork may be taken for its parent. So each adapter names unknown calls that change the model. The gate begins after
 the last change, known or not, if conditions of the loop, or of functions that it calls, tell its end. If a loop moves
@@ -24,8 +24,8 @@ With `share`, densification events are left out *by visits*, when the Gaussians 
 iterations*, when fewer iterations ran before them than their thresholds count. All events are kept where each one adds
 by a budget, a constant share or a resolution.
 
-`skipgs-plug run NAME -- SCRIPT ...` takes the name, or `auto`, which finds it in the script. The checks are described
-in [examples/README.md](../examples/README.md).
+`skipgs-plug run NAME -- SCRIPT ...` takes the name, or `auto`, which finds it in the script. Checks are in
+[examples/README.md](../examples/README.md).
 
 The gate cannot attach to compiled trainers, whose backward pass never goes through Python: Brush (Rust), LichtFeld
 Studio and OpenSplat (C++), Postshot (closed). Nor can it to forks whose loop is not in `training()`: 4DGaussians.
