@@ -50,7 +50,7 @@ def write_cloud(scene: Scene, path: Path) -> None:
     columns = [(name, "f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
     rows = np.empty(len(scene.points), dtype=columns)
     for i, (name, _) in enumerate(columns):
-        rows[name] = (scene.points if i < 3 else scene.points_rgb)[:, i % 3]
+        rows[name] = (scene.points if i < 3 else scene.points_rgb)[:, i % 3].numpy()
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(path))
 
 
