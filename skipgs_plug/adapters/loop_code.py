@@ -143,7 +143,7 @@ def _loop_lines(code: types.CodeType, syntax: ast.FunctionDef | None) -> set[int
     if syntax is None:
         return set()
     # The source of an imported function begins with line 1.
-    shift = code.co_firstlineno - min(node.lineno for node in (syntax, *syntax.decorator_list))
+    shift = code.co_firstlineno - min([syntax.lineno, *(one.lineno for one in syntax.decorator_list)])
     lines: set[int] = set()
     for loop in ast.walk(syntax):
         if not isinstance(loop, (ast.For, ast.While)):
