@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from types import FunctionType
 from typing import Any
 
 import torch
@@ -83,6 +84,12 @@ class StepTrainer(AbstractAdapter):
                 f"Not recognised: {', '.join(unknown)}. The gate begins with iteration {end}, after the last bound."
             )
 
+        if hooks.state.pace.leaves_out and hooks.state.config.always is None and (unread := counting_methods(trainer)):
+            caution(
+                f"It is not known which iterations need {', '.join(unread)}, which the package does not have; name them "
+                "(--always, always=), or they may be left out."
+            )
+
         def watched(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             if end is not None and trainer.curr_step < end - 1:
                 return original(*args, **kwargs)
@@ -124,6 +131,23 @@ def layers(part: Any) -> Iterator[Any]:
     for name in ("base_trainer", "densifier", "base_densifier"):
         if hasattr(part, name):
             yield from layers(getattr(part, name))
+
+
+def counting_methods(trainer: Any) -> list[str]:
+    """Return the methods of users' own layers that read the iteration, and so may save or prune in certain ones."""
+    parts = list(layers(trainer))
+    package = next(top_module(kind) for kind in reversed(type(parts[-1]).__mro__) if kind is not object)
+    own = {kind for part in parts for kind in type(part).__mro__ if top_module(kind) != package}
+    return sorted(
+        f"{kind.__name__}.{name}()"
+        for kind in own
+        for name, method in vars(kind).items()
+        if isinstance(method, FunctionType) and "curr_step" in method.__code__.co_names
+    )
+
+
+def top_module(kind: type) -> str:
+    return kind.__module__.partition(".")[0]
 
 
 def parameters(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:

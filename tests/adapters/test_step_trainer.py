@@ -87,3 +87,20 @@ def test_a_later_prune_of_a_users_wrapper_pauses_the_gate():
     assert gate.config.start_iter == 21 and len(log.values[41][0]) < len(log.values[40][0])
     assert [row.reason for row in gate.trace if row.step in range(41, 45)] == ["pause"] * 4
     assert gate.report()["events"]["number of Gaussians"] == 1
+
+
+@pytest.mark.parametrize("settings", [{"refine_share": 0.4}, {"refine_share": 0.4, "always": [40]}, RULE])
+def test_iterations_that_a_users_wrapper_needs_are_named_as_unknown(settings, recwarn):
+    with SkipGate(Trimmer(step_trainer.make()), **settings):
+        pass
+    said = [str(one.message) for one in recwarn if "curr_step" in str(one.message)]
+    if settings == {"refine_share": 0.4}:
+        assert len(said) == 1 and "which iterations need Trimmer.after_optim_hook()," in said[0]
+    else:
+        assert not said
+
+
+def test_layers_of_the_package_itself_need_no_warning(recwarn):
+    with SkipGate(step_trainer.make(), refine_share=0.4):
+        pass
+    assert not [one for one in recwarn if "curr_step" in str(one.message)]
