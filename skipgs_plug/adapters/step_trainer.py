@@ -86,8 +86,8 @@ class StepTrainer(AbstractAdapter):
 
         if hooks.state.pace.leaves_out and hooks.state.config.always is None and (unread := counting_methods(trainer)):
             caution(
-                f"It is not known which iterations need {', '.join(unread)}, which the package does not have; name them "
-                "(--always, always=), or they may be left out."
+                f"It is not known which iterations need {', '.join(unread)}: reads of curr_step outside the package "
+                "are not evaluated ahead; name the iterations (--always, always=), or they may be left out."
             )
 
         def watched(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

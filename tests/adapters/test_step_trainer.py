@@ -95,7 +95,7 @@ def test_iterations_that_a_users_wrapper_needs_are_named_as_unknown(settings, re
         pass
     said = [str(one.message) for one in recwarn if "curr_step" in str(one.message)]
     if settings == {"refine_share": 0.4}:
-        assert len(said) == 1 and "which iterations need Trimmer.after_optim_hook()," in said[0]
+        assert len(said) == 1 and "which iterations need Trimmer.after_optim_hook():" in said[0]
     else:
         assert not said
 
