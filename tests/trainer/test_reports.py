@@ -127,6 +127,18 @@ def test_a_format_that_is_not_read_is_named(colmap: Path) -> None:
         load_scene(colmap)
 
 
+def test_a_folder_and_a_broken_link_in_place_of_an_image_are_named(colmap: Path) -> None:
+    path = colmap / "images/cam/view_004.png"
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(MissingFileError, match=r"view_004\.png does not exist \(a folder has its name\)"):
+        load_scene(colmap)
+    path.rmdir()
+    path.symlink_to("gone.png")
+    with pytest.raises(MissingFileError, match=r"does not exist \(a link to gone\.png has its name\)"):
+        load_scene(colmap)
+
+
 @pytest.mark.parametrize("write", [write_colmap, write_binary])
 def test_points_only_as_ply_or_given(tmp_path: Path, tiny_scene: Scene, write) -> None:
     root = write(tiny_scene, tmp_path / "scene")

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
+from skipgs_plug.files import printable
 from skipgs_plug.trainer.errors import InputError, MissingFileError
 from skipgs_plug.trainer.scene import is_text
 
@@ -90,10 +91,8 @@ def find_images(folder: Path, names: Sequence[str]) -> list[Path]:
         others = len(missing) - 1
         more = f", and neither do {others} others of {len(names)}" if others else ""
         pronoun = "them" if others else "it"
-        near = same_stem(path)
-        instead = f" ({near.name} is there, which is not read: convert it to PNG)" if near else ""
         raise MissingFileError(
-            f"Image {path} does not exist{instead}{more}; restore {pronoun} or remove {pronoun} from the "
+            f"Image {path} does not exist{found_instead(path)}{more}; restore {pronoun} or remove {pronoun} from the "
             "reconstruction."
         )
     return [path for path in found if path is not None]
@@ -141,12 +140,23 @@ def subfolder(folder: Path, name: str) -> Path:
     return found[0] if len(found) == 1 else folder / name
 
 
+def found_instead(path: Path) -> str:
+    """Return a clause about what is there in place of a missing image; empty if nothing is."""
+    if os.path.isdir(path):
+        return " (a folder has its name)"
+    if os.path.islink(path):
+        return f" (a link to {printable(os.readlink(path))} has its name)"
+    near = same_stem(path)
+    return f" ({near.name} is there, which is not read: convert it to PNG)" if near else ""
+
+
 def same_stem(path: Path) -> Path | None:
     """Return a file beside `path` that differs from it by its suffix alone."""
     try:
-        return next((other for other in sorted(path.parent.iterdir()) if other.stem == path.stem), None)
+        others = sorted(path.parent.iterdir())
     except OSError:
         return None
+    return next((other for other in others if other.stem == path.stem and other.is_file()), None)
 
 
 def entries(folder: Path, names: Sequence[str]) -> list[Path]:
