@@ -19,7 +19,7 @@ from skipgs_plug.core.pace.refinement_policy import RefinementPolicy
 from skipgs_plug.core.pace.refining import Refining
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.release import Release
-from skipgs_plug.core.source.lines import line_of
+from skipgs_plug.core.source.lines import GATED_LOOP, line_of
 from skipgs_plug.core.source.milestones import read_loop
 from skipgs_plug.core.source.progress_bars import Bars
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
@@ -205,7 +205,7 @@ class Phased(Pace):
         Raises:
             SkipGSError: The present iteration could have been left out.
         """
-        how = "so the gate must count them; write the loop as for step in gate.iterations(range(...))."
+        how = f"so the gate must count them; write the loop as: {GATED_LOOP}."
         if needed or self._release.in_script:
             leaves_out = "share and refine_share leave out iterations"
             raise SkipGSError(

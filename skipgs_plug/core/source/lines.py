@@ -10,6 +10,11 @@ import textwrap
 from collections.abc import Container
 from types import CodeType
 
+# How messages describe a loop of which iterations can be left out. A data loader must not set its pace.
+GATED_LOOP = (
+    "for step in gate.iterations(range(...)), with views and batches taken in its body, such as by next(batches)"
+)
+
 
 @functools.cache
 def is_looped_over(code: CodeType, line: int) -> bool:

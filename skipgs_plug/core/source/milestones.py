@@ -32,7 +32,7 @@ from skipgs_plug.core.source.conditions import (
 from skipgs_plug.core.source.counters import counters
 from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator
 from skipgs_plug.core.source.inlining import PLACES, InlinedFunction, InlinedFunctions
-from skipgs_plug.core.source.lines import head_of
+from skipgs_plug.core.source.lines import GATED_LOOP, head_of
 from skipgs_plug.core.source.progress_bars import Moves, moves, only_shows
 from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.run_options import PURE, RunOptions
@@ -345,7 +345,7 @@ def read_loop(
     elif not line:
         found = f"{code.co_name}() of {code.co_filename} has ended, and the loop over its iterations is elsewhere"
     raise SkipGSError(
-        f"{found}; write the loop as: for step in gate.iterations(range(...)).",
+        f"{found}; write the loop as: {GATED_LOOP}.",
         in_script=f"{found}; write the loop as one over range(...) alone, or name the iterations that must run "
         "(--always).",
     )
