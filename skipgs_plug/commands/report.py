@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from skipgs_plug.commands.options.report import Args
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.report.page import build_page
 from skipgs_plug.report.source import read_source
 from skipgs_plug.trainer.files import write_aside
 
+SUFFIXES = (".html", ".htm")
+
 
 def run(args: Args) -> int:
     """Build and write the page; see `Args`."""
     if not args.runs:
         raise SkipGSError("report needs at least one run folder.")
+    suffix = Path(args.out).suffix
+    if suffix.lower() not in ("", *SUFFIXES):
+        raise SkipGSError(f"--out {args.out}: a page is HTML, not {suffix}; give a name that ends in .html.")
     page = build_page([read_source(run) for run in args.runs])
     with write_aside(args.out) as temporary:
         temporary.write_text(page, encoding="utf-8", errors="backslashreplace")

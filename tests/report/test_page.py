@@ -166,6 +166,12 @@ def test_a_run_whose_gate_was_never_active_is_shown(script_folder, tmp_path):
     assert "never active" in text and "<img" not in text
 
 
+def test_a_page_under_the_name_of_another_format_is_refused(script_folder, tmp_path, capsys):
+    assert main(["report", str(script_folder), "--out", str(tmp_path / "page.pdf")]) == 2
+    assert "a page is HTML, not .pdf; give a name that ends in .html" in capsys.readouterr().err
+    assert not (tmp_path / "page.pdf").exists()
+
+
 def test_folders_without_a_run_are_named(tmp_path, capsys):
     assert main(["report", str(tmp_path / "gone/skipgs.json")]) == 2
     assert "gone/skipgs.json does not exist" in capsys.readouterr().err
