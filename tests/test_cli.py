@@ -17,6 +17,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from skipgs_plug.cli import COMMANDS, main
+from skipgs_plug.commands.demo import LEAST
 from skipgs_plug.trainer import Trainer, save_packed
 from skipgs_plug.trainer.synthetic import make_scene
 
@@ -166,6 +167,26 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in names:
         assert len(PlyData.read(str(out / name / "ply/point_cloud_119.ply"))["vertex"]) > 0
         assert "\nframe:\n  centre:\n" in (out / name / "cfg.yml").read_text()
+
+
+@pytest.mark.parametrize("option", ["--max-steps 1", "--views 1", "--width 14", "--points 3"])
+def test_a_demo_that_is_too_small_is_refused_first(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["demo", "--out", str(tmp_path / "demo"), *option.split()]) == 2
+    assert f"{option} is too small for the demo; give at least" in one_sentence(capsys)
+    assert not (tmp_path / "demo").exists()
+
+
+def test_the_smallest_demo_runs(tmp_path: Path) -> None:
+    least = [word for name, value in LEAST.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    assert main(["demo", "--out", str(tmp_path), "--no-progress", *least]) == 0
+
+
+def test_photographs_that_do_not_exist(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    video = str(tmp_path / "gone.mp4")
+    assert main(["train", video, "--sfm", "--out", str(tmp_path / "run")]) == 2
+    assert f"{video} does not exist; give a video or a folder with photographs" in one_sentence(capsys)
 
 
 def test_doctor_renders(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from skipgs_plug import SkipGate
-from skipgs_plug.commands.names import require_names
+from skipgs_plug.commands.names import require_folder, require_names
 from skipgs_plug.commands.options.demo import Args
 from skipgs_plug.core.report import write_report
-from skipgs_plug.trainer import Scene, TrainConfig, Trainer
+from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.ahead import prepare_kernels
 from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.lock import exclusive
@@ -39,9 +39,19 @@ class Result:
     backwards: int
 
 
+# Least values of options: an iteration before and one after the end of densification, a held-out view and one to train
+# on, a height of 11 pixels for SSIM, and the points from which distances to three neighbours can be measured.
+LEAST = {"max_steps": 2, "views": 2, "width": 15, "points": 4}
+
+
 def run(args: Args) -> int:
     """Run the demo in its folder; see `Args`."""
     require_names(("--out", args.out))
+    require_folder(args.out)
+    for name, least in LEAST.items():
+        if getattr(args, name) < least:
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(f"{option} {getattr(args, name)} is too small for the demo; give at least {least}.")
     with exclusive(Path(args.out)):
         compare(args)
     return 0
@@ -53,7 +63,7 @@ def compare(args: Args) -> list[Result]:
     config = TrainConfig(
         result_dir=args.out,
         max_steps=args.max_steps,
-        backend=args.backend,  # type: ignore[arg-type]
+        backend=args.backend,
         seed=args.seed,
         grow_grad2d=GROW_GRAD2D,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from skipgs_plug.commands.options.parse import parse_as
 
@@ -21,8 +22,8 @@ class Args:
     """Image width; height is three quarters of it."""
     points: int = 4000
     """Surface points to start from."""
-    backend: str = "auto"
-    """auto, gsplat (CUDA) or warp (CPU)."""
+    backend: Literal["auto", "gsplat", "warp"] = "auto"
+    """gsplat on CUDA, warp on the CPU; auto: gsplat if CUDA works, else warp."""
     seed: int = 42
     """Seed of training."""
     no_progress: bool = False
