@@ -67,7 +67,9 @@ class Session:
                     self._gate.verify()
                 self._finish()
         if self._failed:
-            lost = f"{len(self._failed)} files of {self._folder.root} could not be written"
+            count = len(self._failed)
+            files = "1 file" if count == 1 else f"{count} files"
+            lost = f"{files} of {self._folder.root} could not be written"
             if not self._folder.checkpoints():
                 raise InputError(
                     f"{lost}, and there is no checkpoint to continue from; make room, and give the same command again, "

@@ -182,7 +182,7 @@ def test_a_full_disk_costs_the_renders_and_not_the_evaluation(
     with monkeypatch.context() as patch:
         fail_to_write(patch, "val_step59_0000.png")
         assert train(packed, tmp_path / "run") == 2
-    assert "1 files of" in capsys.readouterr().err
+    assert "1 file of" in capsys.readouterr().err
     assert (tmp_path / "run/stats/val_step59.json").is_file()
     assert train(packed, tmp_path / "run", "--resume") == 0
     assert_same(tmp_path / "run", whole)
