@@ -294,7 +294,7 @@ def test_a_loop_over_more_than_the_number_is_named():
 
 def test_a_source_that_cannot_be_read_is_refused():
     names = {}
-    exec("def loop(stop):\n    for step in stop():\n        pass\n", names)
+    exec(compile("def loop(stop):\n    for step in stop():\n        pass\n", "no_such_file.py", "exec"), names)
     with pytest.raises(SkipGSError, match=r"source of loop\(\) .* cannot be read"):
         found(names["loop"])
 
