@@ -135,19 +135,17 @@ def layers(part: Any) -> Iterator[Any]:
 
 def counting_methods(trainer: Any) -> list[str]:
     """Return the methods of users' own layers that read the iteration, and so may save or prune in certain ones."""
-    parts = list(layers(trainer))
-    package = next(top_module(kind) for kind in reversed(type(parts[-1]).__mro__) if kind is not object)
-    own = {kind for part in parts for kind in type(part).__mro__ if top_module(kind) != package}
-    return sorted(
-        f"{kind.__name__}.{name}()"
-        for kind in own
-        for name, method in vars(kind).items()
-        if isinstance(method, FunctionType) and "curr_step" in method.__code__.co_names
-    )
+    kinds = [kind for part in reversed([*layers(trainer)]) for kind in reversed(type(part).__mro__)]
+    found = {kind: methods for kind in kinds if (methods := readers(kind))}
+    packages = [kind.__module__.partition(".")[0] for kind in found]  # the base class of the innermost trainer is first
+    own = (kind for kind, package in zip(found, packages, strict=True) if package != packages[0])
+    return sorted(f"{kind.__name__}.{name}()" for kind in own for name in found[kind])
 
 
-def top_module(kind: type) -> str:
-    return kind.__module__.partition(".")[0]
+def readers(kind: type) -> list[str]:
+    """Return the names of the methods that a class defines and that read the iteration."""
+    methods = ((name, one) for name, one in vars(kind).items() if isinstance(one, FunctionType))
+    return [name for name, method in methods if "curr_step" in method.__code__.co_names]
 
 
 def parameters(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:

@@ -130,11 +130,17 @@ def _call(installed: importlib.metadata.EntryPoint, names: dict[str, Any]) -> No
 
 
 def _source_of(module: str) -> Path | None:
-    """Return the file of a module without importing the module; its packages are imported."""
+    """Return the file of a module without importing the module; its packages are imported.
+
+    Raises:
+        SkipGSError: A package of the module imports another module, which does not exist.
+    """
     try:
         found = importlib.util.find_spec(module)
-    except ModuleNotFoundError:  # the package of the module does not exist either
-        return None
+    except ModuleNotFoundError as error:
+        if error.name and not f"{module}.".startswith(f"{error.name}."):
+            raise SkipGSError(f"{module} imports {error.name}, which is not installed: pip install it.") from error
+        return None  # the package of the module does not exist either
     return None if found is None or found.origin is None else Path(found.origin).resolve()
 
 

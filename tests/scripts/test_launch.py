@@ -170,6 +170,16 @@ def test_nothing_to_run_is_said(command, message):
         run_script(command)
 
 
+def test_a_module_that_a_package_lacks_is_named(checkout, monkeypatch):
+    package = checkout / "package_of_script"
+    package.mkdir()
+    (package / "__init__.py").write_text("import absent_module\n")
+    (package / "train.py").write_text("pass\n")
+    monkeypatch.syspath_prepend(checkout)
+    with pytest.raises(SkipGSError, match=r"package_of_script\.train imports absent_module, which is not installed"):
+        run_script(["-m", "package_of_script.train"])
+
+
 def test_missing_script_is_named(tmp_path):
     with pytest.raises(SkipGSError, match=r"no script .*absent\.py"):
         run_script([str(tmp_path / "absent.py")])
