@@ -11,6 +11,7 @@ import traceback
 import types
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -130,17 +131,14 @@ def _call(installed: importlib.metadata.EntryPoint, names: dict[str, Any]) -> No
 
 
 def _source_of(module: str) -> Path | None:
-    """Return the file of a module without importing the module; its packages are imported.
-
-    Raises:
-        SkipGSError: A package of the module imports another module, which does not exist.
-    """
-    try:
-        found = importlib.util.find_spec(module)
-    except ModuleNotFoundError as error:
-        if error.name and not f"{module}.".startswith(f"{error.name}."):
-            raise SkipGSError(f"{module} imports {error.name}, which is not installed: pip install it.") from error
-        return None  # the package of the module does not exist either
+    """Return the file of a module, without importing it or its packages: those may need the stand-ins of `--cpu`."""
+    top, *inner = module.split(".")
+    found = importlib.util.find_spec(top)
+    for name in inner:
+        if found is None:
+            return None
+        places = found.submodule_search_locations
+        found = None if places is None else PathFinder.find_spec(f"{found.name}.{name}", list(places))
     return None if found is None or found.origin is None else Path(found.origin).resolve()
 
 

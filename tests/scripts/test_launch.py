@@ -8,7 +8,7 @@ import torch
 
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.scripts.import_hints import install_hint
-from skipgs_plug.scripts.launch import run_script
+from skipgs_plug.scripts.launch import run_script, source_of
 
 
 @pytest.fixture
@@ -170,14 +170,14 @@ def test_nothing_to_run_is_said(command, message):
         run_script(command)
 
 
-def test_a_module_that_a_package_lacks_is_named(checkout, monkeypatch):
-    package = checkout / "package_of_script"
-    package.mkdir()
-    (package / "__init__.py").write_text("import absent_module\n")
+def test_the_source_of_a_module_is_found_without_importing_its_packages(checkout, monkeypatch):
+    package = checkout / "package_of_script" / "inner"
+    package.mkdir(parents=True)
+    for folder in (package, package.parent):
+        (folder / "__init__.py").write_text("raise ImportError('libtorch_cuda.so')\n")
     (package / "train.py").write_text("pass\n")
     monkeypatch.syspath_prepend(checkout)
-    with pytest.raises(SkipGSError, match=r"package_of_script\.train imports absent_module, which is not installed"):
-        run_script(["-m", "package_of_script.train"])
+    assert source_of(["-m", "package_of_script.inner.train"]) == (package / "train.py").resolve()
 
 
 def test_missing_script_is_named(tmp_path):
