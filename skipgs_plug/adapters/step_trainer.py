@@ -50,6 +50,10 @@ class StepTrainer(AbstractAdapter):
     )
     stand_ins = "pip_gaussian_splatting"
 
+    def __init__(self, trainer: Any = None) -> None:
+        super().__init__(trainer)
+        self._views: list[Any] | None = None  # paths of the training photographs; a trainer object does not tell them
+
     @classmethod
     def matches(cls, trainer: Any) -> bool:
         return all(hasattr(trainer, name) for name in EXPECTED)
@@ -63,6 +67,9 @@ class StepTrainer(AbstractAdapter):
             options = sys._getframe(2).f_globals.get("args")  # frame 2 is the script's
             self.output_folder = getattr(options, "destination", None)
             self.trainer = original(*args, **kwargs)
+            dataset = kwargs.get("dataset", args[1] if len(args) > 1 else None)
+            if dataset is not None:
+                self._views = [dataset[index].ground_truth_image_path for index in range(len(dataset))]
             self.attach(hooks)
             return self.trainer
 
@@ -117,7 +124,7 @@ class StepTrainer(AbstractAdapter):
         hooks.wrap(trainer, "optim_step", watched)
         hooks.gate_tensor_backward("step")
         hooks.check_drift(lambda: [trainer.optimizer])
-        hooks.ready(TrainerInfo(end, gradients_read_until=end))
+        hooks.ready(TrainerInfo(end, view_names=self._views, gradients_read_until=end))
 
     def always_run(self, numbers: range) -> Iterable[int]:
         """Return the iterations in which a wrapper raises the SH degree."""

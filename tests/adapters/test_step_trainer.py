@@ -71,6 +71,21 @@ def test_script_is_reached_through_prepare_trainer(monkeypatch):
     assert not hasattr(prepare.prepare_trainer, "__skipgs_plug__")
 
 
+def test_a_script_tells_the_training_views(monkeypatch):
+    prepare = types.ModuleType("gaussian_splatting.prepare")
+    prepare.prepare_trainer = lambda gaussians, dataset, mode: step_trainer.make()
+    monkeypatch.setitem(sys.modules, "gaussian_splatting", types.ModuleType("gaussian_splatting"))
+    monkeypatch.setitem(sys.modules, "gaussian_splatting.prepare", prepare)
+    new_log()
+    cameras = [step_trainer.Camera(camera.image_name, camera) for camera in step_trainer.dataset()]
+    with SkipGate(adapter="step_trainer", **RULE) as gate:
+        main = {"prepare": prepare, "dataset": cameras}
+        exec("trainer = prepare.prepare_trainer(gaussians=None, dataset=dataset, mode='densify')", main)
+        step_trainer.training(main["trainer"], step_trainer.dataset(), 60)
+    assert not gate.released and gate.report()["backwards_skipped"] > 0
+    assert gate._engine._view_names == [camera.ground_truth_image_path for camera in cameras]
+
+
 class Trimmer(step_trainer.TrainerWrapper):
     """Prunes later than the trainer's bounds, where the adapter does not look."""
 
