@@ -11,7 +11,7 @@ class Row(NamedTuple):
         project: Owner and name of the repository on GitHub.
         folder: Name of its checkout in the folder of all checkouts.
         command: Command line of the script, with placeholders {scene}, {factor}, {out}, {sized} (the folder that
-            `sized_scene` writes) and those of `schedule`.
+            `sized_scene` writes), {training} (the same without held-out views) and those of `schedule`.
         pictures: Whether the project's own renders are measured, because no PLY contains the model in the scene's
             coordinates.
         render: Command line that renders these pictures after training, if the script does not. Its seconds are not
@@ -151,6 +151,14 @@ ROWS = {
         f"examples/simple_trainer.py mcmc {_GSPLAT}--strategy.refine-stop-iter {{late}} --strategy.refine-every 40 "
         "--strategy.cap-max 12000",
         pictures=True,
+    ),
+    "step_trainer": Row(
+        "pip gaussian-splatting 2.11.0, `densify`",
+        "PyPI/gaussian-splatting",
+        "gaussian-splatting",
+        "-m gaussian_splatting.train -s {training} -d {out} -i {n} --save_iterations {n} --mode densify "
+        "-o densify_from_iter=150 -o densify_until_iter={half} -o densify_grad_threshold=0.001 -o prune_from_iter=150 "
+        "-o prune_until_iter={half} -o opacity_reset_until_iter={half}",
     ),
     "nerfstudio": Row(
         "nerfstudio `ns-train splatfacto`",

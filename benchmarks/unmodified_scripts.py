@@ -126,8 +126,9 @@ def run(
     folder.mkdir(parents=True)
     sized = folder / "scene"
     filled = {"scene": scene.resolve(), "factor": data_factor, "out": folder, "sized": sized, **schedule(iterations)}
-    if "{sized}" in one.command:
-        sized_scene(scene, data_factor, sized)
+    filled["training"] = sized
+    if "{sized}" in one.command or "{training}" in one.command:
+        sized_scene(scene, data_factor, sized, with_held_out="{sized}" in one.command)
     gate = ["run", "auto", "--cpu", *MODES[mode], "--"]
     script = [*shlex.split(one.command.format(**filled)), *shlex.split(more)]
     begun = time.perf_counter()
