@@ -138,7 +138,8 @@ def _source_of(module: str) -> Path | None:
         if found is None:
             return None
         places = found.submodule_search_locations
-        found = None if places is None else PathFinder.find_spec(f"{found.name}.{name}", list(places))
+        # The name alone: with those of its packages, namespace packages must have been imported.
+        found = None if places is None else PathFinder.find_spec(name, list(places))
     return None if found is None or found.origin is None else Path(found.origin).resolve()
 
 
