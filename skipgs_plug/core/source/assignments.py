@@ -6,7 +6,8 @@ import ast
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from skipgs_plug.core.source.inlining import PLACES, comprehended
+from skipgs_plug.core.source.inlining import PLACES
+from skipgs_plug.core.source.run_options import comprehended
 
 # Methods that change lists, sets and queues, so that an object can differ from iteration to iteration.
 CHANGES = frozenset({"add", "append", "appendleft", "clear", "discard", "extend", "insert", "pop", "popleft", "remove"})

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from skipgs_plug.core.source.conditions import Guards, is_point, leaves
-from skipgs_plug.core.source.inlining import PLACES, comprehended
-from skipgs_plug.core.source.run_options import RunOptions
+from skipgs_plug.core.source.inlining import PLACES
+from skipgs_plug.core.source.run_options import RunOptions, comprehended
 
 Truths = npt.NDArray[np.bool_]  # one truth value for each number of a range
 _NUMBERS = "numbers of the loop"  # with spaces, so that no name in a source is the same

@@ -7,7 +7,7 @@ import copy
 import dis
 import inspect
 import itertools
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from types import CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from skipgs_plug.core.source.functions import (
     without_partial,
 )
 from skipgs_plug.core.source.project import Project
-from skipgs_plug.core.source.run_options import assigned_globals
+from skipgs_plug.core.source.run_options import assigned_globals, comprehended
 
 # Largest depth of nested calls that are read: a loop calls its trainer, which calls a logger, which opens a file.
 MAX_DEPTH = 3
@@ -293,13 +293,6 @@ class _Repeated(ast.NodeTransformer):
             return self.generic_visit(node)  # type: ignore[return-value]
         name = ast.unparse(node.target)
         return [_Renamed({name: one}).visit(copy.deepcopy(part)) for one in held for part in node.body]
-
-
-def comprehended(nodes: Iterable[ast.AST]) -> Iterator[ast.Name]:
-    """Yield the names that comprehensions among these nodes give to their values."""
-    for node in nodes:
-        if isinstance(node, ast.comprehension):
-            yield from (part for part in ast.walk(node.target) if isinstance(part, ast.Name))
 
 
 def _bound(syntax: ast.FunctionDef) -> set[str]:

@@ -8,7 +8,7 @@ import linecache
 import math
 import re
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from types import CodeType
 from typing import Any
 
@@ -127,11 +127,17 @@ def assigned_globals(file: str) -> set[str]:
     return {name.strip() for names in declared for name in names.split(",")}
 
 
+def comprehended(nodes: Iterable[ast.AST]) -> Iterator[ast.Name]:
+    """Yield the names that comprehensions among these nodes give to their values."""
+    for node in nodes:
+        if isinstance(node, ast.comprehension):
+            yield from (part for part in ast.walk(node.target) if isinstance(part, ast.Name))
+
+
 def _of_comprehensions(source: ast.AST) -> set[str]:
     """Names that only comprehensions assign. Since Python 3.12, they are among the variables of the function's code."""
     nodes = [*ast.walk(source)]
-    targets = [node.target for node in nodes if isinstance(node, ast.comprehension)]
-    inner = {part for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)}
+    inner = set(comprehended(nodes))
     others = {
         node.id
         for node in nodes
