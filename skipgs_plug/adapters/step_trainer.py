@@ -14,7 +14,7 @@ from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.hooks import Hooks
-from skipgs_plug.core.trainer_info import TrainerInfo
+from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
 MODULE = "gaussian_splatting.prepare"
 
@@ -41,8 +41,9 @@ class StepTrainer(AbstractAdapter):
         "Modes without densification need `--start-iter`."
     )
     with_share = (
-        "All iterations of densification run, since its events are hidden in wrappers. A loop of your own can name "
-        "them (`gate.iterations(..., events=...)`). Refinement is shortened."
+        "By visits. Opacity resets happen as often as ever. All iterations of densification run if a wrapper of your own "
+        "reads `curr_step`, or the trainer has a bound that is not the package's; a loop of your own can then name the "
+        "events (`gate.iterations(..., events=...)`)."
     )
     left_alone = (
         "`before_optim_hook`, which reads gradients, is left out with the backward. Attach to the outermost trainer. "
@@ -91,7 +92,8 @@ class StepTrainer(AbstractAdapter):
                 f"Not recognised: {', '.join(unknown)}. The gate begins with iteration {end}, after the last bound."
             )
 
-        if hooks.state.pace.leaves_out and hooks.state.config.always is None and (unread := counting_methods(trainer)):
+        unread = counting_methods(trainer) if hooks.state.pace.leaves_out else []
+        if unread and hooks.state.config.always is None:
             caution(
                 f"It is not known which iterations need {', '.join(unread)}: reads of curr_step outside the package "
                 "are not evaluated ahead; name the iterations (--always, always=), or they may be left out."
@@ -124,12 +126,35 @@ class StepTrainer(AbstractAdapter):
         hooks.wrap(trainer, "optim_step", watched)
         hooks.gate_tensor_backward("step")
         hooks.check_drift(lambda: [trainer.optimizer])
-        hooks.ready(TrainerInfo(end, view_names=self._views, gradients_read_until=end))
+        known = end is not None and not unknown and not unread
+        hooks.ready(
+            TrainerInfo(
+                end,
+                view_names=self._views,
+                gradients_read_until=end,
+                densification=Densification(numbers=self.densification_events) if known else None,
+            )
+        )
 
     def always_run(self, numbers: range) -> Iterable[int]:
-        """Return the iterations in which a wrapper raises the SH degree."""
-        intervals = [part.sh_degree_up_interval for part in layers(self.trainer) if hasattr(part, RAISES)]
-        return (n for n in numbers if any(n % interval == 0 for interval in intervals))
+        """Return the iterations in which a wrapper raises the SH degree or resets opacities."""
+        raises = [part.sh_degree_up_interval for part in layers(self.trainer) if hasattr(part, RAISES)]
+        resets = scheduled(self.trainer, "opacity_reset", numbers)
+        return (n for n in numbers if n in resets or any(n % interval == 0 for interval in raises))
+
+    def densification_events(self, numbers: range) -> Iterable[int]:
+        """Return the iterations in which Gaussians are added or pruned."""
+        return sorted(scheduled(self.trainer, "densify", numbers) | scheduled(self.trainer, "prune", numbers))
+
+
+def scheduled(trainer: Any, kind: str, numbers: range) -> set[int]:
+    """Return the iterations in which a layer acts, from its `<kind>_from_iter`, `_until_iter` and `_interval`."""
+    found: set[int] = set()
+    for part in layers(trainer):
+        if hasattr(part, kind + BOUND):
+            first, last, every = (getattr(part, kind + end) for end in ("_from_iter", BOUND, "_interval"))
+            found.update(n for n in numbers if first <= n <= last and n % every == 0)
+    return found
 
 
 def layers(part: Any) -> Iterator[Any]:

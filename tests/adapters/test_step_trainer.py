@@ -9,6 +9,7 @@ from lookalikes import step_trainer
 from lookalikes.splats import log, new_log
 
 from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError
+from skipgs_plug.core.pace import densification_events, needs
 
 
 def test_start_follows_the_latest_inclusive_bound_and_the_reset_in_it_pauses():
@@ -84,6 +85,40 @@ def test_a_script_tells_the_training_views(monkeypatch):
         step_trainer.training(main["trainer"], step_trainer.dataset(), 60)
     assert not gate.released and gate.report()["backwards_skipped"] > 0
     assert gate._engine._view_names == [camera.ground_truth_image_path for camera in cameras]
+
+
+def thinned(trainer):
+    """Train with a share of 0.4, and return its report and the densification events that ran."""
+    new_log()
+    with SkipGate(trainer, share=0.4) as gate:
+        for step in gate.iterations(range(1, 61)):
+            trainer.step(step_trainer.pick_camera(step_trainer.dataset(), step))
+    return gate.report(), sorted(log.behind)
+
+
+def test_a_share_leaves_out_events_of_densifiers_and_pruners_but_no_reset(monkeypatch):
+    monkeypatch.setattr(densification_events, "LEAST_EVENTS", 1)  # leave out some of a few events
+    monkeypatch.setattr(needs, "STEPS_PER_EVENT", 1)
+    trainer = step_trainer.make()
+    report, events = thinned(trainer)
+    growing = report["growing"]
+    # All events: 6, 9, 12, 15 of the densifier; 5, 10, 15, 20 of the pruner.
+    assert growing["events_run"] + growing["events_skipped"] == 7 and growing["events_skipped"] > 0
+    assert set(events) < {6, 9, 12, 15} and growing["iterations_skipped"] > 0
+    assert [step for step, kind, _ in log.structure if kind == "reset"] == [10, 20]
+    assert trainer.raised == 6 and trainer.curr_step == 60
+
+
+@pytest.mark.parametrize("unread", ["bound", "wrapper"])
+@pytest.mark.filterwarnings("ignore:The trainer does more than", "ignore:It is not known which iterations need")
+def test_all_iterations_of_densification_run_if_not_all_events_are_known(unread):
+    trainer = step_trainer.make()
+    if unread == "bound":
+        trainer.relocate_until_iter = 18
+    with pytest.warns(RuntimeWarning, match="The densification events of iterations 1 to 20 are not known"):
+        report, events = thinned(trainer if unread == "bound" else Trimmer(trainer))
+    assert events == [6, 9, 12, 15] and report["growing"] is None
+    assert report["iterations_skipped"] > 0
 
 
 class Trimmer(step_trainer.TrainerWrapper):

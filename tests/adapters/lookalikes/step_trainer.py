@@ -61,23 +61,24 @@ class DensificationTrainer(AbstractTrainer):
 
 
 class Densifier:
-    densify_until_iter = 15
-
     def __init__(self):
-        self.densify_until_iter = 15
+        self.densify_from_iter, self.densify_until_iter, self.densify_interval = 4, 15, 3
 
     def densify_and_prune(self, model, out, step):
         if step <= self.densify_until_iter:
             model.add_densification_stats(out["viewspace_points"])
+        if self.densify_from_iter <= step <= self.densify_until_iter and step % self.densify_interval == 0:
+            model._densify(0.02)
 
 
 class Pruner:
     def __init__(self, base_densifier):
-        self.base_densifier, self.prune_until_iter = base_densifier, 20
+        self.base_densifier = base_densifier
+        self.prune_from_iter, self.prune_until_iter, self.prune_interval = 5, 20, 5
 
     def densify_and_prune(self, model, out, step):
         self.base_densifier.densify_and_prune(model, out, step)
-        if step <= self.prune_until_iter and step % 5 == 0:
+        if self.prune_from_iter <= step <= self.prune_until_iter and step % self.prune_interval == 0:
             model.prune_gaussians(0.05, model.values["opacity"])
 
 
@@ -108,10 +109,11 @@ class TrainerWrapper(AbstractTrainer):
 class OpacityResetter(TrainerWrapper):
     def __init__(self, base_trainer):
         super().__init__(base_trainer)
-        self.opacity_reset_until_iter = 20
+        self.opacity_reset_from_iter, self.opacity_reset_until_iter, self.opacity_reset_interval = 10, 20, 10
 
     def optim_step(self):
-        if self.curr_step <= self.opacity_reset_until_iter and self.curr_step % 10 == 0:
+        resets = self.opacity_reset_from_iter <= self.curr_step <= self.opacity_reset_until_iter
+        if resets and self.curr_step % self.opacity_reset_interval == 0:
             with torch.no_grad():
                 self.model.reset_opacity()
             group = next(group for group in self.optimizer.param_groups if group["name"] == "opacity")
