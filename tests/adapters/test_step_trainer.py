@@ -109,6 +109,14 @@ def test_a_share_leaves_out_events_of_densifiers_and_pruners_but_no_reset(monkey
     assert trainer.raised == 6 and trainer.curr_step == 60
 
 
+def test_all_iterations_of_a_short_schedule_run_while_sizes_on_the_screen_prune():
+    trainer = step_trainer.make()
+    trainer.base_trainer.base_trainer.densifier.prune_screensize_threshold = 20
+    report, events = thinned(trainer)
+    assert events == [6, 9, 12, 15] and report["growing"]["iterations_skipped"] == 0
+    assert report["iterations_skipped"] > 0
+
+
 @pytest.mark.parametrize("unread", ["bound", "wrapper"])
 @pytest.mark.filterwarnings("ignore:The trainer does more than", "ignore:It is not known which iterations need")
 def test_all_iterations_of_densification_run_if_not_all_events_are_known(unread):
