@@ -108,7 +108,9 @@ class DensificationEvents:
         """Number of Gaussians that the last event added, as a share of those before it."""
         return self.grown / self._rows_before if self._rows_before else 0.0
 
-    def needed(self, number: int, visible: float | None, share: float, length: int, sooner: float | None = None) -> int:
+    def needed(
+        self, number: int, visible: float | None, share: float, length: int, grows_strongly: bool = False
+    ) -> int:
         """Return the number of iterations that the event in iteration `number` needs; compare with `behind`.
 
         Args:
@@ -116,8 +118,7 @@ class DensificationEvents:
             visible: Share of the Gaussians that a view shows; None if unknown.
             share: Share of the iterations that runs, in (0, 1].
             length: Number of iterations of the phase, left-out ones included.
-            sooner: In a scene with many new Gaussians, the factor by which the event needs fewer iterations, at least
-                1; a larger share asks for no more there. None in other scenes.
+            grows_strongly: Whether the scene has many new Gaussians. A larger share asks for no more iterations then.
         """
         if self.all_run or share >= 1.0:
             return 0
@@ -125,8 +126,9 @@ class DensificationEvents:
         if self._needs == "iterations":
             return distance
         visible = visible or VISIBLE
-        larger = (share / LEAST_GROWING_SHARE) ** (POWER_OF_SHARE * visible**2)
-        needed = STEPS_BEHIND * (1.0 - visible) ** POWER_OF_HIDDEN * (larger if sooner is None else 1.0 / sooner)
+        needed = STEPS_BEHIND * (1.0 - visible) ** POWER_OF_HIDDEN
+        if not grows_strongly:
+            needed *= (share / LEAST_GROWING_SHARE) ** (POWER_OF_SHARE * visible**2)
         return min(int(needed), math.ceil(share * length / LEAST_EVENTS), distance)
 
     def _distance(self, number: int) -> int:

@@ -11,7 +11,6 @@ from skipgs_plug.core.pace.densification_events import DensificationEvents
 from skipgs_plug.core.pace.needs import (
     LEAST_GROWING_SHARE,
     MOST_RAISED_SHARE,
-    events_sooner,
     for_new_gaussians,
     growing_factor,
     growing_share,
@@ -196,10 +195,10 @@ class Growing(Phase):
     def _needed(self, number: int) -> int:
         """Return the number of iterations that must run before the event in iteration `number`."""
         assert self.events is not None and self.share is not None
-        # Events come sooner only in a scene with many new Gaussians. The ray-traced scene, which grows to e times as
-        # many at most, ended with a tenth more Gaussians otherwise.
-        sooner = events_sooner(self.events.growth) if self._auto and self.stretch > 1.0 else None
-        return self.events.needed(number, self._visible_now, self.share, self._length, sooner)
+        # The ray-traced scene, which grows to e times as many Gaussians at most, needs more iterations per event with a
+        # larger share. Scenes that grow more do not.
+        grows_strongly = self._auto and self.stretch > 1.0
+        return self.events.needed(number, self._visible_now, self.share, self._length, grows_strongly)
 
     @property
     def _auto(self) -> bool:

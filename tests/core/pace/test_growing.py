@@ -12,7 +12,6 @@ from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.core.pace import needs
 from skipgs_plug.core.pace.densification_events import LEAST_EVENTS, DensificationEvents
 from skipgs_plug.core.pace.needs import (
-    events_sooner,
     for_new_gaussians,
     growing_factor,
     growing_share,
@@ -298,15 +297,11 @@ def test_needs_of_an_event():
     assert kept("visits", 0.3, 5, length=4000)[:2] == [200, 300]  # 25 iterations each, of 20 and 40
 
 
-def test_an_event_can_come_sooner():
+def test_a_larger_share_asks_for_more_iterations_per_event_unless_the_scene_grows_strongly():
     events = DensificationEvents(range(100, 1001, 100), Densification())
-    for sooner, needed in ((None, 47), (1.0, 47), (2.0, 23), (10.0, 4)):
-        found = []
-        for behind in range(1, 60):
-            events.load_state_dict({**events.state_dict(), "behind": behind - 1})
-            if events.behind >= events.needed(200, 0.3, 0.1, 100_000, sooner):
-                found.append(behind)
-        assert found[0] == needed
+    assert events.needed(200, 0.7, 0.1, 100_000) == 33  # 55 * 0.3 ** 0.4
+    assert events.needed(200, 0.7, 0.4, 100_000) == 47  # times 4 ** (0.7 ** 2 / 2)
+    assert events.needed(200, 0.7, 0.4, 100_000, grows_strongly=True) == 33
 
 
 def test_growth_is_that_of_the_last_event():
@@ -323,8 +318,7 @@ def test_growth_is_that_of_the_last_event():
 
 
 def test_new_gaussians_ask_for_more_iterations():
-    assert share_factor(0.0) == share_factor(0.03) == 1.0 and share_factor(0.09) == pytest.approx(3.0)
-    assert events_sooner(0.0) == events_sooner(0.025) == 1.0 and events_sooner(0.09) == pytest.approx(3.6)
+    assert share_factor(0.0) == share_factor(0.02) == 1.0 and share_factor(0.06) == pytest.approx(3.0)
     assert for_new_gaussians(None) == for_new_gaussians(0.2) == for_new_gaussians(2.718) == 1.0
     assert for_new_gaussians(97 / 3) == pytest.approx(1.82, abs=0.01)
 
