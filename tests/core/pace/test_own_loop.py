@@ -309,8 +309,9 @@ def test_auto_leaves_a_short_refinement_as_it_is():
 
 def test_auto_must_know_the_views():
     sentence = r"give their names to gate\.iterations\(\) as views=, or a share"
-    with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match=sentence):
-        Loop().train(gate)
+    for unknown in ({}, {"views": []}):
+        with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match=sentence):
+            Loop().train(gate, **unknown)
     with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match="views= takes a list"):
         gate.iterations(range(100), views="0.png")
 
