@@ -235,6 +235,9 @@ def test_a_state_of_another_share_is_refused():
     for settings in ({"refine_share": 0.5}, {}):
         with SkipGate(start_iter=10, **settings) as gate, pytest.raises(SkipGSError, match=r"refine_share=0\.4"):
             gate.load_state_dict(state)
+    with SkipGate(start_iter=10, refine_share=0.4, enabled=False) as gate:
+        gate.load_state_dict(state)
+        assert Loop(begin=50).train(gate).ran == [*range(50, 100)]
 
 
 def test_a_state_with_larger_steps_does_not_go_on_without():
