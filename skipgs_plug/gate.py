@@ -334,7 +334,7 @@ class SkipGate:
         """Continue from `state_dict()`, or from a state of the authors' controller (version 1).
 
         A state of another scene with the same view names is noticed later: if the first ten losses are all far from
-        the means of their views, the gate is released at the tenth.
+        the means of their views, the gate is released at the tenth. A gate that is off ignores the state of a share.
 
         Args:
             state: Result of `state_dict()`.

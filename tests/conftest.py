@@ -19,7 +19,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def no_warning_of_the_gate_is_missed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Where warnings are errors, as here, the gate prints its own instead: a test that expects none must fail."""
     printed: list[str] = []
-    monkeypatch.setattr(caution, "_print", printed.append)
+    monkeypatch.setattr(caution, "say", printed.append)
     yield
     assert not printed, f"The gate warned, and the test does not expect it: {printed}"
 

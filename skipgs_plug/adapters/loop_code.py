@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import dis
 import inspect
+import platform
 import types
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -64,7 +65,9 @@ class LoopCode(NamedTuple):
         try:
             script = compile(path.read_bytes(), str(path), "exec")
         except (SyntaxError, ValueError) as error:
-            raise AdapterMismatchError(f"{path} is not a Python script: {error}.") from error
+            raise AdapterMismatchError(
+                f"{path} is not a script for Python {platform.python_version()}: {error}."
+            ) from error
         functions = {const.co_name: const for const in script.co_consts if isinstance(const, types.CodeType)}
         return cls._made(str(path), {*script.co_names, *functions}, functions, function_of(path, LOOP))
 

@@ -17,7 +17,6 @@ from skipgs_plug.adapters.gsplat_strategy import (
 )
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode, function_names
-from skipgs_plug.adapters.loss_scaler import guard_scaler
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 
@@ -41,8 +40,8 @@ class Nerfstudio(AbstractAdapter):
         "accumulated gradients always run."
     )
     left_alone = (
-        "An enabled loss scaler does not update without a gradient. The command: `skipgs-plug run nerfstudio "
-        "-- ns-train splatfacto ...` (or `-m nerfstudio.scripts.train`). `skipgs.json` lies beside its `config.yml`."
+        "The command: `skipgs-plug run nerfstudio -- ns-train splatfacto ...` (or `-m nerfstudio.scripts.train`). "
+        "`skipgs.json` lies beside its `config.yml`."
     )
     stand_ins = "nerfstudio"
 
@@ -92,7 +91,6 @@ class Nerfstudio(AbstractAdapter):
         hooks.wrap(pipeline.datamanager, "next_train", batch_made)
         hooks.gate_tensor_backward(LOOP)
         hooks.loop(function_names(type(trainer).train), "train", always=self.always_run, pure=("step_check",))
-        guard_scaler(hooks, trainer.grad_scaler)
         hooks.optimizer_names(lambda: trainer.optimizers.optimizers)
         hooks.check_drift(lambda: trainer.optimizers.optimizers)
         self._relocations = leave_out_noise(hooks, strategy, strategy)

@@ -15,6 +15,7 @@ from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
 from skipgs_plug.commands.options.run import Args
 from skipgs_plug.compat import FAMILIES, serve
+from skipgs_plug.core.messages import say, show
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster import ADAM_REPLACED, instead_of_torchs_adam
 from skipgs_plug.scripts import spawned
@@ -123,10 +124,6 @@ def run_gated(
     return code, gates[0] if gates else None
 
 
-def say(sentence: str) -> None:
-    print(f"skipgs-plug: {sentence}", file=sys.stderr)
-
-
 def say_ungated(command: Sequence[str], error: SkipGSError) -> None:
     say(f"{script_name(command)} runs without a gate, and so without skipgs.json: {error}")
 
@@ -143,7 +140,7 @@ def report(gate: SkipGate, adapter: AbstractAdapter) -> None:
     path = Path(adapter.output_folder or ".") / "skipgs.json"
     try:
         write_report(gate, path)
-        print(gate.summary(), file=sys.stderr)
+        show(gate.summary())
     except Exception as error:  # the model is trained, so the script's exit code stands
         say(f"{path} could not be written ({type(error).__name__}: {error}).")
 

@@ -95,9 +95,10 @@ def check(args: Args, checkpoints: list[Path]) -> None:
     require_folder(args.out)
     SkipConfig(**args.gate_options.given())
     given = Path(args.scene).expanduser()
-    if args.sfm and not given.exists():
+    reads_photographs = args.sfm and not (args.resume and is_scene(RunFolder(args.out).root / SCENE))
+    if reads_photographs and not given.exists():
         raise MissingFileError(f"{args.scene} does not exist; give a video or a folder with photographs.")
-    if args.sfm and not are_photographs(given):
+    if reads_photographs and not are_photographs(given):
         what = "is a scene already" if is_scene(given) else "is neither a video nor a folder with photographs"
         raise InputError(f"{args.scene} {what}; leave out --sfm or give photographs.")
     if not args.sfm and are_photographs(given):

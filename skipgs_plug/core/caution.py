@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
+
+from skipgs_plug.core.messages import say
 
 
 def caution(sentence: str, stacklevel: int = 2) -> None:
@@ -18,8 +19,4 @@ def caution(sentence: str, stacklevel: int = 2) -> None:
     try:
         warnings.warn(sentence, RuntimeWarning, stacklevel=stacklevel + 1)
     except RuntimeWarning:
-        _print(sentence)
-
-
-def _print(sentence: str) -> None:
-    print(f"skipgs-plug: {sentence}", file=sys.stderr)
+        say(sentence)

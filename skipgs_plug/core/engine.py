@@ -313,6 +313,8 @@ class Engine:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load a state; see `SkipGate.load_state_dict`. Before `configure`, the state is kept until that call."""
         require_state(state)
+        if not self.config.enabled and state.get("pace") is not None:
+            return  # a gate that is off leaves out no iterations
         if self.policy is None:
             self._pending_state = dict(state)
             # The loop asks about its first number before the trainer reports anything else.

@@ -15,6 +15,7 @@ from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.gaussian_count import GaussianCount
 from skipgs_plug.core.intercept import Around, Original, Patches, intercept_tensor_backward
 from skipgs_plug.core.loop_hooks import LoopHooks
+from skipgs_plug.core.loss_scaler import guard_scalers
 from skipgs_plug.core.optimizers import Optimizers
 from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.core.views import NOT_READ, view_key
@@ -276,12 +277,13 @@ class Hooks(LoopHooks):
             self.wrap(owner, name, around)
 
     def gate_tensor_backward(self, *callers: str) -> None:
-        """Gate the scalar `Tensor.backward` that certain functions call themselves.
+        """Gate the scalar `Tensor.backward` that certain functions call themselves, with or without a loss scaler.
 
         Args:
             *callers: Names of these functions.
         """
         intercept_tensor_backward(self._patches, callers, self.backward)
+        guard_scalers(self._patches, self._iteration)
 
     def check_drift(self, optimizers: Optimizers) -> None:
         """Check that no code of a fork changes the parameters of these optimizers unseen.

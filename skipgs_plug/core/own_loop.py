@@ -61,7 +61,7 @@ class OwnLoop:
         if isinstance(views, str):
             raise SkipGSError(f"views= takes a list of all names of training views, not the one name {views!r}.")
         with self.guarded:
-            keys = None if views is None else list(dict.fromkeys(view_key(view) for view in views))
+            keys = list(dict.fromkeys(view_key(view) for view in (() if views is None else views))) or None
             pace, on_error = self._engine.pace, self._release.on_error
             loop = pace.follow(numbers, source, always, keys, events)
             if pace.leaves_out and not self._release.attached:  # adapters step the schedulers of their trainers

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import os
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.messages import say
 from skipgs_plug.files import write_aside
 from skipgs_plug.gate import SkipGate
 
@@ -85,13 +85,13 @@ class Checkpoints:
                     f"continues with iteration {first}: give the state beside the checkpoint that the script loads, "
                     "or --resume-gate off."
                 )
-            _say(f"The gate takes its state from {self._given}.")
+            say(f"The gate takes its state from {self._given}.")
             return content["gate"]
         refused = ""
         for path in self._found:
             content = _read(path)
             if content["gate"]["step"] == first - 1 and {name: content[name] for name in self._run} == self._run:
-                _say(f"The gate takes its state from {path}.")
+                say(f"The gate takes its state from {path}.")
                 return content["gate"]
             refused = (
                 f"The gate starts afresh: {path} belongs to iteration {content['gate']['step']} of "
@@ -100,7 +100,7 @@ class Checkpoints:
         if not refused and self._without and first > 1:
             refused = f"The gate starts afresh in iteration {first}: {self._without[-1]} does not exist."
         if refused:
-            _say(refused)
+            say(refused)
         return None
 
     def _save_beside(self, checkpoint: Path) -> None:
@@ -115,7 +115,7 @@ class Checkpoints:
                 temporary.write_text(json.dumps({**self._run, "gate": gate.state_dict()}) + "\n")
         except Exception as error:  # the script has its checkpoint and can continue to train
             why = f"{type(error).__name__}: {error}"
-            _say(f"{_beside(checkpoint)} could not be written ({why}): if a run resumes here, its gate starts afresh.")
+            say(f"{_beside(checkpoint)} could not be written ({why}): if a run resumes here, its gate starts afresh.")
 
 
 def _path_of(file: Any) -> Path | None:
@@ -139,7 +139,3 @@ def _read(path: Path) -> dict[str, Any]:
         f"{path} does not hold a gate state: give a file that ends in {SUFFIX}, from beside the checkpoints of a gated "
         "run, or --resume-gate off."
     )
-
-
-def _say(sentence: str) -> None:
-    print(f"skipgs-plug: {sentence}", file=sys.stderr)

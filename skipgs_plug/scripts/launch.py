@@ -7,7 +7,6 @@ import importlib.metadata
 import importlib.util
 import runpy
 import sys
-import traceback
 import types
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from typing import Any, NamedTuple
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.messages import say
 from skipgs_plug.scripts.import_hints import install_hint
 from skipgs_plug.scripts.stand_in_hints import stand_in_hint
 
@@ -67,11 +67,11 @@ def _run(
             raise
         except BaseException as error:
             if on_cpu and (sentence := stand_in_hint(error)):
-                print(f"skipgs-plug: {sentence}", file=sys.stderr)
+                say(sentence)
                 return 1
             _print_traceback(error, program)
             if isinstance(error, ModuleNotFoundError) and error.name:
-                print(f"skipgs-plug: {install_hint(error.name, program.source, on_cpu)}", file=sys.stderr)
+                say(install_hint(error.name, program.source, on_cpu))
             return 130 if isinstance(error, KeyboardInterrupt) else 1
     return 0
 
@@ -160,7 +160,8 @@ def _print_traceback(error: BaseException, program: _Program) -> None:
     trace = error.__traceback__
     while trace is not None and is_ours(trace):
         trace = trace.tb_next
-    traceback.print_exception(type(error), error, trace or error.__traceback__)
+    shown = error.with_traceback(trace or error.__traceback__)
+    sys.excepthook(type(shown), shown, shown.__traceback__)  # the script may have set its own
 
 
 def _refuse_shadowed_modules(checkout: Path) -> None:
@@ -169,7 +170,8 @@ def _refuse_shadowed_modules(checkout: Path) -> None:
         origin = getattr(sys.modules[name], "__file__", None)
         if origin and checkout not in Path(origin).resolve().parents:
             raise SkipGSError(
-                f"The script's module {name!r} was already imported from {origin}: run one training script per process."
+                f"The script's module {name!r} was already imported from {origin}: run one training script per "
+                "process, or rename this module if it is a library's."
             )
 
 

@@ -109,7 +109,7 @@ def test_where_warnings_are_errors_the_sentence_is_printed_once_and_training_goe
     case = next(case for case in cases if case.name == "inria")
     plain = alone(case)
     printed = []
-    monkeypatch.setattr(caution, "_print", printed.append)
+    monkeypatch.setattr(caution, "say", printed.append)
     new_log()
     trainer, train = case.make()
     failed = fail_from(monkeypatch, SkipPolicy, "decide", case.start + 3)

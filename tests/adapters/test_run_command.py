@@ -1,5 +1,7 @@
 """`skipgs-plug run` on a look-alike of Inria's checkout that asks for CUDA and its extension modules."""
 
+import errno
+import io
 import json
 import os
 import sys
@@ -180,6 +182,18 @@ def test_inert_and_never_skipping_train_bit_for_bit_alike(checkout, tmp_path):
 def test_failing_script_keeps_its_code_and_leaves_a_report(checkout, tmp_path):
     assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path), "--fail"]) == 3
     assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 4
+
+
+class FullDisk(io.StringIO):
+    def write(self, text):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_messages_that_cannot_be_written_end_no_training(checkout, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", FullDisk())
+    (tmp_path / "model.pth.skipgs.json" / "in_the_way").mkdir(parents=True)  # of a message
+    assert cli.main(["run", "auto", "--cpu", "--", checkout, str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 60
 
 
 def test_script_that_ends_its_process_leaves_a_report_first(checkout, tmp_path, monkeypatch):

@@ -52,6 +52,20 @@ class ToyTrainer:
                 self.prune()
 
 
+class ScaledTrainer(ToyTrainer):
+    """Scales its loss, as mixed precision needs it."""
+
+    def train(self) -> None:
+        scaler = torch.amp.GradScaler("cpu")
+        for step in range(self.steps):
+            self.begin(step)
+            scaler.scale((self.render(f"v{step % 10}") ** 2).mean()).backward()
+            scaler.unscale_(self.optimizer)
+            scaler.step(self.optimizer)
+            scaler.update()
+            self.optimizer.zero_grad(set_to_none=True)
+
+
 class Toy(AbstractAdapter):
     name = "toy"
     checked = "ToyTrainer 1.0"
@@ -93,7 +107,7 @@ def plain(trainer: ToyTrainer) -> bool:
 def test_gates_counts_and_leaves_nothing_behind() -> None:
     trainer = ToyTrainer()
     with attach(trainer) as gate:
-        assert len(gate.patched) == 5
+        assert len(gate.patched) == 8
         trainer.train()
         gate.verify()
     assert plain(trainer)
@@ -124,6 +138,20 @@ def test_never_skipping_changes_no_bit(settings) -> None:
         trainer.train()
     assert torch.equal(expected.parameter, trainer.parameter)
     assert trainer.noise == 100
+
+
+def test_a_loss_scaler_survives_iterations_without_gradients() -> None:
+    trainer, never = ScaledTrainer(), ScaledTrainer()
+    with attach(trainer, policy=Always()) as gate:
+        trainer.train()
+    assert gate.released is None and gate.stats()["backwards_skipped"] == 79
+    assert trainer.optimizer.state[trainer.parameter]["step"] == 21
+    assert not hasattr(torch.amp.GradScaler.step, "__skipgs_plug__")
+    with attach(never, warmup=100):
+        never.train()
+    plain_one = ScaledTrainer()
+    plain_one.train()
+    assert torch.equal(never.parameter, plain_one.parameter)
 
 
 def test_always_skipping_keeps_parameters_but_for_forced_iterations() -> None:

@@ -71,6 +71,14 @@ def test_traceback_starts_in_the_script(checkout, capfd):
     assert "runpy" not in error and "launch.py" not in error
 
 
+def test_an_error_goes_to_the_hook_that_the_script_has_set(checkout, monkeypatch, capfd):
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    hook = "sys.excepthook = lambda kind, error, trace: print(error, trace.tb_frame.f_globals['__name__'])"
+    assert run_script([write(checkout, f"import sys\n{hook}\nraise ValueError('broken scene')\n")]) == 1
+    captured = capfd.readouterr()
+    assert captured.out == "broken scene __main__\n" and captured.err == ""
+
+
 def test_objects_of_the_scripts_classes_come_back_from_its_processes(checkout, capfd):
     script = write(
         checkout,

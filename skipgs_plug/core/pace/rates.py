@@ -160,9 +160,10 @@ class ScaledRates:
         self._unstepped += 1
         if self._unstepped in (UNSTEPPED_WARNS, UNSTEPPED_RAISES):
             sentence = (
-                f"{self._unstepped} iterations ran with larger steps, and no torch.optim.Optimizer stepped. The "
-                "optimizer of this loop is not one of PyTorch's, so its steps are not larger: derive it from "
-                "torch.optim.Optimizer and let it read the lr of its param_groups, or give compensate=False."
+                f"{self._unstepped} iterations ran with larger steps, and no torch.optim.Optimizer stepped in the "
+                "thread of the loop. The optimizer of this loop is not one of PyTorch's, or steps elsewhere, so its "
+                "steps are not larger: derive it from torch.optim.Optimizer, let it read the lr of its param_groups, "
+                "and step in the thread of the loop, or give compensate=False."
             )
             if self._unstepped == UNSTEPPED_RAISES:
                 raise SkipGSError(sentence)

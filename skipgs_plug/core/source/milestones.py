@@ -38,6 +38,9 @@ from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.run_options import PURE, RunOptions
 from skipgs_plug.core.source.substitution import Substitution
 
+# Functions that take all numbers from a range at once, before any iteration has run.
+GATHERING = frozenset({"list", "set", "sorted", "tuple"})
+
 
 class TrainingLoop:
     """One `for` statement of a function, whose target is the iteration's number.
@@ -336,10 +339,12 @@ def read_loop(
     # The head of a loop inside or around it lies on other lines.
     heads = (node for node in ast.walk(tree) if isinstance(node, ast.For))
     loop = next((one for one in heads if one.lineno <= line_in_source <= (one.iter.end_lineno or one.lineno)), None)
-    if loop is not None and isinstance(loop.target, ast.Name):
+    gathered = loop is not None and _gathers(loop.iter)
+    if loop is not None and isinstance(loop.target, ast.Name) and not gathered:
         _refuse_to_yield(loop, code)
         return TrainingLoop(loop, tree, code, {**names, **known}, known, frozenset(pure))
-    found = f"Line {line} of {code.co_filename} is not in a loop over one number"
+    fault = "takes all numbers before the first iteration" if gathered else "is not in a loop over one number"
+    found = f"Line {line} of {code.co_filename} {fault}"
     if loop is not None:
         found = f"{found} ({head_of(loop)})"
     elif not line:
@@ -349,6 +354,15 @@ def read_loop(
         in_script=f"{found}; write the loop as one over range(...) alone, or name the iterations that must run "
         "(--always).",
     )
+
+
+def _gathers(numbers: ast.expr) -> bool:
+    """Whether the head of a loop takes all numbers before the first iteration, as `list(gate.iterations(...))` does."""
+    while isinstance(numbers, ast.Call) and isinstance(numbers.func, ast.Name) and numbers.args:
+        if numbers.func.id in GATHERING:
+            return True
+        numbers = numbers.args[0]
+    return False
 
 
 def _refuse_to_yield(loop: ast.For, code: CodeType) -> None:

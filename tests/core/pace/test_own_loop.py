@@ -235,6 +235,9 @@ def test_a_state_of_another_share_is_refused():
     for settings in ({"refine_share": 0.5}, {}):
         with SkipGate(start_iter=10, **settings) as gate, pytest.raises(SkipGSError, match=r"refine_share=0\.4"):
             gate.load_state_dict(state)
+    with SkipGate(start_iter=10, refine_share=0.4, enabled=False) as gate:
+        gate.load_state_dict(state)
+        assert Loop(begin=50).train(gate).ran == [*range(50, 100)]
 
 
 def test_a_state_with_larger_steps_does_not_go_on_without():
@@ -309,8 +312,9 @@ def test_auto_leaves_a_short_refinement_as_it_is():
 
 def test_auto_must_know_the_views():
     sentence = r"give their names to gate\.iterations\(\) as views=, or a share"
-    with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match=sentence):
-        Loop().train(gate)
+    for unknown in ({}, {"views": []}):
+        with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match=sentence):
+            Loop().train(gate, **unknown)
     with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match="views= takes a list"):
         gate.iterations(range(100), views="0.png")
 

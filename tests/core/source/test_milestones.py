@@ -292,6 +292,15 @@ def test_a_loop_over_more_than_the_number_is_named():
         found(loop)
 
 
+def test_a_loop_whose_numbers_are_all_taken_before_it_is_refused():
+    def loop(stop):
+        for step in iter(list(stop())):
+            print(step)
+
+    with pytest.raises(SkipGSError, match=r"takes all numbers before the first iteration \(for step in iter"):
+        found(loop)
+
+
 def test_a_source_that_cannot_be_read_is_refused():
     names = {}
     exec(compile("def loop(stop):\n    for step in stop():\n        pass\n", "no_such_file.py", "exec"), names)
