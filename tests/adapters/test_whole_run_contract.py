@@ -26,7 +26,7 @@ def begun(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def thinned():
+def shortened():
     """Log of each trainer with a share, and the numbers of the iterations that ran."""
     logs = {}
 
@@ -113,9 +113,9 @@ def test_leaving_out_nothing_leaves_the_whole_run_bit_identical(case, settings):
 @pytest.mark.filterwarnings("ignore:Seems like `optimizer.step:UserWarning")
 @pytest.mark.parametrize("grows", [True, False], ids=["growing", "refining"])
 @pytest.mark.parametrize("case", [case for case in LOOPS if case.resume], ids=lambda case: case.name)
-def test_interrupted_and_resumed_leaves_out_the_same(case, grows, thinned, begun, short):
+def test_interrupted_and_resumed_leaves_out_the_same(case, grows, shortened, begun, short):
     settings = {"share": SHARE, "pause_iters": 0}
-    whole, numbers = thinned(case)
+    whole, numbers = shortened(case)
     start, first, last = case.refined_from, case.module.FIRST, case.module.LAST
     there = [n for n in numbers if (first + 3 <= n < start - 3 if grows else last - 16 <= n < last)]
     if not there:

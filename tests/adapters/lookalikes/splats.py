@@ -79,10 +79,10 @@ def make_cameras(order=0):
 
 def pick(cameras, iteration):
     """The view of an iteration: in a new order each round, and the same in a resumed run."""
-    turn, place = divmod(iteration, len(cameras))
+    epoch, position = divmod(iteration, len(cameras))
     order = sorted(cameras, key=lambda camera: camera.image_name)
-    random.Random(turn).shuffle(order)
-    return order[place]
+    random.Random(epoch).shuffle(order)
+    return order[position]
 
 
 class SplatModel:
