@@ -19,7 +19,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 @pytest.fixture(autouse=True)
 def no_warning_of_the_gate_is_missed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Where warnings are errors, as here, the gate prints its own instead: a test that expects none must fail."""
+    """Fail a test in which the gate prints an unexpected warning. It prints since warnings are errors in the tests."""
     printed: list[str] = []
     monkeypatch.setattr(caution, "_print", printed.append)
     yield

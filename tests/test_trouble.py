@@ -48,7 +48,7 @@ def test_base_install_says_how_to_get_the_rest() -> None:
 
 def test_doctor_works_without_extras() -> None:
     tried = without(EXTRAS, "doctor")
-    # Backends are tried in processes of their own, which have what is hidden from this one.
+    # Backends are tried in processes of their own, which have the packages that are hidden from this one.
     assert tried.returncode == 0 and tried.stderr == ""
     assert "tyro          missing, for: command line; run: pip install tyro" in tried.stdout
     assert f"Get all missing packages with: {install_command()}" in tried.stdout

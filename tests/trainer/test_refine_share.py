@@ -1,4 +1,4 @@
-"""Iterations left out of the reference trainer: interrupted and resumed, in turns, and what is counted."""
+"""Iterations left out of the reference trainer: interrupted runs, trainers in turns, and counts."""
 
 from __future__ import annotations
 
