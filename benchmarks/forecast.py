@@ -32,9 +32,9 @@ from skipgs_plug.trainer.files import write_json
 
 FILE = RESULTS / "forecast.json"
 FOLDERS = {"fern": ("fern", 2), "lego": ("lego_200", 1), "bonsai": ("bonsai", 4), "bonsai_large": ("bonsai", 1)}
-LENGTHS = (3000, 7000)  # iterations: of the bench's runs on fern and bonsai, and of the runs made here
+LENGTHS = (3000, 7000)  # iterations of the bench's runs on fern and bonsai, and of the runs made here
 RUN = 7000  # iterations of a run made here
-SECONDS = 30.0  # of training from which a forecast is made
+SECONDS = 30.0  # seconds of training from which a forecast is made
 
 
 def settings(name: str, steps: int, load: bool = True) -> tuple[TrainConfig, Scene | None]:

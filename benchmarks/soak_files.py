@@ -28,7 +28,7 @@ from skipgs_plug.trainer import InputError
 
 ROOT = Path(__file__).parents[1]
 MEMORY = 1 << 30  # bytes of address space that a case may add to that of the loaded libraries
-SECONDS = 20.0  # after which the child process ends itself; a case takes milliseconds
+SECONDS = 20.0  # seconds after which the child process ends itself; a case takes milliseconds
 BATCH = 500  # cases of one child process
 # Values that counts, sizes and coordinates rarely have.
 NUMBERS = (0, 1, -1, 127, 255, 2**31 - 1, -(2**31), 2**32 - 1, 2**40, 2**62, -(2**63), 2**64 - 1)

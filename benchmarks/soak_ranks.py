@@ -16,7 +16,7 @@ import torch.distributed as dist
 
 from skipgs_plug import SkipGate, SkipGSError
 
-TIME_OUT = 5.0  # of the process group, seconds
+TIME_OUT = 5.0  # time-out of the process group, in seconds
 STEPS, AT = 60, 30  # iterations, and the one at which the second process fails
 LATE = {"disagree": 0.0, "lag": 2.0, "hang": 3 * TIME_OUT}  # seconds that it then waits
 

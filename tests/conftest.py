@@ -8,8 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
 from skipgs_plug.core import caution
+from skipgs_plug.fallback_raster.runtime import guard
 
 # A shell starts jobs in the background with SIGINT ignored, and the commands that tests interrupt inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -17,11 +19,25 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 @pytest.fixture(autouse=True)
 def no_warning_of_the_gate_is_missed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Where warnings are errors, as here, the gate prints its own instead: a test that expects none must fail."""
+    """Fail a test in which the gate prints an unexpected warning. It prints since warnings are errors in the tests."""
     printed: list[str] = []
     monkeypatch.setattr(caution, "say", printed.append)
     yield
     assert not printed, f"The gate warned, and the test does not expect it: {printed}"
+
+
+@pytest.fixture
+def kernels_checked() -> Iterator[None]:
+    """Let every kernel call compare sizes of tensors with declarations, and run torch on one thread.
+
+    SKIPGS_PLUG_GUARD=1 adds guard zones. On a busy machine, several threads are ten times slower for the small
+    operations of the reference.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with guard.at_least(guard.SIZES):
+        yield
+    torch.set_num_threads(threads)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -201,13 +201,13 @@ def test_doctor_names_the_measurement_where_a_gpu_is(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "Imagined GPU")
-    assert main(["doctor"]) == 0  # warp renders; what gsplat does without a driver is a finding of its own
+    assert main(["doctor"]) == 0  # warp renders; gsplat's behaviour without a driver has a line of its own
     named = re.search(r"python -m (benchmarks\.gpu) SCENE", capsys.readouterr().out)
     assert named and importlib.util.find_spec(named[1]) is not None
 
 
 HEAVY = {"torch", "numpy", "warp", "gsplat", "pycolmap", "scipy", "matplotlib", "torchmetrics", "PIL", "viser", "tqdm"}
-HEAVY |= {"typeguard", "unittest", "asyncio"}  # what tyro loads for types that it does not compare by itself
+HEAVY |= {"typeguard", "unittest", "asyncio"}  # tyro loads it for types that it does not compare by itself
 UNUSED_IN_TRAINING = {"torchmetrics", "matplotlib", "scipy.signal", "viser", "torchvision", "pycolmap"}
 
 
@@ -229,7 +229,7 @@ def test_training_loads_nothing_that_it_does_not_use(tmp_path: Path, packed: str
     arguments = ["train", packed, "--out", str(tmp_path / "run"), "--max-steps", "1", "--no-progress"]
     code = f"from skipgs_plug.cli import main\nassert main({arguments!r}) == 0"
     assert loaded_by(code, UNUSED_IN_TRAINING) == set()
-    assert loaded_by(code.replace("== 0", "== 2"), {"torch"}) == {"torch"}  # the probe sees what is there
+    assert loaded_by(code.replace("== 0", "== 2"), {"torch"}) == {"torch"}  # the probe sees all devices
 
 
 def test_the_collector_passes_over_what_a_program_has_loaded(packed: str, tmp_path: Path) -> None:

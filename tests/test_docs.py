@@ -14,7 +14,7 @@ from skipgs_plug import adapters, fallback_raster, trainer
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("", "docs/", "docs/how_it_works/", "benchmarks/notes/", "examples/", "tests/")
 PAGES = sorted(page for folder in FOLDERS for page in ROOT.glob(f"{folder}*.md"))
-# What a user reads, from the first line to the last option.
+# All pages for users.
 USER_PATH = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
 
 

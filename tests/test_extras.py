@@ -1,4 +1,4 @@
-"""Each command imports with the packages of its extra alone, and says which extra brings what is missing."""
+"""Each command imports with the packages of its extra alone, and names the extra of a missing package."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ tomllib = pytest.importorskip("tomllib")  # Python 3.11
 
 PROJECT = Path(__file__).parents[1] / "pyproject.toml"
 MODULES = {"warp-lang": "warp", "pillow": "PIL", "pyyaml": "yaml", "imageio": "imageio", "jinja2": "jinja2"}
-# What comes with torch and numpy, and may be imported by them.
+# Packages that come with torch and numpy, which may import them.
 HIDE = """
 import importlib.abc, sys
 class Hidden(importlib.abc.MetaPathFinder):

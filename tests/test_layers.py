@@ -1,4 +1,4 @@
-"""Who imports whom, read from the source: the parts know only those below them, and no two modules each other."""
+"""Imports between parts, read from the source: a part imports only lower ones, and modules form no circle."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 import skipgs_plug
 
 ROOT = Path(skipgs_plug.__path__[0])
-# What each part may import besides itself and modules that import nothing of the package.
+# Parts that each part may import, besides itself and modules that import nothing of the package.
 MAY_IMPORT = {
     "core": set(),
     "adapters": {"core"},

@@ -1,4 +1,4 @@
-"""What is published: one version everywhere, every file accounted for, no code of others without its licence."""
+"""The release has one version everywhere, accounts for every file, and has a licence for all code of others."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-# Kinds of files that the package consists of. What others wrote, such as a library of scripts for a page, comes
+# Kinds of files that the package consists of. Code of others, such as a library of scripts for a page, comes
 # minified or compiled: it needs a licence beside it that `license-files` names.
 OWN = {".py", ".h", ".jinja", ".css", ".js", ".html", ".json", ".typed"}
 LONGEST_LINE = 500  # characters; scripts that were put through a minifier have longer ones
@@ -28,7 +28,7 @@ def test_one_version_everywhere() -> None:
     cited = re.search(r"^version: (.*)$", texts["CITATION.cff"], re.MULTILINE)
     headings = re.findall(r"^## \[(.*?)\]", texts["CHANGELOG.md"], re.MULTILINE)
     assert project and cited and project[1] == cited[1]
-    # What comes next may stand above what is released.
+    # An unreleased section may stand above the released version.
     assert next(heading for heading in headings if heading != "Unreleased") == project[1]
 
 

@@ -48,7 +48,7 @@ def test_base_install_says_how_to_get_the_rest() -> None:
 
 def test_doctor_works_without_extras() -> None:
     tried = without(EXTRAS, "doctor")
-    # Backends are tried in processes of their own, which have what is hidden from this one.
+    # Backends are tried in processes of their own, which have the packages that are hidden from this one.
     assert tried.returncode == 0 and tried.stderr == ""
     assert "tyro          missing, for: command line; run: pip install tyro" in tried.stdout
     assert f"Get all missing packages with: {install_command()}" in tried.stdout
@@ -123,6 +123,21 @@ def test_ctrl_c_that_an_import_turned_into_another_error(monkeypatch: pytest.Mon
     assert cli.main(["train"]) == 130
 
 
+def failing(error: OSError) -> type:
+    """Return the module of a command that ends with this error."""
+
+    class Command:
+        @staticmethod
+        def parse(arguments: list[str]) -> None:
+            return None
+
+        @staticmethod
+        def run(args: None) -> int:
+            raise error
+
+    return Command
+
+
 @pytest.mark.parametrize(
     ("number", "cure"),
     [
@@ -137,16 +152,8 @@ def test_ctrl_c_that_an_import_turned_into_another_error(monkeypatch: pytest.Mon
 def test_file_systems_in_trouble(
     number: int, cure: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    class Command:
-        @staticmethod
-        def parse(arguments: list[str]) -> None:
-            return None
-
-        @staticmethod
-        def run(args: None) -> int:
-            raise OSError(number, os.strerror(number), "/some/where")
-
-    monkeypatch.setattr(cli.importlib, "import_module", lambda name: Command)
+    error = OSError(number, os.strerror(number), "/some/where")
+    monkeypatch.setattr(cli.importlib, "import_module", lambda name: failing(error))
     assert cli.main(["report"]) == 2
     assert capsys.readouterr().err == (f"skipgs-plug: /some/where: {os.strerror(number)}; {cure}.\n")
 
@@ -238,15 +245,7 @@ def test_what_is_in_the_way_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_a_copy_that_does_not_fit_names_the_copy(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    class Command:
-        @staticmethod
-        def parse(arguments: list[str]) -> None:
-            return None
-
-        @staticmethod
-        def run(args: None) -> int:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/photographs/a.jpg", None, "/scene/a.jpg")
-
-    monkeypatch.setattr(cli.importlib, "import_module", lambda name: Command)
+    error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/photographs/a.jpg", None, "/scene/a.jpg")
+    monkeypatch.setattr(cli.importlib, "import_module", lambda name: failing(error))
     assert cli.main(["sfm"]) == 2
     assert capsys.readouterr().err.startswith("skipgs-plug: /scene/a.jpg: No space left on device; make room there")

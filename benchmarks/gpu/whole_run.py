@@ -152,7 +152,7 @@ def run(name: str, mode: str, folder: Path, asked: argparse.Namespace, seconds: 
 
 
 def call(arguments: list[str], checkout: Path, folder: Path, seconds: float) -> str | None:
-    """Run Python with `arguments`. Return None, or what went wrong."""
+    """Run Python with `arguments`. Return None, or a sentence about the failure."""
     with (folder / "log.txt").open("a") as log:
         try:
             done = subprocess.run(

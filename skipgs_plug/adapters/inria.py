@@ -285,9 +285,9 @@ class InriaFamily(AbstractAdapter):
     def _refuse_loop_elsewhere(self, code: LoopCode) -> None:
         """Refuse a script whose training loop is in a function that `training` calls, as 4DGaussians' two stages."""
         if LOOP not in code.backward:
-            place = ", ".join(f"{name}()" for name in sorted(code.backward & code.used)) or "another module"
+            where = ", ".join(f"{name}()" for name in sorted(code.backward & code.used)) or "another module"
             raise AdapterMismatchError(
-                f"{self.difference(code)}: its training loop is in {place}, not in {LOOP}(), as in 4DGaussians, and is "
+                f"{self.difference(code)}: its training loop is in {where}, not in {LOOP}(), as in 4DGaussians, and is "
                 f"not supported. {BY_HAND}"
             )
 

@@ -23,7 +23,7 @@ CONTROLLER = "DensityControllerTamingGS"
 EVENTS = ("split_and_clone", "prune", "reset_opacity")
 # Further methods that a controller runs. Reordering Gaussians assigns to the data of parameters, and changes no image.
 KNOWN = ("is_densify_actived", "_get_params_from_optimizer", ASSIGNED)
-INDEX = 11  # place of the view's index (a tensor) among the arguments of `render_preprocess`
+INDEX = 11  # position of the view's index (a tensor) among the arguments of `render_preprocess`
 
 
 class LiteGS(AbstractAdapter):

@@ -6,7 +6,7 @@ from skipgs_plug.adapters.inria import InriaFamily
 
 
 class PixelGS(InriaFamily):
-    """Only densification reads what this fork adds to Inria's loop, so it does not matter to the gate."""
+    """Only densification reads the values that this fork adds to Inria's loop, so the gate need not know them."""
 
     name = "pixel_gs"
     checked = "zhengzhang01/Pixel-GS 05c9d557 (its script, run on the CPU)"

@@ -1,4 +1,4 @@
-"""What a spawned process runs as its main module in place of the script; see `child_processes`."""
+"""The main module of a spawned process, in place of the script; see `child_processes`."""
 
 from .child_processes import import_main
 

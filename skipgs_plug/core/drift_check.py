@@ -9,7 +9,7 @@ from skipgs_plug.core import decision, distributed
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.optimizers import Optimizers, has_pending_gradient, with_names
 
-CHECKED_SKIPS = 5  # skipped iterations that are checked, from the second on; a loop repeats what it does
+CHECKED_SKIPS = 5  # skipped iterations that are checked, from the second on; a loop repeats its changes
 
 
 class DriftCheck:

@@ -17,7 +17,7 @@ class SkipGSError(RuntimeError):
 
 
 class UnknownTrainerError(SkipGSError):
-    """No adapter recognises the trainer, or none has the given name."""
+    """No adapter recognises the trainer, or no adapter has the given name."""
 
 
 class AdapterMismatchError(SkipGSError):

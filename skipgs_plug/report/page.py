@@ -9,8 +9,8 @@ from skipgs_plug.bench.store import flat
 from skipgs_plug.bench.summary import row_from_dict
 from skipgs_plug.bench.table import is_whole, legend, notes, tables
 from skipgs_plug.report import plots
-from skipgs_plug.report.blocks import Block, Details, Picture, Section, Strip, Table, Text, write_page
-from skipgs_plug.report.phases import phase_blocks
+from skipgs_plug.report.elements import Details, Element, Picture, Section, Strip, Table, Text, write_page
+from skipgs_plug.report.phases import phase_elements
 from skipgs_plug.report.source import BenchSource, RunSource
 
 GATE_HEADING = (
@@ -61,18 +61,18 @@ def build_page(sources: Sequence[RunSource | BenchSource]) -> str:
 def comparison(runs: Sequence[RunSource]) -> Section:
     """Return the section that shows several runs side by side."""
     names = unique_names(runs)
-    blocks: list[Block] = [results("All runs", runs), *different_settings(names)]
+    elements: list[Element] = [results("All runs", runs), *different_settings(names)]
     curves = {name: run.curve for name, run in names.items() if run.curve}
     if curves:
-        blocks.append(picture(plots.loss_over_time(curves), "Training loss over iterations."))
-        blocks.append(picture(plots.gaussians_over_time(curves, {}), "Number of Gaussians over training time."))
+        elements.append(picture(plots.loss_over_time(curves), "Training loss over iterations."))
+        elements.append(picture(plots.gaussians_over_time(curves, {}), "Number of Gaussians over training time."))
     views = {name: run.views for name, run in names.items() if run.views}
     if views:
-        blocks.append(picture(plots.quality_of_views(views), "PSNR of each held-out view; dashed: mean of each run."))
-    return Section("Side by side", blocks)
+        elements.append(picture(plots.quality_of_views(views), "PSNR of each held-out view; dashed: mean of each run."))
+    return Section("Side by side", elements)
 
 
-def different_settings(runs: Mapping[str, RunSource]) -> list[Block]:
+def different_settings(runs: Mapping[str, RunSource]) -> list[Element]:
     """Return a table of the training settings that differ, such as the size of the images; nothing if all are equal."""
     settings = [dict(flat(run.settings)) for run in runs.values()]
     known = [one for one in settings if one]
@@ -91,28 +91,28 @@ def unique_names(runs: Sequence[RunSource]) -> dict[str, RunSource]:
 
 
 def run_section(run: RunSource) -> Section:
-    blocks: list[Block] = [results("Results", [run])]
+    elements: list[Element] = [results("Results", [run])]
     # Older versions, which could not leave out iterations, did not write this field.
     if run.gate is not None and run.gate.get("refine_share") is not None:
-        blocks += phase_blocks(run.gate, run.curve)
+        elements += phase_elements(run.gate, run.curve)
     if run.curve:
-        blocks.append(picture(plots.loss_over_time({run.name: run.curve}), "Training loss over iterations."))
-        blocks.append(gaussians(run))
+        elements.append(picture(plots.loss_over_time({run.name: run.curve}), "Training loss over iterations."))
+        elements.append(gaussians(run))
     if run.views:
-        blocks.append(picture(plots.quality_of_views({run.name: run.views}), "PSNR of held-out views; dashed: mean."))
-    blocks += pictured_views(run)
+        elements.append(picture(plots.quality_of_views({run.name: run.views}), "PSNR of held-out views; dashed: mean."))
+    elements += pictured_views(run)
     if run.gate is not None:
-        blocks += gate_blocks(run.name, run.gate)
+        elements += gate_elements(run.name, run.gate)
     if run.views:
         names = list(run.views[0])
         rows = [[rounded(row[name]) for name in names] for row in run.views]
-        blocks.append(Details(f"Table of {len(rows)} held-out views", [Table("Held-out views", names, rows)]))
+        elements.append(Details(f"Table of {len(rows)} held-out views", [Table("Held-out views", names, rows)]))
     if run.metrics:
         metrics = [(name, rounded(value)) for name, value in run.metrics.items()]
-        blocks.append(Details("Last evaluation", [Table("Last evaluation", ("metric", "value"), metrics, text=True)]))
+        elements.append(Details("Last evaluation", [Table("Last evaluation", ("metric", "value"), metrics, text=True)]))
     if run.settings:
-        blocks.append(Details("Settings of training", [settings_table("Settings of training", run.settings)]))
-    return Section(run.name, blocks)
+        elements.append(Details("Settings of training", [settings_table("Settings of training", run.settings)]))
+    return Section(run.name, elements)
 
 
 def gaussians(run: RunSource) -> Picture:
@@ -125,7 +125,7 @@ def gaussians(run: RunSource) -> Picture:
     return picture(plots.gaussians_over_time({run.name: run.curve}, ends), caption)
 
 
-def pictured_views(run: RunSource) -> list[Block]:
+def pictured_views(run: RunSource) -> list[Element]:
     """Return pictures of the worst held-out views, or of the first ones if their quality is unknown."""
     if len(run.views) != len(run.renders):
         return [Strip(path.name, plots.split_render(path)) for path in run.renders[:PICTURED]]
@@ -139,39 +139,39 @@ def pictured_views(run: RunSource) -> list[Block]:
     ]
 
 
-def gate_blocks(name: str, data: dict[str, Any]) -> list[Block]:
-    blocks: list[Block] = [gate_table("Decisions of the gate", name, data)]
+def gate_elements(name: str, data: dict[str, Any]) -> list[Element]:
+    elements: list[Element] = [gate_table("Decisions of the gate", name, data)]
     if data.get("refine_share") is not None:  # older versions did not write this field
-        blocks.append(refinement_table("Whole iterations left out", name, data))
+        elements.append(refinement_table("Whole iterations left out", name, data))
     views = data["views"]
     if data["gated_iterations"] == 0:
-        blocks.append(Text(["The gate was never active in this run, so there is nothing to draw."]))
+        elements.append(Text(["The gate was never active in this run, so there is nothing to draw."]))
     else:
-        blocks.append(picture(plots.reasons(data), "Iterations since the gate became active, by reason of decision."))
-        blocks.append(picture(plots.view_shares(views), "Share of skipped visits of each training view."))
+        elements.append(picture(plots.reasons(data), "Iterations since the gate became active, by reason of decision."))
+        elements.append(picture(plots.view_shares(views), "Share of skipped visits of each training view."))
         if any(row["mean_loss"] is not None for row in views):
-            blocks.append(picture(plots.loss_against_skips(views), "Loss and skipped visits, one point per view."))
+            elements.append(picture(plots.loss_against_skips(views), "Loss and skipped visits, one point per view."))
     if views:
         names = ("view", "visits", "backwards", "skips", "mean_loss", "last_loss")
         rows = [[rounded(row[name]) for name in names] for row in views]
-        blocks.append(Details(f"Table of {len(views)} training views", [Table("Training views", names, rows)]))
-    blocks.append(Details("Settings of the gate", [settings_table("Settings of the gate", data["settings"])]))
-    return blocks
+        elements.append(Details(f"Table of {len(views)} training views", [Table("Training views", names, rows)]))
+    elements.append(Details("Settings of the gate", [settings_table("Settings of the gate", data["settings"])]))
+    return elements
 
 
 def bench_section(bench: BenchSource) -> Section:
     data = bench.data
     rows = [row_from_dict(row) for row in data["rows"]]
-    blocks: list[Block] = [Table(caption, lines[0], lines[1:]) for caption, lines in tables(rows, is_whole(data))]
-    blocks.append(Text(notes(rows, data)))
-    blocks += [Picture(plots.inline_png(path), text, wide=True) for path, text in bench.pictures]
+    elements: list[Element] = [Table(caption, lines[0], lines[1:]) for caption, lines in tables(rows, is_whole(data))]
+    elements.append(Text(notes(rows, data)))
+    elements += [Picture(plots.inline_png(path), text, wide=True) for path, text in bench.pictures]
     if any(any(trace.skipped) for trace in bench.decisions.values()):
         text = "Share of backward passes skipped during refinement, one curve per policy that skips."
-        blocks.append(picture(plots.skips_over_time(bench.decisions), text))
-    blocks.append(Table("Policies", ("policy", "meaning"), legend(rows, is_whole(data)), text=True))
+        elements.append(picture(plots.skips_over_time(bench.decisions), text))
+    elements.append(Table("Policies", ("policy", "meaning"), legend(rows, is_whole(data)), text=True))
     facts = {"command": data["command"], "commits": ", ".join(data["commits"]), **data["versions"], **data["settings"]}
-    blocks.append(Details("Command, machine, versions, settings", [settings_table("Settings", facts)]))
-    return Section(f"Bench: {data['settings']['scene']['name']}", blocks)
+    elements.append(Details("Command, machine, versions, settings", [settings_table("Settings", facts)]))
+    return Section(f"Bench: {data['settings']['scene']['name']}", elements)
 
 
 def results(caption: str, runs: Sequence[RunSource]) -> Table:

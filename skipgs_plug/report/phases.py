@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from skipgs_plug.report.blocks import Block, Table, Text
+from skipgs_plug.report.elements import Element, Table, Text
 
 ROWS = (
     "iterations of the schedule",
@@ -89,7 +89,7 @@ def phases(gate: Mapping[str, Any], curve: Mapping[str, Sequence[float]]) -> tup
     return first, last
 
 
-def phase_blocks(gate: Mapping[str, Any], curve: Mapping[str, Sequence[float]]) -> list[Block]:
+def phase_elements(gate: Mapping[str, Any], curve: Mapping[str, Sequence[float]]) -> list[Element]:
     """Return a table of both phases and the whole run, and a text that explains the estimate."""
     growing, refining = phases(gate, curve)
     whole = Phase(

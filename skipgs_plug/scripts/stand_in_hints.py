@@ -42,7 +42,7 @@ def stand_in_hint(error: BaseException) -> str | None:
         text += " where the renderer unpacks the outputs"
     if not lacks:
         return None
-    return f"The script uses what the stand-ins of --cpu do not have ({text}): it needs CUDA; run it without --cpu."
+    return f"The script uses a feature that the stand-ins of --cpu lack ({text}): it needs CUDA; run it without --cpu."
 
 
 def is_stand_in(thing: Any) -> bool:

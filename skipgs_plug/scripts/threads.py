@@ -1,4 +1,4 @@
-"""Let the threads that a script starts enter what holds for one thread only."""
+"""Make the threads that a script starts enter context managers that hold for one thread only."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ class TrainConfig:
     data_factor: int = 1
     """Use images_{factor}; without that folder, photographs are resized in memory."""
     test_every: int = 8
-    """Hold out every n-th view by name (index % n == 0); 0 holds out none."""
+    """Hold out every n-th view by name (index % n == 0); 0 holds out no view."""
     init_num_pts: int = 100_000
     """Random initial points for scenes without a point cloud (Blender)."""
     init_ply: str = ""

@@ -13,12 +13,12 @@ from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.scene import View
 
 ERROR_GAIN = 4.0  # factor on absolute errors: at 1, an error of 0.05 would look black
-ROWS = 3  # views to show, at most
-ZOOM = 2  # side of one pixel of the render in the picture, in pixels
+ROWS = 3  # views to show, at most: more rows do not fit on one screen
+ZOOM = 2  # side of one pixel of the render in the picture, in pixels, so that small renders stay legible
 # Width of a column, as a multiple of its title's height. The title stays legible where a page shrinks the picture, and
 # "share=auto error x4" is the longest one.
 COLUMN_WIDTH = 10
-LEAST_HEIGHT = 11  # of a title, in pixels: titles of narrow columns overlap before they are too small to read
+LEAST_HEIGHT = 11  # least height of a title, in pixels: smaller titles cannot be read
 SMOOTH = 0.95  # decay of the running mean of losses per iteration: about the mean of the last 20
 
 

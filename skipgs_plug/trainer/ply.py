@@ -55,13 +55,13 @@ def write_ply(splats: Mapping[str, Tensor], path: str | Path) -> None:
     values = saturated({name: tensor.detach().cpu().float() for name, tensor in splats.items()}, path)
     positions = splats["means"].detach().cpu()  # float64 where float32 would lose some
     n = len(values["means"])
-    rest = torch.zeros(n, HIGHER_COEFFICIENTS, 3, dtype=torch.float32)
-    rest[:, : values["shN"].shape[1]] = values["shN"]
+    higher = torch.zeros(n, HIGHER_COEFFICIENTS, 3, dtype=torch.float32)
+    higher[:, : values["shN"].shape[1]] = values["shN"]
     columns = [
         values["means"],
         torch.zeros(n, 3, dtype=torch.float32),
         values["sh0"].reshape(n, 3),
-        rest.transpose(1, 2).reshape(n, 3 * HIGHER_COEFFICIENTS),
+        higher.transpose(1, 2).reshape(n, 3 * HIGHER_COEFFICIENTS),
         values["opacities"].reshape(n, 1),
         values["scales"],
         values["quats"],
@@ -131,7 +131,7 @@ def model_of(path: Path, vertices: Mapping[str, np.ndarray]) -> dict[str, Tensor
     table = columns(path, vertices, names, infinite=SATURATING)
     if not len(table):
         raise InputError(f"PLY {path} holds no Gaussians; export it again from a sound checkpoint.")
-    means, sh0, rest, opacity, scales, quats = torch.from_numpy(table).split([3, 3, count, 1, 3, 4], dim=1)
+    means, sh0, higher, opacity, scales, quats = torch.from_numpy(table).split([3, 3, count, 1, 3, 4], dim=1)
     if (quats == 0).all(dim=1).any():
         raise InputError(f"PLY {path} holds rotations of length 0; export it again from a sound checkpoint.")
     exact = positions_of(vertices)
@@ -141,7 +141,7 @@ def model_of(path: Path, vertices: Mapping[str, np.ndarray]) -> dict[str, Tensor
         "quats": quats.contiguous(),
         "opacities": opacity[:, 0].contiguous(),
         "sh0": sh0[:, None, :].contiguous(),
-        "shN": rest.reshape(len(rest), 3, count // 3).transpose(1, 2).contiguous(),
+        "shN": higher.reshape(len(higher), 3, count // 3).transpose(1, 2).contiguous(),
     }
     return renderable(splats, path)
 

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-# Of SSIM's Gaussian window, in pixels, as in its paper (Wang et al. 2004): 11 pixels along each side.
+# Sigma and radius of SSIM's Gaussian window, in pixels. The window has 11 pixels along each side (Wang et al. 2004).
 SIGMA, RADIUS = 1.5, 5
-# They keep quotients finite where an image is flat, for values in [0, 1], as in the paper.
+# Terms that keep SSIM's quotients finite where an image is flat; the paper's values for images in [0, 1].
 C1, C2 = 0.01**2, 0.03**2
 BAND = 1 << 18  # pixels of an image that are measured together: all planes of a photograph of 12 megapixels take 7 GiB
 

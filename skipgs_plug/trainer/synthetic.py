@@ -26,7 +26,7 @@ from skipgs_plug.trainer.raytrace import (
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene
 
 RADIUS = 3.6  # distance of each camera from the middle; the floor is 5.2 wide and fills most of the picture
-FOV_X = np.deg2rad(52.0)
+FOV_X = np.deg2rad(52.0)  # horizontal angle of view in radians, at which the floor fills most of the picture
 
 
 def make_scene(

@@ -128,7 +128,7 @@ class Page:
         for handle, picture in zip(self._pictures, pictures, strict=True):
             handle.image = picture
         kind = "held out" if view.name in self._held_out else "trained on"
-        kind += "" if view.mask is None else ", without what its mask leaves out"
+        kind += "" if view.mask is None else ", masked pixels left out"
         self._quality.content = f"PSNR **{psnr(shown, truth, view.mask):.2f} dB** ({kind})"
 
     def measure(self) -> None:

@@ -60,7 +60,7 @@ def to_spz(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
             *SCALES,
             cut,
         )
-    n, rest = len(means), splats["shN"].numpy().astype(np.float32)
+    n, higher = len(means), splats["shN"].numpy().astype(np.float32)
     largest = float(np.abs(means).max(initial=1e-9))
     bits = min(max(math.floor(math.log2((2**POSITION_BITS - 1) / largest)), 0), 24)
     fixed = np.rint(means * (1.0, -1.0, -1.0) * 2.0**bits).astype("<i4")
@@ -70,13 +70,13 @@ def to_spz(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(min=1e-12)
     quats = np.where(quats[:, :1] < 0, -quats, quats)[:, 1:] * (1.0, -1.0, -1.0)
     parts = [
-        struct.pack(HEADER, MAGIC, VERSION, n, sh_degree(rest.shape[1]), bits, ANTIALIASED * antialiased, 0),
+        struct.pack(HEADER, MAGIC, VERSION, n, sh_degree(higher.shape[1]), bits, ANTIALIASED * antialiased, 0),
         fixed.view(np.uint8).reshape(n, 3, 4)[..., :3].tobytes(),  # three bytes, the lowest first
         _bytes(opacities),
         _bytes((colours[:, 0] * COLOUR_SCALE + 0.5) * 255.0),
         _bytes((scales + 10.0) * 16.0),
         _bytes(quats * 127.5 + 127.5),
-        _bytes(_harmonics(rest)),
+        _bytes(_harmonics(higher)),
     ]
     return gzip.compress(b"".join(parts), mtime=0)
 
@@ -105,14 +105,14 @@ def read_spz(path: Path) -> Spz:
     raw = np.frombuffer(content, np.uint8, offset=struct.calcsize(HEADER))
     if len(raw) != n * sum(sizes):
         raise InputError(f"{path} is damaged: {len(raw):,} bytes for {n:,} Gaussians; export it again.")
-    means, alpha, colours, scales, quats, rest = np.split(raw, np.cumsum(sizes[:-1]) * n)
+    means, alpha, colours, scales, quats, higher = np.split(raw, np.cumsum(sizes[:-1]) * n)
     values = {
         "means": _positions(means, bits, version).reshape(n, 3) * (1.0, -1.0, -1.0),
         "scales": scales.reshape(n, 3) / 16.0 - 10.0,
         "quats": (_smallest_three if version == 3 else _first_three)(quats.reshape(n, -1)) * (1.0, 1.0, -1.0, -1.0),
         "opacities": logits(alpha / 255.0),
         "sh0": ((colours.reshape(n, 3) / 255.0 - 0.5) / COLOUR_SCALE)[:, None],
-        "shN": (rest.reshape(n, k, 3) / 128.0 - 1.0) * SH_SIGNS[:k, None],
+        "shN": (higher.reshape(n, k, 3) / 128.0 - 1.0) * SH_SIGNS[:k, None],
     }
     splats = {name: torch.from_numpy(value.astype(np.float32)) for name, value in values.items()}
     return Spz(renderable(splats, path), bool(flags & ANTIALIASED))
@@ -146,10 +146,10 @@ def _smallest_three(data: np.ndarray) -> np.ndarray:
     return parts[:, [3, 0, 1, 2]]
 
 
-def _harmonics(rest: np.ndarray) -> np.ndarray:
+def _harmonics(higher: np.ndarray) -> np.ndarray:
     """Quantise coefficients [N, K, 3] so that zero stays exact."""
-    steps = np.where(np.arange(rest.shape[1]) < 3, FIRST_BAND_STEP, OTHER_BAND_STEP)[:, None]
-    values = np.rint(rest * SH_SIGNS[: rest.shape[1], None] * 128.0) + 128.0
+    steps = np.where(np.arange(higher.shape[1]) < 3, FIRST_BAND_STEP, OTHER_BAND_STEP)[:, None]
+    values = np.rint(higher * SH_SIGNS[: higher.shape[1], None] * 128.0) + 128.0
     return np.floor((values + steps / 2) / steps) * steps
 
 

@@ -1,4 +1,4 @@
-"""Every look-alike as a case: how to make its trainer, how to run it, and what is expected of it."""
+"""One case for each look-alike: how to make its trainer, how to run it, and the expected results."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ PAUSE = 4  # iterations
 
 @dataclass(frozen=True)
 class Case:
-    """A trainer and what it does when left alone.
+    """A trainer and its behaviour without a gate.
 
     Attributes:
         name: of the test.
         module: the look-alike; has ADAPTER, FIRST, START and LAST iteration.
         make: gives the trainer and a function `train(last)` that runs it.
-        resume: runs a copy of what `train` returned: resume(result) gives another trainer and `train`.
+        resume: runs a copy of the result of `train`: resume(result) gives another trainer and `train`.
         settled: iteration from which nothing changes when everything is skipped.
         pending: gradients are left over when skipping begins, and are to be applied right before `settled`.
         views: keys of all training views.
@@ -191,7 +191,7 @@ def frgs(name: str, **options: Any) -> Case:
 
 
 def passes_over(trainer: Any) -> None:
-    """A resumed runner takes all minibatches again, and trains on those that are new."""
+    """Resume a runner: it takes all minibatches again, and trains on the new ones."""
     trainer._start_step = trainer._global_step
 
 
@@ -249,7 +249,7 @@ CASES = [
 
 
 class SkipAlways(Policy):
-    """A policy that skips whatever it is asked about."""
+    """A policy that skips every backward pass."""
 
     def decide(self, view, loss, step):
         return decision.AT_OR_BELOW_MEAN
@@ -266,7 +266,7 @@ class SkipAlways(Policy):
 
 @functools.cache
 def alone(case: Case) -> Any:
-    """Log of a trainer when left alone; read it only, it serves all tests."""
+    """Return the log of a trainer without a gate. All tests share it, so they must not change it."""
     return run(case)[0]
 
 

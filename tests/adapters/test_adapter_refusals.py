@@ -1,4 +1,4 @@
-"""Whatever does not fit is one sentence that names what was expected and where, early enough."""
+"""A trainer that does not fit its adapter is refused before training, with one sentence about the difference."""
 
 import copy
 import types
@@ -65,7 +65,7 @@ def copied(module):
     return copy_of
 
 
-# The render is what begins an iteration of Deformable, whose learning rates are set at its end.
+# An iteration of Deformable begins with its render, since its learning rates are set at the end.
 BEGUN_BY_METHOD = [case for case in SCRIPTS if case.name != "deformable"]
 
 
@@ -217,7 +217,7 @@ def test_user_adapter_of_a_fork_is_asked_first(mine):
             assert gate.adapter.name == "inria"
         with pytest.raises(AdapterMismatchError, match=r"'mine' is for my fork .* training script of 'inria'"):
             SkipGate(inria, adapter="mine")
-        SkipGate(module, adapter="inria").detach()  # by name, an adapter takes what it can
+        SkipGate(module, adapter="inria").detach()  # an adapter chosen by name accepts forks
     finally:
         registry._registered.pop("mine", None)
     assert copy.copy(adapter_names())[0] == "reference"

@@ -1,4 +1,4 @@
-"""docs/adapters.md says what the adapters say."""
+"""docs/adapters.md agrees with the adapters."""
 
 from pathlib import Path
 

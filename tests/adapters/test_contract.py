@@ -1,4 +1,4 @@
-"""What holds for every adapter, on look-alikes of the trainers (lookalikes/)."""
+"""The contract of every adapter, on look-alikes of the trainers (lookalikes/)."""
 
 import copy
 import json
@@ -57,12 +57,12 @@ def test_skipping_everything_holds_the_model_still(case):
     assert gate.report()["backwards_skipped"] == case.module.LAST + 1 - start
     settled = case.settled or start
     assert all(step < settled for step in gated.steps)
-    if case.pending:  # what the last backwards had left was applied, in a skipped iteration
+    if case.pending:  # pending gradients of the last backwards were applied, in a skipped iteration
         assert start < gated.steps[-1] == settled - 1
     before, after = rows(gated.values[settled]), rows(gated.current)
     assert (after[:, None] == before[None]).all(dim=2).any(dim=1).all()  # prunes take rows away, nothing moves
     assert len(after) == len(rows(alone(case).current))
-    # What the trainer does for itself goes on: same prunes with the same counts, and the backwards they need.
+    # The trainer's own changes go on: the same prunes with the same counts, and the backwards that they need.
     assert gated.structure == alone(case).structure
     assert gated.other_backwards == alone(case).other_backwards
 

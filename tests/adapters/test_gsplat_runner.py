@@ -89,7 +89,7 @@ def gsplat_module(monkeypatch):
 
 
 def script():
-    """What simple_trainer.py does when run, in a namespace of its own."""
+    """Run simple_trainer.py's own steps, in a namespace of its own."""
     names = {"Runner": type("Runner", (Runner,), {}), "DefaultStrategy": DefaultStrategy}
     code = """
 from gsplat.distributed import cli

@@ -1,4 +1,4 @@
-"""Whatever code of the gate fails, wherever it is called: training finishes, and one warning says so."""
+"""If any code of the gate fails, in any kind of loop, training finishes, and one warning says so."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What holds for every adapter when whole iterations are left out, on look-alikes of the trainers."""
+"""The contract of every adapter when whole iterations are left out, on look-alikes of the trainers."""
 
 import json
 

@@ -78,5 +78,7 @@ def test_every_built_in_adapter_loads_under_its_name(name: str) -> None:
     module, _, attribute = registry.BUILTIN[name].partition(":")
     adapter = getattr(importlib.import_module(module), attribute)
     assert adapter.name == name
-    assert re.fullmatch(r".*\w \([^()]*\w\)", adapter.checked)  # with what, and in brackets how
+    assert re.fullmatch(
+        r".*\w \([^()]*\w\)", adapter.checked
+    )  # names the checked commit, and in brackets how it was checked
     assert not adapter.matches(object())

@@ -131,7 +131,7 @@ def test_script_is_gated_on_the_cpu(checkout, tmp_path, capfd):
     code = cli.main(["run", "inria", "--cpu", "--warmup", "10", "--", checkout, str(tmp_path)])
     captured = capfd.readouterr()
     assert code == 0
-    assert captured.out.endswith("Training complete.\n")  # what we say goes to stderr
+    assert captured.out.endswith("Training complete.\n")  # the gate's own output goes to stderr
     assert "SkipGS: " in captured.err
     report = json.loads((tmp_path / "skipgs.json").read_text())
     assert report["iterations"] == 60 and report["gated_iterations"] == 41
@@ -499,7 +499,7 @@ def test_what_the_stand_ins_lack_is_one_sentence(checkout, tmp_path, capfd, old,
     renderer.write_text(renderer.read_text().replace(old, new))
     assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
     error = capfd.readouterr().err
-    assert "The script uses what the stand-ins of --cpu do not have (" in error and found in error
+    assert "The script uses a feature that the stand-ins of --cpu lack (" in error and found in error
     assert "it needs CUDA; run it without --cpu." in error and "Traceback" not in error
 
 

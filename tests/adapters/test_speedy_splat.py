@@ -9,7 +9,7 @@ CASE = script("speedy_splat", speedy_splat)
 def test_prunes_in_skipped_iterations_run_their_backwards():
     gated, gate = run(CASE, policy=SkipAlways())
     prunes = [step for step, kind, _ in gated.structure if kind == "prune" and step not in (5, 15)]
-    assert prunes == [10, 10, 20, 30, 40, 50, 60]  # two of them in 10: of densification, then by scores
+    assert prunes == [10, 10, 20, 30, 40, 50, 60]  # iteration 10 has two: one of densification, then one by scores
     prunes.remove(10)
     assert gated.other_backwards == len(prunes) * 5
     assert not {30, 40, 50, 60} & set(gated.backwards)

@@ -1,4 +1,4 @@
-"""Forks that no adapter knows: refused, warned of, or let go on ungated, by what their loop does."""
+"""Forks that no adapter knows are refused, warned about, or run without a gate, as their loop requires."""
 
 import types
 

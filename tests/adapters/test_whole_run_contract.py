@@ -1,4 +1,4 @@
-"""What holds for every adapter when iterations are left out while the scene grows, too, on look-alikes."""
+"""The contract of every adapter when iterations are also left out while the scene grows, on look-alikes."""
 
 import json
 
@@ -15,7 +15,7 @@ each = pytest.mark.parametrize("case", LOOPS, ids=lambda case: case.name)
 # Budgets, constant shares and resolutions by event: all of their events are kept.
 KEEP_ALL_EVENTS = {"taming", "mcmc", "improved_gs", "gns", "dash_gaussian"}
 SHARE = 0.4
-# Of the views at each of these: a term of the loss, or what only the iterations before can make of the model.
+# Iterations that must all run, by adapter: a further term of the loss acts on the model in each of them.
 WHOLE = {"gns": range(20, 31), "gaussianspa": range(20, 41)}
 
 
@@ -26,7 +26,7 @@ def begun(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def thinned():
+def shortened():
     """Log of each trainer with a share, and the numbers of the iterations that ran."""
     logs = {}
 
@@ -51,7 +51,7 @@ def short(monkeypatch):
 
 
 def beside(entries, events):
-    """What else happened to the model than densification events: when, and what."""
+    """Return all changes of the model except densification events: iteration and kind."""
     return [(step, kind) for step, kind, _ in entries if step not in events]
 
 
@@ -68,7 +68,7 @@ def test_events_are_thinned_and_everything_else_happens_exactly_as_often(case, s
     assert gated.happened == plain.happened  # SH, saves, ADMM and the like
     assert beside(gated.structure, events) == beside(plain.structure, events)  # prunes, resets, new models
     assert gated.other_backwards == plain.other_backwards
-    # Events that run have their number, and what was gathered since the one before.
+    # Events that run have their number, and the gradients that were gathered since the previous event.
     assert set(gated.behind) == events & set(begun)
     before = case.module.FIRST - 1
     for event, gathered in gated.behind.items():
@@ -113,9 +113,9 @@ def test_leaving_out_nothing_leaves_the_whole_run_bit_identical(case, settings):
 @pytest.mark.filterwarnings("ignore:Seems like `optimizer.step:UserWarning")
 @pytest.mark.parametrize("grows", [True, False], ids=["growing", "refining"])
 @pytest.mark.parametrize("case", [case for case in LOOPS if case.resume], ids=lambda case: case.name)
-def test_interrupted_and_resumed_leaves_out_the_same(case, grows, thinned, begun, short):
+def test_interrupted_and_resumed_leaves_out_the_same(case, grows, shortened, begun, short):
     settings = {"share": SHARE, "pause_iters": 0}
-    whole, numbers = thinned(case)
+    whole, numbers = shortened(case)
     start, first, last = case.refined_from, case.module.FIRST, case.module.LAST
     there = [n for n in numbers if (first + 3 <= n < start - 3 if grows else last - 16 <= n < last)]
     if not there:

@@ -135,7 +135,10 @@ def test_peak_memory_is_that_of_the_run_alone(monkeypatch):
     )
     record = RunRecord(0, "gate")
     monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda device: None)
-    for others, peak in ((50_000, 57_000), (90_000, 93_000)):  # what all runs hold, and the most during this part
+    for others, peak in (
+        (50_000, 57_000),
+        (90_000, 93_000),
+    ):  # memory that all runs hold, and the peak during this part
         monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device, held=others: held)
         monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device, most=peak: most)
         with peak_memory(trainer, record):

@@ -1,4 +1,4 @@
-"""benchmarks/gpu/whole_run.py: what is measured is stored, without a GPU here."""
+"""benchmarks/gpu/whole_run.py stores its measurements; these tests need no GPU."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""What the runner of other projects' scripts measures of their models."""
+"""Measurements of the models that other projects' scripts write."""
 
 from __future__ import annotations
 

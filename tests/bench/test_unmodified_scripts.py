@@ -72,7 +72,7 @@ def test_second_run_replaces_the_record_of_the_same_mode_alone(checkouts, monkey
     run(checkouts, monkeypatch)
     run(checkouts, monkeypatch)
     runs = json.loads((checkouts.parent / "runs.json").read_text())["runs"]
-    runs = [{**one, "seconds": 1.0} for one in runs]  # the stand-in takes none
+    runs = [{**one, "seconds": 1.0} for one in runs]  # the stand-in takes no options
     assert [one["mode"] for one in runs] == ["own", "auto"]
     assert "| Tiny | 100 | 70 |" in table(runs)
 

@@ -236,4 +236,4 @@ def test_a_run_after_another_needs_as_much_memory():
     first, second = (record.peak_memory for record in records)
     held = sum(parameter.nbytes for parameter in trainers[1].splats.values()) * 3  # with moments
     assert second > 1.5 * held
-    assert second > 0.4 * first  # which loaded kernels too
+    assert second > 0.4 * first  # the first run loaded the kernels too

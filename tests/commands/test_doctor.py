@@ -1,4 +1,4 @@
-"""The doctor: what it tries may crash, in a process of its own, and the finding is one sentence."""
+"""The doctor tries each backend in a process of its own, which may crash, and prints one sentence about it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A few of the kills of `python -m benchmarks.soak`: whatever moment they meet, the run ends as if left alone."""
+"""A few of the kills of `python -m benchmarks.soak`: a run that is killed at any moment ends like one that is not."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_killed_at_random_moments(scene: Path, tmp_path: Path, gated: bool, numb
 
 @pytest.fixture(scope="module")
 def whole(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A gated run that nothing happened to."""
+    """A gated run that was not interrupted."""
     run = Run(scene, tmp_path_factory.mktemp("whole") / "run", gated=True, save_every=50)
     run.finish()
     return run.out

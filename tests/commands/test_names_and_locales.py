@@ -52,7 +52,7 @@ def write_colmap(root: Path, name: str = "view", binary: bool = False) -> Path:
 @pytest.mark.timeout(1800)  # five processes, each of which loads torch
 @pytest.mark.parametrize("strict", [False, True], ids=["POSIX", "ASCII"])
 def test_every_locale(tmp_path: Path, strict: bool) -> None:
-    """`strict` is what Python does of itself under any other locale than C and POSIX, such as de_DE.ISO-8859-1."""
+    """Python itself uses `strict` under every locale except C and POSIX, such as de_DE.ISO-8859-1."""
     scene = write_colmap(tmp_path / "Straße", "Bäume")
     env = {name: value for name, value in os.environ.items() if not name.startswith(("LC_", "LANG", "PYTHONUTF8"))}
     env |= {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"} if strict else {"LC_ALL": "POSIX"}
@@ -116,7 +116,7 @@ def text_options(kind: type) -> list[tuple[str, str]]:
 
 
 def values_of(args: object, name: str) -> list[str]:
-    """Return what the field of this name holds, in `args` or in one of the dataclasses in it."""
+    """Return the value of the field with this name, in `args` or in one of its dataclasses."""
     for field in dataclasses.fields(args):  # type: ignore[arg-type]
         value = getattr(args, field.name)
         if field.name == name:

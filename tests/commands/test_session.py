@@ -37,7 +37,7 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="module")
 def whole(packed: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that nothing happened to."""
+    """A run that was not interrupted."""
     out = tmp_path_factory.mktemp("whole") / "run"
     assert train(packed, out) == 0
     return out
@@ -113,7 +113,7 @@ def test_a_second_signal_ends_at_once_and_keeps_what_was_saved(
 
 @pytest.mark.parametrize("lost", ["ply/", "renders/", "stats/", "skipgs.json"])
 def test_a_finished_run_is_completed(tmp_path: Path, packed: str, whole: Path, lost: str) -> None:
-    """Killed while it wrote what a run leaves, with half a file aside."""
+    """Kill a run while it writes its results, with a half-written temporary file."""
     out = tmp_path / "run"
     subprocess.run(["cp", "-r", str(whole), str(out)], check=True)
     for path in [

@@ -1,4 +1,4 @@
-"""What `--tensorboard` leaves, read back as TensorBoard reads it."""
+"""Files of `--tensorboard`, read back as TensorBoard reads them."""
 
 from __future__ import annotations
 

@@ -209,7 +209,7 @@ def test_modules_are_served_and_taken_away(family):
     other_module = object()
     names = list(FAMILIES[family])
     before = set(sys.modules)
-    sys.modules[names[0]] = other_module  # what was there comes back
+    sys.modules[names[0]] = other_module  # the earlier modules come back
     try:
         with serve(family):
             for name, (_, offered) in FAMILIES[family].items():

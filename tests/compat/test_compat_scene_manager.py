@@ -30,7 +30,7 @@ def test_model_is_read_as_gsplats_parser_asks_for_it(model):
         manager.load_cameras(), manager.load_images(), manager.load_points3D()
     assert hasattr(pycolmap, "SceneManager") == had
     bent, plain = manager.cameras[1], manager.cameras[2]
-    assert (bent.camera_type, plain.camera_type) == (4, 0)  # what gsplat compares with
+    assert (bent.camera_type, plain.camera_type) == (4, 0)  # gsplat compares with this value
     assert (bent.fx, bent.fy, bent.cx, bent.cy, bent.width, bent.height) == (50, 51, 32, 24, 64, 48)
     assert (bent.k1, bent.k2, bent.p1, bent.p2) == (0.1, 0.2, 0.3, 0.4)
     assert (plain.fx, plain.fy, plain.cx, plain.cy) == (50, 50, 32, 24)

@@ -1,4 +1,4 @@
-"""Settings refuse what they cannot mean, by name."""
+"""Settings refuse invalid values, and name the setting."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def test_ranks_agree(tmp_path: Path) -> None:
     assert "other rank" in one["reasons"]
     assert "other rank" in two["reasons"]
     assert one["reasons"][130] == two["reasons"][130] == "non-finite"
-    # What a policy counts is what happened, but for the poisoned iteration.
+    # The policy counts the backwards that ran and those that were skipped, except in the poisoned iteration.
     assert one["recorded"] == two["recorded"] == [one["skips"].count(False), one["skips"].count(True) - 1]
 
 
@@ -147,7 +147,7 @@ def test_ranks_in_trouble_end_within_the_time_out(tmp_path: Path, kind: str, siz
 
 
 def release(rank: int, folder: str, place: str, ranks: tuple[int, ...]) -> None:
-    """The gate's own code fails at a place on some ranks, from iteration 60 on; says what each rank did."""
+    """Make the gate's own code fail at a place on some ranks, from iteration 60 on; report the result of each rank."""
     start(rank, folder, seconds=5)
     owner, name, share = PLACES[place]
     now, original = 0, getattr(owner, name)

@@ -1,4 +1,4 @@
-"""What a skipped iteration leaves in memory, and backwards that do not wait for the loss."""
+"""Memory after a skipped iteration, and backwards that do not wait for the loss."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ N = 20_000
 
 
 class Allocated:
-    """Counts live numbers of what a forward allocates and saves."""
+    """Counts the live numbers that a forward allocates and saves."""
 
     def __init__(self):
         self.live = self.peak = 0
@@ -56,7 +56,7 @@ class Stage(torch.autograd.Function):
 
 
 class Every(Policy):
-    """Skips what its list says."""
+    """Skips the decisions that its list marks."""
 
     def __init__(self, skips):
         self.skips = skips
@@ -90,7 +90,7 @@ def peak(skips, update=True):
 def test_a_skipped_graph_does_not_raise_the_peak():
     assert peak([False] * 4) == 3 * N
     assert peak([False, True, False]) == peak([False, True, True, True, False]) == 3 * N
-    assert peak([False, True, False], update=False) > 3 * N  # what shares a graph may come until the next step
+    assert peak([False, True, False], update=False) > 3 * N  # backwards that share a graph may come until the next step
 
 
 @pytest.mark.parametrize("skips", [[False, True, False, True]])
@@ -193,7 +193,7 @@ def test_hooks_of_the_trainers_own_are_left_alone():
 
 
 def losses(gate, steps, poison=()):
-    """Losses of a random walk; what each iteration left in the parameter's gradient."""
+    """Train on losses of a random walk; return the parameter's gradient after each iteration."""
     draw, left = random.Random(0), []
     value = torch.nn.Parameter(torch.ones(4))
     for step in range(steps):

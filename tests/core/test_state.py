@@ -126,7 +126,7 @@ def test_an_entry_that_is_missing_or_of_another_type_is_an_error_or_harmless(kin
                 refused += 1
                 assert str(error).count(";") >= 1 and len(str(error)) < 300
                 continue
-            # What is taken can be used, shown and saved.
+            # A state that is accepted can be used, shown and saved.
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RuntimeWarning)
                 for step in other.iterations(range(600, 601)):

@@ -49,7 +49,7 @@ def test_shared_names_are_found() -> None:
 def test_an_index_on_a_device_is_read_from_the_start_on_alone() -> None:
     there = torch.tensor(7, device="meta")
     with pytest.raises(SkipGSError, match="view key"):
-        view_key(there)  # whoever reads it gets an error
+        view_key(there)  # reading it raises an error
     gate = SkipGate(start_iter=3, warmup=0)
     for step in range(3):
         assert gate.backward(torch.tensor(1.0, requires_grad=True), view=there, step=step)

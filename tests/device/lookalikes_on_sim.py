@@ -43,7 +43,7 @@ SETTINGS: dict[str, dict[str, Any] | None] = {
 
 
 class MadeOnSim(torch.overrides.TorchFunctionMode):
-    """Whatever a look-alike's own file makes lies on the device, as it does in the trainer."""
+    """Put every tensor that a look-alike's own file makes on the device, like the trainer does."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})

@@ -48,10 +48,10 @@ class MixedDevicesError(RuntimeError):
 
 
 class HostReads:
-    """Counts what a GPU would be waited for.
+    """Counts the reads for which the host would wait for a GPU.
 
     Attributes:
-        reads: how often, by kind and by file, line and function of whoever asked: the innermost frame that is
+        reads: how often, by kind and by file, line and function of the reader: the innermost frame that is
             neither PyTorch's nor this file's.
     """
 
@@ -98,7 +98,7 @@ class _Guard(torch._C._acc.DeviceGuard):
 
 
 class _Event:
-    """Waits for what was launched before `record`, and for nothing after it."""
+    """Waits for the work that was launched before `record`, and for no later work."""
 
     def record(self, stream: Any = None) -> None: ...
 
@@ -220,7 +220,7 @@ class OnSim(TorchDispatchMode):
 
 
 class ToHost(torch.autograd.Function):
-    """What enters a stand-in for a CUDA extension; its gradient comes out on `sim` again."""
+    """Inputs of a stand-in for a CUDA extension; their gradients are on `sim` again."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
@@ -232,7 +232,7 @@ class ToHost(torch.autograd.Function):
 
 
 class ToSim(torch.autograd.Function):
-    """What comes out of such a stand-in."""
+    """Outputs of such a stand-in."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:

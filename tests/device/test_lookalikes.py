@@ -67,7 +67,7 @@ NO_SHARE = ("No loop over range", "cannot leave out whole iterations")
 
 
 def complaints(name: str, found: dict[str, Any]) -> list[str]:
-    """What one look-alike's iterations, by settings, do that they should not."""
+    """Return the faults of one look-alike's iterations, by settings."""
     wrong = []
     for settings, rows in found.items():
         if isinstance(rows, str):
@@ -92,7 +92,7 @@ def complaints(name: str, found: dict[str, Any]) -> list[str]:
 
 
 class Counts:
-    """Host reads of the gate in one iteration, by what they are for."""
+    """Host reads of the gate in one iteration, by their purpose."""
 
     def __init__(self, gate: list[tuple[str, str, int, int]]) -> None:
         self.looks = self.visibility = self.waits = self.reads = 0
@@ -108,7 +108,7 @@ class Counts:
 
 
 def test_every_lookalike_has_its_turn():
-    """Whatever the day, the turns that follow it reach all of them."""
+    """Starting from any day, the following turns reach all look-alikes."""
     names = [f"lookalike {i}" for i in range(28)]
     assert {name for day in range(100, 106) for name in chosen(names, str(day))} == set(names)
     assert chosen(names, "all") == names and len(chosen(names, "100")) == 5

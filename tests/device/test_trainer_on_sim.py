@@ -1,4 +1,4 @@
-"""The trainer of this package on a device: one read an iteration; and what benchmarks/gpu makes of a device."""
+"""The trainer of this package on a device reads once per iteration; benchmarks/gpu runs on that device."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def measured() -> dict[str, Any]:
 @pytest.mark.parametrize("photographs", ["resident", "ahead"])
 def test_an_iteration_reads_its_loss_behind_the_backward_and_nothing_else(measured, photographs):
     reads = {kind: count for kind, _, _, count in measured[photographs]}
-    assert reads == {"waited for a copy": 10, "synchronize": 1}  # of ten iterations, and of the end
+    assert reads == {"waited for a copy": 10, "synchronize": 1}  # ten iterations and the end of the run
 
 
 @on_sim

@@ -20,7 +20,7 @@ from simulated import SIM, OnSim, host  # noqa: E402
 
 
 class SimMachine:
-    """What benchmarks/gpu asks of a device."""
+    """Run the measurements of benchmarks/gpu on a device."""
 
     name = "sim"
 

@@ -9,5 +9,5 @@ def chosen(names: list[str], turn: str) -> list[str]:
     """Return the names of a turn, given as a number of days, or of "all"."""
     if turn == "all":
         return names
-    place = int(turn) % -(-len(names) // A_TURN) * A_TURN
-    return names[place : place + A_TURN]
+    first = int(turn) % -(-len(names) // A_TURN) * A_TURN
+    return names[first : first + A_TURN]

@@ -1,29 +1,13 @@
-"""Options of the rasterizer's tests."""
+"""Checks and options of the rasterizer's tests."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
-import torch
-
-from skipgs_plug.fallback_raster.runtime import guard
 
 
 @pytest.fixture(autouse=True)
-def one_torch_thread() -> Iterator[None]:
-    """Run torch on one thread: on a busy machine, several are ten times slower for the reference's small operations."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(autouse=True)
-def sizes_checked() -> Iterator[None]:
-    """Let every kernel call compare sizes of tensors with declarations. SKIPGS_PLUG_GUARD=1 adds guard zones."""
-    with guard.at_least(guard.SIZES):
-        yield
+def all_kernels_checked(kernels_checked: None) -> None:
+    """Check the kernel calls of every test in this folder."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

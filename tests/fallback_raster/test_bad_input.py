@@ -12,7 +12,7 @@ from raster_scenes import random_scene
 from skipgs_plug.fallback_raster import rasterization
 from skipgs_plug.fallback_raster.runtime.arguments import camera_centre
 
-# A type of its own per case is not worth having; NotImplementedError marks what gsplat can and we cannot.
+# One type serves most cases. NotImplementedError marks features that gsplat has and this rasterizer has not.
 REFUSALS = (ValueError, TypeError, NotImplementedError)
 
 

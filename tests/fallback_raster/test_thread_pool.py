@@ -19,21 +19,21 @@ from skipgs_plug.fallback_raster.runtime.thread_pool import ThreadPool
 SPIN_SECONDS = 2e-4  # time after which spinning threads sleep, about
 
 
-class Block(ctypes.Structure):
+class Arguments(ctypes.Structure):
     _fields_ = (("number", ctypes.c_int32),)
 
 
 def kernel(work: Callable[[int], None]) -> Kernel:
     """A kernel that calls Python with the number in its arguments."""
 
-    def body(bounds: int, block: int) -> None:
+    def body(bounds: int, arguments: int) -> None:
         assert bounds == 7
-        work(Block.from_address(block).number)
+        work(Arguments.from_address(arguments).number)
 
     function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(body)
     address = ctypes.cast(function, ctypes.c_void_p).value
     assert address is not None
-    return Kernel(function, None, Block, (address, 7), function)
+    return Kernel(function, None, Arguments, (address, 7), function)
 
 
 @pytest.fixture(params=[1, 3])
@@ -56,7 +56,7 @@ def test_all_that_began_are_done_when_a_launch_returns(pool: ThreadPool) -> None
 
     working = kernel(work)
     for number in range(400):
-        pool.run(working, bytes(Block(number)))
+        pool.run(working, bytes(Arguments(number)))
         assert sorted(begun) == sorted(ended)
         mine = [thread for launch, thread in ended if launch == number]
         assert threading.get_ident() in mine
@@ -71,7 +71,7 @@ def test_helpers_that_sleep_are_woken(pool: ThreadPool) -> None:
     meeting = kernel(lambda _: together.wait(10) and None)
     for _ in range(3):
         time.sleep(20 * SPIN_SECONDS)
-        pool.run(meeting, bytes(Block(0)))
+        pool.run(meeting, bytes(Arguments(0)))
     assert not together.broken
 
 
@@ -87,13 +87,13 @@ def test_a_caller_waits_for_helpers_that_take_long(pool: ThreadPool) -> None:
             time.sleep(0.05)
             ended.append(True)
 
-    pool.run(kernel(work), bytes(Block(0)))
+    pool.run(kernel(work), bytes(Arguments(0)))
     assert ended
 
 
 def test_who_is_dismissed_is_gone_and_may_be_dismissed_again() -> None:
     pool = ThreadPool(4)
-    pool.run(kernel(lambda _: None), bytes(Block(0)))
+    pool.run(kernel(lambda _: None), bytes(Arguments(0)))
     pool.dismiss()
     assert not pool._alive and not pool._locks
     pool.dismiss()

@@ -59,7 +59,9 @@ def test_mcmc_grows_no_further_than_its_cap() -> None:
 def test_the_cost_of_an_iteration_follows_what_was_seen(power: float) -> None:
     cost = fit_cost(pilot_of(1.0, seconds=lambda count: 0.02 * (count / 10_000) ** power))
     assert cost(20_000) == pytest.approx(0.02 * 2**power, rel=0.05)
-    assert cost(50_000) == pytest.approx(0.02 * 5**power, rel=0.35)  # beyond what was seen the usual power counts too
+    assert cost(50_000) == pytest.approx(
+        0.02 * 5**power, rel=0.35
+    )  # beyond the measured numbers the usual power counts too
 
 
 def test_a_longer_run_takes_longer_and_auto_takes_less() -> None:

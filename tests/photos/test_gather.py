@@ -146,7 +146,7 @@ def test_linked_folders_and_transparency(pattern, tmp_path):
 
 
 def test_what_programs_leave_in_folders_is_no_photograph(pattern, tmp_path):
-    """Copies that Jupyter and file managers keep, and what macOS puts beside files on other disks."""
+    """Files that Jupyter, file managers and macOS put beside photographs are left out."""
     source = tmp_path / "source"
     kept = ["front/0001.png", "back/0001.png", "back/0002.png"]  # cameras of a rig give the same names
     left = [".ipynb_checkpoints/0001-checkpoint.png", "front/.thumbnails/0001.png", "front/._0001.png"]

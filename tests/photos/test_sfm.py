@@ -1,4 +1,4 @@
-"""The command: photographs and videos become scenes that load, and what was left out is named."""
+"""The command makes scenes of photographs and videos, and names the photographs that it leaves out."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_photographs_become_a_scene(photos, tmp_path, capsys, monkeypatch, mappi
     counted_to = {}
 
     class Bar(sfm.tqdm):
-        """Says where it ended: a fast machine may draw none of the numbers between."""
+        """Prints the last number: a fast machine may draw no number between."""
 
         def close(self):
             counted_to[self.desc] = self.n

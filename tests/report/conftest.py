@@ -51,7 +51,7 @@ def bench_folder(scene_file: str, tmp_path_factory: pytest.TempPathFactory) -> P
 
 @pytest.fixture(scope="session")
 def script_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a gated script of another project leaves: its own files, which say nothing to us, and skipgs.json."""
+    """The output folder of a gated script of another project: files of its own format, and skipgs.json."""
     folder = tmp_path_factory.mktemp("script") / "output & <model>"
     gate = SkipGate(start_iter=5, warmup=6)
     for step in range(60):

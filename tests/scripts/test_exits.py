@@ -1,4 +1,4 @@
-"""A script that ends by `os._exit`: what the gate does at the end is done before, in that process alone."""
+"""A script that ends by `os._exit`: the gate writes its results before, in that process alone."""
 
 import os
 

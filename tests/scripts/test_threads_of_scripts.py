@@ -1,4 +1,4 @@
-"""Threads that start inside the block enter what it names; threads that start afterwards do not."""
+"""Threads that start inside the block enter its context manager; threads that start afterwards do not."""
 
 import threading
 from contextlib import contextmanager

@@ -1,4 +1,4 @@
-"""What counts as time of training."""
+"""Times that count as training."""
 
 import math
 import time

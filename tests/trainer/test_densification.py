@@ -1,4 +1,4 @@
-"""Densification that moves every row once makes what gsplat's strategy makes of the same parameters."""
+"""Densification that moves every row once has the same result as gsplat's strategy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from skipgs_plug.trainer.row_order import sort_rows
 
 
 def seen(n: int, seed: int = 0) -> dict[str, Any]:
-    """What a rasterizer says of an image that shows half of n Gaussians."""
+    """Return a rasterizer's `info` for an image that shows half of n Gaussians."""
     generator = torch.Generator().manual_seed(seed)
     ids = torch.randperm(n, generator=generator)[: n // 2]
     means2d = torch.randn(len(ids), 2, generator=generator).requires_grad_()

@@ -1,4 +1,4 @@
-"""Distorted cameras against an analytic picture: what a ray sees depends on its direction alone."""
+"""Distorted cameras against an analytic picture, in which a ray's colour depends on its direction alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exposure: what was done to the colours of photographs is undone, and nothing else changes."""
+"""Exposure: changes of the photographs' colours are undone, and nothing else changes."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def test_photographs_are_decoded_before_their_turn_and_memory_is_bounded(
 
     trainer.on_step = look
     trainer.train(progress=False)
-    assert store._resident <= 3 * PICTURE and 1 <= most <= 2  # the one in use beside those ahead
+    assert store._resident <= 3 * PICTURE and 1 <= most <= 2  # the photograph in use and the ones ahead
     assert unexpected == 0
     assert not store._ahead
 

@@ -1,4 +1,4 @@
-"""The training loop: it learns, follows its schedule, resets opacities, and refuses what it cannot use."""
+"""The training loop learns, follows its schedule, resets opacities, and refuses input that it cannot use."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def test_plain_loss_equals_the_fused_one() -> None:
 
 def test_psnr_clamps_and_ssim_of_equal_images_is_one() -> None:
     target = torch.rand(20, 20, 3, generator=torch.Generator().manual_seed(2))
-    assert metrics.psnr(target, target) == 100.0  # of no error, and a number that JSON holds
+    assert metrics.psnr(target, target) == 100.0  # the PSNR of an exact image, a number that JSON can hold
     assert metrics.psnr(torch.full((4, 4, 3), 7.0), torch.full((4, 4, 3), 0.9)) == pytest.approx(20.0, abs=1e-4)
     assert metrics.ssim(target, target) == pytest.approx(1.0)
 

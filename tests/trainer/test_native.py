@@ -1,4 +1,4 @@
-"""What pycolmap does to the process that loads it: nothing to PNG files, nothing to SIGTERM."""
+"""Loading pycolmap changes neither the reading of PNG files nor the handling of SIGTERM."""
 
 from __future__ import annotations
 

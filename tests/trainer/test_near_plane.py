@@ -1,4 +1,4 @@
-"""The near plane follows the scene, whatever its unit."""
+"""The near plane follows the scene in any unit."""
 
 import pytest
 import torch
@@ -66,7 +66,7 @@ def test_points_that_nothing_would_ever_draw_do_not_become_gaussians() -> None:
     other = scene()
     other.points[0] = torch.tensor([0.5, 0.0, 0.2])
     assert before_a_lens(other.train, other.points, 0.4).nonzero().flatten().tolist() == [0]
-    other.train[1].viewmat[2, 3] = 3.0  # stands back: it shows what lies before the lens of the other
+    other.train[1].viewmat[2, 3] = 3.0  # stands back, and shows the space before the lens of the other
     assert not before_a_lens(other.train, other.points, 0.4).any()
 
 

@@ -1,4 +1,4 @@
-"""A scene is the same whatever format it comes in, and wherever, however turned and however large its world is."""
+"""A scene trains alike in every format, and at any position, rotation and size of its world."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def test_the_first_image_does_not_depend_on_the_world(black: Scene, seed: int, s
     other = moved(black, rotation_of(seed), scale * np.array(shift), scale)
     difference = (first_image(other) - first_image(black)).abs()
     assert float(difference.mean()) < 2e-5
-    assert float(difference.max()) < 5e-3  # where a Gaussian is just below what counts as visible
+    assert float(difference.max()) < 5e-3  # where a Gaussian is just below the threshold of visibility
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

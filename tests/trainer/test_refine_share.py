@@ -1,4 +1,4 @@
-"""Iterations left out of the reference trainer: interrupted and resumed, in turns, and what is counted."""
+"""Iterations left out of the reference trainer: interrupted runs, trainers in turns, and counts."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ def test_resumed_equals_uninterrupted(scene, tmp_path, settings, at) -> None:
 def test_trainers_that_take_turns_do_not_scale_each_others_rates(scene) -> None:
     alone = trainer_of(scene)
     alone.train(progress=False)
-    plain, thinned = trainer_of(scene), trainer_of(scene)
-    with SkipGate(thinned, refine_share=0.4):
+    plain, shortened = trainer_of(scene), trainer_of(scene)
+    with SkipGate(shortened, refine_share=0.4):
         for until in range(20, STEPS + 1, 20):
-            thinned.train(until=until, progress=False)
+            shortened.train(until=until, progress=False)
             plain.train(until=until, progress=False)
     assert all(torch.equal(one, two) for one, two in zip(left(alone), left(plain), strict=True))
 

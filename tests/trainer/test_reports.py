@@ -286,7 +286,7 @@ def test_pointers_of_git_lfs_are_named(colmap: Path) -> None:
 
 
 def test_names_with_dots(nerf: Path) -> None:
-    """What follows the last dot of a name without suffix is no suffix."""
+    """In a name without a suffix, the text after the last dot is part of the name."""
 
     def rename(number: int, frame: dict) -> None:
         new = f"images/IMG.{number:04d}"
@@ -411,7 +411,7 @@ def test_moving_scenes_are_named(nerf: Path, caplog: pytest.LogCaptureFixture) -
 
 
 def test_masks_of_transparency_and_of_lossy_formats(colmap: Path) -> None:
-    """Further members of the kind of LichtFeld-Studio#547: what a mask says is taken as it was meant."""
+    """Masks of every number format have their intended meaning (LichtFeld-Studio#547)."""
     folder = colmap / "masks/cam"
     folder.mkdir(parents=True)
     half = np.zeros((24, 32), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""COLMAP folders: what is read, and one sentence for everything that is wrong with them."""
+"""COLMAP folders are read, and every fault of a folder gives one sentence."""
 
 from __future__ import annotations
 

@@ -146,7 +146,7 @@ def test_camera_keys(keys: dict, model: str, parameters: list[float]) -> None:
 
 
 def test_a_frame_has_the_last_word_about_its_lens() -> None:
-    """In whatever keys the file and the frame speak of it."""
+    """A frame's focal length replaces the file's, by whichever keys they give it."""
     file = {"w": 80, "h": 60, "fl_x": 50.0, "fl_y": 50.0, "k1": 0.0}
     for own, focal in (
         ({"camera_angle_x": 2 * math.atan(0.5)}, 80.0),

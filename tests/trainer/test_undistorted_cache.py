@@ -1,4 +1,4 @@
-"""What is undistorted is kept: the same pixels, never out of date, never half written."""
+"""Undistorted photographs are cached: the same pixels, never outdated, never half written."""
 
 from __future__ import annotations
 

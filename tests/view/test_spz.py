@@ -59,14 +59,16 @@ def test_what_is_read_back_is_what_was_written(k: int, size: float) -> None:
     assert np.abs(read["sh0"] - visible).max() <= 0.51 / 255 / 0.15
     quats = torch.nn.functional.normalize(splats["quats"], dim=1).numpy()
     turned = read["quats"] * (1, *FLIP)
-    assert np.abs((turned * quats).sum(axis=1)).min() > 0.99  # w is what is left of 1: coarse near half a turn
+    assert (
+        np.abs((turned * quats).sum(axis=1)).min() > 0.99
+    )  # w follows from the length 1, so it is coarse near half a turn
 
 
 def test_directions_turn_with_the_axes() -> None:
     """A colour seen along a direction is the one of the turned coefficients seen along the turned direction."""
     generator = torch.Generator().manual_seed(1)
     n = 40
-    rest = torch.randint(-3, 4, (n, 15, 3), generator=generator) / 8  # what four bits hold exactly
+    rest = torch.randint(-3, 4, (n, 15, 3), generator=generator) / 8  # four bits hold these exactly
     splats = {
         "means": torch.zeros(n, 3),
         "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),

@@ -1,4 +1,4 @@
-"""The page for anybody, in a real browser, at a phone's width and a desktop's; and what it is made of."""
+"""The public page in a real browser, at the widths of a phone and a desktop, and its files."""
 
 from __future__ import annotations
 

@@ -17,12 +17,12 @@ Known = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 def nothing_always(numbers: range) -> Iterable[int]:
-    """Return no iterations: only those that the loop's own conditions name must run."""
+    """Return no iterations: only the iterations that the loop's own conditions name must run."""
     return ()
 
 
 def nothing_known(names: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return no values: none is known of the names that the loop assigns."""
+    """Return no values: the names that the loop assigns have no known value."""
     return {}
 
 

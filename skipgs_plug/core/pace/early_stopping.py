@@ -21,16 +21,17 @@ from typing import Any
 
 from skipgs_plug.core.errors import SkipGSError
 
-CYCLE_ENDS = (0.125, 0.25, 1.0)  # ends of the cycles, as shares of the iterations that may run
+# Ends of the cycles, as shares of the iterations that may run. Training is judged at the first two ends.
+CYCLE_ENDS = (0.125, 0.25, 1.0)
 ONE_CYCLE = (1.0,)  # the same if nothing is estimated: the share is given, or no view is watched
 LEAST_LOSS = 1e-5  # mean absolute difference below which losses count as equal; 8-bit images have steps of 4e-3
-WATCHED_FRACTION = 1 / 12  # fraction of the views that is watched
+WATCHED_FRACTION = 1 / 12  # fraction of the views that is watched: a few, since they never recover completely
 # Bounds on the number of watched views. Fewer than three cannot resolve 0.05 dB; more than twelve cost quality.
 LEAST_WATCHED, MOST_WATCHED = 3, 12
 
 
 def watched_views(names: Iterable[str], iterations: float, seed: int = 0) -> frozenset[str]:
-    """Draw the views to watch: the same for the same names, and none if there are few views.
+    """Draw the views to watch: the same views for the same names, and no view if there are few.
 
     Args:
         names: Names of all training views.

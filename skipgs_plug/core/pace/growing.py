@@ -23,7 +23,8 @@ from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.sampling import Sampling
 
-# Number of steps over which the share of the Gaussians that a view shows is averaged before it decides on shares.
+# Number of steps over which the share of the Gaussians that a view shows is averaged before it decides on shares, so
+# that a single view does not decide.
 MEASURED = 20
 # Number of these steps after each event that ran. The share falls as the scene grows, on bonsai from 46 % to 30 %. A
 # few steps are precise enough to count visits, and each measured step can cost a read of the GPU.

@@ -5,23 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from skipgs_plug.core import distributed
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.base import Always, Known, Pace, Source, nothing_always, nothing_known
 from skipgs_plug.core.pace.growing import Growing
+from skipgs_plug.core.pace.loop_facts import LoopFacts
 from skipgs_plug.core.pace.loop_finder import LoopFinder
 from skipgs_plug.core.pace.loop_range import LoopRange, require_planned
-from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
+from skipgs_plug.core.pace.phase import Phase
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refinement_policy import RefinementPolicy
 from skipgs_plug.core.pace.refining import Refining
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.release import Release
-from skipgs_plug.core.source.lines import GATED_LOOP, line_of
-from skipgs_plug.core.source.milestones import read_loop
-from skipgs_plug.core.source.progress_bars import Bars
+from skipgs_plug.core.source.lines import GATED_LOOP
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
 
@@ -46,24 +44,11 @@ class Phased(Pace):
         self._release = release
         self.refining = Refining(config, rates)
         self.growing: Phase = Phase() if config.growing is None else Growing(config, rates)
-        self._grows = self.growing  # phase of the iterations before `_start` in the present loop
+        self._grows = self.growing  # phase of the iterations before refinement in the present loop
         self._finder = LoopFinder()
-        self._densification: Densification | None = None
-        self._accumulates = self._steps_each = False
-        self._views: list[str] | None = None
-        self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
-        self._start = 0
-        self._last: int | None = None
-        self._always: Always = nothing_always
-        self._chosen = frozenset(config.always or ())
-        self._pure: tuple[str, ...] = ()
-        self._known: Known = nothing_known
-        self._required: set[int] = set()
-        # Iterations that the loop's conditions name, by condition: of the growing phase, and of the refining phase.
-        self._conditions: list[dict[str, set[int]]] = [{}, {}]
+        self._facts = LoopFacts(config.always)
         self._planned: LoopRange | None = None  # loop whose conditions were read; nothing in it is refused after that
         self._left_out = 0
-        self._bars = Bars([])
         self._attached = False  # by an adapter
         self._asked = False  # whether the user was told, in the first iteration, that the loop is not known
         self._configured = self._removed = False
@@ -71,9 +56,7 @@ class Phased(Pace):
     # Facts about the trainer.
 
     def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
-        self._start, self._last, self._views = start, info.max_steps, views
-        self._accumulates, self._steps_each, self._epoch = info.accumulates, info.steps_each, info.epoch
-        self._densification = info.densification or self._densification
+        self._facts.configure(start, info, views)
         self._configured = True
 
     def policy(self, config: SkipConfig) -> Policy:
@@ -87,17 +70,17 @@ class Phased(Pace):
         known: Known = nothing_known,
         functions: tuple[str, ...] = (),
     ) -> None:
-        self._always, self._pure, self._densification, self._known = always, tuple(pure), densification, known
+        self._facts.describe(always, pure, densification, known)
         self._finder.functions = functions
         self._attached = True
 
     def require(self, number: int) -> None:
-        self._required.add(number)
+        self._facts.required.add(number)
         self.refining.require(number)
         self.growing.require(number)
 
     def is_named(self, number: int) -> bool:
-        return number in self._required or self._phase(number).is_named(number)
+        return number in self._facts.required or self._phase(number).is_named(number)
 
     def follow(
         self,
@@ -107,14 +90,8 @@ class Phased(Pace):
         views: list[str] | None = None,
         events: Iterable[int] | None = None,
     ) -> LoopRange:
-        if events is not None:
-            known = frozenset(int(number) for number in events)
-            self._densification = Densification(numbers=lambda part: known.intersection(part))
-        self._chosen = frozenset((*always, *(self._config.always or ())))
-        if views is not None:
-            self._views = views
-        if self.refining.begun and self._last is not None:
-            require_planned(numbers, self._last)
+        self._facts.choose(always, views, events)
+        self._require_planned(numbers)
         self._finder.found = LoopRange(numbers, self, source)
         return self._finder.found
 
@@ -135,11 +112,11 @@ class Phased(Pace):
 
     def begin(self, step: int, policy: Policy | None) -> None:
         # An adapter's loop is searched for from the first iteration on, so that a refusal comes before any training.
-        needed = self._attached or self._grows.leaves_out or step >= self._start
+        needed = self._attached or self._grows.leaves_out or step >= self._facts.start
         if not self._attached and self.number is None and not self._removed:
             self._ask_for_loop(needed)
         self._asked = True
-        if self._finder.begins(step, needed) and step >= self._start:
+        if self._finder.begins(step, needed) and step >= self._facts.start:
             self.refining.count_first(step)
 
     # Questions of loops.
@@ -175,21 +152,21 @@ class Phased(Pace):
         if runs:
             self.gap, self._left_out = self._left_out, 0
             if self.gap:
-                self._bars.catch_up()
+                self._facts.bars.catch_up()
         else:
             self._left_out += 1
-            self._bars.left_out(number)
+            self._facts.bars.left_out(number)
         return runs
 
     def _phase(self, number: int) -> Phase:
-        return self._grows if number < self._start else self.refining
+        return self._grows if number < self._facts.start else self.refining
 
     def expected(self, loop: LoopRange) -> int:
         """Return the number of iterations that the loop will run, as far as it is known."""
         numbers = loop.numbers
         if self._removed:
             return len(numbers)
-        before = len(range(numbers.start, min(max(self._start, numbers.start), numbers.stop)))
+        before = len(range(numbers.start, min(max(self._facts.start, numbers.start), numbers.stop)))
         grown, refined = self._grows.share or 1.0, self.refining.share or 1.0
         return round(before * grown) + round((len(numbers) - before) * refined)
 
@@ -213,35 +190,29 @@ class Phased(Pace):
                 in_script=f"{leaves_out}, but this adapter names no loop; use the gate without them.",
             )
         if not self._asked:
-            caution(f"refine_share leaves out iterations from {self._start} on, {how}")
+            caution(f"refine_share leaves out iterations from {self._facts.start} on, {how}")
 
     def _read(self, loop: LoopRange, number: int) -> None:
         """Plan the rest of the run by the loop's conditions, at the loop's first number that can be left out.
 
         Loops that follow each other are read one after the other, and each plan takes the place of the one before.
         """
-        if self.refining.begun and self._last is not None:
-            require_planned(loop.numbers, self._last)
+        facts = self._facts
+        self._require_planned(loop.numbers)
         # On resume, include iterations that are done already, because conditions are judged by how often they hold.
         # A trainer that is trained in parts, such as train(until=1000), has more numbers than its first loop.
-        end = loop.numbers.stop if self._last is None else max(loop.numbers.stop, self._last + 1)
-        grown = self.growing.numbers(number, min(self._start, end))
-        refined = self.refining.numbers(max(self._start, number), end)
-        grows = bool(grown) and number < self._start
+        end = loop.numbers.stop if facts.last is None else max(loop.numbers.stop, facts.last + 1)
+        grown = self.growing.numbers(number, min(facts.start, end))
+        refined = self.refining.numbers(max(facts.start, number), end)
+        grows = bool(grown) and number < facts.start
         if grows:
             self._require_events()
-        if loop.source is not None and self._config.always is None:
-            code, names = loop.source
-            read = read_loop(code, line_of(code), names, self._pure, self._known(names))
-            self._conditions = [read.milestones(numbers) if numbers else {} for numbers in (grown, refined)]
-            self._bars = Bars(read.bar_moves(loop.numbers))
-        elif self._planned is not loop:  # they are known if a state is loaded inside this loop
-            self._conditions, self._bars = [{}, {}], Bars([])
-        loop.source = None
-        last = loop.numbers[-1] if self._last is None else self._last
+        if self._planned is not loop:  # a state may be loaded inside a loop that was read
+            facts.read(loop, grown, refined)
+        last = loop.numbers[-1] if facts.last is None else facts.last
         if grown:  # also after the phase, whose length the refining phase must know in a resumed run
-            plan = self._plan(grown, self._conditions[0], last, Phase())
-            known = self._densification is not None and self.growing.begin(plan)
+            plan = facts.plan(grown, facts.grown, last, Phase())
+            known = facts.densification is not None and self.growing.begin(plan)
             self._grows = self.growing if known else Phase()
             if grows and not known:
                 until = min(grown.stop, loop.numbers.stop) - 1
@@ -250,28 +221,13 @@ class Phased(Pace):
                     f"iterations run, and only later ones are left out.{self._why_no_event()}"
                 )
         if refined:
-            self._last = last  # settled, because steps shrink until then
-            self.refining.begin(self._plan(refined, self._conditions[1], last, self.growing))
+            facts.last = last  # settled, because steps shrink until then
+            self.refining.begin(facts.plan(refined, facts.refined, last, self.growing))
         self._planned = loop
 
-    def _plan(self, numbers: range, conditions: dict[str, set[int]], last: int, before: Phase) -> PhasePlan:
-        own = {n for n in (*self._always(numbers), *self._chosen, *self._required) if n in numbers}
-        # A condition may hold on one rank alone, such as `rank == 0 and step % 1000 == 0`.
-        found = distributed.united({**conditions, NAMED_FOR_TRAINER: own})
-        named = found.pop(NAMED_FOR_TRAINER)
-        epoch = self._epoch or (None if self._views is None else len(self._views))
-        return PhasePlan(
-            numbers,
-            found,
-            named,
-            last,
-            before,
-            self._views,
-            epoch,
-            self._densification,
-            self._accumulates,
-            self._steps_each,
-        )
+    def _require_planned(self, numbers: range) -> None:
+        if self.refining.begun and self._facts.last is not None:
+            require_planned(numbers, self._facts.last)
 
     def _require_events(self) -> None:
         """Refuse `grow_share` if the densification events are not known. With `share`, densification runs whole then.
@@ -279,7 +235,7 @@ class Phased(Pace):
         Raises:
             SkipGSError: They are not known.
         """
-        if self._densification is None and self._config.share is None:
+        if self._facts.densification is None and self._config.share is None:
             sentence = (
                 "grow_share leaves out iterations of densification, but the densification events of this trainer are "
                 "not known; remove grow_share"
@@ -288,11 +244,11 @@ class Phased(Pace):
 
     def _why_no_event(self) -> str:
         """Return why no densification event is known, as a sentence after a space; empty if there is nothing to add."""
-        if self._densification is None:
+        if self._facts.densification is None:
             return "" if self._release.in_script else " In a loop of your own give events= to gate.iterations()."
-        marks = ", ".join(self._densification.marks)
+        marks = ", ".join(self._facts.densification.marks)
         if self._config.always is None:
-            return f" No condition of the loop that names {marks} holds before iteration {self._start}."
+            return f" No condition of the loop that names {marks} holds before iteration {self._facts.start}."
         return f" The numbers given as always replace the loop's conditions, also those that name {marks}."
 
     # State and report.
@@ -306,12 +262,9 @@ class Phased(Pace):
 
     def state_dict(self) -> dict[str, Any]:
         return {
-            "start": self._start,
-            "last": self._last,
-            "keeps_rates": self._accumulates,
-            "steps_each": self._steps_each,
+            **self._facts.state_dict(),
             "next": self._finder.expected,
-            "required": sorted(self._required),
+            "required": sorted(self._facts.required),
             "refining": self.refining.state_dict(),
             "grow_asked": self._config.growing,
             "growing": self.growing.state_dict(),  # None, too, if the phase runs whole
@@ -326,15 +279,14 @@ class Phased(Pace):
                 f"grow_share={asked!r}, not {self._config.refining!r} and {self._config.growing!r}; continue with "
                 "those settings, or start the gate afresh."
             )
-        self._required = set(state["required"])
+        self._facts.required = set(state["required"])
         self.refining.load_state_dict(state["refining"])
         if growing is not None:
             self.growing.load_state_dict(growing)
         self._finder.expected = state["next"]
         # The loop asks about its first number before the trainer reports its facts.
         if not self._configured:
-            self._start, self._last, self._accumulates = state["start"], state["last"], state["keeps_rates"]
-            self._steps_each = state.get("steps_each", False)
+            self._facts.load_state_dict(state)
             self._configured = True
         if self._planned is not None:
-            self._read(self._planned, max(self._start, state["next"] or 0))
+            self._read(self._planned, max(self._facts.start, state["next"] or 0))

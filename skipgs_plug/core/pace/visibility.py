@@ -68,9 +68,9 @@ class Visibility:
             return
         visible = visible_share(gradient)
         if distributed.group_size() == 1 and visible.device.type == "cpu":
-            seen = visible.item()
-            if seen > 0.0:  # a step without gradients belongs to no view
-                self._sum, self._steps, self._looks = self._sum + seen, self._steps + 1, self._looks + 1
+            shown = visible.item()
+            if shown > 0.0:  # a step without gradients belongs to no view
+                self._sum, self._steps, self._looks = self._sum + shown, self._steps + 1, self._looks + 1
                 self.complete = self._looks >= STEPS
             return
         self._looks += 1

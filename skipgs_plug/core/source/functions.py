@@ -26,7 +26,7 @@ def value_of(place: ast.expr, names: Mapping[str, Any], unknown: Collection[str]
     """Return the value that a name, attribute or entry has before the loop and in it; None if unknown.
 
     Args:
-        place: The syntax of it. Properties are not evaluated.
+        place: The name, attribute or entry, as an expression. Properties are not evaluated.
         names: Names and values before the loop.
         unknown: Names and attributes that the loop assigns.
     """
@@ -79,10 +79,10 @@ def without_partial(call: ast.Call, function: Any, named: Callable[[str, Any], a
     """
     if not isinstance(function, functools.partial):
         return call, function
-    place, given = ast.unparse(call.func), {keyword.arg for keyword in call.keywords}
+    called, given = ast.unparse(call.func), {keyword.arg for keyword in call.keywords}
 
     def at_call(part: str, value: Any) -> ast.expr:
-        return ast.copy_location(named(f"{place}.{part}", value), call)
+        return ast.copy_location(named(f"{called}.{part}", value), call)
 
     first = [at_call(f"args[{index}]", value) for index, value in enumerate(function.args)]
     further = [

@@ -129,7 +129,7 @@ class InlinedFunctions:
         return None, None
 
     def _held(self, loop: ast.For) -> list[ast.expr]:
-        """Return names for what a loop over functions or objects runs with, such as callbacks; none if unknown."""
+        """Return names for the functions or objects that a loop runs over, such as callbacks; empty if unknown."""
         held, place = callbacks(self._value(loop.iter)), ast.unparse(loop.iter)
         return [self._named(f"{place}[{index}]", one) for index, one in enumerate(held)]
 

@@ -111,14 +111,14 @@ class TrainingLoop:
         Raises:
             SkipGSError: A condition cannot be evaluated ahead because of the loop itself.
         """
-        for place in self._without_warning(map(self._place, self._counted_by_itself())):
+        for location in self._without_warning(map(self._location, self._counted_by_itself())):
             caution(
-                f"Line {place} counts the iterations that run, so it holds less often if others are left out. Decide "
-                f"by {self._target} if that matters."
+                f"Line {location} counts the iterations that run, so it holds less often if others are left out. "
+                f"Decide by {self._target} if that matters."
             )
-        for place in self._without_warning(map(self._place, self._moving_limits())):
+        for location in self._without_warning(map(self._location, self._moving_limits())):
             caution(
-                f"Line {place} moves its own limit, so it can hold later and less often if iterations are left out; "
+                f"Line {location} moves its own limit, so it can hold later and less often if iterations are left out; "
                 "name the iterations that must run (--always, always=)."
             )
         found: dict[str, set[int]] = {}
@@ -130,7 +130,7 @@ class TrainingLoop:
             if hits is not None:
                 found.setdefault(f"{self._where(condition)}: {text}", set()).update(hits)
             if not certain:
-                uncertain.append(f"line {self._place(condition)}")
+                uncertain.append(f"line {self._location(condition)}")
         for lookup in self._lookups():
             hits = _rarer(self._evaluator, lookup, numbers)
             if hits:
@@ -258,14 +258,14 @@ class TrainingLoop:
     def _code_of(self, condition: Condition) -> CodeType:
         return self._code if condition.function is None else condition.function.code
 
-    def _place(self, condition: Condition) -> str:
+    def _location(self, condition: Condition) -> str:
         """Return the number of the line, the file and the text of a condition, as warnings show them."""
         code = self._code_of(condition)
         return f"{_line(condition.test, code)} of {code.co_filename} ({ast.unparse(condition.test)})"
 
-    def _without_warning(self, places: Iterable[str]) -> list[str]:
+    def _without_warning(self, locations: Iterable[str]) -> list[str]:
         """Return the conditions that no warning has named; they are evaluated for each phase."""
-        found = [place for place in dict.fromkeys(places) if place not in self._warned_of]
+        found = [location for location in dict.fromkeys(locations) if location not in self._warned_of]
         self._warned_of.update(found)
         return found
 

@@ -25,7 +25,7 @@ FOCAL = (
 )  # alternative ways to give a focal length
 NUMBERS = ("w", "h", "cx", "cy", *FOCAL, *DISTORTION)
 UNDISTORT = "undistort the images"
-ALPHA = "write what is transparent as the alpha channel of the images"
+ALPHA = "write transparency as the alpha channel of the images"
 # Keys that change a picture and are not modelled, with meaning and cure. They are refused unless zero, false or empty.
 UNSUPPORTED = {
     **dict.fromkeys(

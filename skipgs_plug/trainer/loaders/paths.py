@@ -63,7 +63,7 @@ def inside(folder: Path, name: str) -> Path:
     """Return folder/name; see `relative_name`.
 
     Raises:
-        InputError: as there.
+        InputError: The name is not one of a file inside the folder.
     """
     return folder / relative_name(folder, name)
 
@@ -76,12 +76,12 @@ def find_image(folder: Path, name: str) -> Path:
 def find_images(folder: Path, names: Sequence[str]) -> list[Path]:
     """Return the files of images by their names in a scene.
 
-    Downscaled copies are often PNG, so another image suffix will do, or one that is added. Where letters differ in
-    case, as Windows does not mind, and where there are leading folders too many (instant-ngp writes paths as seen from
-    where it was called), the file is found as well.
+    Downscaled copies are often PNG, so a file with another or an added image suffix is found too. So is a file whose
+    name differs in capital letters, which Windows does not distinguish, and a file under fewer folders than the name
+    says, because instant-ngp writes paths relative to the folder from which it was called.
 
     Raises:
-        MissingFileError: some are not there; says how many.
+        MissingFileError: Some files do not exist. The message gives their number.
     """
     found = [look_up(folder, PurePosixPath(relative_name(folder, name))) for name in names]
     missing = [name for name, path in zip(names, found, strict=True) if path is None]
@@ -117,7 +117,7 @@ def look_up(folder: Path, name: PurePosixPath) -> Path | None:
 def spellings(name: PurePosixPath) -> Iterator[PurePosixPath]:
     """Yield a name, the name with other image suffixes, and the name with a suffix added."""
     yield name
-    if name.suffix.lower() in IMAGE_SUFFIXES:  # what follows a dot may be part of the name
+    if name.suffix.lower() in IMAGE_SUFFIXES:  # otherwise the text after the dot may belong to the name
         yield from (name.with_suffix(suffix) for suffix in IMAGE_SUFFIXES)
     yield from (name.with_name(name.name + suffix) for suffix in IMAGE_SUFFIXES)
 
@@ -141,7 +141,7 @@ def subfolder(folder: Path, name: str) -> Path:
 
 
 def found_instead(path: Path) -> str:
-    """Return a clause about what is there in place of a missing image; empty if nothing is."""
+    """Return a clause that names the object found in place of a missing image; empty if there is none."""
     if os.path.isdir(path):
         return " (a folder has its name)"
     if os.path.islink(path):

@@ -31,16 +31,16 @@ def rotated(splats: Mapping[str, Tensor], rotation: np.ndarray, unit: float) -> 
     matrix = torch.from_numpy(rotation).double()
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
     left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float32)
-    rest = splats["shN"].float()
-    if rest.shape[1]:
-        rest = torch.einsum("ij,njc->nic", rotated_harmonics(matrix, rest.shape[1]).float(), rest)
+    higher = splats["shN"].float()
+    if higher.shape[1]:
+        higher = torch.einsum("ij,njc->nic", rotated_harmonics(matrix, higher.shape[1]).float(), higher)
     return {
         "means": (splats["means"].double() @ matrix.T * unit).float(),
         "scales": splats["scales"].float() + float(np.log(unit)),
         "quats": splats["quats"].float() @ left.T,
         "opacities": splats["opacities"].float(),
         "sh0": splats["sh0"].float(),
-        "shN": rest,
+        "shN": higher,
     }
 
 

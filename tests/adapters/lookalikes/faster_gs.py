@@ -9,7 +9,7 @@ ADAPTER, FIRST, START, LAST = "faster_gs", 0, 20, 59
 
 
 def training_callback(start_iteration=None, end_iteration=None):
-    """As in NeRFICG: what it registers does not tell which function it wraps."""
+    """Wrap a function like NeRFICG: the registered object does not tell which function it wraps."""
 
     def decorator(function):
         def wrapper(*args, **kwargs):

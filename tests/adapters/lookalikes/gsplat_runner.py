@@ -93,7 +93,7 @@ class Runner:
 
     def train(self, last=LAST):
         cfg = self.cfg
-        yaml.dump(vars(cfg))  # would pickle whatever hangs on the strategy's instance
+        yaml.dump(vars(cfg))  # would pickle every attribute of the strategy's instance
         schedulers = [torch.optim.lr_scheduler.ExponentialLR(self.optimizers["xyz"], gamma=0.99)]
         for step in range(last + 1):
             log.begins(step, self.splats.values())

@@ -66,6 +66,6 @@ def training(dataset, opt, pipe, checkpoint=None):
 
 
 def train(checkpoint=None, last=LAST, order=0, **given):
-    """Run like the script: what follows is what a command line gives."""
+    """Run like the script, with the settings that a command line gives."""
     opt = options(LAST, last, given)
     return training(dataset(order), opt, None, checkpoint)

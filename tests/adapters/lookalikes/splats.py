@@ -1,4 +1,4 @@
-"""What all look-alikes share: a tiny scene, a model with the methods of Inria's, and a log of what really ran."""
+"""A tiny scene, a model with the methods of Inria's, and a log of a run, for all look-alikes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NAMES = [f"rig{i % 2}/IMG_{i // 2}.png" for i in range(5)]
 
 
 class Log:
-    """What a run really did, seen from inside: backwards, prunes, values at the beginning of each iteration."""
+    """Log of a run from inside: backwards, prunes, values at the beginning of each iteration."""
 
     def __init__(self):
         self.backwards = []  # iterations in which a backward reached a training render
@@ -39,7 +39,7 @@ log = Log()
 
 
 def new_log():
-    """Begin a new run's log, and seed what is drawn at random."""
+    """Begin the log of a new run, and seed the random numbers."""
     log.__init__()
     random.seed(0)
     torch.manual_seed(0)
@@ -79,10 +79,10 @@ def make_cameras(order=0):
 
 def pick(cameras, iteration):
     """The view of an iteration: in a new order each round, and the same in a resumed run."""
-    turn, place = divmod(iteration, len(cameras))
+    epoch, position = divmod(iteration, len(cameras))
     order = sorted(cameras, key=lambda camera: camera.image_name)
-    random.Random(turn).shuffle(order)
-    return order[place]
+    random.Random(epoch).shuffle(order)
+    return order[position]
 
 
 class SplatModel:
@@ -144,7 +144,7 @@ class SplatModel:
         self.prune_points(mask)
 
     def _densify(self, share, scores=None):
-        """A densification event: what was gathered is used up."""
+        """Densify, and reset the gathered gradients."""
         self._use_up()
         self._prune_gaussians(share, self.values["opacity"] if scores is None else scores)
 
@@ -215,7 +215,7 @@ def dataset(order=0):
 
 
 def options(iterations, last, given, **own):
-    """What a command line gives to `opt` in the Inria family; `last` is where the look-alike stops."""
+    """Return the options `opt` of the Inria family's command line; the look-alike stops at `last`."""
     all_have = {
         "densify_from_iter": 2,
         "densify_until_iter": 20,

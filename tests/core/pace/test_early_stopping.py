@@ -12,7 +12,7 @@ VIEWS = [f"{i}.png" for i in range(6)]
 
 
 def follow(losses, tolerance=0.05, iterations=800):
-    """Go through all cycles; `losses(view, share done)` is what a view shows."""
+    """Go through all cycles; `losses(view, share done)` is the loss of a view."""
     early_stopping = EarlyStopping(tolerance)
     for i in range(iterations):
         done = i / iterations

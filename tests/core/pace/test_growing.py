@@ -235,7 +235,9 @@ def test_events_stop_before_the_bound_on_gaussians():
     with SkipGate(start_iter=START, share=0.25, max_gaussians=6) as gate:
         assert set(Loop().train(gate).grown)
     with SkipGate(start_iter=START, share=0.25, max_gaussians=5) as gate:
-        assert all(event % 60 == 0 for event in Loop().train(gate).grown)  # what must run densifies all the same
+        assert all(
+            event % 60 == 0 for event in Loop().train(gate).grown
+        )  # iterations that must run densify all the same
     with pytest.raises(SkipGSError, match="needs share or grow_share"):
         SkipGate(start_iter=START, max_gaussians=5)
 

@@ -1,4 +1,4 @@
-"""Which ranges of a training function the gate may leave numbers out of, and what progress bars count."""
+"""Ranges of a training function in which the gate may leave out numbers, and the lengths of progress bars."""
 
 import pytest
 

@@ -15,7 +15,7 @@ VIEWS = [f"{i}.png" for i in range(4)]
 
 
 class Loop:
-    """A training loop with what real ones have: a save by number, a rate by number, Adam."""
+    """A training loop with a save by number, a rate by number and Adam, like real loops."""
 
     def __init__(self, begin=0, end=100, value=None, moments=None):
         self.begin, self.end = begin, end
@@ -163,7 +163,7 @@ def test_interrupted_and_resumed_goes_as_uninterrupted(settings):
         whole = Loop(end=400).train(gate, **options)
     middle = 200
     with SkipGate(start_iter=40, **settings) as gate:
-        # A save belongs to an iteration that runs; what comes after it is decided by the one who goes on.
+        # A save belongs to an iteration that runs. The resumed run decides on the iterations after it.
         first = Loop(end=400)
         state = None
         for step in first_part(first, gate, middle, options):

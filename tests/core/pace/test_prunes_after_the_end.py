@@ -1,4 +1,4 @@
-"""Prunes when refinement has ended: each gets its share of what comes after it, the last one all of it."""
+"""Prunes when refinement has ended: a share of the iterations after each prune runs, and all after the last."""
 
 import json
 

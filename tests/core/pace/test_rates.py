@@ -194,7 +194,7 @@ def test_a_step_is_as_long_as_the_factor_says_and_the_rate_comes_back(kind, rate
 
 @pytest.mark.parametrize("fused", [False, True])
 def test_squares_are_forgotten_sooner_while_steps_are_larger(fused, rates):
-    """As an Adam whose second beta is 0.98 from the first larger step on."""
+    """Larger steps equal those of an Adam whose second beta is 0.98 from the first larger step on."""
     values = parameter(), parameter()
     scaled, sooner = (torch.optim.Adam([value], lr=0.1, fused=fused) for value in values)
     for iteration in range(8):

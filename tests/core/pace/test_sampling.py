@@ -10,8 +10,8 @@ from skipgs_plug.core.pace.sampling import Sampling
 
 
 def ran(share: float, numbers: range, must: frozenset[int] = frozenset()) -> list[int]:
-    thinning = Sampling(share)
-    return [n for n in numbers if thinning.runs(n in must)]
+    sampling = Sampling(share)
+    return [n for n in numbers if sampling.runs(n in must)]
 
 
 @settings(deadline=None)

@@ -1,4 +1,4 @@
-"""A module of the same project as the loops of the tests: what a user's loop calls with its number."""
+"""Functions of a user's project, which the loops of the tests call with their number."""
 
 EVERY = 30
 switched_on = False

@@ -1,4 +1,4 @@
-"""What is read off a loop: iterations that something hangs on."""
+"""Milestones read from a loop's source: iterations that must run."""
 
 import re
 from types import SimpleNamespace
@@ -11,7 +11,7 @@ from skipgs_plug import SkipGSError
 
 
 def report(step, saves):
-    """Something that a loop calls with its number."""
+    """Stand for a function that a loop calls with its number."""
 
 
 def test_conditions_on_the_number():

@@ -80,7 +80,7 @@ def test_texts_for_the_bar_and_moves_in_every_iteration_are_no_more():
 
 
 def work(step):
-    """Something that a loop does."""
+    """Stand for the body of a loop."""
 
 
 kept = []

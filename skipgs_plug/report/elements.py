@@ -51,16 +51,16 @@ class Details:
 
     kind: ClassVar[str] = "details"
     summary: str
-    blocks: Sequence[Table]
+    elements: Sequence[Table]
 
 
-Block = Table | Picture | Strip | Text | Details
+Element = Table | Picture | Strip | Text | Details
 
 
 @dataclass
 class Section:
     title: str
-    blocks: Sequence[Block]
+    elements: Sequence[Element]
 
 
 def write_page(title: str, lead: str, sections: Sequence[Section]) -> str:

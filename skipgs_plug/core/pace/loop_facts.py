@@ -1,0 +1,129 @@
+"""Facts about a training loop, from its trainer, its user and its source, and the plans that follow from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from skipgs_plug.core import distributed
+from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_known
+from skipgs_plug.core.pace.loop_range import LoopRange
+from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
+from skipgs_plug.core.source.lines import line_of
+from skipgs_plug.core.source.milestones import read_loop
+from skipgs_plug.core.source.progress_bars import Bars
+from skipgs_plug.core.trainer_info import Densification, TrainerInfo
+
+
+class LoopFacts:
+    """Collects the facts that the phases of a run need to plan their iterations.
+
+    Args:
+        always: Iterations that must run in place of those that the loop's conditions name; None to read the conditions.
+
+    Attributes:
+        start: First iteration of refinement.
+        last: Last iteration of the run; None if unknown.
+        densification: How to recognise densification events; None if unknown.
+        required: Iterations that must run for needs that showed during the run.
+        grown: Iterations of the growing phase that the loop's conditions name, by condition.
+        refined: The same for the refining phase.
+        bars: Progress bars of the loop.
+    """
+
+    def __init__(self, always: Iterable[int] | None) -> None:
+        self.start = 0
+        self.last: int | None = None
+        self.densification: Densification | None = None
+        self.required: set[int] = set()
+        self.grown: dict[str, set[int]] = {}
+        self.refined: dict[str, set[int]] = {}
+        self.bars = Bars([])
+        self._reads = always is None  # whether the loop's conditions are read
+        self._given = self._chosen = frozenset(always or ())  # iterations that must run: by the settings, and in all
+        self._always: Always = nothing_always
+        self._pure: tuple[str, ...] = ()
+        self._known: Known = nothing_known
+        self._accumulates = self._steps_each = False
+        self._views: list[str] | None = None
+        self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
+
+    def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
+        """Receive the facts about the trainer; see `Pace.configure`."""
+        self.start, self.last, self._views = start, info.max_steps, views
+        self._accumulates, self._steps_each, self._epoch = info.accumulates, info.steps_each, info.epoch
+        self.densification = info.densification or self.densification
+
+    def describe(self, always: Always, pure: Iterable[str], densification: Densification | None, known: Known) -> None:
+        """Receive facts from the trainer's adapter; see `Pace.describe`."""
+        self._always, self._pure, self.densification, self._known = always, tuple(pure), densification, known
+
+    def choose(self, always: Iterable[int], views: list[str] | None, events: Iterable[int] | None) -> None:
+        """Receive facts about a loop of the user's own; see `Pace.follow`."""
+        if events is not None:
+            known = frozenset(int(number) for number in events)
+            self.densification = Densification(numbers=lambda part: known.intersection(part))
+        self._chosen = self._given.union(always)
+        if views is not None:
+            self._views = views
+
+    def read(self, loop: LoopRange, grown: range, refined: range) -> None:
+        """Read the conditions and the progress bars of a loop from its source.
+
+        Args:
+            loop: The loop. Its source is dropped afterwards.
+            grown: Iterations of the growing phase.
+            refined: Iterations of the refining phase.
+
+        Raises:
+            SkipGSError: A condition cannot be evaluated ahead because of the loop itself.
+        """
+        if loop.source is not None and self._reads:
+            code, names = loop.source
+            source = read_loop(code, line_of(code), names, self._pure, self._known(names))
+            self.grown, self.refined = (source.milestones(part) if part else {} for part in (grown, refined))
+            self.bars = Bars(source.bar_moves(loop.numbers))
+        else:
+            self.grown, self.refined, self.bars = {}, {}, Bars([])
+        loop.source = None
+
+    def plan(self, numbers: range, conditions: dict[str, set[int]], last: int, before: Phase) -> PhasePlan:
+        """Return the plan of a phase. All processes must call it together.
+
+        Args:
+            numbers: Iterations of the phase.
+            conditions: Its iterations that the loop's conditions name: `grown` or `refined`.
+            last: Last iteration of the run.
+            before: The phase before it.
+        """
+        own = {n for n in (*self._always(numbers), *self._chosen, *self.required) if n in numbers}
+        # A condition may hold on one rank alone, such as `rank == 0 and step % 1000 == 0`.
+        found = distributed.united({**conditions, NAMED_FOR_TRAINER: own})
+        named = found.pop(NAMED_FOR_TRAINER)
+        epoch = self._epoch or (None if self._views is None else len(self._views))
+        return PhasePlan(
+            numbers,
+            found,
+            named,
+            last,
+            before,
+            self._views,
+            epoch,
+            self.densification,
+            self._accumulates,
+            self._steps_each,
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the facts that a resumed run needs before the trainer tells its own."""
+        return {
+            "start": self.start,
+            "last": self.last,
+            "keeps_rates": self._accumulates,
+            "steps_each": self._steps_each,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict()`."""
+        self.start, self.last, self._accumulates = state["start"], state["last"], state["keeps_rates"]
+        self._steps_each = state.get("steps_each", False)
