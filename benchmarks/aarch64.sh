@@ -33,6 +33,8 @@ if ! [ -e "$python" ]; then
     chmod +x "$python"
 fi
 export EMULATED_PYTHON=$python PYTHONPATH=$source PYTHONDONTWRITEBYTECODE=1 WARP_CACHE_PATH=$folder/kernels
+export PYTEST_TIMEOUT=0  # no limit, nor for the pytest that a test starts
 cd "$source"
 "$python" -c 'import platform; print(platform.machine())'
-exec "$python" -m pytest -q -p no:cacheprovider --timeout 100000 "$@"
+# The profile "ci" of hypothesis lets a test take its time when it draws inputs.
+exec "$python" -m pytest -q -p no:cacheprovider --hypothesis-profile ci "$@"

@@ -215,6 +215,7 @@ def test_its_state_dict_is_adams() -> None:
     assert_equal(lazy, other)
 
 
+@pytest.mark.filterwarnings("ignore:You are using `torch.load`:FutureWarning")  # pickle does, with torch 2.4
 @pytest.mark.parametrize("again", [copy.deepcopy, lambda lazy: pickle.loads(pickle.dumps(lazy))])
 def test_a_copy_goes_on_as_the_original(again: Callable[[LazyAdam], LazyAdam]) -> None:
     generator = torch.Generator().manual_seed(4)

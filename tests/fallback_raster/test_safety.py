@@ -25,13 +25,15 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 
 
-def run(*command: str, timeout: float = 120, **environment: str) -> str:
-    """Run Python in a new process, which must succeed, and return its output."""
+def run(*command: str, **environment: str) -> str:
+    """Run Python in a new process, which must succeed, and return its output.
+
+    Its time limit is that of the test: pytest's option --timeout. The end of a test kills it.
+    """
     found = subprocess.run(
         [sys.executable, *command],
         capture_output=True,
         text=True,
-        timeout=timeout,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(HERE)]), **environment},
         cwd=ROOT,
     )
@@ -93,7 +95,7 @@ if AGAIN:
 
 @pytest.mark.parametrize("again", [False, True])
 def test_a_process_interrupted_while_it_starts_threads_comes_to_its_end(again: bool) -> None:
-    assert run("-c", f"AGAIN = {again}\n{INTERRUPTED_START}", timeout=60) == "interrupted\n"
+    assert run("-c", f"AGAIN = {again}\n{INTERRUPTED_START}") == "interrupted\n"
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs SIGALRM")
@@ -218,7 +220,7 @@ os._exit(0)
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_fork_while_another_thread_renders_can_render() -> None:
-    run("-c", FORKED, timeout=60)
+    run("-c", FORKED)
 
 
 LISTED = """
@@ -317,4 +319,4 @@ def test_kernels_stay_inside_their_buffers() -> None:
     chosen = "not tiles and not features and not near and not blur and not radius"
     options = ["-m", "pytest", "-q", "-x", "-k", chosen, "-p", "no:cacheprovider"]
     if os.environ.get("SKIPGS_PLUG_GUARD", "0") in ("", "0"):
-        assert " passed" in run(*options, *(str(HERE / test) for test in tests), SKIPGS_PLUG_GUARD="1", timeout=280)
+        assert " passed" in run(*options, *(str(HERE / test) for test in tests), SKIPGS_PLUG_GUARD="1")
