@@ -245,11 +245,12 @@ def test_the_collector_passes_over_what_a_program_has_loaded(packed: str, tmp_pa
         )
         return int(ended.stdout.rpartition("frozen")[2])
 
+    pythons = 1_000  # objects that Python passes over by itself: 375 with Python 3.12
     assert frozen(f"sys.argv = {arguments!r}", "main()") > 100_000
-    assert frozen("", f"main({[*arguments[1:], '--resume']!r})") == 0  # a caller in Python goes on after it
+    assert frozen("", f"main({[*arguments[1:], '--resume']!r})") < pythons  # a caller in Python goes on after it
     script = tmp_path / "script.py"
-    script.write_text("import gc\nassert gc.isenabled() and not gc.get_freeze_count()")
-    assert frozen(f"sys.argv = {['skipgs-plug', 'run', 'inria', '--no-gate', '--', str(script)]!r}", "main()") == 0
+    script.write_text(f"import gc\nassert gc.isenabled() and gc.get_freeze_count() < {pythons}")
+    assert frozen(f"sys.argv = {['skipgs-plug', 'run', 'inria', '--no-gate', '--', str(script)]!r}", "main()") < pythons
 
 
 def test_the_home_folder_is_known_everywhere(monkeypatch):

@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Hashable
 from datetime import timedelta
+from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
 
@@ -109,8 +110,9 @@ def test_an_error_on_one_rank_ends_both(tmp_path: Path) -> None:
     assert "another process" in (tmp_path / "0.txt").read_text()
 
 
-def trouble(rank: int, folder: str, size: int, kind: str) -> None:
+def trouble(rank: int, folder: str, size: int, kind: str, loaded: Barrier) -> None:
     """Rank 1 dies, stops answering, or is late; says how each rank ended."""
+    loaded.wait()  # loading torch takes longer than 3 s on a busy machine
     start(rank, folder, size, seconds=3)
     gate = SkipGate(start_iter=0, warmup=2)
     parameter = torch.nn.Parameter(torch.ones(1))
@@ -132,7 +134,8 @@ def trouble(rank: int, folder: str, size: int, kind: str) -> None:
 @pytest.mark.parametrize(("kind", "size"), [("lags", 2), ("dies", 2), ("hangs", 2), ("dies", 4)])
 def test_ranks_in_trouble_end_within_the_time_out(tmp_path: Path, kind: str, size: int) -> None:
     context = mp.get_context("spawn")
-    ranks = [context.Process(target=trouble, args=(rank, str(tmp_path), size, kind)) for rank in range(size)]
+    loaded = context.Barrier(size, timeout=60)
+    ranks = [context.Process(target=trouble, args=(rank, str(tmp_path), size, kind, loaded)) for rank in range(size)]
     for rank in ranks:
         rank.start()
     for rank in ranks:
