@@ -195,8 +195,15 @@ class Engine:
             loss: The tensor whose backward pass runs, if it is not the signal.
             alone: Whether the iteration has no other backward pass, so that a skipped graph can be freed at once.
         """
+        now = self.iteration
+        if not now.gated:
+            self.stats.iterations += 1
+            run()
+            now.ran = True
+            self.clock.mark()
+            return True
         back_from = loss if loss is not None else signal if isinstance(signal, Tensor) else None
-        ahead = self._known_ahead(view, signal, back_from) if self.iteration.gated else None
+        ahead = self._known_ahead(view, signal, back_from)
         if ahead is False:
             skip = self._run_first(view, signal, run, back_from)
         else:
@@ -204,9 +211,8 @@ class Engine:
             skip = self.decide(view, None if ahead else signal).skip
             if not skip:
                 run()
-                self.iteration.ran = True
-                if self.iteration.gated:
-                    self.rates.ran()
+                now.ran = True
+                self.rates.ran()
             elif back_from is not None:
                 self._skipped.append(weakref.ref(back_from))
                 if alone:

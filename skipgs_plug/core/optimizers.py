@@ -13,7 +13,11 @@ Optimizers = Named | Callable[[], Iterable[torch.optim.Optimizer]]
 
 def has_pending_gradient(optimizer: torch.optim.Optimizer) -> bool:
     """Whether a parameter of the optimizer has a gradient."""
-    return any(p.grad is not None for group in optimizer.param_groups for p in group["params"])
+    for group in optimizer.param_groups:  # a loop takes half of the time that `any` takes
+        for parameter in group["params"]:
+            if parameter.grad is not None:
+                return True
+    return False
 
 
 def listed(optimizer: Any) -> list[torch.optim.Optimizer]:

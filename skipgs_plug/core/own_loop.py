@@ -82,9 +82,13 @@ class OwnLoop:
             GateOrderError: The verbs were called out of order.
             SkipGSError: See `SkipGate.backward`.
         """
-        _check_losses(loss, view)
+        batch = isinstance(view, list)
+        if batch:
+            _require_losses(loss, view)
+        elif not hasattr(loss, "backward"):
+            raise _no_loss(loss)
         step = int(step)
-        run = Original(_backward_of_sum if isinstance(view, list) else loss.backward)
+        run = Original(_backward_of_sum if batch else loss.backward)
         if self._release.reason is None:
             try:
                 return self._gated_backward(loss, view, step, signal, run)
@@ -95,7 +99,7 @@ class OwnLoop:
         self._iteration.begin(step, gated=False)
         self._iteration.ran = True
         if not run.made:
-            run(*([loss] if isinstance(view, list) else ()))
+            run(*([loss] if batch else ()))
         return True
 
     def step(self, optimizer: Any, *args: Any) -> bool:
@@ -117,10 +121,13 @@ class OwnLoop:
                     self._refuse(
                         "step() was called twice for one optimizer in this iteration; call it once, after backward()."
                     )
-            stepped.update(map(id, optimizers))
+            for one in optimizers:
+                stepped.add(id(one))
             if self._engine.config.enabled and self._release.reason is None:  # otherwise every optimizer steps
-                with self.guarded:
+                try:
                     stepping = [one for one in optimizers if has_pending_gradient(one)]
+                except Exception as error:
+                    self._release.on_error(error, self._iteration.step)
         for one in stepping:
             one.step(*args)
         return bool(stepping)
@@ -133,8 +140,10 @@ class OwnLoop:
         """
         self._require_backward_before("update")
         self._iteration.ended = True
-        with self.guarded:
+        try:
             self._engine.free_skipped()
+        except Exception as error:
+            self._release.on_error(error, self._iteration.step)
 
     def _gated_backward(self, loss: Any, view: Any, step: int, signal: Any, run: Original) -> bool:
         """Do the work of `backward` while the gate is not released; `run` is the loop's own backward pass."""
@@ -149,13 +158,15 @@ class OwnLoop:
             )
         if isinstance(view, list):
             return self._backward_batch(loss, view, signal, run)
-        [key] = self._new_in_iteration([view])
+        key = self._new_in_iteration(view)
+        now.keys.add(key)
         return engine.gate(key, signal, run, loss)
 
     def _backward_batch(self, losses: Any, views: list[Any], signals: Any, run: Original) -> bool:
         if not len(losses) == len(views) == len(signals):
             raise SkipGSError(f"{len(views)} view keys came with {len(losses)} losses; give one loss per view.")
-        keys = self._new_in_iteration(views)
+        keys = [self._new_in_iteration(view) for view in views]  # a batch may hold a view twice
+        self._iteration.keys.update(keys)
         answers = [self._engine.decide(key, signal) for key, signal in zip(keys, signals, strict=True)]
         kept = [loss for loss, answer in zip(losses, answers, strict=True) if not answer.skip]
         if kept:
@@ -165,27 +176,21 @@ class OwnLoop:
         self._engine.clock.mark()
         return bool(kept)
 
-    def _new_in_iteration(self, views: list[Any]) -> list[str]:
-        """Return the keys of views that have had no backward pass in this iteration. A batch may hold a view twice.
+    def _new_in_iteration(self, view: Any) -> str:
+        """Return the key of a view that has had no backward pass in this iteration.
 
         Before `start_iter` an index on a device is not read: reading it would wait for the device.
         """
-        before = self._iteration.keys
-        found: list[str] = []
-        for view in views:
-            if isinstance(view, Tensor) and not self._iteration.gated and _is_index_on_device(view):
-                found.append(NOT_READ)
-                continue
-            key = view_key(view)
-            if key in before:
-                raise GateOrderError(
-                    f"backward() was called twice for view {key!r} in iteration {self._iteration.step}; give each "
-                    "iteration its own step number, and call backward() once for each view (the closure of LBFGS runs "
-                    "several times)."
-                )
-            found.append(key)
-        before.update(found)
-        return found
+        now = self._iteration
+        if not now.gated and isinstance(view, Tensor) and _is_index_on_device(view):
+            return NOT_READ
+        key = view_key(view)
+        if key in now.keys:
+            raise GateOrderError(
+                f"backward() was called twice for view {key!r} in iteration {now.step}; give each iteration its own "
+                "step number, and call backward() once for each view (the closure of LBFGS runs several times)."
+            )
+        return key
 
     def _require_backward_before(self, verb: str) -> None:
         if self._release.reason is None and (self._iteration.ended or not self._iteration.keys):
@@ -196,13 +201,16 @@ class OwnLoop:
         self._release.on_error(GateOrderError(sentence), self._iteration.step)
 
 
-def _check_losses(loss: Any, view: Any) -> None:
-    batch = isinstance(view, list)
-    if batch and not isinstance(loss, (list, tuple)) and not (isinstance(loss, Tensor) and loss.dim()):
-        raise SkipGSError(f"{len(view)} view keys came with one loss; give one loss per view.")
-    for one in loss if batch else (loss,):
-        if not hasattr(one, "backward"):
-            raise SkipGSError(f"backward() needs the loss itself, a tensor, not {type(one).__name__}.")
+def _require_losses(losses: Any, views: list[Any]) -> None:
+    if not isinstance(losses, (list, tuple)) and not (isinstance(losses, Tensor) and losses.dim()):
+        raise SkipGSError(f"{len(views)} view keys came with one loss; give one loss per view.")
+    for loss in losses:
+        if not hasattr(loss, "backward"):
+            raise _no_loss(loss)
+
+
+def _no_loss(loss: Any) -> SkipGSError:
+    return SkipGSError(f"backward() needs the loss itself, a tensor, not {type(loss).__name__}.")
 
 
 def _is_index_on_device(view: Tensor) -> bool:
