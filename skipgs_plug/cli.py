@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, NamedTuple, Union
 
 from skipgs_plug.garbage import keep_everything, uncollected
+from skipgs_plug.messages import say
 from skipgs_plug.terminate import UNREAD, Terminated, terminable
 
 
@@ -201,10 +202,10 @@ def chain(error: BaseException | None) -> Iterator[BaseException]:
 
 def interrupted(causes: Sequence[BaseException]) -> int:
     terminated = any(isinstance(cause, Terminated) for cause in causes)
-    print(f"skipgs-plug: {'terminated' if terminated else 'interrupted'}.", file=sys.stderr)
+    say("terminated." if terminated else "interrupted.")
     return TERMINATED if terminated else INTERRUPTED
 
 
 def fail(sentence: str) -> int:
-    print(f"skipgs-plug: {sentence}", file=sys.stderr)
+    say(sentence)
     return BAD_INPUT

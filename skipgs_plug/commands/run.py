@@ -15,9 +15,9 @@ from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
 from skipgs_plug.commands.options.run import Args
 from skipgs_plug.compat import FAMILIES, serve
-from skipgs_plug.core.messages import say, show
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster import ADAM_REPLACED, instead_of_torchs_adam
+from skipgs_plug.messages import say, show
 from skipgs_plug.scripts import spawned
 from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
 from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED

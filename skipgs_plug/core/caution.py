@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 
-from skipgs_plug.core.messages import say
+from skipgs_plug.messages import say
 
 
 def caution(sentence: str, stacklevel: int = 2) -> None:

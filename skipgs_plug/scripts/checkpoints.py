@@ -13,9 +13,9 @@ from typing import Any
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.messages import say
 from skipgs_plug.files import write_aside
 from skipgs_plug.gate import SkipGate
+from skipgs_plug.messages import say
 
 # Functions that `watch` replaces. `run_script` replaces `torch.load` too.
 REPLACED = ("torch.save", "torch.load")

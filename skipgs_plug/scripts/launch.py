@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.messages import say
+from skipgs_plug.messages import say
 from skipgs_plug.scripts.import_hints import install_hint
 from skipgs_plug.scripts.stand_in_hints import stand_in_hint
 

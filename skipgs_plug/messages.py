@@ -1,4 +1,4 @@
-"""Messages of the gate to the user. They never end a training."""
+"""Messages to the user on stderr. They never end a program."""
 
 from __future__ import annotations
 
