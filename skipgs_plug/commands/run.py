@@ -43,7 +43,9 @@ def run(args: Args) -> int:
         args = dataclasses.replace(args, adapter=adapter)
         say(f"{script_name(command)} is run as {args.adapter}.")
     with spawned.gated_when_spawned(functools.partial(run_spawned, args, command)) as processes:
-        code, gate = run_gated(args, command, functools.partial(run_script, command, on_cpu=args.cpu))
+        stand_ins = FAMILIES.get(get_adapter(args.adapter).stand_ins_for(command), {})
+        execute = functools.partial(run_script, command, on_cpu=args.cpu, stand_ins=stand_ins)
+        code, gate = run_gated(args, command, execute)
     verify(code, gate)
     seen = args.no_gate if gate is None else gate.trained or gate.released
     if code == 0 and not processes and not seen:
@@ -60,8 +62,14 @@ def find_adapter(args: Args, command: list[str]) -> str | None:
     try:
         return find_script_adapter(source_of(command)).name
     except UnknownTrainerError as error:
-        if not args.no_gate or args.cpu:
+        if not args.no_gate:
             raise
+        if args.cpu:
+            raise UnknownTrainerError(
+                f"--cpu replaces the CUDA modules of trainers that an adapter knows, and none knows "
+                f"{script_name(command)}: run it without --cpu, or name the adapter of the trainer that it was forked "
+                "from."
+            ) from error
         say_ungated(command, error)
         return None
 
@@ -90,10 +98,11 @@ def run_gated(
 ) -> tuple[int, SkipGate | None]:
     """Attach a gate to the script that `execute(attach)` runs, and write skipgs.json if `rank` is 0."""
     adapter = get_adapter(args.adapter)()
-    checkpoints = Checkpoints(args.adapter, script_name(command), args.resume_gate)
+    # Without a gate nothing is refused that only a gate would need.
+    checkpoints = Checkpoints(args.adapter, script_name(command), "off" if args.no_gate else args.resume_gate)
     for_cpu = (*CUDA_REPLACED, ADAM_REPLACED)
     adapter.replaced = (*REPLACED, *(for_cpu if args.cpu else ()))
-    settings = args.gate_options.given() | ({"enabled": False} if args.no_gate else {})
+    settings = {"enabled": False} if args.no_gate else args.gate_options.given()
     gates: list[SkipGate] = []
 
     def attach() -> dict[str, Any]:

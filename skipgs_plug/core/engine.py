@@ -15,7 +15,7 @@ from skipgs_plug.core import decision, distributed
 from skipgs_plug.core.clock import GateClock
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.decision import Decision
-from skipgs_plug.core.errors import GateOrderError, SkipGSError
+from skipgs_plug.core.errors import GateOrderError, GateStateError, SkipGSError
 from skipgs_plug.core.gated_iteration import GatedIteration
 from skipgs_plug.core.nonfinite import NonFiniteGuard
 from skipgs_plug.core.pace.choose import pace_of
@@ -115,7 +115,8 @@ class Engine:
                 settings["start_iter"] = max(info.start_iter or 0, info.settled_iter)
         self.config = config = dataclasses.replace(self.config, **settings)
         if config.start_iter is None:
-            raise SkipGSError("This trainer does not densify, so the gate cannot know when to begin; give start_iter=.")
+            sentence = "This trainer does not densify, so the gate cannot know when to begin; give"
+            raise SkipGSError(f"{sentence} start_iter=.", in_script=f"{sentence} --start-iter.")
         self.start = config.start_iter
         read_until = info.gradients_read_until
         if config.enabled and read_until is not None and self.start < read_until:
@@ -360,7 +361,7 @@ class Engine:
         state = whole.get("pace")
         if (state is None) == self.pace.leaves_out:
             saved = None if state is None else state["refining"]["asked"]
-            raise SkipGSError(
+            raise GateStateError(
                 f"The gate state was saved with refine_share={saved!r}, not {self.config.refining!r}; "
                 "continue with that setting, or start the gate afresh."
             )

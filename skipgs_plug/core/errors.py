@@ -16,6 +16,17 @@ class SkipGSError(RuntimeError):
         self.in_script = in_script
 
 
+class GateStateError(SkipGSError):
+    """A saved gate state cannot be used.
+
+    Args:
+        sentence: A sentence that ends with the advice "start the gate afresh.".
+    """
+
+    def __init__(self, sentence: str) -> None:
+        super().__init__(sentence, in_script=f"{sentence.removesuffix('.')} with --resume-gate off.")
+
+
 class UnknownTrainerError(SkipGSError):
     """No adapter recognises the trainer, or no adapter has the given name."""
 

@@ -8,7 +8,6 @@ from typing import Any, Protocol
 
 from skipgs_plug.core.clock import Times
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, LEAST_WATCHED
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.files import write_aside
 
@@ -125,10 +124,8 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
         )
     stopping = counted["early_stopping"]
     if stopping is not None and not stopping["watched"]:
-        lines.append(
-            f"  no view is watched, so the whole share runs: watching needs {LEAST_WATCHED} views in a twelfth of all "
-            f"views, each view in the first {CYCLE_ENDS[0]:.1%} of the iterations that run, and training in one process"
-        )
+        why = stopping["why_none_watched"]
+        lines.append(f"  the whole share runs, because no view is watched{'' if why is None else f': {why}'}")
     elif stopping is not None:
         worth = stopping["rest_worth_db"]
         judged = "was not estimated" if worth is None else f"could gain at most {worth:.2f} dB at the last check"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.errors import GateStateError
 
 # Number of losses after a resume that are compared with the means of their views. A few may be far off by chance, but
 # not ten in a row.
@@ -29,7 +29,7 @@ def require_same_scene(saved: Iterable[Any], names: list[str] | None) -> None:
         return
     unknown = sorted({str(view) for view in saved} - set(names))
     if unknown:
-        raise SkipGSError(
+        raise GateStateError(
             f"The gate state belongs to another scene: it knows view {unknown[0]!r}, which is not among "
             f"the {len(names)} training views; start the gate afresh."
         )
@@ -71,7 +71,7 @@ class SceneCheck:
             return
         self._left -= 1
         if self._left == 0:
-            raise SkipGSError(
+            raise GateStateError(
                 f"The gate state belongs to another scene: up to iteration {step} each of {CHECKED_LOSSES} losses was "
                 f"more than twice, or less than half, the mean of its view (last {loss:.4g}, mean {mean:.4g}); "
                 "start the gate afresh."

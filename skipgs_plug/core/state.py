@@ -8,7 +8,7 @@ from numbers import Real
 from typing import Any, TypedDict
 
 from skipgs_plug import schema
-from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.errors import GateStateError, SkipGSError
 
 # Versions of the two formats of state. Version 1 of the policy's is that of the authors' controller.
 POLICY_VERSION = 2
@@ -235,7 +235,7 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
     require_state(state)
     accumulator = state.get("accumulator") or {}
     if accumulator.get("norm_mean") is not None:
-        raise SkipGSError(
+        raise GateStateError(
             'The gate state was saved with step_mode="adaptive_norm", which no longer exists; start the gate afresh.'
         )
     if is_release_state(state):
@@ -244,7 +244,7 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
     else:
         _require_version(state, GATE_VERSION)
         if state.get("refinement") is not None:
-            raise SkipGSError(
+            raise GateStateError(
                 "The gate state was saved by a version before 0.2.0, which left out iterations in another way; "
                 "continue with that version, or start the gate afresh."
             )
@@ -262,7 +262,7 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
 def require_state(state: Any) -> None:
     """Raise SkipGSError unless this is a dictionary with entries."""
     if not isinstance(state, Mapping):
-        raise SkipGSError(f"A gate state is a dict, not {type(state).__name__}; start the gate afresh.")
+        raise GateStateError(f"A gate state is a dict, not {type(state).__name__}; start the gate afresh.")
     if not state:
         raise SkipGSError("The gate state is empty: it was saved before training began; start afresh.")
 
@@ -270,7 +270,7 @@ def require_state(state: Any) -> None:
 def _require_version(state: Mapping[str, Any], expected: int) -> None:
     version = state.get("version")
     if version != expected:
-        raise SkipGSError(f"Gate state has version {version!r}, expected {expected}; start the gate afresh.")
+        raise GateStateError(f"Gate state has version {version!r}, expected {expected}; start the gate afresh.")
 
 
 def _require_release_version(state: Mapping[str, Any]) -> None:
@@ -283,7 +283,7 @@ def _require(state: Mapping[str, Any], kind: type, name: str) -> None:
     try:
         schema.check(state, kind, name)
     except schema.SchemaError as error:
-        raise SkipGSError(f"Gate state is damaged ({error}); start the gate afresh.") from error
+        raise GateStateError(f"Gate state is damaged ({error}); start the gate afresh.") from error
 
 
 def _from_release(state: Mapping[str, Any], warmup_end: int) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 
 # Modules that every checkout of the Inria family contains.
@@ -23,7 +23,12 @@ REQUIREMENTS = ("*requirements*.txt", "environment*.yml", "environment*.yaml", "
 FOLDERS = 2
 
 
-def install_hint(module: str, script: Path, on_cpu: bool = False) -> str:
+def is_extension(module: str) -> bool:
+    """Return whether a module is named like a CUDA extension of a trainer."""
+    return module.startswith(EXTENSIONS)
+
+
+def install_hint(module: str, script: Path, on_cpu: bool = False, stand_ins: Container[str] = ()) -> str:
     """Return a sentence that explains how to install a missing module.
 
     The sentence names a package only if the requirements of the checkout list it or if `PACKAGES` holds the module.
@@ -34,20 +39,19 @@ def install_hint(module: str, script: Path, on_cpu: bool = False) -> str:
         module: Name of the missing module.
         script: File of the script that imports the module.
         on_cpu: Whether CPU stand-ins replace CUDA modules.
+        stand_ins: Modules that `--cpu` replaces for this trainer.
     """
     top = module.partition(".")[0]
     if top in OF_CHECKOUTS:
         return f"{script.name} is not in its checkout: its folder has no {top}. Run the script in a complete checkout."
-    if top.startswith(EXTENSIONS) and on_cpu:
+    if is_extension(top) and on_cpu:
         return (
-            f"{top} is a CUDA extension for which this adapter has no CPU stand-in: name the adapter of the trainer "
-            "that uses it, or run on a GPU, without --cpu."
+            f"{top} is a CUDA extension for which this adapter has no CPU stand-in: run the script on a GPU, without "
+            "--cpu."
         )
-    if top.startswith(EXTENSIONS):
-        return (
-            f"{top} is a CUDA extension of the trainer: build it as the trainer's README says, or run on the CPU with "
-            "--cpu before '--'."
-        )
+    if is_extension(top):
+        cpu = ", or run on the CPU with --cpu before '--'" if top in stand_ins else ""
+        return f"{top} is a CUDA extension of the trainer: build it as the trainer's README says{cpu}."
     package = PACKAGES.get(top, top)
     for listing in requirements(script):
         if names(listing, package):

@@ -8,7 +8,7 @@ import importlib.util
 import runpy
 import sys
 import types
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -18,13 +18,15 @@ import torch
 
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.messages import say
-from skipgs_plug.scripts.import_hints import install_hint
+from skipgs_plug.scripts.import_hints import install_hint, is_extension
 from skipgs_plug.scripts.stand_in_hints import stand_in_hint
 
 Attach = Callable[[], dict[str, Any]]  # see `run_script`
 
 
-def run_script(command: Sequence[str], attach: Attach | None = None, on_cpu: bool = False) -> int:
+def run_script(
+    command: Sequence[str], attach: Attach | None = None, on_cpu: bool = False, stand_ins: Container[str] = ()
+) -> int:
     """Run an unmodified script in its own checkout and return its exit code.
 
     The script finds its own folder first on `sys.path`, its own `sys.argv`, and `__name__ == "__main__"`. Its output,
@@ -36,23 +38,28 @@ def run_script(command: Sequence[str], attach: Attach | None = None, on_cpu: boo
         attach: Called immediately before the script runs, when its folder is on `sys.path` and none of its modules is
             imported. Returns names to add to the script's globals.
         on_cpu: Whether CPU stand-ins replace CUDA modules. Error messages depend on it.
+        stand_ins: Modules that `--cpu` replaces for this trainer. Error messages depend on them.
 
     Raises:
         SkipGSError: The script or module does not exist, or a module of the script's checkout was already imported
             from another folder.
     """
-    return _run(_resolve(command), attach, None, on_cpu)
+    return _run(_resolve(command), attach, None, on_cpu, stand_ins)
 
 
 def run_in_script(
     command: Sequence[str], attach: Attach, run: Callable[[str, dict[str, Any]], None], on_cpu: bool = False
 ) -> int:
     """Like `run_script`, but call `run(file, names)` instead of running the script."""
-    return _run(_resolve(command), attach, run, on_cpu)
+    return _run(_resolve(command), attach, run, on_cpu, ())
 
 
 def _run(
-    program: _Program, attach: Attach | None, instead: Callable[[str, dict[str, Any]], None] | None, on_cpu: bool
+    program: _Program,
+    attach: Attach | None,
+    instead: Callable[[str, dict[str, Any]], None] | None,
+    on_cpu: bool,
+    stand_ins: Container[str],
 ) -> int:
     with _as_main_program(program), _known_to_processes(), _whole_checkpoints():
         try:
@@ -66,12 +73,14 @@ def _run(
         except SkipGSError:
             raise
         except BaseException as error:
-            if on_cpu and (sentence := stand_in_hint(error)):
+            missing = error.name if isinstance(error, ModuleNotFoundError) else None
+            sentence = stand_in_hint(error) if on_cpu else None
+            if sentence is None and missing:
+                sentence = install_hint(missing, program.source, on_cpu, stand_ins)
+            if sentence is None or (missing and not (on_cpu and is_extension(missing))):
+                _print_traceback(error, program)
+            if sentence is not None:
                 say(sentence)
-                return 1
-            _print_traceback(error, program)
-            if isinstance(error, ModuleNotFoundError) and error.name:
-                say(install_hint(error.name, program.source, on_cpu))
             return 130 if isinstance(error, KeyboardInterrupt) else 1
     return 0
 
@@ -114,6 +123,8 @@ def _resolve(command: Sequence[str]) -> _Program:
         folder = Path(sys.executable).parent
         source = _source_of(installed.module) or folder / name
         return _Program([str(folder / name), *arguments], folder, source, functools.partial(_call, installed))
+    if script.is_dir():
+        raise SkipGSError(f"{script} is a folder: name the training script in it after '--'.")
     raise SkipGSError(f"There is no script {script}: name the training script after '--'.")
 
 

@@ -289,6 +289,7 @@ def test_no_gate_runs_a_script_that_no_adapter_knows(tmp_path, capfd):
     assert (tmp_path / "model").read_text() == "trained"
     assert "train.py runs without a gate, and so without skipgs.json: No adapter knows" in capfd.readouterr().err
     assert cli.main(["run", "auto", "--no-gate", "--cpu", "--", str(script), "x"]) == cli.BAD_INPUT
+    assert "an adapter knows, and none knows train.py: run it without --cpu" in capfd.readouterr().err
 
 
 def test_a_folder_named_like_a_gate_state_ends_no_training(train, tmp_path):
@@ -453,7 +454,8 @@ def test_an_error_while_the_gate_attaches_lets_the_script_train(checkout, tmp_pa
 
 def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(SpeedySplat, "stand_ins", "inria")  # the look-alike has Inria's rasterizer
-    wrong = ["run", "speedy_splat", "--no-gate", "--cpu", "--", checkout, str(tmp_path)]
+    options = ["--always", "5", "--share", "7", "--resume-gate", "absent"]  # without a gate nothing reads them
+    wrong = ["run", "speedy_splat", "--no-gate", *options, "--cpu", "--", checkout, str(tmp_path)]
     assert cli.main(wrong) == 0 and (tmp_path / "model.pth").exists()
     assert "train.py runs without a gate, and so without skipgs.json: Adapter 'speedy_s" in capfd.readouterr().err
     forget()

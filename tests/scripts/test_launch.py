@@ -191,6 +191,8 @@ def test_the_source_of_a_module_is_found_without_importing_its_packages(checkout
 def test_missing_script_is_named(tmp_path):
     with pytest.raises(SkipGSError, match=r"no script .*absent\.py"):
         run_script([str(tmp_path / "absent.py")])
+    with pytest.raises(SkipGSError, match="is a folder: name the training script in it"):
+        run_script([str(tmp_path)])
 
 
 def test_a_module_imported_from_elsewhere_is_refused(checkout, tmp_path, monkeypatch):
@@ -240,3 +242,14 @@ def test_error_while_attaching_is_the_scripts(checkout, capfd):
     error = capfd.readouterr().err
     assert "neighbour_of_script/__init__.py" in error and "launch.py" not in error
     assert "simple_knn is a CUDA extension" in error
+
+
+def test_the_cpu_is_advised_only_where_it_serves_the_module(checkout, capfd):
+    script = write(checkout, "import diff_of_fork\n")
+    for stand_ins in ((), ("diff_of_fork",)):
+        assert run_script([script], stand_ins=stand_ins) == 1
+        error = capfd.readouterr().err
+        assert "Traceback" in error and ("--cpu before '--'" in error) == bool(stand_ins)
+    assert run_script([script], on_cpu=True) == 1
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1 and "no CPU stand-in: run the script on a GPU, without --cpu" in error

@@ -19,7 +19,7 @@ import random
 from collections.abc import Iterable
 from typing import Any
 
-from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.errors import GateStateError
 
 # Ends of the cycles, as shares of the iterations that may run. Training is judged at the first two ends.
 CYCLE_ENDS = (0.125, 0.25, 1.0)
@@ -39,10 +39,28 @@ def watched_views(names: Iterable[str], iterations: float, seed: int = 0) -> fro
         seed: Seed of the draw.
     """
     names = sorted(names)
-    count = min(MOST_WATCHED, round(len(names) * WATCHED_FRACTION))
-    if count < LEAST_WATCHED or CYCLE_ENDS[0] * iterations < len(names):
+    if why_none_watched(len(names), iterations) is not None:
         return frozenset()
-    return frozenset(random.Random(seed).sample(names, count))
+    return frozenset(random.Random(seed).sample(names, _watched(len(names))))
+
+
+def why_none_watched(views: int, iterations: float) -> str | None:
+    """Return why no view can be watched, as a clause; None if views can be watched.
+
+    Args:
+        views: Number of training views.
+        iterations: Number of iterations that may run.
+    """
+    if _watched(views) < LEAST_WATCHED:
+        return f"a twelfth of {views} training views is less than {LEAST_WATCHED} views"
+    if CYCLE_ENDS[0] * iterations < views:
+        cycle = math.floor(CYCLE_ENDS[0] * iterations)
+        return f"the first cycle of {cycle:,} iterations is too short to show each of {views} training views"
+    return None
+
+
+def _watched(views: int) -> int:
+    return min(MOST_WATCHED, round(views * WATCHED_FRACTION))
 
 
 class EarlyStopping:
@@ -138,7 +156,7 @@ class EarlyStopping:
             SkipGSError: No run has such cycles.
         """
         if tuple(state["ends"]) not in (CYCLE_ENDS, ONE_CYCLE) or not 0 <= state["cycle"] < len(state["ends"]):
-            raise SkipGSError(
+            raise GateStateError(
                 f"The gate state is in cycle {state['cycle']} of cycles that end at {state['ends']}, which no run has; "
                 "start the gate afresh."
             )

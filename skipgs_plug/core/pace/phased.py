@@ -7,7 +7,7 @@ from typing import Any
 
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.errors import GateStateError, SkipGSError
 from skipgs_plug.core.pace.base import Always, Known, Pace, Source, nothing_always, nothing_known
 from skipgs_plug.core.pace.growing import Growing
 from skipgs_plug.core.pace.loop_facts import LoopFacts
@@ -274,7 +274,7 @@ class Phased(Pace):
         growing = state["growing"]
         asked = state.get("grow_asked", None if growing is None else growing["asked"])
         if (state["refining"]["asked"], asked) != (self._config.refining, self._config.growing):
-            raise SkipGSError(
+            raise GateStateError(
                 f"The gate state was saved with refine_share={state['refining']['asked']!r} and "
                 f"grow_share={asked!r}, not {self._config.refining!r} and {self._config.growing!r}; continue with "
                 "those settings, or start the gate afresh."

@@ -163,7 +163,7 @@ class ScaledRates:
                 f"{self._unstepped} iterations ran with larger steps, and no torch.optim.Optimizer stepped in the "
                 "thread of the loop. The optimizer of this loop is not one of PyTorch's, or steps elsewhere, so its "
                 "steps are not larger: derive it from torch.optim.Optimizer, let it read the lr of its param_groups, "
-                "and step in the thread of the loop, or give compensate=False."
+                "and step in the thread of the loop, or give compensate=False (--compensate False)."
             )
             if self._unstepped == UNSTEPPED_RAISES:
                 raise SkipGSError(sentence)

@@ -8,8 +8,8 @@ from typing import Any
 
 from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, ONE_CYCLE, EarlyStopping, watched_views
+from skipgs_plug.core.errors import GateStateError, SkipGSError
+from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, ONE_CYCLE, EarlyStopping, watched_views, why_none_watched
 from skipgs_plug.core.pace.needs import MOST_RAISED_SHARE, refining_share
 from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates, path_factor
@@ -53,6 +53,7 @@ class Refining(Phase):
         self.stopping: EarlyStopping | None = None
         self.always: dict[str, set[int]] = {}
         self.watched: frozenset[str] = frozenset()
+        self._why_none_watched: str | None = None
         self._first: int | None = None
         self._last: int | None = None
         self._must: frozenset[int] = frozenset()
@@ -103,16 +104,17 @@ class Refining(Phase):
                 )
             self.share = refining_share(total, plan.epoch, grown)
         assert self.share is not None
-        # Several processes train on different views at a time, so no view can be watched and kept out of training.
-        if self._judges and plan.views is not None and self.stopping is None and distributed.group_size() == 1:
-            self.watched = watched_views(plan.views, self.share * total)
+        if self._judges:
+            self._why_none_watched = self._unwatchable(plan, self.share * total)
+            if plan.views is not None and self._why_none_watched is None and self.stopping is None:
+                self.watched = watched_views(plan.views, self.share * total)
         # Iterations are spread evenly if gradients accumulate, so that each step gets some.
         spread = plan.accumulates or plan.steps_each
         scales = self._scales
         self._shrinks, self._steps_each = scales and spread, plan.steps_each
         if not scales or spread:
             if self.stopping is not None:
-                raise SkipGSError(
+                raise GateStateError(
                     "The gate state was saved with larger, shrinking steps, which are off now; continue with the same "
                     "compensate setting, or start the gate afresh."
                 )
@@ -228,6 +230,15 @@ class Refining(Phase):
         """
         return self._auto and not self._grown_by_few
 
+    @staticmethod
+    def _unwatchable(plan: PhasePlan, iterations: float) -> str | None:
+        """Return why no view can be watched, as a clause; None if views can be watched."""
+        if distributed.group_size() > 1:  # they train on different views at a time, so none can be kept out of training
+            return "several processes train"
+        if plan.views is None:
+            return "the trainer does not tell its training views"
+        return why_none_watched(len(plan.views), iterations)
+
     @property
     def _scales(self) -> bool:
         """Whether learning rates change."""
@@ -280,6 +291,7 @@ class Refining(Phase):
                 "gains_db": [list(gain) for gain in stopping.gains],
                 "rest_worth_db": stopping.gain_left,
                 "watched": sorted(self.watched),
+                "why_none_watched": self._why_none_watched,
             },
         }
 
@@ -300,7 +312,7 @@ class Refining(Phase):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         share = state["share"]
         if not (self._auto and state["first"] is None if share is None else 0.0 < share <= 1.0):
-            raise SkipGSError(f"The gate state has share={share!r}, expected one in (0, 1]; start the gate afresh.")
+            raise GateStateError(f"The gate state has share={share!r}, expected one in (0, 1]; start the gate afresh.")
         self.share, self._first = share, state["first"]
         self.sampling.load_state_dict(state["sampling"])
         self.watched = frozenset(state["watched"])

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, EarlyStopping, mean_gain, watched_views
+from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, EarlyStopping, mean_gain, watched_views, why_none_watched
 from skipgs_plug.core.pace.needs import refining_share
 
 VIEWS = [f"{i}.png" for i in range(6)]
@@ -100,6 +100,8 @@ def test_watched_views_are_few_and_always_the_same():
     assert len(watched_views(names[:46], 1000)) == 4 and len(watched_views(names[:31], 1000)) == 3
     assert watched_views(names[:17], 1000) == watched_views(names[:1], 1000) == frozenset()
     assert len(watched_views(names, 8 * 255)) == 12 and not watched_views(names, 8 * 255 - 1)  # a cycle shows not all
+    assert why_none_watched(255, 8 * 255) is None
+    assert "254 iterations is too short to show each of 255" in str(why_none_watched(255, 8 * 255 - 1))
 
 
 def test_gain_in_decibels():
