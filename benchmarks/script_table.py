@@ -30,14 +30,28 @@ def table(runs: list[Run]) -> str:
         draws = rows.setdefault((run["scene"], run["script"], run["iterations"]), {})
         draws.setdefault(run["points_seed"], {})[run["mode"]] = run
     lines: list[str] = []
+    shown: list[Pair] = []
     for scene in dict.fromkeys(key[0] for key in rows):
         lines += [f"{scene}:", "", HEAD, "|---" + "|---:" * 10 + "|"]
         for key, draws in rows.items():
             pairs = [pair for _, pair in sorted(draws.items()) if pair.keys() >= {"own", "auto"}]
             if key[0] == scene and pairs:
                 lines.append(row(key[1], key[2], pairs))
+                shown += pairs
         lines.append("")
-    return "\n".join(lines)
+    return "\n".join([*lines, *notes(shown)])
+
+
+def notes(pairs: list[Pair]) -> list[str]:
+    """Return the sentences below the table, as lines."""
+    differ = sum(pair["own"]["package_commit"] != pair["auto"]["package_commit"] for pair in pairs)
+    return [
+        "Seconds with a star are from a core that other programs used, too, which makes them too high. The percentage",
+        "compares only pairs whose runs are alike in this.",
+        "",
+        f"In {differ} of {len(pairs)} pairs the own run is from another version of this package than the run with auto",
+        "(`runs.json` has the commits). Rounding differs between versions, which alone moves a run by 0.0 to 0.5 dB.",
+    ]
 
 
 def row(script: str, iterations: int, pairs: list[Pair]) -> str:

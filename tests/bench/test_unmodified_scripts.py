@@ -125,14 +125,17 @@ def test_sized_scene_has_cameras_of_the_photographs_and_lists_every_eighth_by_na
 def test_table_has_means_over_draws_of_the_points_and_each_difference():
     def one(mode, seed, psnr, **changed):
         run = {"scene": "fern", "script": "Tiny", "iterations": 100, "mode": mode, "points_seed": seed, "psnr": psnr}
+        run |= {"package_commit": "1"}
         return {**run, "iterations_run": 40, "seconds": 2.0, "gaussians": 10, "ssim": 0.5, **changed}
 
     runs = [one("own", 0, 30.0), one("auto", 0, 31.0, seconds=1.0, gaussians=None)]
-    assert table(runs).splitlines()[-1] == (
+    assert table(runs).splitlines()[4] == (
         "| Tiny | 100 | 40 | 2 | 1 | 50 | 10 |  | 30.00 (0.5000) | 31.00 (0.5000) | +1.00 |"
     )
     runs += [one("own", 1, 32.0, seconds=4.0, ssim=0.6), one("own", 2, 20.0)]  # the last has no partner
     runs += [one("auto", 1, 31.5, gaussians=30, iterations_run=50, busy_core=True)]
-    assert table(runs).splitlines()[-1] == (
+    assert table(runs).splitlines()[4] == (
         "| Tiny | 100 | 45 | 3 | 2* | 50 | 10 |  | 31.00 (0.5500) | 31.25 (0.5000) | +0.25 (+1.00, -0.50) |"
     )
+    runs[-1]["package_commit"] = "2"
+    assert "In 1 of 2 pairs the own run is from another version" in table(runs)
