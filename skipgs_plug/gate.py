@@ -161,8 +161,8 @@ class SkipGate:
                 the gate decides on each view separately, and one backward pass runs on the sum of the kept losses.
             view: Stable key of the view: image name or index. For a joint loss of a batch, one constant key.
             step: Iteration, counted like `start_iter`.
-            signal: Value (or list of values) to decide by, when it is not the loss itself: the image term, or
-                the loss before an AMP scaler.
+            signal: Value (or list of values) to decide by, when it is not the loss itself, such as the image term.
+                A loss that `torch.amp.GradScaler` has scaled stands for the loss before.
 
         Raises:
             GateOrderError: In the first iteration, `backward` was already called for this view, or `update` or `step`
@@ -287,7 +287,7 @@ class SkipGate:
         Under `skipgs-plug run` the list also holds the names that are replaced while the script runs: `torch.save`,
         `torch.load` (with `weights_only=False` unless the script sets it) and, with `--cpu`, names of `torch.cuda`.
         """
-        own = [] if self._hooks is None else self._hooks.patched
+        own = self._loop.patches.names if self._hooks is None else self._hooks.patched
         return [*own, *self._adapter.replaced] if own and self._adapter is not None else own
 
     def stats(self) -> dict[str, Any]:
@@ -361,6 +361,7 @@ class SkipGate:
         """Restore everything that was replaced. Counters and summary stay readable."""
         if self._hooks is not None:
             self._hooks.restore()
+        self._loop.patches.restore()
         self._engine.remove()
 
     def __enter__(self) -> SkipGate:

@@ -17,6 +17,7 @@ from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.errors import GateOrderError, GateStateError, SkipGSError
 from skipgs_plug.core.gated_iteration import GatedIteration
+from skipgs_plug.core.loss_scaler import unscaled
 from skipgs_plug.core.nonfinite import NonFiniteGuard
 from skipgs_plug.core.pace.choose import pace_of
 from skipgs_plug.core.pace.rates import ScaledRates
@@ -182,7 +183,7 @@ class Engine:
         self.clock.open(post)
 
     def gate(
-        self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor | None = None, alone: bool = False
+        self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor, alone: bool = False
     ) -> bool:
         """Call `run`, a real backward pass, unless it is skipped; return True if gradients were computed and kept.
 
@@ -191,9 +192,9 @@ class Engine:
 
         Args:
             view: Key of the view.
-            signal: Value to decide by.
+            signal: Value to decide by. A loss that a scaler has scaled stands for the loss before.
             run: The backward pass.
-            loss: The tensor whose backward pass runs, if it is not the signal.
+            loss: The tensor whose backward pass runs.
             alone: Whether the iteration has no other backward pass, so that a skipped graph can be freed at once.
         """
         now = self.iteration
@@ -203,10 +204,10 @@ class Engine:
             now.ran = True
             self.clock.mark()
             return True
-        back_from = loss if loss is not None else signal if isinstance(signal, Tensor) else None
-        ahead = self._known_ahead(view, signal, back_from)
+        signal = unscaled(signal)
+        ahead = self._known_ahead(view, signal)
         if ahead is False:
-            skip = self._run_first(view, signal, run, back_from)
+            skip = self._run_first(view, signal, run, loss)
         else:
             # The loss is not read in iterations that train nothing.
             skip = self.decide(view, None if ahead else signal).skip
@@ -214,8 +215,8 @@ class Engine:
                 run()
                 now.ran = True
                 self.rates.ran()
-            elif back_from is not None:
-                self._skipped.append(weakref.ref(back_from))
+            else:
+                self._skipped.append(weakref.ref(loss))
                 if alone:
                     self.free_skipped()
         self.clock.mark()
@@ -229,10 +230,10 @@ class Engine:
                 free_graph(loss)
         self._skipped.clear()
 
-    def _known_ahead(self, view: str, signal: float | Tensor, loss: Tensor | None) -> bool | None:
+    def _known_ahead(self, view: str, signal: float | Tensor) -> bool | None:
         """Whether the backward of a gated iteration is skipped, if that is known without waiting for the loss."""
         now = self.iteration
-        if not (loss is not None and isinstance(signal, Tensor) and copies_in_background(signal.device)):
+        if not (isinstance(signal, Tensor) and copies_in_background(signal.device)):
             return None
         # Other processes must be asked. With accumulation, a non-finite loss would drop earlier gradients too.
         if self._accumulates or self._scene_check.running or distributed.group_size() > 1:
@@ -242,9 +243,9 @@ class Engine:
             return False
         return self.policy.known_ahead(view, now.step)
 
-    def _run_first(self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor | None) -> bool:
+    def _run_first(self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor) -> bool:
         """Launch the backward pass, then decide; return True if its gradients were dropped."""
-        assert isinstance(signal, Tensor) and loss is not None
+        assert isinstance(signal, Tensor)
         copy = HostCopy(signal)
         run()
         self.iteration.ran = True

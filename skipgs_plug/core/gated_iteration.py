@@ -26,7 +26,7 @@ class GatedIteration:
 
     __slots__ = (
         *("backwards", "decision", "ended", "gated", "keys", "opened"),
-        *("ran", "signal", "step", "stepped", "view"),
+        *("ran", "signal", "step", "stepped", "view", "__weakref__"),
     )
 
     def __init__(self) -> None:

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
-from skipgs_plug.core.intercept import Original
+from skipgs_plug.core.intercept import Original, Patches
+from skipgs_plug.core.loss_scaler import guard_scalers, unscaled
 from skipgs_plug.core.optimizers import has_pending_gradient, listed
 from skipgs_plug.core.pace.base import EveryNumber, Source
 from skipgs_plug.core.pace.loop_range import LoopRange
@@ -28,6 +29,7 @@ class OwnLoop:
 
     Attributes:
         guarded: A block of the gate's own code. An error in it releases the gate, and the loop continues.
+        patches: List of the names that are replaced in PyTorch.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -35,6 +37,9 @@ class OwnLoop:
         self._iteration = iteration = engine.iteration
         self._release = engine.release
         self.guarded = self._release.guarded(lambda: iteration.step)
+        self.patches = Patches()
+        if engine.config.enabled and not self._release.attached:  # adapters guard the scalers of their trainers
+            guard_scalers(self.patches, iteration)
 
     def iterations(
         self,
@@ -167,7 +172,7 @@ class OwnLoop:
             raise SkipGSError(f"{len(views)} view keys came with {len(losses)} losses; give one loss per view.")
         keys = [self._new_in_iteration(view) for view in views]  # a batch may hold a view twice
         self._iteration.keys.update(keys)
-        answers = [self._engine.decide(key, signal) for key, signal in zip(keys, signals, strict=True)]
+        answers = [self._engine.decide(key, unscaled(signal)) for key, signal in zip(keys, signals, strict=True)]
         kept = [loss for loss, answer in zip(losses, answers, strict=True) if not answer.skip]
         if kept:
             run(kept)

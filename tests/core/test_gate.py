@@ -256,7 +256,6 @@ def test_trace_holds_the_mean_before_the_loss() -> None:
 def test_config_object_serves_as_well() -> None:
     gate = SkipGate(config=SkipConfig(start_iter=7, warmup=1))
     assert gate.config.start_iter == 7
-    assert gate.patched == []
 
 
 def test_clock_separates_the_part_from_start_on() -> None:

@@ -107,7 +107,7 @@ def plain(trainer: ToyTrainer) -> bool:
 def test_gates_counts_and_leaves_nothing_behind() -> None:
     trainer = ToyTrainer()
     with attach(trainer) as gate:
-        assert len(gate.patched) == 8
+        assert len(gate.patched) == 9
         trainer.train()
         gate.verify()
     assert plain(trainer)
@@ -146,7 +146,7 @@ def test_a_loss_scaler_survives_iterations_without_gradients() -> None:
         trainer.train()
     assert gate.released is None and gate.stats()["backwards_skipped"] == 79
     assert trainer.optimizer.state[trainer.parameter]["step"] == 21
-    assert not hasattr(torch.amp.GradScaler.step, "__skipgs_plug__")
+    assert gate.patched == []
     with attach(never, warmup=100):
         never.train()
     plain_one = ScaledTrainer()
