@@ -48,8 +48,9 @@ class ViewMeans:
         Raises:
             SkipGSError: Two keys have the same text, such as 6 and "6".
         """
-        state = {str(view): mean for view, mean in self.values.items()}
-        if len(state) != len(self.values):
+        values = list(self.values.items())  # another thread may train meanwhile
+        state = {str(view): mean for view, mean in values}
+        if len(state) != len(values):
             raise SkipGSError("Two view keys have the same text; use image names as view keys.")
         return state
 

@@ -98,7 +98,7 @@ class GateStats:
             "skips": self.skips,
             "reasons": dict(self.reasons),
             "events": dict(self.changes),
-            "views": {view: list(row) for view, row in self._views.items()},
+            "views": {view: list(row) for view, row in list(self._views.items())},  # another thread may train meanwhile
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
