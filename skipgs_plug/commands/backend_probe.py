@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import warnings
 
 LONGEST = 600  # seconds until a backend counts as hanging; compiling all kernels takes about a minute
 # The child finds the package in the same place as this process, installed or not.
@@ -39,11 +40,13 @@ def how_it_ended(code: int) -> str:
 def main(name: str) -> None:
     """Try a backend in this process. Print the result, and exit with 0 if it works, else with 1."""
     try:
-        finding = render(name)
+        with warnings.catch_warnings(record=True) as cautions:
+            warnings.simplefilter("always", RuntimeWarning)
+            finding = render(name)
     except Exception as error:  # any error is a result
         print(str(error).splitlines()[0] if str(error) else type(error).__name__)
         raise SystemExit(1) from None
-    print(finding)
+    print(finding, *(caution.message for caution in cautions), sep="; ")
 
 
 def render(name: str) -> str:

@@ -14,7 +14,8 @@ import torch
 from raster_scenes import leaves, random_scene
 
 from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
-from skipgs_plug.fallback_raster.runtime.cache import load_or_rebuild, say_unwritable
+from skipgs_plug.fallback_raster.runtime import cache
+from skipgs_plug.fallback_raster.runtime.cache import load_or_rebuild
 from skipgs_plug.fallback_raster.runtime.constants import SPARE_COUNTS
 from skipgs_plug.fallback_raster.stages import binning
 from skipgs_plug.fallback_raster.stages.structs import grid
@@ -271,15 +272,43 @@ assert len(started) == 1, started
     run("-c", code)
 
 
-def test_a_cache_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
+def test_kernels_are_kept_in_a_temporary_folder_if_the_cache_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
+    (tmp_path / "temporary").mkdir()
+    places = {"WARP_CACHE_PATH": str(tmp_path / "file/cache"), "TMPDIR": str(tmp_path / "temporary")}
+    said = run("-c", LISTED, **places)
+    assert said.count("file/cache (Not a directory), and each process compiles them again: set WARP_CACHE_PATH") == 1
+    assert list((tmp_path / "temporary").iterdir()) == []
     code = "import sys\nfrom skipgs_plug.commands.doctor import check_backend\ncheck_backend('warp')"
-    said = run("-c", code, WARP_CACHE_PATH=str(tmp_path / "file/cache"))
-    assert len(said.splitlines()) == 1 and "Errno" not in said
-    assert "Not a directory; set WARP_CACHE_PATH to a folder that can be written." in said
-    folder = tmp_path / "kernel"
-    with pytest.raises(WriteError, match=f"compiled kernels in {folder}: Read-only file system"), say_unwritable():
-        raise OSError(errno.EROFS, "Read-only file system", str(folder))
+    (line,) = run("-c", code, **places).splitlines()
+    assert "  ok  warp" in line and line.endswith("set WARP_CACHE_PATH to a folder that can be written.")
+
+
+# Warp begins with a folder that exists, and finds only later that it cannot write there.
+LATER = """
+import warp
+from skipgs_plug.fallback_raster.runtime.native import _warp
+
+_warp().config.kernel_cache_dir += "/../../file/cache"
+"""
+
+
+def test_a_cache_that_cannot_be_written_later_ends_no_training(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    said = run("-c", LATER + LISTED, WARP_CACHE_PATH=str(tmp_path / "cache"))
+    assert said.count("each process compiles them again") == 1
+
+
+def test_without_any_folder_the_fix_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(**_: object) -> None:
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found")
+
+    monkeypatch.setattr(cache, "TemporaryDirectory", fails)
+    monkeypatch.setattr(cache, "_temporary", [])
+    refused = OSError(errno.EROFS, "Read-only file system", "/cache/kernel")
+    sentence = r"in /cache/kernel \(Read-only file system\), and there is no temporary folder: set WARP_CACHE_PATH"
+    with pytest.raises(WriteError, match=sentence):
+        cache.in_temporary_folder(None, refused)
 
 
 def test_what_does_not_load_is_compiled_again_once(tmp_path: Path) -> None:

@@ -8,9 +8,10 @@ import hashlib
 import os
 import shutil
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import warnings
+from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from skipgs_plug.files import WriteError
@@ -18,21 +19,38 @@ from skipgs_plug.files import WriteError
 _SUM = "sha256"
 
 
-@contextmanager
-def say_unwritable() -> Iterator[None]:
-    """Turn a failure to write a kernel inside the `with` statement into one clear sentence.
+_choosing = threading.Lock()
+_temporary: list[TemporaryDirectory[str]] = []  # of this process, removed when it ends
+
+
+def in_temporary_folder(wp: Any, error: OSError) -> None:
+    """Let Warp keep kernels in a temporary folder, because its cache cannot be written; warn once.
+
+    Args:
+        wp: The module `warp`.
+        error: The failure to write.
 
     Raises:
-        WriteError: The cache cannot be written. The message names the file and the fix.
+        WriteError: There is no temporary folder that can be written. The message names the file and the fix.
     """
-    try:
-        yield
-    except OSError as error:
-        why = os.strerror(error.errno) if error.errno else str(error)
-        raise WriteError(
-            f"The CPU rasterizer cannot keep its compiled kernels in {error.filename or 'Warp'}: {why}; "
-            "set WARP_CACHE_PATH to a folder that can be written."
-        ) from error
+    with _choosing:
+        if _temporary:
+            return
+        try:
+            # Nobody else can put native code into it, unlike a folder whose name is known.
+            _temporary.append(TemporaryDirectory(prefix="skipgs-plug-kernels-", ignore_cleanup_errors=True))
+        except OSError as second:
+            raise WriteError(_sentence(error, "there is no temporary folder")) from second
+        wp.config.kernel_cache_dir = _temporary[0].name
+    warnings.warn(_sentence(error, "each process compiles them again"), RuntimeWarning, stacklevel=3)
+
+
+def _sentence(error: OSError, then: str) -> str:
+    why = os.strerror(error.errno) if error.errno else str(error)
+    return (
+        f"The CPU rasterizer cannot keep its compiled kernels in {error.filename or 'Warp'} ({why}), and {then}: "
+        "set WARP_CACHE_PATH to a folder that can be written."
+    )
 
 
 def load_or_rebuild(folder: Path, load: Callable[[], Any], forget: Callable[[], None]) -> Any:
@@ -47,7 +65,7 @@ def load_or_rebuild(folder: Path, load: Callable[[], Any], forget: Callable[[], 
         The kernel that `load` returned.
 
     Raises:
-        WriteError: The kernel has to be compiled, but the folder cannot be written.
+        OSError: The kernel has to be compiled, but the folder cannot be written.
     """
     if any(_checksum(path) != _expected(path) for path in folder.glob("*.o") if _expected(path) is not None):
         shutil.rmtree(folder, ignore_errors=True)

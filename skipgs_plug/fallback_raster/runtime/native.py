@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from skipgs_plug.install import install_command
 
-from .cache import load_or_rebuild, say_unwritable
+from .cache import in_temporary_folder, load_or_rebuild
 
 
 class Kernel(NamedTuple):
@@ -45,6 +45,7 @@ def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:
 
     Raises:
         ImportError: Warp is not installed.
+        WriteError: The kernel has to be compiled, but neither the cache nor a temporary folder can be written.
     """
     wp = _warp()
     signature = ", ".join(f"{parameter}: {kind}" for parameter, kind in parameters.items())
@@ -59,14 +60,21 @@ def load_kernel(name: str, parameters: dict[str, str], code: str) -> Kernel:
     namespace[f"{name}_body"] = wp.func_native(code)(body)
     kernel = wp.kernel(enable_backward=False)(namespace[name])
     inputs = [0] * len(parameters)
-    # Warp's module identifier depends on the number of threads per block, which is 1 on the CPU.
-    folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(1)
 
     def load() -> Any:
-        with say_unwritable():
-            return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
+        return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
 
-    command = load_or_rebuild(folder, load, kernel.module.unload)
+    def load_from_cache() -> Any:
+        # Warp's module identifier depends on the number of threads per block, which is 1 on the CPU.
+        folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(1)
+        return load_or_rebuild(folder, load, kernel.module.unload)
+
+    try:
+        command = load_from_cache()
+    except OSError as error:
+        in_temporary_folder(wp, error)
+        kernel.module.unload()
+        command = load_from_cache()
     bounds, *values = command.params
     pack = _packer(f"{name}_arguments", dict(zip(parameters, map(type, values), strict=True)))
     run = command.hooks.forward
@@ -107,8 +115,13 @@ def _started_warp() -> Any:
         raise ImportError(f"The CPU rasterizer needs NVIDIA Warp: {install_command()}.") from error
     wp.config.quiet = True
     wp.config.log_level = wp.LOG_ERROR
-    with _quiet_stderr(), say_unwritable():
-        wp.init()
+    try:
+        with _quiet_stderr():
+            wp.init()
+    except OSError as error:
+        in_temporary_folder(wp, error)
+        with _quiet_stderr():
+            wp.init()
     return wp
 
 
