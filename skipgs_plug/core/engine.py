@@ -169,10 +169,9 @@ class Engine:
         if self.iteration.step is None:
             self._go_on_from_saved(step)
             self._saved_state = None
-        before = self.iteration.step
-        if before is not None and step < before:
+        if self.iteration.step is not None and step < self.iteration.step:
             raise GateOrderError(
-                f"Iterations went back from {before} to {step}: load the gate state that belongs to "
+                f"Iterations went back from {self.iteration.step} to {step}: load the gate state that belongs to "
                 "the checkpoint, or attach a new gate."
             )
         self.pace.begin(step, self.policy)
