@@ -15,8 +15,10 @@ from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
 from skipgs_plug.commands.options.run import Args
 from skipgs_plug.compat import FAMILIES, serve
+from skipgs_plug.core.errors import BrokenTrainingError
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster import ADAM_REPLACED, instead_of_torchs_adam
+from skipgs_plug.files import WriteError
 from skipgs_plug.messages import say, show
 from skipgs_plug.scripts import spawned
 from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
@@ -96,7 +98,10 @@ def verify(code: int, gate: SkipGate | None) -> None:
 def run_gated(
     args: Args, command: list[str], execute: Callable[[Attach], int], rank: int = 0
 ) -> tuple[int, SkipGate | None]:
-    """Attach a gate to the script that `execute(attach)` runs, and write skipgs.json if `rank` is 0."""
+    """Attach a gate to the script that `execute(attach)` runs, and write skipgs.json if `rank` is 0.
+
+    A run that the gate refuses has trained nothing, so it leaves a report of an earlier run as it is.
+    """
     adapter = get_adapter(args.adapter)()
     # Without a gate nothing is refused that only a gate would need.
     checkpoints = Checkpoints(args.adapter, script_name(command), "off" if args.no_gate else args.resume_gate)
@@ -104,6 +109,7 @@ def run_gated(
     adapter.replaced = (*REPLACED, *(for_cpu if args.cpu else ()))
     settings = {"enabled": False} if args.no_gate else args.gate_options.given()
     gates: list[SkipGate] = []
+    refused = False
 
     def attach() -> dict[str, Any]:
         if not args.no_gate:
@@ -121,13 +127,16 @@ def run_gated(
     def finish() -> None:
         for gate in gates:
             gate.detach()
-            if rank == 0:
+            if rank == 0 and not refused:
                 report(gate, adapter)
 
     with cpu_instead_of_cuda(args, command) if args.cpu else contextlib.nullcontext():
         try:
             with checkpoints.watch(), before_os_exit(finish):
                 code = execute(attach)
+        except SkipGSError as error:
+            refused = not isinstance(error, BrokenTrainingError)
+            raise
         finally:
             finish()
     return code, gates[0] if gates else None
@@ -148,8 +157,10 @@ def report(gate: SkipGate, adapter: AbstractAdapter) -> None:
         return
     path = Path(adapter.output_folder or ".") / "skipgs.json"
     try:
-        write_report(gate, path)
         show(gate.summary())
+        write_report(gate, path)
+    except WriteError as error:
+        say(str(error))
     except Exception as error:  # the model is trained, so the script's exit code stands
         say(f"{path} could not be written ({type(error).__name__}: {error}).")
 

@@ -12,9 +12,10 @@ from pkgutil import resolve_name
 import pytest
 import torch
 
-from skipgs_plug import cli
+from skipgs_plug import SkipGSError, cli
 from skipgs_plug.adapters.speedy_splat import SpeedySplat
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.policy import SkipPolicy
 from skipgs_plug.scripts.checkpoints import Checkpoints
 
 RENDERER = """
@@ -328,6 +329,25 @@ def test_gate_state_of_another_scene_is_not_used(train, capfd):
         code, folder = train("bright", *start, "--bright")
     assert code == 0  # the losses tell it only after some iterations: the gate is released, and the run goes on
     assert counted(folder)["iterations"] == 40 + 10
+
+
+def test_a_run_that_is_refused_leaves_the_report_of_the_run_before(train, monkeypatch):
+    _, folder = train("whole", "--save")
+    before = (folder / "skipgs.json").read_bytes()
+
+    def refuses(*args):
+        raise SkipGSError("This scene is refused.")
+
+    monkeypatch.setattr(SkipPolicy, "decide", refuses)
+    code, _ = train("whole", "--start", str(folder / "chkpnt40.pth"))
+    assert code == cli.BAD_INPUT and (folder / "skipgs.json").read_bytes() == before
+
+
+def test_a_report_that_cannot_be_written_is_one_sentence(train, tmp_path, capfd):
+    (tmp_path / "blocked" / "skipgs.json").mkdir(parents=True)
+    code, folder = train("blocked")
+    sentence = "skipgs.json cannot be written (Is a directory): "
+    assert code == 0 and (folder / "model.pth").exists() and capfd.readouterr().err.count(sentence) == 1
 
 
 def test_gate_state_of_another_run_is_left_alone(train, capfd):
