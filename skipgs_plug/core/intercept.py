@@ -154,7 +154,8 @@ def intercept_tensor_backward(
     """Pass scalar backward calls of functions with these names to `gated`.
 
     `torch.Tensor.backward` is replaced in the whole process. Calls from other functions, such as for a pruning score,
-    and calls on tensors that are not scalars go to the original.
+    and calls on tensors that are not scalars go to the original. The caller of a function `backward` that makes the
+    call, such as `Accelerator.backward` of accelerate, counts as its caller.
 
     Args:
         patches: List of replacements, to which this one is added.
@@ -164,7 +165,10 @@ def intercept_tensor_backward(
 
     def around(original: Callable[..., Any], loss: torch.Tensor, *args: Any, **kwargs: Any) -> Any:
         # Frame 0 is this function, frame 1 the wrapper, frame 2 the caller of backward.
-        if sys._getframe(2).f_code.co_name not in callers or loss.numel() != 1:
+        frame: types.FrameType | None = sys._getframe(2)
+        while frame is not None and frame.f_code.co_name == "backward":
+            frame = frame.f_back
+        if frame is None or frame.f_code.co_name not in callers or loss.numel() != 1:
             return original(loss, *args, **kwargs)
         return gated(loss, lambda: original(loss, *args, **kwargs))
 

@@ -121,6 +121,32 @@ def test_only_the_training_backward_is_handed_over() -> None:
     assert torch.Tensor.backward is original
 
 
+class Accelerator:
+    """Calls backward as accelerate, Fabric and precision plugins do."""
+
+    def backward(self, loss: torch.Tensor) -> None:
+        loss.backward()
+
+
+def test_a_backward_that_calls_backward_is_not_its_caller() -> None:
+    patches, seen = Patches(), []
+    intercept_tensor_backward(patches, ("training",), lambda loss, run: seen.append(loss.item()))
+
+    def training(loss: torch.Tensor) -> None:
+        Accelerator().backward(loss)
+
+    def score(loss: torch.Tensor) -> None:
+        Accelerator().backward(loss)
+
+    a, b = (torch.ones(1, requires_grad=True) for _ in range(2))
+    try:
+        training(a.sum())
+        score(b.sum())
+    finally:
+        patches.restore()
+    assert seen == [1.0] and a.grad is None and b.grad is not None
+
+
 def test_the_real_backward_keeps_its_arguments() -> None:
     patches = Patches()
     intercept_tensor_backward(patches, ("training_twice",), lambda loss, run: run())
