@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -109,7 +110,7 @@ def run_gated(
     adapter.replaced = (*REPLACED, *(for_cpu if args.cpu else ()))
     settings = {"enabled": False} if args.no_gate else args.gate_options.given()
     gates: list[SkipGate] = []
-    refused = False
+    refused, process = False, os.getpid()
 
     def attach() -> dict[str, Any]:
         if not args.no_gate:
@@ -127,7 +128,7 @@ def run_gated(
     def finish() -> None:
         for gate in gates:
             gate.detach()
-            if rank == 0 and not refused:
+            if rank == 0 and not refused and os.getpid() == process:  # not in a child that the script forked
                 report(gate, adapter)
 
     with cpu_instead_of_cuda(args, command) if args.cpu else contextlib.nullcontext():

@@ -4,6 +4,7 @@ import errno
 import io
 import json
 import os
+import subprocess
 import sys
 import textwrap
 from pathlib import Path
@@ -206,6 +207,17 @@ def test_script_that_ends_its_process_leaves_a_report_first(checkout, tmp_path, 
     text = Path(checkout).read_text().replace('print("Training complete.")', "__import__('os')._exit(4)")
     Path(checkout).write_text(text)
     assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 4
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
+def test_a_forked_child_that_ends_leaves_no_report(checkout, tmp_path):
+    forks = "if iteration == 30 and os.fork() == 0: sys.exit()\n        if iteration == 40: sys.exit(os.wait()[1])\n"
+    text = Path(checkout).read_text().replace("import random", "import os, random")
+    Path(checkout).write_text(text.replace("        loss.backward()", f"        {forks}        loss.backward()"))
+    command = [sys.executable, "-m", "skipgs_plug", "run", "inria", "--cpu", "--", checkout, str(tmp_path)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0 and run.stderr.count("SkipGS: ") == 1
+    assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 39
 
 
 def test_script_that_never_trains_keeps_its_code(checkout, tmp_path, capfd):
