@@ -108,7 +108,8 @@ def run_gated(
     checkpoints = Checkpoints(args.adapter, script_name(command), "off" if args.no_gate else args.resume_gate)
     for_cpu = (*CUDA_REPLACED, ADAM_REPLACED)
     adapter.replaced = (*REPLACED, *(for_cpu if args.cpu else ()))
-    settings = {"enabled": False} if args.no_gate else args.gate_options.given()
+    off = {"enabled": False, "start_iter": args.gate_options.start_iter}  # `t_post` begins there without a gate, too
+    settings = off if args.no_gate else args.gate_options.given()
     gates: list[SkipGate] = []
     refused, process = False, os.getpid()
 

@@ -96,7 +96,7 @@ def _skipped() -> bool:
 
 
 def _restore_after_last() -> None:
-    if not any(True for _ in _guarded):
+    if not any(True for _ in _guarded):  # `len` may still count a gate that is being dropped
         _replaced.restore()
 
 

@@ -28,7 +28,7 @@ def is_extension(module: str) -> bool:
     return module.startswith(EXTENSIONS)
 
 
-def install_hint(module: str, script: Path, on_cpu: bool = False, stand_ins: Container[str] = ()) -> str:
+def install_hint(module: str, script: Path, stand_ins: Container[str] = ()) -> str:
     """Return a sentence that explains how to install a missing module.
 
     The sentence names a package only if the requirements of the checkout list it or if `PACKAGES` holds the module.
@@ -38,17 +38,11 @@ def install_hint(module: str, script: Path, on_cpu: bool = False, stand_ins: Con
     Args:
         module: Name of the missing module.
         script: File of the script that imports the module.
-        on_cpu: Whether CPU stand-ins replace CUDA modules.
         stand_ins: Modules that `--cpu` replaces for this trainer.
     """
     top = module.partition(".")[0]
     if top in OF_CHECKOUTS:
         return f"{script.name} is not in its checkout: its folder has no {top}. Run the script in a complete checkout."
-    if is_extension(top) and on_cpu:
-        return (
-            f"{top} is a CUDA extension for which this adapter has no CPU stand-in: run the script on a GPU, without "
-            "--cpu."
-        )
     if is_extension(top):
         cpu = ", or run on the CPU with --cpu before '--'" if top in stand_ins else ""
         return f"{top} is a CUDA extension of the trainer: build it as the trainer's README says{cpu}."

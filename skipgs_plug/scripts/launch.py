@@ -18,7 +18,7 @@ import torch
 
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.messages import say
-from skipgs_plug.scripts.import_hints import install_hint, is_extension
+from skipgs_plug.scripts.import_hints import install_hint
 from skipgs_plug.scripts.stand_in_hints import stand_in_hint
 
 Attach = Callable[[], dict[str, Any]]  # see `run_script`
@@ -73,14 +73,12 @@ def _run(
         except SkipGSError:
             raise
         except BaseException as error:
-            missing = error.name if isinstance(error, ModuleNotFoundError) else None
-            sentence = stand_in_hint(error) if on_cpu else None
-            if sentence is None and missing:
-                sentence = install_hint(missing, program.source, on_cpu, stand_ins)
-            if sentence is None or (missing and not (on_cpu and is_extension(missing))):
-                _print_traceback(error, program)
-            if sentence is not None:
+            if on_cpu and (sentence := stand_in_hint(error)):
                 say(sentence)
+                return 1
+            _print_traceback(error, program)
+            if isinstance(error, ModuleNotFoundError) and error.name:
+                say(install_hint(error.name, program.source, stand_ins))
             return 130 if isinstance(error, KeyboardInterrupt) else 1
     return 0
 

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from skipgs_plug.scripts.import_hints import is_extension
+
 PACKAGES = ("skipgs_plug.compat", "skipgs_plug.fallback_raster")  # of the stand-ins, and of their rasterizer
 FOLDERS = tuple(Path(__file__).parents[1] / package.rpartition(".")[2] for package in PACKAGES)
 # Beginning of the message of a `TypeError`, if a call has other arguments than the function.
@@ -18,7 +20,7 @@ SIGNATURE = re.compile(r"([\w.]+)\(\) (got|takes|missing) ")
 def stand_in_hint(error: BaseException) -> str | None:
     """Return a sentence that explains the error of a script that needs more than the CPU stand-ins have.
 
-    A stand-in can lack a name, an argument or an output, or refuse an option.
+    A stand-in can lack a name, an argument or an output, or refuse an option. A CUDA extension can have none.
 
     Returns:
         The sentence; None for any other error.
@@ -32,6 +34,12 @@ def stand_in_hint(error: BaseException) -> str | None:
         lacks = is_stand_in(error.obj)
     elif isinstance(error, ImportError) and error.name:  # a stand-in lacks a name or a module
         lacks = any(is_stand_in(sys.modules.get(name)) for name in (error.name, error.name.rpartition(".")[0]))
+        if not lacks and isinstance(error, ModuleNotFoundError) and is_extension(error.name):
+            top = error.name.partition(".")[0]
+            return (
+                f"{top} is a CUDA extension for which this adapter has no CPU stand-in: run the script on a GPU, "
+                "without --cpu."
+            )
         text = text.partition(" (")[0]
     elif isinstance(error, TypeError) and (call := SIGNATURE.match(text)):
         lacks = inside or call[1].partition(".")[0] in callables()

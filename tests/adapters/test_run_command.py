@@ -198,6 +198,13 @@ def test_messages_that_cannot_be_written_end_no_training(checkout, tmp_path, mon
     assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 60
 
 
+def test_without_a_gate_the_given_start_still_splits_the_time(checkout, tmp_path):
+    command = ["run", "auto", "--no-gate", "--start-iter", "50", "--cpu", "--", checkout, str(tmp_path)]
+    assert cli.main(command) == 0
+    report = json.loads((tmp_path / "skipgs.json").read_text())
+    assert report["settings"]["start_iter"] == 50 and report["t_total"] > report["t_post"] > 0
+
+
 def test_script_that_ends_its_process_leaves_a_report_first(checkout, tmp_path, monkeypatch):
     def ended(status):
         assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 60
@@ -486,7 +493,7 @@ def test_an_error_while_the_gate_attaches_lets_the_script_train(checkout, tmp_pa
 
 def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(SpeedySplat, "stand_ins", "inria")  # the look-alike has Inria's rasterizer
-    options = ["--always", "5", "--share", "7", "--resume-gate", "absent"]  # without a gate nothing reads them
+    options = ["--always", "5", "--share", "7", "--resume-gate", "absent"]  # a run without a gate does not read them
     wrong = ["run", "speedy_splat", "--no-gate", *options, "--cpu", "--", checkout, str(tmp_path)]
     assert cli.main(wrong) == 0 and (tmp_path / "model.pth").exists()
     assert "train.py runs without a gate, and so without skipgs.json: Adapter 'speedy_s" in capfd.readouterr().err
