@@ -199,8 +199,7 @@ class Engine:
         now = self.iteration
         if not now.gated:
             self.stats.iterations += 1
-            run()
-            now.ran = True
+            now.run(run)
             self.clock.mark()
             return True
         signal = unscaled(signal)
@@ -211,8 +210,7 @@ class Engine:
             # The loss is not read in iterations that train nothing.
             skip = self.decide(view, None if ahead else signal).skip
             if not skip:
-                run()
-                now.ran = True
+                now.run(run)
                 self.rates.ran()
             else:
                 self._skipped.append(weakref.ref(loss))
@@ -246,8 +244,7 @@ class Engine:
         """Launch the backward pass, then decide; return True if its gradients were dropped."""
         assert isinstance(signal, Tensor)
         copy = HostCopy(signal)
-        run()
-        self.iteration.ran = True
+        self.iteration.run(run)
         try:
             skip = self.decide(view, copy).skip
         except SkipGSError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from skipgs_plug.core import decision
@@ -17,6 +18,8 @@ class GatedIteration:
         opened: Number of iterations that have begun with this gate.
         decision: The last decision in the iteration.
         ran: Whether a real backward pass ran in the iteration.
+        running: Whether a real backward pass has begun and has not returned, so that an error comes from the trainer.
+        passes: Number of real backward passes that have returned with this gate.
         view, signal: View and value that the trainer's hooks reported for the coming backward pass.
         backwards: Number of training backward passes that the hooks saw.
         keys: Keys of the views that the user called `backward` with.
@@ -25,14 +28,14 @@ class GatedIteration:
     """
 
     __slots__ = (
-        *("backwards", "decision", "ended", "gated", "keys", "opened"),
-        *("ran", "signal", "step", "stepped", "view", "__weakref__"),
+        *("backwards", "decision", "ended", "gated", "keys", "opened", "passes"),
+        *("ran", "running", "signal", "step", "stepped", "view", "__weakref__"),
     )
 
     def __init__(self) -> None:
         self.keys: set[str] = set()
         self.stepped: set[int] = set()
-        self.opened = 0
+        self.opened = self.passes = 0
         self.begin(None, gated=False)
 
     def begin(self, step: int | None, gated: bool) -> None:
@@ -40,13 +43,21 @@ class GatedIteration:
         self.step = step
         self.gated = gated
         self.decision: Decision = decision.INACTIVE
-        self.ran = False
+        self.ran = self.running = False
         self.view: Any = None
         self.signal: Any = None
         self.backwards = 0
         self.keys.clear()
         self.stepped.clear()
         self.ended = False
+
+    def run(self, backward: Callable[[], Any]) -> None:
+        """Call `backward`, a real backward pass."""
+        self.running = True
+        backward()
+        self.running = False
+        self.passes += 1
+        self.ran = True
 
     @property
     def skipped(self) -> bool:

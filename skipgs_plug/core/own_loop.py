@@ -10,7 +10,7 @@ from torch import Tensor
 
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import GateOrderError, SkipGSError
-from skipgs_plug.core.intercept import Original, Patches
+from skipgs_plug.core.intercept import Patches
 from skipgs_plug.core.loss_scaler import guard_scalers, unscaled
 from skipgs_plug.core.optimizers import has_pending_gradient, listed
 from skipgs_plug.core.pace.base import EveryNumber, Source
@@ -93,18 +93,22 @@ class OwnLoop:
         elif not hasattr(loss, "backward"):
             raise _no_loss(loss)
         step = int(step)
-        run = Original(_backward_of_sum if batch else loss.backward)
+        now = self._iteration
+        passes = now.passes
+        now.running = False
         if self._release.reason is None:
             try:
-                return self._gated_backward(loss, view, step, signal, run)
+                return self._gated_backward(loss, view, step, signal)
             except Exception as error:
-                if run.failed:
+                if now.running:
                     raise  # the error comes from the loop's own backward pass
                 self._release.on_error(error, step)
-        self._iteration.begin(step, gated=False)
-        self._iteration.ran = True
-        if not run.made:
-            run(*([loss] if batch else ()))
+        returned = now.passes > passes
+        now.begin(step, gated=False)
+        if returned:
+            now.ran = True
+        else:
+            now.run(lambda: _backward_of_sum(loss) if batch else loss.backward())
         return True
 
     def step(self, optimizer: Any, *args: Any) -> bool:
@@ -150,8 +154,8 @@ class OwnLoop:
         except Exception as error:
             self._release.on_error(error, self._iteration.step)
 
-    def _gated_backward(self, loss: Any, view: Any, step: int, signal: Any, run: Original) -> bool:
-        """Do the work of `backward` while the gate is not released; `run` is the loop's own backward pass."""
+    def _gated_backward(self, loss: Any, view: Any, step: int, signal: Any) -> bool:
+        """Do the work of `backward` while the gate is not released."""
         engine, now = self._engine, self._iteration
         if step != now.step:
             engine.open_iteration(step)
@@ -162,12 +166,12 @@ class OwnLoop:
                 "iteration first, and give each iteration its own step number."
             )
         if isinstance(view, list):
-            return self._backward_batch(loss, view, signal, run)
+            return self._backward_batch(loss, view, signal)
         key = self._new_in_iteration(view)
         now.keys.add(key)
-        return engine.gate(key, signal, run, loss)
+        return engine.gate(key, signal, loss.backward, loss)
 
-    def _backward_batch(self, losses: Any, views: list[Any], signals: Any, run: Original) -> bool:
+    def _backward_batch(self, losses: Any, views: list[Any], signals: Any) -> bool:
         if not len(losses) == len(views) == len(signals):
             raise SkipGSError(f"{len(views)} view keys came with {len(losses)} losses; give one loss per view.")
         keys = [self._new_in_iteration(view) for view in views]  # a batch may hold a view twice
@@ -175,8 +179,7 @@ class OwnLoop:
         answers = [self._engine.decide(key, unscaled(signal)) for key, signal in zip(keys, signals, strict=True)]
         kept = [loss for loss, answer in zip(losses, answers, strict=True) if not answer.skip]
         if kept:
-            run(kept)
-            self._iteration.ran = True
+            self._iteration.run(lambda: _backward_of_sum(kept))
             self._engine.rates.ran()
         self._engine.clock.mark()
         return bool(kept)

@@ -7,9 +7,12 @@ import pytest
 import torch
 
 from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.core import decision
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.optimizers import has_pending_gradient
 from skipgs_plug.core.pace.phased import Phased
+from skipgs_plug.core.pace.rates import ScaledRates
+from skipgs_plug.core.policy import SkipPolicy
 from tests.entries import ENTRIES
 
 LAST, FAILS = 80, 40
@@ -133,6 +136,39 @@ def test_an_error_of_the_loops_own_backward_stays_its_own():
     with pytest.raises(RuntimeError, match="second time"):
         gate.backward(loss * 1, view="a.png", step=0) and gate.backward(loss, view="a.png", step=1)
     assert gate.released is None
+
+
+@pytest.mark.parametrize("entry", ["SkipPolicy.decide", "ScaledRates.ran"])
+def test_each_backward_runs_once_when_the_gate_fails_in_the_second_view(entry, monkeypatch, recwarn):
+    weight = torch.nn.Parameter(torch.zeros(1))
+    calls = []
+
+    def fails(*args):
+        calls.append(args)
+        if len(calls) == 2:
+            raise ZeroDivisionError("in the second view")
+
+    if entry == "SkipPolicy.decide":  # before the backward pass of the view
+        monkeypatch.setattr(SkipPolicy, "decide", lambda *args: fails(*args) or decision.WARM_UP)
+    else:  # after it
+        monkeypatch.setattr(ScaledRates, "ran", fails)
+    gate = SkipGate(start_iter=0)
+    for view in VIEWS:
+        assert gate.backward(weight.sum(), view=view, step=0)
+    assert weight.grad == 2 and gate.released == str(recwarn.pop().message)
+
+
+def test_a_loop_may_try_again_after_an_error_of_its_own_backward(monkeypatch, recwarn):
+    weight = torch.nn.Parameter(torch.zeros(1))
+    gate = SkipGate(start_iter=0)
+    loss = weight.sum()
+    loss.backward = lambda: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        gate.backward(loss, view="a.png", step=0)
+    assert gate.released is None
+    monkeypatch.setattr(Engine, "open_iteration", lambda *args: 1 / 0)
+    assert gate.backward(weight.sum(), view="a.png", step=1)  # this error is the gate's
+    assert weight.grad == 1 and gate.released == str(recwarn.pop().message)
 
 
 SCRIPT = """
