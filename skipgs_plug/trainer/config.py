@@ -150,7 +150,7 @@ class TrainConfig:
     antialiased: bool = False
     """Compensate opacities for the 2D low-pass filter (Mip-Splatting)."""
     random_bkgd: bool = False
-    """Train on random background colours."""
+    """Train on random background colours, so that no Gaussian imitates a background. Photographs must be opaque."""
     near_plane: Optional[float] = None
     """Near clipping plane, world units; default: a tenth of the depth of the nearest points that a view shows."""
     far_plane: float = 1e10

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from skipgs_plug.trainer.backend import Backend
 from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.exposure import Exposure
 from skipgs_plug.trainer.mask import leave_out
 from skipgs_plug.trainer.near_plane import far_plane
@@ -27,6 +28,9 @@ class ViewRenderer:
         optimizers: One optimizer per parameter.
         exposure: Colour correction of each photograph; None for none.
         near_plane: Near clipping plane, in the units of `scene.frame`.
+
+    Raises:
+        InputError: The backgrounds would be random, but the photographs have one of their own.
     """
 
     def __init__(
@@ -45,6 +49,11 @@ class ViewRenderer:
         self._recipe = config.recipe
         self._background: Tensor | None = None  # [3]; None for black, which needs no compositing
         if any(scene.background):
+            if config.random_bkgd:  # the photographs do not change with it, so it becomes a part of the model
+                raise InputError(
+                    f"The photographs of {scene.name} have one colour behind the scene (transparency becomes white), "
+                    "and random backgrounds would train that colour into the model; leave out --random-bkgd."
+                )
             self._background = torch.tensor(scene.background, dtype=torch.float32, device=backend.device)
 
     def render(self, view: View, degree: int) -> Tensor:

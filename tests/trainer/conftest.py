@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer
+from skipgs_plug.trainer.scene import BLACK
 from skipgs_plug.trainer.synthetic import make_scene
 
 
 @pytest.fixture(scope="session")
 def tiny_scene() -> Scene:
     return make_scene(n_views=10, width=32, height=24, n_points=160)
+
+
+@pytest.fixture
+def opaque_scene(tiny_scene: Scene) -> Scene:
+    """The same photographs, in which no colour is known to lie behind the scene."""
+    return dataclasses.replace(tiny_scene, background=BLACK)
 
 
 @pytest.fixture

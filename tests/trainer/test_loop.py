@@ -123,14 +123,26 @@ def test_non_finite_loss_names_view_and_step(trainer: Trainer) -> None:
         trainer.train_step()
 
 
-@pytest.mark.parametrize("field", ["visible_adam", "antialiased", "random_bkgd", "absgrad"])
+@pytest.mark.parametrize("field", ["visible_adam", "antialiased", "absgrad"])
 def test_options_train(tiny_scene: Scene, tiny_config: TrainConfig, field: str) -> None:
-    plain = Trainer(tiny_config, tiny_scene)
-    varied = Trainer(dataclasses.replace(tiny_config, **{field: True}), tiny_scene)
+    train_with(tiny_scene, tiny_config, field)
+
+
+def train_with(scene: Scene, config: TrainConfig, field: str) -> None:
+    """Check that training with an option stays finite and takes another course."""
+    plain, varied = Trainer(config, scene), Trainer(dataclasses.replace(config, **{field: True}), scene)
     for trainer in (plain, varied):
         trainer.train(until=6, progress=False)
     assert all(torch.isfinite(p).all() for p in varied.splats.values())
     assert not torch.equal(plain.splats["means"], varied.splats["means"])
+
+
+def test_random_backgrounds_train_opaque_photographs_alone(
+    tiny_scene: Scene, opaque_scene: Scene, tiny_config: TrainConfig
+) -> None:
+    train_with(opaque_scene, tiny_config, "random_bkgd")
+    with pytest.raises(InputError, match="leave out --random-bkgd"):
+        Trainer(dataclasses.replace(tiny_config, random_bkgd=True), tiny_scene)
 
 
 def test_absolute_gradients_decide_about_densification_only(tiny_scene: Scene, tiny_config: TrainConfig) -> None:

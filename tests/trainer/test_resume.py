@@ -40,15 +40,15 @@ def assert_same(one: Trainer, other: Trainer) -> None:
 @pytest.mark.parametrize("visible_adam", [False, True])
 @pytest.mark.parametrize("stop", [6, 13, 45])
 def test_resumed_equals_uninterrupted(
-    tmp_path: Path, tiny_scene: Scene, tiny_config: TrainConfig, stop: int, visible_adam: bool
+    tmp_path: Path, opaque_scene: Scene, tiny_config: TrainConfig, stop: int, visible_adam: bool
 ) -> None:
     config = dataclasses.replace(tiny_config, visible_adam=visible_adam, random_bkgd=True)
-    whole = Trainer(config, tiny_scene)
+    whole = Trainer(config, opaque_scene)
     whole.train(progress=False)
-    first = Trainer(config, tiny_scene)
+    first = Trainer(config, opaque_scene)
     first.train(until=stop, progress=False)
     first.save_checkpoint(tmp_path / "c.pt")
-    second = Trainer(config, tiny_scene)
+    second = Trainer(config, opaque_scene)
     second.load_checkpoint(tmp_path / "c.pt")
     assert second.step == stop
     second.train(progress=False)

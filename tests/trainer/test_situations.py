@@ -312,12 +312,12 @@ def test_saturated_values_are_clamped_and_counted(tmp_path: Path, caplog: pytest
 @pytest.mark.parametrize(
     "settings", [{}, {"strategy": "mcmc", "cap_max": 200}, {"exposure": True, "random_bkgd": True}]
 )
-def test_any_default_type(tiny_scene: Scene, dtype: torch.dtype, settings: dict) -> None:
+def test_any_default_type(opaque_scene: Scene, dtype: torch.dtype, settings: dict) -> None:
     runs = []
     for default in (torch.float32, dtype):
         torch.set_default_dtype(default)
         try:
-            trainer = Trainer(TrainConfig(max_steps=60, refine_every=4, **settings), tiny_scene)
+            trainer = Trainer(TrainConfig(max_steps=60, refine_every=4, **settings), opaque_scene)
             trainer.train(progress=False)
             runs.append(trainer.evaluate()["psnr"])
             assert torch.get_default_dtype() == default
