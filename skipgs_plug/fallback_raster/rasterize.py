@@ -182,7 +182,6 @@ def rasterization(
     if shN is not None:
         (shN,) = as_kernels_read(shN)
     antialiased = rasterize_mode == "antialiased"
-    shared_colors = colors.dim() == (2 if sh_degree is None else 3)
 
     projected = [
         Project.apply(
@@ -200,28 +199,17 @@ def rasterization(
 
     features = []
     if "RGB" in render_mode:
-        for camera in range(n_cameras):
-            of_camera = colors if shared_colors else colors[camera]
-            if sh_degree is not None:
-                centre = camera_centre(viewmats[camera])
-                of_camera = SphericalHarmonics.apply(
-                    means, centre, of_camera, shN, visible[camera], block_starts[camera], sh_degree
-                )
-            features.append(of_camera)
+        features = _camera_colors(means, colors, shN, viewmats, visible, block_starts, sh_degree)
 
     camera_ids = gaussian_ids = counts = None
     if packed:
         counts = [len(rows) for rows in visible]
         camera_ids = torch.cat([torch.full((count,), camera, device="cpu") for camera, count in enumerate(counts)])
         gaussian_ids = torch.cat(visible).long()
-
-        def pack(of_cameras: Sequence[Tensor]) -> list[Tensor]:
-            return [Pack.apply(*rows) for rows in zip(of_cameras, visible, block_starts, strict=True)]
-
-        features = pack(features) if features else []
+        features = _pack(features, visible, block_starts) if features else []
         means2d, depths, conics, opacities, radii, sigmas = (
             # `unbind` has an adjoint that copies.
-            _join(pack([t.squeeze(0)] if n_cameras == 1 else t.unbind()))
+            _join(_pack([t.squeeze(0)] if n_cameras == 1 else t.unbind(), visible, block_starts))
             for t in (means2d, depths, conics, opacities, radii, sigmas)
         )
         visible, block_starts = map(list, zip(*map(all_rows, counts), strict=True))
@@ -267,6 +255,33 @@ def rasterization(
         "n_cameras": n_cameras,
     }
     return _join(images).to(dtype), _join(alphas).to(dtype), info
+
+
+def _camera_colors(
+    means: Tensor,  # [N, 3]
+    colors: Tensor,  # [(C,) N, D], [(C,) N, K, 3], or [N, 1, 3] with `shN`
+    shN: Tensor | None,  # [N, K - 1, 3]
+    viewmats: Tensor,  # [C, 4, 4]
+    visible: Sequence[Tensor],
+    block_starts: Sequence[Tensor],
+    sh_degree: int | None,
+) -> list[Tensor]:
+    """Return the colours [N, D] of the Gaussians as each of the C cameras sees them."""
+    shared = colors.dim() == (2 if sh_degree is None else 3)
+    of_cameras = [colors if shared else colors[camera] for camera in range(len(viewmats))]
+    if sh_degree is None:
+        return of_cameras
+    return [
+        SphericalHarmonics.apply(
+            means, camera_centre(viewmats[camera]), of_camera, shN, visible[camera], block_starts[camera], sh_degree
+        )
+        for camera, of_camera in enumerate(of_cameras)
+    ]
+
+
+def _pack(of_cameras: Sequence[Tensor], visible: list[Tensor], block_starts: list[Tensor]) -> list[Tensor]:
+    """Return the visible rows [M, ...] of each camera's tensor [N, ...]."""
+    return [Pack.apply(*rows) for rows in zip(of_cameras, visible, block_starts, strict=True)]
 
 
 def _render_camera(

@@ -29,19 +29,24 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int) -> None:
         try:
             target.touch()  # fails with a reason, unlike the encoder
             options: dict[str, Any] = {"fps": fps, "quality": QUALITY, "macro_block_size": 2}
-            writer: Any
-            given = 0
             with iio.get_writer(target, format="FFMPEG", **options) as writer:
-                for frame in frames:
-                    height, width = (side // 2 * 2 for side in frame.shape[:2])
-                    with encoder_ended_early(path):
-                        writer.append_data(frame[:height, :width])
-                    given += 1
+                given = append_frames(writer, path, frames)
             with encoder_ended_early(path):
                 check_length(target, given)
             target.replace(temporary)
         finally:
             target.unlink(missing_ok=True)
+
+
+def append_frames(writer: Any, path: Path, frames: Iterable[np.ndarray]) -> int:
+    """Encode frames for the film at `path`, and return their number."""
+    given = 0
+    for frame in frames:
+        height, width = (side // 2 * 2 for side in frame.shape[:2])
+        with encoder_ended_early(path):
+            writer.append_data(frame[:height, :width])
+        given += 1
+    return given
 
 
 @contextlib.contextmanager

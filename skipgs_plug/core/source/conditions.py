@@ -46,11 +46,9 @@ def conditions_in(
     for statement in body:
         if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
             continue
-        for part in ast.iter_child_nodes(statement):
-            if not isinstance(part, (ast.stmt, ast.ExceptHandler, ast.match_case)):
-                for call, reached in _calls(part, guards):
-                    if (inside := functions.get(id(call))) is not None:
-                        yield from conditions_in(inside.body, functions, reached, inside)
+        for call, reached in _calls_of(statement, guards):
+            if (inside := functions.get(id(call))) is not None:
+                yield from conditions_in(inside.body, functions, reached, inside)
         if isinstance(statement, (ast.If, ast.While)):
             yield Condition(statement.test, guards, function)
             yield from conditions_in(statement.body, functions, (*guards, statement.test), function)
@@ -208,6 +206,13 @@ def _filters(generators: Sequence[ast.comprehension]) -> Iterator[ast.expr]:
             one = ast.GeneratorExp(test, [*generators[:index], ast.comprehension(last.target, last.iter, [], 0)])
             anywhere = ast.Call(ast.Name("any", ast.Load()), [one], [])
             yield ast.fix_missing_locations(ast.copy_location(anywhere, test))
+
+
+def _calls_of(statement: ast.stmt, guards: Guards) -> Iterator[tuple[ast.expr, Guards]]:
+    """Yield the calls and attributes in a statement, but not in the blocks inside it; see `_calls`."""
+    for part in ast.iter_child_nodes(statement):
+        if not isinstance(part, (ast.stmt, ast.ExceptHandler, ast.match_case)):
+            yield from _calls(part, guards)
 
 
 def _calls(node: ast.AST, guards: Guards) -> Iterator[tuple[ast.expr, Guards]]:

@@ -25,6 +25,9 @@ TRANSMITTANCE_STOP = 1e-4
 # Pixels along each side of the squares that are blended at a time. This bounds the memory, which is a few tensors of
 # SQUARE^2 x M numbers for the M Gaussians that reach the square.
 SQUARE = 16
+# Difference of two depths, as a share of the depth, below which rounding to float32 may swap two Gaussians: 8 of its
+# steps of 1.2e-7.
+SAME_DEPTH = 1e-6
 
 
 def rasterization_reference(
@@ -111,24 +114,19 @@ def rasterization_reference(
         rows.means2d.absgrad = torch.zeros_like(rows.means2d)  # type: ignore[attr-defined]
         absolute = rows.means2d.absgrad.view(-1, 2)  # type: ignore[attr-defined]
 
-    n_depth = 0 if render_mode == "RGB" else 1
     images, alphas = [], []
     for camera in range(n_cameras):
         here = camera_ids == camera
-        projected = Projected(*(t[row_ids[here]] for t in flat))
-        values = {
-            "RGB": [features[here]],
-            "D": [projected.depths[:, None]],
-            "RGBD": [features[here], projected.depths[:, None]],
-        }[render_mode.replace("+", "").replace("ED", "D")]
-        background = means.new_zeros(sum(v.shape[-1] for v in values))
-        if backgrounds is not None:
-            colored = len(background) - n_depth  # depth has a background of 0
-            background = torch.cat([backgrounds[camera, :colored], background[colored:]])
-        image, alpha = composite(projected, torch.cat(values, -1), background, width, height, row_ids[here], absolute)
-        if render_mode.endswith("ED"):
-            expected = image[..., -1:] / alpha.clamp(min=1e-10)
-            image = torch.cat([image[..., :-1], expected], dim=-1)
+        image, alpha = _render_camera(
+            Projected(*(t[row_ids[here]] for t in flat)),
+            features[here],
+            None if backgrounds is None else backgrounds[camera],
+            width,
+            height,
+            render_mode,
+            row_ids[here],
+            absolute,
+        )
         images.append(image)
         alphas.append(alpha)
 
@@ -146,6 +144,29 @@ def rasterization_reference(
     image_ids = camera_ids if packed else torch.arange(n_cameras).repeat_interleave(n_gaussians)
     info.update(tiles(rows, image_ids, n_cameras, width, height, tile_size))
     return torch.stack(images), torch.stack(alphas), info
+
+
+def _render_camera(
+    projected: Projected,  # M rows
+    features: Tensor,  # [M, D]
+    background: Tensor | None,  # [D]
+    width: int,
+    height: int,
+    render_mode: str,
+    row_ids: Tensor,  # [M] rows of `absolute`
+    absolute: Tensor | None,  # [R, 2] receives the sums of absolute gradients of means2d
+) -> tuple[Tensor, Tensor]:
+    """Render the colours, the depth, or both. Returns image [H, W, X] and alpha [H, W, 1]."""
+    colors = [features] if "RGB" in render_mode else []
+    depths = [] if render_mode == "RGB" else [projected.depths[:, None]]
+    values = torch.cat([*colors, *depths], -1)
+    behind = values.new_zeros(values.shape[-1])  # depth has a background of 0
+    if background is not None and colors:
+        behind = torch.cat([background, behind[len(background) :]])
+    image, alpha = composite(projected, values, behind, width, height, row_ids, absolute)
+    if render_mode.endswith("ED"):
+        image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp(min=1e-10)], dim=-1)
+    return image, alpha
 
 
 class _OneCopyPerPixel(torch.autograd.Function):
@@ -197,14 +218,15 @@ def composite(
 
 
 @torch.no_grad()
-def near_cutoff(info: dict[str, Any], relative: float = 1e-3, depth_relative: float = 1e-6) -> Tensor:
+def near_cutoff(info: dict[str, Any], relative: float = 1e-3) -> Tensor:
     """Mask pixels whose value or gradient may jump under rounding. A comparison should leave these pixels out.
+
+    They include pixels with two Gaussians whose depths differ by less than SAME_DEPTH.
 
     Args:
         info: The dictionary that `rasterization_reference` returned.
         relative: Masks pixels in which an alpha is this close to 1/255 or 0.999, or a transmittance to 1e-4, relative
             to it.
-        depth_relative: Two Gaussians in one pixel whose depths are this close, relative to the depth, may be swapped.
 
     Returns:
         Boolean mask. [C, H, W]
@@ -216,12 +238,12 @@ def near_cutoff(info: dict[str, Any], relative: float = 1e-3, depth_relative: fl
         else:
             index = info["camera_ids"] == camera
         projected = Projected(*(info[name][index].detach() for name in Projected._fields))
-        blend_square = partial(_near_cutoff_in_square, projected, relative, depth_relative)
+        blend_square = partial(_near_cutoff_in_square, projected, relative)
         masks.append(_image_of_squares(blend_square, info["width"], info["height"], projected.depths)[..., 0])
     return torch.stack(masks)
 
 
-def _near_cutoff_in_square(projected: Projected, relative: float, depth_relative: float, pixels: Tensor) -> Tensor:
+def _near_cutoff_in_square(projected: Projected, relative: float, pixels: Tensor) -> Tensor:
     order = torch.sort(projected.depths, stable=True).indices
     order = order[_reaches(projected, pixels)[order]]
     if len(order) == 0:
@@ -236,7 +258,7 @@ def _near_cutoff_in_square(projected: Projected, relative: float, depth_relative
     # Depth of the nearest blended Gaussian in front, as a running maximum along the sorted row.
     contributing = torch.where(alpha > 0, depths, -torch.inf)
     in_front = torch.cummax(contributing, dim=1).values[:, :-1]
-    tie = (alpha > 0)[:, 1:] & (depths[1:] - in_front <= depth_relative * depths[1:].abs())
+    tie = (alpha > 0)[:, 1:] & (depths[1:] - in_front <= SAME_DEPTH * depths[1:].abs())
     # Gaussians behind the stop are never blended.
     near[:, 1:] |= tie
     reached = transmittance > 0.5 * TRANSMITTANCE_STOP
