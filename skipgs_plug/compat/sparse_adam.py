@@ -7,8 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from skipgs_plug.fallback_raster.training.adam import adam_rows
-from skipgs_plug.fallback_raster.training.optimizer import moments
+from skipgs_plug.fallback_raster import adam_rows, moments
 
 
 class SparseGaussianAdam(torch.optim.Adam):

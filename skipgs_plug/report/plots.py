@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 WIDTH = 5.2  # width of a plot in inches; text stays readable when a phone shrinks the plot to its screen
 RUN_COLOUR = "#0072B2"
 SKIP_COLOUR = "#D55E00"
-ERROR_GAIN = 4  # factor that makes errors visible in the pictures of views
+ERROR_GAIN = 4  # factor on absolute errors in pictures: at 1, an error of 0.05 would look black
+PARTS = 25  # parts of refinement in a plot of skips: enough for its shape, and each holds many iterations
 REASON_COLOURS = {
     "warm-up": "#999999",
     "new view": "#56B4E9",
@@ -30,7 +31,7 @@ REASON_COLOURS = {
 }
 
 
-def skips_over_time(traces: Mapping[tuple[int, str], Trace], parts: int = 25) -> Figure:
+def skips_over_time(traces: Mapping[tuple[int, str], Trace]) -> Figure:
     """Plot the share of skipped backward passes in equal parts of refinement, as a mean over seeds, by policy."""
     figure, axes = new_figure(WIDTH, 3.4)
     for i, policy in enumerate(dict.fromkeys(policy for _, policy in traces)):
@@ -39,7 +40,7 @@ def skips_over_time(traces: Mapping[tuple[int, str], Trace], parts: int = 25) ->
         if not any(run.any() for run in runs):
             continue
         start = next(trace.start for (_, name), trace in traces.items() if name == policy)
-        edges = np.linspace(0, len(runs[0]), min(parts, len(runs[0])) + 1).round().astype(int)
+        edges = np.linspace(0, len(runs[0]), min(PARTS, len(runs[0])) + 1).round().astype(int)
         shares = [[100 * part.mean() for part in np.split(run, edges[1:-1])] for run in runs]
         width = max(1.0, 4.0 - 0.5 * i)  # if two policies agree, the wider line of the earlier one stays visible
         axes.stairs(np.mean(shares, axis=0), start + edges, baseline=None, color=colour, linewidth=width, label=policy)

@@ -23,25 +23,24 @@ from skipgs_plug.core.errors import GateStateError
 
 # Ends of the cycles, as shares of the iterations that may run. Training is judged at the first two ends.
 CYCLE_ENDS = (0.125, 0.25, 1.0)
-ONE_CYCLE = (1.0,)  # the same if nothing is estimated: the share is given, or no view is watched
+ONE_CYCLE = (1.0,)  # end of the only cycle if nothing is estimated: the share is given, or no view is watched
 LEAST_LOSS = 1e-5  # mean absolute difference below which losses count as equal; 8-bit images have steps of 4e-3
 WATCHED_FRACTION = 1 / 12  # fraction of the views that is watched: a few, since they never recover completely
 # Bounds on the number of watched views. Fewer than three cannot resolve 0.05 dB; more than twelve cost quality.
 LEAST_WATCHED, MOST_WATCHED = 3, 12
 
 
-def watched_views(names: Iterable[str], iterations: float, seed: int = 0) -> frozenset[str]:
+def watched_views(names: Iterable[str], iterations: float) -> frozenset[str]:
     """Draw the views to watch: the same views for the same names, and no view if there are few.
 
     Args:
         names: Names of all training views.
         iterations: Number of iterations that may run. No view is watched if the first cycle does not show every view.
-        seed: Seed of the draw.
     """
     names = sorted(names)
     if why_none_watched(len(names), iterations) is not None:
         return frozenset()
-    return frozenset(random.Random(seed).sample(names, _watched(len(names))))
+    return frozenset(random.Random(0).sample(names, _watched(len(names))))
 
 
 def why_none_watched(views: int, iterations: float) -> str | None:
