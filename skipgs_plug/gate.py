@@ -162,7 +162,7 @@ class SkipGate:
             view: Stable key of the view: image name or index. For a joint loss of a batch, one constant key.
             step: Iteration, counted like `start_iter`.
             signal: Value (or list of values) to decide by, when it is not the loss itself, such as the image term.
-                A loss that `torch.amp.GradScaler` has scaled stands for the loss before.
+                A loss that `torch.amp.GradScaler` has scaled counts with its value before that.
 
         Raises:
             GateOrderError: In the first iteration, `backward` was already called for this view, or `update` or `step`

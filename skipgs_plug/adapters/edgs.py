@@ -19,7 +19,7 @@ from skipgs_plug.core.views import view_key
 MODULE, STEP = "source.trainer", "train_step_gs"
 EXPECTED = (STEP, "train", "GS", "gs_step", "training_config", "scene")
 EVENTS = ("prune_points", "reset_opacity", "training_setup")
-CHANGES = (*EVENTS, "densify_and_prune", ASSIGNED)  # opacities are assigned to with `reduce_opacity`
+CHANGES = (*EVENTS, "densify_and_prune", ASSIGNED)  # with `reduce_opacity` the loop assigns to opacities
 
 
 class EDGS(AbstractAdapter):

@@ -283,7 +283,7 @@ class InriaFamily(AbstractAdapter):
             )
 
     def _refuse_loop_elsewhere(self, code: LoopCode) -> None:
-        """Refuse a script whose training loop is in a function that `training` calls, as 4DGaussians' two stages."""
+        """Refuse a script whose loop is in a function that `training` calls, such as the two stages of 4DGaussians."""
         if LOOP not in code.backward:
             where = ", ".join(f"{name}()" for name in sorted(code.backward & code.used)) or "another module"
             raise AdapterMismatchError(

@@ -255,7 +255,7 @@ class CallReader:
         return None
 
     def _end_of_result(self, call: ast.Call, scope: Scope, holds: bool) -> int | None:
-        """Return the same for the result of a function of the trainer that only returns a condition."""
+        """Return the result of `_end` for a call of a trainer's function that only returns a condition."""
         call, function, syntax = self._called(call, scope)
         plain, result = undecorated(function), None if syntax is None else returned(syntax.body)
         if plain is None or syntax is None or result is None or plain.__code__ in self._open:

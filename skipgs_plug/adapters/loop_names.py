@@ -14,7 +14,7 @@ from skipgs_plug.core.source.run_options import PURE, is_namespace, is_plain
 from skipgs_plug.core.source.substitution import assigned_values
 
 _PURE = {name: getattr(builtins, name) for name in PURE}
-NOTHING: dict[str, Any] = {}  # of a scope before its function is read
+NOTHING: dict[str, Any] = {}  # stands for the names of a function that was not read yet
 
 
 class Scope(NamedTuple):

@@ -22,7 +22,7 @@ from skipgs_plug.core.trainer_info import TrainerInfo
 
 MODULE = "nerfstudio.engine.trainer"
 LOOP = "train_iteration"
-CALLBACKS = ("step_cb", "step_post_backward")  # of splatfacto
+CALLBACKS = ("step_cb", "step_post_backward")  # methods of splatfacto that the trainer calls
 
 
 class Nerfstudio(AbstractAdapter):

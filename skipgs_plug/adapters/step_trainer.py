@@ -20,10 +20,12 @@ MODULE = "gaussian_splatting.prepare"
 
 # Attributes of the outermost trainer that `step` or this adapter uses.
 EXPECTED = ("step", "curr_step", "optimizer", "update_learning_rate", "preprocess", "before_optim_hook", "optim_step")
-BOUND = "_until_iter"  # ends the name of a part's last iteration (inclusive) with a change of its kind
-BOUNDS = ("densify_until_iter", "prune_until_iter", "opacity_reset_until_iter")  # of the package itself
-RAISES = "sh_degree_up_interval"  # of the wrapper that raises the SH degree
-SIZE = "prune_screensize_threshold"  # of the wrapper that prunes, also by the largest size on the screen in any step
+# End of the names of attributes that hold the last iteration (inclusive) with a change, and such names of the package.
+BOUND = "_until_iter"
+BOUNDS = ("densify_until_iter", "prune_until_iter", "opacity_reset_until_iter")
+RAISES = "sh_degree_up_interval"  # attribute of the wrapper that raises the SH degree
+# Attribute of the wrapper that prunes, among others by the largest size that a Gaussian had on the screen in any step.
+SIZE = "prune_screensize_threshold"
 # Least number of iterations with prunes by the size on the screen, if some of them may be left out. With longer steps,
 # sizes overshoot. In 3,000 iterations, of which 1,500 prune, the script lost 1.1 dB on fern from one of two draws of
 # the points. In 12,000, of which 6,000 prune, it gained 0.9 dB on bonsai.

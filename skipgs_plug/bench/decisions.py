@@ -24,7 +24,7 @@ from skipgs_plug.trainer.files import write_json
 
 FILE = "decisions.json"
 KIND = "skipgs-decisions"
-SCHEMA_VERSION = 1  # of decisions.json
+SCHEMA_VERSION = 1  # version of the format of decisions.json
 
 
 def write_decisions(path: Path, records: Sequence[RunRecord]) -> None:

@@ -10,7 +10,7 @@ from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.bench.runner import Bench
 from skipgs_plug.bench.summary import ceiling, row_as_dict, summarise, timing_noise
 
-SCHEMA_VERSION = 2  # of bench.json
+SCHEMA_VERSION = 2  # version of the format of bench.json
 KIND = "skipgs-bench"
 
 

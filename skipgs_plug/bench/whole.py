@@ -168,7 +168,7 @@ def shortened(
     """
 
     def run(make: Maker, earlier: Earlier, record: RunRecord) -> Turns:
-        make = dataclasses.replace(make, scalars=None)  # of several tries
+        make = dataclasses.replace(make, scalars=None)  # several tries would write to one folder
         full, wanted = earlier[REFERENCE].iterations, earlier[name].t_total
         found: list[RunRecord] = []
 
@@ -198,7 +198,7 @@ def as_many_gaussians(name: str) -> Callable[[Maker, Earlier, RunRecord], Turns]
     """
 
     def run(make: Maker, earlier: Earlier, record: RunRecord) -> Turns:
-        make = dataclasses.replace(make, scalars=None)  # of several tries
+        make = dataclasses.replace(make, scalars=None)  # several tries would write to one folder
         own, wanted = earlier[REFERENCE], float(earlier[name].metrics["num_GS"])
         if make().mcmc is not None:
             raise NotRunError("MCMC grows by a share per event, not by grow_grad2d")

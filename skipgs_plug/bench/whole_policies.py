@@ -1,6 +1,6 @@
 """Policies of the whole run, from its first iteration on, and the controls.
 
-The name of a policy is the settings that a user would give to `SkipGate`, like in `policies`. A new policy is one entry
+The name of a policy is the settings that a user would give to `SkipGate`, as in `policies`. A new policy is one entry
 of WHOLE_POLICIES: a name, a line of explanation, the policies that it copies from, and the function that runs it.
 """
 

@@ -35,7 +35,7 @@ class Result:
     renders: list[Any]
     t_post: float
     t_total: float
-    iterations: int  # of the whole run
+    iterations: int  # number in the whole run
     backwards: int
 
 

@@ -13,7 +13,7 @@ from skipgs_plug.trainer import load_scene
 from skipgs_plug.trainer.ahead import prepare_kernels
 
 HEADS = ("iterations", "time", "with --share auto", "Gaussians", "peak memory")
-SHOWN = ("seconds", "seconds_auto", "gaussians", "memory")  # in the order of HEADS
+SHOWN = ("seconds", "seconds_auto", "gaussians", "memory")  # quantities of the table, in the order of HEADS
 
 
 def run(args: Args) -> int:

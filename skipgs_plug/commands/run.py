@@ -57,7 +57,7 @@ def run(args: Args) -> int:
 
 
 def find_adapter(args: Args, command: list[str]) -> str | None:
-    """Return the name of the adapter that knows the script; None if none does and the script can run without.
+    """Return the name of the adapter that knows the script; None if no adapter does, and the script needs none.
 
     Raises:
         UnknownTrainerError: No adapter knows the script, and it should be gated, or needs stand-ins for CUDA modules.
@@ -89,7 +89,7 @@ def verify(code: int, gate: SkipGate | None) -> None:
     """Check that the gate of a finished run has seen one training backward per iteration.
 
     Raises:
-        SkipGSError: It has not, and the gate did not say so during the run.
+        SkipGSError: The numbers differ, and the gate did not say so during the run.
     """
     if code or gate is None or not gate.trained or not gate.config.enabled:
         return

@@ -15,7 +15,7 @@ from typing import Any
 
 Enter = Callable[[], AbstractContextManager[None]]
 
-_entered_here: list[Enter] = []  # in the order in which new processes enter them
+_entered_here: list[Enter] = []  # context managers, in the order in which new processes enter them
 _until_exit = ExitStack()  # context managers that a child process entered; never closed
 _MAIN = ("init_main_from_name", "init_main_from_path")  # keys of the data that name the main module
 _preparation_data = spawn.get_preparation_data

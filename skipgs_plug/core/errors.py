@@ -32,7 +32,7 @@ class UnknownTrainerError(SkipGSError):
 
 
 class AdapterMismatchError(SkipGSError):
-    """The trainer lacks an attribute, or behaves differently, than its adapter expects."""
+    """The trainer lacks an attribute that its adapter expects, or behaves differently."""
 
 
 class BrokenTrainingError(SkipGSError):

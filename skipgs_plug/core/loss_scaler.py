@@ -100,6 +100,6 @@ def _restore_after_last() -> None:
         _replaced.restore()
 
 
-_guarded: weakref.WeakSet[GatedIteration] = weakref.WeakSet()  # of all gates whose loops may have a scaler
-_used: weakref.WeakSet[torch.amp.GradScaler] = weakref.WeakSet()  # for gradients, since their last update
+_guarded: weakref.WeakSet[GatedIteration] = weakref.WeakSet()  # present iterations of the gates with guarded scalers
+_used: weakref.WeakSet[torch.amp.GradScaler] = weakref.WeakSet()  # scalers that had gradients since their last update
 _replaced = Patches(on_error=lambda error: None)  # after an error here, the scaler does its work as without a gate

@@ -11,7 +11,7 @@ from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.files import write_aside
 
-SCHEMA_VERSION = 1  # of skipgs.json
+SCHEMA_VERSION = 1  # version of the format of skipgs.json
 # The entries of skipgs.json about whole iterations, for a gate that leaves out none.
 NO_REFINEMENT: dict[str, Any] = {
     "refine_share": None,

@@ -138,14 +138,14 @@ class GrowingState(NewerGrowingState):
     share: float | None
     first: int | None
     views: int
-    gaussians_shown: tuple[float | None, float | None]  # in the first measurement, in the latest one
+    gaussians_shown: tuple[float | None, float | None]  # first and latest measured share
     measuring: bool
     sampling: SamplingState
     events: EventsState | None
 
 
 class NewerPaceState(TypedDict, total=False):
-    """An entry that states of earlier versions do not have."""
+    """Entry that states of earlier versions do not have."""
 
     grow_asked: float | str | None
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from skipgs_plug.scripts.import_hints import is_extension
 
-PACKAGES = ("skipgs_plug.compat", "skipgs_plug.fallback_raster")  # of the stand-ins, and of their rasterizer
+PACKAGES = ("skipgs_plug.compat", "skipgs_plug.fallback_raster")  # packages of the stand-ins and their rasterizer
 FOLDERS = tuple(Path(__file__).parents[1] / package.rpartition(".")[2] for package in PACKAGES)
 # Beginning of the message of a `TypeError`, if a call has other arguments than the function.
 SIGNATURE = re.compile(r"([\w.]+)\(\) (got|takes|missing) ")

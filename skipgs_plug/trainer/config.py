@@ -67,7 +67,8 @@ class Recipe(NamedTuple):
     scale_reg: float
 
 
-RECIPES = {"default": Recipe(0.1, 1.0, 15_000, 0.0, 0.0), "mcmc": Recipe(0.5, 0.1, 25_000, 0.01, 0.01)}  # gsplat's
+# The values of gsplat's script.
+RECIPES = {"default": Recipe(0.1, 1.0, 15_000, 0.0, 0.0), "mcmc": Recipe(0.5, 0.1, 25_000, 0.01, 0.01)}
 BELONGS_TO = {
     **dict.fromkeys(("grow_grad2d", "grow_scale3d", "prune_scale3d", "reset_every", "absgrad"), "default"),
     **dict.fromkeys(("cap_max", "noise_lr"), "mcmc"),

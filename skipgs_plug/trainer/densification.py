@@ -37,7 +37,7 @@ def densify(
 ) -> None:
     """Densify like `strategy.step_post_backward`, with the same result.
 
-    Parameters whose rows changed become new objects, and new rows get moments of zero, like in gsplat.
+    Parameters whose rows changed become new objects, and new rows get moments of zero, as in gsplat.
 
     Args:
         strategy: gsplat's DefaultStrategy.

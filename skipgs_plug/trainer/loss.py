@@ -8,7 +8,7 @@ from torch import Tensor
 
 from skipgs_plug.trainer.ssim import C1, C2, RADIUS, SIGMA
 
-WINDOW = 2 * RADIUS + 1  # pixels along each side
+WINDOW = 2 * RADIUS + 1  # pixels along each side of SSIM's window
 
 
 def l1_ssim_loss(image: Tensor, target: Tensor, ssim_lambda: float = 0.2) -> Tensor:

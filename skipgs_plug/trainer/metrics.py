@@ -33,7 +33,7 @@ class Metric:
         flavour: A clause that distinguishes it from other metrics of that name.
         measure: Function of render and target, images [H, W, 3], the target in [0, 1], and mask [H, W] or None.
         unit: Unit after the label.
-        tag: Name in TensorBoard, like in gsplat; empty for the key.
+        tag: Name in TensorBoard, as in gsplat; empty for the key.
         net: LPIPS backbone of a metric that is computed on request only; None for a metric of every evaluation.
         fitted: Whether it measures the render after `fit_colours`, for models that were trained with exposure.
     """

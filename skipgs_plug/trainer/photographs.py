@@ -36,7 +36,7 @@ class Photographs:
 
     def __init__(self, views: Sequence[View], device: torch.device, free_bytes: int | None = None) -> None:
         self._device = device
-        self._views: dict[str, View] = {}  # by name, on the device but for the photograph
+        self._views: dict[str, View] = {}  # views by name; all but the photograph is on the device
         self._ahead: dict[str, tuple[Tensor, Any]] = {}  # at most one copy under way, and the event that ends it
         self._backend: Any = getattr(torch, device.type, None)
         self._stream: Any = None

@@ -26,7 +26,7 @@ from skipgs_plug.trainer.scene import Scene
 
 log = logging.getLogger(__name__)
 
-VERSION = 1  # of checkpoints; a checkpoint with another one is refused
+VERSION = 1  # version of the format of checkpoints; a checkpoint with another one is refused
 MOMENTS = {"step", "exp_avg", "exp_avg_sq"}
 # Settings that may differ between a run and its continuation; `_require_same_run` treats the two lengths.
 FREE_FIELDS = ("data_dir", "result_dir", "backend", "max_steps", "schedule_steps")

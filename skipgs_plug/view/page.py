@@ -24,7 +24,7 @@ from skipgs_plug.view.upright import up_direction
 
 # Radius of the cameras in units of the page. Viser's half precision, near plane and mouse speed suit this size.
 RADIUS = 5.0
-FRUSTUM = 0.04  # height of a camera's frustum, in radii
+FRUSTUM = 0.04  # height of a camera's frustum as a share of RADIUS, so that a hundred cameras hide little of the model
 STEP_BACK = 2.0  # distance of the first viewpoint behind the first camera, in units of the page
 THUMBNAIL = 96  # longer side of the photograph in a frustum, in pixels; small, since a scene may have hundreds
 ERROR_GAIN = 4.0  # factor on absolute errors: at 1, an error of 0.05 would look black

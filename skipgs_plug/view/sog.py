@@ -19,7 +19,7 @@ from torch import Tensor
 from skipgs_plug.trainer.ply import sh_degree
 from skipgs_plug.trainer.row_order import morton_order
 
-VERSION = 2  # of the format that is written
+VERSION = 2  # version of the format that is written
 STEPS = (1 << 16) - 1  # steps from the lowest position to the highest: a coordinate has 16 bits
 LEVELS = 256  # levels of a codebook: a number has one byte
 ROUNDS = 8  # rounds of k-means; later ones change little
@@ -28,7 +28,7 @@ LARGEST_COMPONENT = 252  # alpha of a rotation whose largest component is w; 253
 MOST_ENTRIES = 1 << 16  # palette entries, at most: a label has two bytes
 GAUSSIANS_PER_ENTRY = 8  # Gaussians that share an entry on average, at least: more entries make the file larger
 PAIRS = 5e8  # pairs of a Gaussian and an entry per round of the search, which takes seconds on one core
-SAMPLES_PER_ENTRY = 16  # Gaussians per entry that the search looks at
+SAMPLES_PER_ENTRY = 16  # Gaussians per entry that the search looks at, at most; it bounds the time of a round
 CHUNK = 4096  # Gaussians compared with all entries at once, which bounds memory
 
 

@@ -32,7 +32,7 @@ ANTIALIASED, EXTENDED = 1, 2  # flags
 MOST = 10_000_000  # Gaussians in a file, at most: the authors' own reader refuses more
 POSITION_BITS = 23  # bits of a coordinate without its sign; the format has 24 bits in all
 COLOUR_SCALE = 0.15  # factor on constant SH coefficients before 0.5 is added, as the format says
-HIGHEST_DEGREE = 3  # of SH that the format holds
+HIGHEST_DEGREE = 3  # highest SH degree that is read, which is also the highest of this package's models
 # Signs of the coefficients of bands 1 to 3 when y and z change sign: (y z x) (xy yz zz xz xx-yy) (...)
 SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)
 SCALES = (-10.0, 255 / 16 - 10.0)  # logarithms of the scales that the bytes 0 and 255 stand for

@@ -27,7 +27,7 @@ class LoopFacts:
         densification: How to recognise densification events; None if unknown.
         required: Iterations that must run for needs that showed during the run.
         grown: Iterations of the growing phase that the loop's conditions name, by condition.
-        refined: The same for the refining phase.
+        refined: Iterations of the refining phase that the conditions name, by condition.
         bars: Progress bars of the loop.
     """
 

@@ -64,12 +64,14 @@ LONGEST_STEPS_OF_POSITIONS = 4.0
 
 # Refining (after densification ends).
 LEAST_SHARE = 0.2  # least share of the iterations that run, in any schedule
-# Least share if iterations were left out before refinement too. Steps then shrink once, and no view is watched.
+# Least share of the iterations that run, if iterations were left out before refinement too. Steps then shrink once, and
+# no view is watched.
 LEAST_SHARE_AFTER_FEW = 0.12
 LEAST_STEPS = 400  # least number of iterations, so that steps can shrink
-# Least number if iterations were left out before refinement too. With 400 scripts of 3,000 iterations end 0.1 to 0.2 dB
-# lower on bonsai than with 600, and up to 0.2 dB below their own runs. 600 would take over 40 % of the time on fern.
-# Longer schedules need more, as while the scene grows: of 3,000 iterations, 550 lost 0.1 dB on a ray-traced scene.
+# Least number of iterations, if iterations were left out before refinement too. With 400, scripts of 3,000 iterations
+# end 0.1 to 0.2 dB lower on bonsai than with 600, and up to 0.2 dB below their own runs. 600 would take over 40 % of
+# the time on fern. Longer schedules need more, as in the growing phase: of 3,000 iterations, 550 lost 0.1 dB on a
+# ray-traced scene.
 LEAST_STEPS_AFTER_FEW = 550
 # Largest share that the least number of iterations can ask for. Where all iterations run, steps are not longer and do
 # not shrink: 500 such iterations after its last prune ended 0.3 dB lower than 400 for LightGaussian.
@@ -77,8 +79,8 @@ MOST_SHARE_OF_STEPS = 0.8
 # Share of the iterations that run if refinement shows each view once. The share falls with the fourth root of the
 # number of visits. On bonsai, shares of 0.35, 0.3 and 0.25 lose nothing at 2, 6 and 12 visits.
 RARE_SHARE = 0.46
-# This share if iterations were left out before refinement too. On bonsai at 59 visits (30,000 iterations) a share
-# of 0.18 loses nothing, and 0.15 loses 0.2 dB.
+# Share of the iterations that run if refinement shows each view once, and iterations were left out before it too. On
+# bonsai at 59 visits (30,000 iterations) a share of 0.18 loses nothing, and 0.15 loses 0.2 dB.
 RARE_SHARE_AFTER_FEW = 0.48
 
 

@@ -49,7 +49,7 @@ class Phased(Pace):
         self._facts = LoopFacts(config.always)
         self._planned: LoopRange | None = None  # loop whose conditions were read; nothing in it is refused after that
         self._left_out = 0
-        self._attached = False  # by an adapter
+        self._attached = False  # whether an adapter described the loop
         self._asked = False  # whether the user was told, in the first iteration, that the loop is not known
         self._configured = self._removed = False
 

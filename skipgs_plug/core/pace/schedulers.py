@@ -31,7 +31,9 @@ def catch_up_schedulers(patches: Patches, pace: Pace) -> None:
 
 @contextlib.contextmanager
 def schedulers_caught_up(pace: Pace, on_error: Callable[[Exception], None]) -> Iterator[None]:
-    """Do the same for a loop of the user's own, while it runs in this thread.
+    """Keep every scheduler that a loop of the user's own steps where it would be if all iterations ran.
+
+    It holds inside the `with` statement, for loops in this thread.
 
     Several such loops may run at a time, in threads or one inside another.
 

@@ -162,7 +162,7 @@ def read_syntax(function: FunctionType) -> ast.FunctionDef | None:
 
 
 def _lambda_syntax(function: FunctionType) -> ast.FunctionDef | None:
-    """Return the syntax of a lambda; None if there is no source, or if another one with these parameters is beside."""
+    """Return the syntax of a lambda; None without source, or if its line has another one with these parameters."""
     first, parameters = function.__code__.co_firstlineno, [*inspect.signature(function).parameters]
     try:
         tree = ast.parse("".join(inspect.findsource(function)[0]))

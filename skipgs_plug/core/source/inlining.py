@@ -278,7 +278,7 @@ class _Renamed(ast.NodeTransformer):
 
 
 class _Repeated(ast.NodeTransformer):
-    """Puts the statements of a loop over known objects there once for each object, with its name."""
+    """Replaces a loop over known objects by its statements, once for each object, with the object's name."""
 
     def __init__(self, held: Callable[[ast.For], list[ast.expr]]) -> None:
         self._held = held

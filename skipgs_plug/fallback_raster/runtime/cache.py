@@ -20,7 +20,7 @@ _SUM = "sha256"
 
 
 _choosing = threading.Lock()
-_temporary: list[TemporaryDirectory[str]] = []  # of this process, removed when it ends
+_temporary: list[TemporaryDirectory[str]] = []  # folders of this process, removed when it ends
 
 
 def in_temporary_folder(wp: Any, error: OSError) -> None:

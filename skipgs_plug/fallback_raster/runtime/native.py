@@ -27,7 +27,7 @@ class Kernel(NamedTuple):
     run: Callable[..., None]
     bounds: Any
     pack: Callable[..., bytes]  # makes the structure of arguments from their values, in order
-    addresses: tuple[int, int]  # of the function and of the bounds
+    addresses: tuple[int, int]  # addresses of the function and of the bounds
     command: Any  # Warp's command, which keeps the code loaded while it lives
 
     def __call__(self, arguments: bytes) -> None:

@@ -53,7 +53,7 @@ def read_camera(values: dict[str, Any], image_path: Path, source: Path) -> Any:
     """Return the pycolmap.Camera that a frame (its own values over those of the file) describes.
 
     Focal lengths come from `x_fov` and `y_fov` (degrees), `fl_x` and `fl_y` (pixels) or `camera_angle_x` and
-    `camera_angle_y` (radians), in this order, like in instant-ngp. A value for one axis counts for both.
+    `camera_angle_y` (radians), in this order, as in instant-ngp. A value for one axis counts for both.
 
     Raises:
         InputError: The model is neither a pinhole nor OpenCV's (fisheye) lens, there is no focal length, or a key

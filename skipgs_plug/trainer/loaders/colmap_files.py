@@ -14,10 +14,10 @@ from typing import Any
 from skipgs_plug.trainer.errors import InputError, reason
 from skipgs_plug.trainer.lfs import HINT, is_pointer
 
-# Sizes in bytes.
-POINT_2D = 24  # x, y, id of the 3D point
-TRACK_ELEMENT = 8  # image id, index of the 2D point
-POSE = 56  # quaternion, translation
+# Bytes of the records that COLMAP's files repeat.
+POINT_2D = 24  # x and y, float64; id of the 3D point, uint64
+TRACK_ELEMENT = 8  # id of the image and index of the 2D point, uint32
+POSE = 56  # quaternion and translation, float64
 
 
 def check_lengths(model: Path, camera_models: dict[int, int]) -> None:

@@ -33,7 +33,7 @@ def read_image(
         label: Name of the image in errors.
         background: Colour that transparency is composed onto; None keeps colours, for alpha as a mask.
         factor: Factor by which the image is reduced.
-        size: Width and height that the camera was calibrated for. Pixels stay as they are stored, like in COLMAP. The
+        size: Width and height that the camera was calibrated for. Pixels stay as they are stored, as in COLMAP. The
             orientation in EXIF is applied only if the image fits the camera with it and not without it.
 
     Returns:

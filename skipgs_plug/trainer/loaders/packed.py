@@ -17,7 +17,7 @@ from skipgs_plug.trainer.files import write_aside
 from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.scene import Scene, View, assemble_scene
 
-VERSION = 1  # of the format; a file with another one is refused
+VERSION = 1  # version of the format; a file with another one is refused
 # 256 MiB, in bytes. A larger array that is compressed to less than a twentieth is refused: photographs and points do
 # not compress that far, and a damaged or hostile file could request any amount of memory.
 BOMB = 1 << 28

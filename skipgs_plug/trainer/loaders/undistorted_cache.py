@@ -20,8 +20,8 @@ from skipgs_plug.trainer.loaders.native import import_pycolmap
 log = logging.getLogger(__name__)
 
 FOLDER = "undistorted_cache"
-VERSION = "1"
-CAMERA = "pinhole"  # entry of the PNG: calibration matrix
+VERSION = "1"  # part of each hash: files of another version are not found
+CAMERA = "pinhole"  # text entry of the PNG that holds the calibration matrix
 
 
 class Straight(NamedTuple):

@@ -31,8 +31,8 @@ from skipgs_plug.view.web.rotate_model import rotated, upright
 log = logging.getLogger(__name__)
 
 PAIRS = 5e7  # see `to_sog`; a tenth of its default, so that the page opens sooner
-KEPT = 32  # comparisons that stay in memory
-PORTS = 50  # ports that are tried, from the given one on
+KEPT = 32  # comparisons that stay in memory, at most; a visitor who goes back and forth looks at fewer
+PORTS = 50  # ports that are tried, from the given one on; hardly anyone serves as many pages at once
 TO_PAGE = np.diag([-1.0, -1.0, 1.0])  # the viewer turns a model half a turn about z
 POSE = ([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 60.0)  # position, target, degrees of the first view without a scene
 FILES = {
