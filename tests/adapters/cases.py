@@ -53,7 +53,7 @@ from skipgs_plug import SkipGate
 from skipgs_plug.core import decision
 from skipgs_plug.core.policy import Policy
 
-PAUSE = 4  # iterations
+PAUSE = 4  # iterations of a pause
 
 
 @dataclass(frozen=True)
@@ -61,15 +61,15 @@ class Case:
     """A trainer and its behaviour without a gate.
 
     Attributes:
-        name: of the test.
-        module: the look-alike; has ADAPTER, FIRST, START and LAST iteration.
-        make: gives the trainer and a function `train(last)` that runs it.
-        resume: runs a copy of the result of `train`: resume(result) gives another trainer and `train`.
-        settled: iteration from which nothing changes when everything is skipped.
-        pending: gradients are left over when skipping begins, and are to be applied right before `settled`.
-        views: keys of all training views.
-        leaves_out: its loop counts with a range, so that whole iterations can be left out.
-        later: first iteration that may be skipped, if it is not START of the module.
+        name: Name of the test.
+        module: The look-alike. It has ADAPTER and the numbers of three iterations, FIRST, START and LAST.
+        make: Returns the trainer and a function `train(last)` that runs it.
+        resume: Returns another trainer and its `train`, which continue from a copy of the result of `train`.
+        settled: Iteration from which nothing changes when everything is skipped.
+        pending: Whether gradients are left over when skipping begins. They must be applied right before `settled`.
+        views: Keys of all training views.
+        leaves_out: Whether its loop counts with a range, so that whole iterations can be left out.
+        later: First iteration that may be skipped, if it is not START of the module.
     """
 
     name: str
@@ -89,7 +89,7 @@ class Case:
 
     @property
     def refined_from(self) -> int:
-        """Return the iteration from which refinement leaves out iterations; SETTLED of the module, or the start."""
+        """Return the first iteration that refinement may leave out: SETTLED of the module, or the start."""
         return getattr(self.module, "SETTLED", self.start)
 
     @property

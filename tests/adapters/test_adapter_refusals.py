@@ -43,7 +43,7 @@ def test_wrong_fork_of_a_script_is_noticed_in_its_first_iteration():
     with SkipGate(copied(inria)) as gate:
         adapter, hooks = gate.adapter, gate._hooks
         gate.detach()
-        adapter._attach_to_model(hooks, vars(module))  # as attach_script does
+        adapter._attach_to_model(hooks, vars(module))  # attach_script makes this call
         with pytest.raises(AdapterMismatchError, match="looks like the training script of 'speedy_splat'"):
             module.training(dataset(), types.SimpleNamespace(last=5, iterations=5), None)
 

@@ -15,7 +15,7 @@ from skipgs_plug.adapters.registry import get_adapter
 each = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 resumable = [case for case in CASES if case.resume]
 REAL_BACKWARD = torch.Tensor.backward
-NOT_EVENTS = ("frozen", "relocate", "filter")  # change nothing about the losses, or belong to every iteration
+NOT_EVENTS = ("frozen", "relocate", "filter")  # these change no loss, or happen in every iteration
 
 
 def rows(values):
@@ -57,12 +57,12 @@ def test_skipping_everything_holds_the_model_still(case):
     assert gate.report()["backwards_skipped"] == case.module.LAST + 1 - start
     settled = case.settled or start
     assert all(step < settled for step in gated.steps)
-    if case.pending:  # pending gradients of the last backwards were applied, in a skipped iteration
+    if case.pending:  # a skipped iteration applied the gradients of the last backward passes
         assert start < gated.steps[-1] == settled - 1
     before, after = rows(gated.values[settled]), rows(gated.current)
-    assert (after[:, None] == before[None]).all(dim=2).any(dim=1).all()  # prunes take rows away, nothing moves
+    assert (after[:, None] == before[None]).all(dim=2).any(dim=1).all()  # prunes remove rows, and no other row moves
     assert len(after) == len(rows(alone(case).current))
-    # The trainer's own changes go on: the same prunes with the same counts, and the backwards that they need.
+    # The trainer's own changes go on: the same prunes of as many rows, and the backward passes that they need.
     assert gated.structure == alone(case).structure
     assert gated.other_backwards == alone(case).other_backwards
 
@@ -96,7 +96,7 @@ def test_events_pause_the_gate(case):
 def test_interrupted_and_resumed_decides_as_uninterrupted(case):
     whole, gate = run(case, **RULE)
     new_log()
-    middle = case.module.LAST - 16  # nothing is pending there: no trainer saves gradients
+    middle = case.module.LAST - 16  # no gradient is pending there, which a checkpoint would lose
     trainer, train = case.make()
     with SkipGate(trainer, **RULE) as first:
         checkpoint = train(last=middle)
@@ -178,7 +178,7 @@ def test_answers_about_a_run_change_nothing(case, monkeypatch):
     trainer, train = case.make()
     with SkipGate(trainer):
         train(last=case.module.FIRST)
-    assert len(answers) >= 2 and all(one == other for one, other in answers)  # some answers ask for others
+    assert len(answers) >= 2 and all(one == other for one, other in answers)  # some answers are computed from others
 
 
 @pytest.mark.parametrize("case", SCRIPTS, ids=lambda case: case.name)

@@ -39,7 +39,7 @@ def test_what_moves_the_model_in_skipped_iterations_releases_the_gate(case, shak
     assert [one for one in recwarn if str(one.message) == gate.released]
     assert f"The loop moved xyz in iteration {case.start + 1}" in gate.released
     assert log.backwards[-1] == case.module.LAST == max(log.values)
-    assert gate.report()["backwards_skipped"] == 2  # nothing is compared before the first; it moved in the second
+    assert gate.report()["backwards_skipped"] == 2  # the first has nothing to compare with; xyz moved in the second
 
 
 def test_a_model_that_keeps_still_in_skipped_iterations_is_gated_to_the_end(case):

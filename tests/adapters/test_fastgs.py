@@ -36,7 +36,7 @@ def moved(log: Log, name: str) -> list[int]:
 def test_fastgs_applies_the_sum_of_backwards_that_ran():
     gated, gate = run(CASES["fastgs"], policy=SkipWhenDue())
     assert [i for i in range(20, 65) if i not in gated.backwards] == [24, 32, 40, 48, 56, 64]
-    # 32 is a prune too: new parameters have no gradient, upstream as here, so that step is empty.
+    # Iteration 32 prunes too. New parameters have no gradient, as in the trainer itself, so its step changes nothing.
     assert [step for step in gated.steps if step > 20] == [24, 40, 48, 56]
     assert moved(gated, "f_rest")[-3:] == [40, 48, 56] and moved(gated, "xyz")[-3:] == [40, 48, 56]
     assert gate.report()["backwards_skipped"] == 6
@@ -45,7 +45,7 @@ def test_fastgs_applies_the_sum_of_backwards_that_ran():
 def test_taming_applies_pending_sh_gradients():
     gated, _ = run(CASES["taming"], policy=SkipWhenDue())
     assert moved(gated, "f_rest") == [8, 16, 24, 32, 40, 48, 56]
-    assert not set(moved(gated, "xyz")) & {24, 32, 40, 48, 56}  # the other optimizer has nothing pending there
+    assert not set(moved(gated, "xyz")) & {24, 32, 40, 48, 56}  # the other optimizer has no pending gradient there
 
 
 def test_prunes_of_fastgs_are_events():
@@ -71,7 +71,7 @@ def test_densification_runs_whole_before_steps_with_accumulated_gradients(monkey
     gated, gate = run(CASES[name], **settings)
     grown, before = ([step for step in one.backwards if step < 20] for one in (gated, shorter))
     assert len(before) < 16
-    assert grown == list(range(1, 20)) if "share" in settings else len(grown) < 16  # the user asked for it
+    assert grown == list(range(1, 20)) if "share" in settings else len(grown) < 16  # grow_share is the user's wish
     if "share" in settings:
         assert len([step for step in gated.backwards if step >= 20]) < 45
         assert "18 of 18 iterations run (100.0 %) until densification ends" in gate.summary()
@@ -98,14 +98,14 @@ def test_steps_with_fewer_gradients_are_longer_and_shrink(monkeypatch, compensat
     monkeypatch.setattr(ImprovedGS, "accumulates_from", 20)
     settings = {"refine_share": 0.25, "compensate": compensate}
     gated, gate, factors = factors_of(CASES["improved_gs"], improved_gs, monkeypatch, **settings)
-    # All steps of the own run happen but the last: every 4th iteration, then every 8th.
+    # All steps of the own run but the last one happen: in every 4th iteration, then in every 8th.
     assert sorted({step for step in gated.steps if step > 20}) == [24, 28, 32, 36, 40, 48, 56]
     for step in (24, 40, 48, 56):
         shrunk = 2.0 / 0.25**0.5 * (1.0 - (step - 20) / 45)  # refinement has 45 iterations
         assert factors[step, "rotation"] == pytest.approx(1.0 if compensate is False else shrunk)
         assert factors[step, "opacity"] == pytest.approx(1.0 if compensate is False else min(shrunk, 1.0))
     assert factors[19, "rotation"] == 1.0
-    assert gate.report()["gaussians_shown"] is None  # several views stand behind a gradient
+    assert gate.report()["gaussians_shown"] is None  # a gradient is gathered from several views
 
 
 def test_fastgs_steps_in_each_iteration_of_refinement_that_runs(monkeypatch):
@@ -114,9 +114,9 @@ def test_fastgs_steps_in_each_iteration_of_refinement_that_runs(monkeypatch):
     ran = [step for step in gated.backwards if 20 < step < 64 and step not in fastgs.PRUNES]
     assert set(ran) == {step for step in gated.steps if 20 < step < 64} and 8 < len(ran) < 16
     assert any(step % fastgs.STEP_EVERY for step in ran)  # the script alone would not step there
-    assert gate.report()["gaussians_shown"] > 0.5  # it is measured, since one view stands behind a gradient
+    assert gate.report()["gaussians_shown"] > 0.5  # it is measured, since each gradient is of one view
     for step in ran:
-        assert factors[step, "rotation"] > path_factor(0.25, (step - 20) / 45)  # the factor of a third of the Gaussians
+        assert factors[step, "rotation"] > path_factor(0.25, (step - 20) / 45)  # if a third is shown
         assert factors[step, "f_rest"] == pytest.approx(4.0 * factors[step, "rotation"])
 
 
@@ -124,7 +124,7 @@ def test_fastgs_accumulates_if_steps_stay_as_they_are(monkeypatch):
     monkeypatch.setattr(adapter, "ACCUMULATES_FROM", 20)
     monkeypatch.setattr(adapter, "interval", lambda iteration: 8)
     gated, _ = run(CASES["fastgs"], refine_share=0.25, compensate=False)
-    # 32 is a prune, whose new parameters have no gradient.
+    # Iteration 32 prunes. Its new parameters have no gradient.
     assert [step for step in gated.steps if step > 20] == [24, 40, 48, 56]
 
 

@@ -13,7 +13,7 @@ MODULES = pytest.mark.parametrize("module", [gaussianspa, gaussianspa_op], ids=[
 def test_gate_begins_after_the_sparsifying_phase_and_pauses_for_its_prune(module):
     gated, gate = run(script("", module), **RULE)
     assert gated.structure[-1][:2] == (40, "prune")
-    assert gate.trace[0].step == 41  # counted: update_learning_rate got numbers shifted by 10
+    assert gate.trace[0].step == 41  # the adapter counts: update_learning_rate got numbers shifted by 10
     assert [row.reason for row in gate.trace[:PAUSE]] == ["pause"] * PAUSE
     assert gate.stats()["events"] == {"prune_points": 1}
 

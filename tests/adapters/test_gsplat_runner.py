@@ -155,7 +155,7 @@ def test_the_papers_gate_skips_no_backward_of_the_controller(monkeypatch):
     with SkipGate(gated, start_iter=20, policy=SkipAlways()) as gate:
         gated.train()
     assert gate.report()["backwards_skipped"] == 20 and stepped == [True] * 20
-    assert gated.controller.item() != plain.controller.item() != 1.0  # trained on other Gaussians
+    assert gated.controller.item() != plain.controller.item() != 1.0  # the gated one was trained on other Gaussians
 
 
 @pytest.mark.parametrize("batch_size, share", [(1, 0.353), (2, 0.297)])

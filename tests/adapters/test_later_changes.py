@@ -72,7 +72,7 @@ class Trimmer:
         (f"rounds, rest = divmod(opt.prune_until_iter, 7)\n            if iteration < 7 * rounds: {PRUNE}", 28),
         (f"if opt.changed_late and iteration < 30: {PRUNE}\n            opt.changed_late = True", 30),
         (f"if pruned and iteration < 30: {PRUNE}\n            pruned = iteration > 3", 30),
-        (f"if iteration < opt.iterations: {PRUNE}", 20),  # until the end: each prune pauses the gate
+        (f"if iteration < opt.iterations: {PRUNE}", 20),  # it prunes until the end, and each prune pauses the gate
         (f"if iteration in range(22, 28, 2): {PRUNE}", 27),
         (f"if stages.get(iteration): {PRUNE}", 29),
         (f"if is_due(iteration, opt): {PRUNE}", 31),
@@ -120,7 +120,11 @@ NONE = "torch.zeros(30, dtype=torch.bool)"
     [
         ("", f"maybe_prune(gaussians, iteration, {NONE})", 30),
         ("", "if iteration > 100: pruner.step(gaussians, iteration)", 30),
-        ("", "if iteration > 100: fork_helpers.Pruner().step(gaussians, iteration)", 20),  # made by the loop: not known
+        (
+            "",
+            "if iteration > 100: fork_helpers.Pruner().step(gaussians, iteration)",
+            20,
+        ),  # the loop makes the object, so its method is not known
         ("site-packages", f"maybe_prune(gaussians, iteration, {NONE})", 20),
     ],
 )

@@ -13,7 +13,9 @@ def test_start_is_relative_to_the_first_iteration():
     settings = {"warmup": 0, "pause_iters": 5, "record_trace": True}
     gated, gate = run(script("", lightgaussian_prune_finetune), **settings)
     assert gated.structure == [(31, "prune", 15)] and gate.config.start_iter == 32
-    assert [row.reason for row in gate.trace[:6]] == ["pause"] * 5 + ["new view"]  # no mean is seeded at the peak
+    assert [row.reason for row in gate.trace[:6]] == ["pause"] * 5 + [
+        "new view"
+    ]  # the pause seeds no mean with losses after the prune
     assert run(script("", lightgaussian_distill), **settings)[1].config.start_iter == 31
     assert run(script("", lightgaussian_densify_prune), **settings)[1].config.start_iter == 20
 

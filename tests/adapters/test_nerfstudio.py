@@ -23,7 +23,7 @@ def train(gate_settings, **options):
 
 def test_terms_of_some_iterations_do_not_enter_the_decision():
     _, gate = train(RULE)
-    assert max(row.loss for row in gate.trace) < 1.0  # scale_reg, in every tenth iteration, is above that
+    assert max(row.loss for row in gate.trace) < 1.0  # scale_reg, which every tenth iteration adds, is larger
     _, plain = train({**RULE, "enabled": True, "threshold": -0.999})
     assert all(row.loss < 1.0 for row in plain.trace if row.step % 10 == 0)
 
@@ -41,7 +41,7 @@ class SkipOdd(SkipAlways):
 
 
 def test_accumulated_gradients_are_stepped_in_a_skipped_iteration():
-    train({"policy": SkipOdd()}, accumulate=2)  # zeroed in even iterations, stepped in odd ones
+    train({"policy": SkipOdd()}, accumulate=2)  # it zeroes gradients in even iterations and steps in odd ones
     assert [step for step in log.steps if step >= 20] == list(range(21, 60, 2))
 
 

@@ -16,7 +16,7 @@ from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.policy import SkipPolicy
 from tests.entries import ENTRIES
 
-# One of each kind: a script, an object whose strategy is called, callbacks, wrapped trainers, epochs, minibatches.
+# One trainer of each kind: script, object with a strategy, callbacks, wrapped trainers, epochs, minibatches.
 KINDS = ("inria", "deformable", "gsplat_default", "nerfstudio_scaled", "step_trainer", "litegs", "faster_gs", "edgs")
 KINDS += ("3dgrut", "fvdb")
 cases = [case for case in CASES if case.name in KINDS]

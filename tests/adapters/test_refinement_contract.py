@@ -36,7 +36,7 @@ def test_a_share_of_the_iterations_runs_and_nothing_that_hangs_on_numbers_is_los
     assert report["iterations_run"] + report["iterations_skipped"] == last + 1 - start
     always = sum(report["always_run"].values())
     assert len(refined) <= SHARE * (last + 1 - start) + always + 2
-    assert gated.structure == plain.structure  # prunes, resets, relocations: same iterations, same counts
+    assert gated.structure == plain.structure  # the same prunes, resets and relocations in the same iterations
     assert gated.other_backwards == plain.other_backwards
     assert gated.backwards == [n for n in begun if n in gated.backwards]
     assert report["backwards_run"] == len([n for n in gated.backwards if n >= start])
@@ -83,7 +83,7 @@ def test_rates_are_the_trainers_own_between_steps(case, monkeypatch):
     alive.clear()
     gated = rates_of({"refine_share": SHARE})
     assert len(gated) < len(plain)
-    for number, rates in gated.items():  # after each iteration that ran, of schedulers that count calls too
+    for number, rates in gated.items():  # also rates of schedulers that count calls
         assert rates == pytest.approx(plain[number], rel=1e-9)
 
 
@@ -93,7 +93,9 @@ def test_interrupted_and_resumed_leaves_out_the_same(case, begun):
     whole, _ = run(case, **settings)
     numbers = list(begun)
     last = case.module.LAST
-    later = [n for n in numbers if last - 16 <= n < last]  # nothing is pending at first: no trainer saves gradients
+    later = [
+        n for n in numbers if last - 16 <= n < last
+    ]  # no gradient is pending at the first, which a checkpoint would lose
     middle = later[0] if later else numbers[-2]
     new_log()
     begun.clear()
@@ -155,7 +157,7 @@ def test_a_loop_around_a_pip_trainer_is_written_with_the_gates_iterations():
         for step in gate.iterations(range(1, 61)):
             trainer.step(step_trainer.pick_camera(step_trainer.dataset(), step))
             assert trainer.curr_step == step
-    assert gate.report()["iterations_run"] == 16 + 3  # those in which the SH degree is raised
+    assert gate.report()["iterations_run"] == 16 + 3  # a share, and three that raise the SH degree
     assert trainer.raised == plain.raised == 6
     assert [event for event in structure if event[0] < 21] == log.structure
     trainer = step_trainer.make()

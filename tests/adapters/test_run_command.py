@@ -193,7 +193,7 @@ class FullDisk(io.StringIO):
 
 def test_messages_that_cannot_be_written_end_no_training(checkout, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "stderr", FullDisk())
-    (tmp_path / "model.pth.skipgs.json" / "in_the_way").mkdir(parents=True)  # of a message
+    (tmp_path / "model.pth.skipgs.json" / "in_the_way").mkdir(parents=True)  # the state cannot be written: a message
     assert cli.main(["run", "auto", "--cpu", "--", checkout, str(tmp_path)]) == 0
     assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 60
 
@@ -346,7 +346,7 @@ def test_gate_state_of_another_scene_is_not_used(train, capfd):
     assert not (folder / "skipgs.json").exists()  # no iteration ran
     with pytest.warns(RuntimeWarning, match="belongs to another scene: up to iteration"):
         code, folder = train("bright", *start, "--bright")
-    assert code == 0  # the losses tell it only after some iterations: the gate is released, and the run goes on
+    assert code == 0  # only the losses show it, so the gate is released and the run goes on
     assert counted(folder)["iterations"] == 40 + 10
 
 

@@ -20,7 +20,7 @@ def test_start_follows_the_latest_inclusive_bound_and_the_reset_in_it_pauses():
     assert gate.config.start_iter == 21
     assert log.structure[-1][:2] == (20, "reset")
     assert [row.reason for row in gate.trace[:4]] == ["pause"] * 4 and gate.trace[4].reason != "pause"
-    assert trainer.raised == 6  # the loss, and with it the SH degree, goes on once per iteration
+    assert trainer.raised == 6  # each iteration computes the loss once, which raises the SH degree
 
 
 def test_wrappers_put_around_a_gated_trainer_stay_gated():
@@ -87,7 +87,7 @@ def test_a_script_tells_the_training_views(monkeypatch):
     assert gate._engine._view_names == [camera.ground_truth_image_path for camera in cameras]
 
 
-def thinned(trainer):
+def trained_with_share(trainer):
     """Train with a share of 0.4, and return its report and the densification events that ran."""
     new_log()
     with SkipGate(trainer, share=0.4) as gate:
@@ -100,7 +100,7 @@ def test_a_share_leaves_out_events_of_densifiers_and_pruners_but_no_reset(monkey
     monkeypatch.setattr(densification_events, "LEAST_EVENTS", 1)  # leave out some of a few events
     monkeypatch.setattr(needs, "STEPS_PER_EVENT", 1)
     trainer = step_trainer.make()
-    report, events = thinned(trainer)
+    report, events = trained_with_share(trainer)
     growing = report["growing"]
     # All events: 6, 9, 12, 15 of the densifier; 5, 10, 15, 20 of the pruner.
     assert growing["events_run"] + growing["events_skipped"] == 7 and growing["events_skipped"] > 0
@@ -112,7 +112,7 @@ def test_a_share_leaves_out_events_of_densifiers_and_pruners_but_no_reset(monkey
 def test_all_iterations_of_a_short_schedule_run_while_sizes_on_the_screen_prune():
     trainer = step_trainer.make()
     trainer.base_trainer.base_trainer.densifier.prune_screensize_threshold = 20
-    report, events = thinned(trainer)
+    report, events = trained_with_share(trainer)
     assert events == [6, 9, 12, 15] and report["growing"]["iterations_skipped"] == 0
     assert report["iterations_skipped"] > 0
 
@@ -124,7 +124,7 @@ def test_all_iterations_of_densification_run_if_not_all_events_are_known(unread)
     if unread == "bound":
         trainer.relocate_until_iter = 18
     with pytest.warns(RuntimeWarning, match="The densification events of iterations 1 to 20 are not known"):
-        report, events = thinned(trainer if unread == "bound" else Trimmer(trainer))
+        report, events = trained_with_share(trainer if unread == "bound" else Trimmer(trainer))
     assert events == [6, 9, 12, 15] and report["growing"] is None
     assert report["iterations_skipped"] > 0
 

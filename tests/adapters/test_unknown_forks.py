@@ -76,7 +76,7 @@ def train(module, **options):
     module.training(dataset(), opt, None)
 
 
-def test_loop_of_inrias_own_is_no_stranger():
+def test_inrias_own_loop_is_not_an_unknown_fork():
     with SkipGate(unknown_fork(), policy=SkipAlways()) as gate:
         assert gate.adapter.name == "inria"
         train(gate.adapter.trainer)
@@ -110,7 +110,7 @@ def test_further_calls_and_arguments_are_listed():
     assert "Recognised: render, backward, training_setup, update_learning_rate." in sentence
     assert sentence.endswith("still executed in skipped iterations: render(kernel_size=), count().")
     with gate:
-        train(gate.adapter.trainer)  # nothing moves, so it is gated to the end
+        train(gate.adapter.trainer)  # no parameter moves in skipped iterations, so the gate stays to the end
     assert gate.report()["backwards_skipped"] == 21
 
 
@@ -139,7 +139,7 @@ def test_what_moves_the_model_in_skipped_iterations_ends_the_gate_and_not_the_tr
     with gate, pytest.warns(RuntimeWarning, match="The loop moved xyz in iteration 21, whose backward was skipped"):
         train(gate.adapter.trainer)
         assert not gate.patched
-    assert gate.report()["backwards_skipped"] == 2  # 20, before which nothing is compared, and 21
+    assert gate.report()["backwards_skipped"] == 2  # in iteration 20, which has nothing to compare with, and in 21
     assert log.backwards == [*range(1, 20), *range(22, 41)]
 
 
@@ -208,7 +208,7 @@ def test_functions_that_the_loop_calls_are_read_too():
         ("if iteration < opt.prune_until_iter: gaussians.count()", 30),
         ("if opt.prune_until_iter >= iteration and iteration % 5 == 0: gaussians.count()", 31),
         ("if iteration in [24, 28]: gaussians.count()", 29),
-        ("if iteration == 300: gaussians.count()", 20),  # after the last iteration: never
+        ("if iteration == 300: gaussians.count()", 20),  # the run ends before
         ("gaussians.count()", 20),
         ("if iteration > 10: gaussians.count()", 20),
         ("if iteration < 25 or opt.prune_until_iter: gaussians.count()", 20),

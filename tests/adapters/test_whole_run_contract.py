@@ -57,7 +57,7 @@ def beside(entries, events):
 
 @pytest.mark.parametrize("share", [SHARE, "auto"])
 @each
-def test_events_are_thinned_and_everything_else_happens_exactly_as_often(case, share, begun, short):
+def test_events_are_left_out_and_everything_else_happens_exactly_as_often(case, share, begun, short):
     plain = alone(case)
     events = set(plain.behind)
     begun.clear()
@@ -75,17 +75,17 @@ def test_events_are_thinned_and_everything_else_happens_exactly_as_often(case, s
         earliest = min(n for n in plain.values if n > before)
         since = [n for n in begun if earliest <= n <= event]
         assert gathered <= len(since)
-        if any(plain.behind.values()):  # MCMC gathers nothing
+        if any(plain.behind.values()):  # MCMC gathers no gradients
             assert len(since) - gathered <= start_of_gathering(plain, case)
         before = event
     growing = report["growing"]
     if not events:
-        assert grown == list(range(case.module.FIRST, start))  # nothing grows in this script
+        assert grown == list(range(case.module.FIRST, start))  # this script has no densification
         return
     assert growing["events_run"] == len(gated.behind)
     assert growing["events_run"] + growing["events_skipped"] == len(events)
     asked = growing["iterations_run"] + growing["iterations_skipped"]
-    assert asked == start - case.module.FIRST - 1  # the loop is not known in the first
+    assert asked == start - case.module.FIRST - 1  # in the first iteration the loop is not known yet
     whole = WHOLE.get(case.module.ADAPTER, range(0))
     assert set(whole) <= set(begun) and len(grown) < start - case.module.FIRST
     if case.module.ADAPTER in KEEP_ALL_EVENTS or "mcmc" in case.name:
@@ -109,7 +109,7 @@ def test_leaving_out_nothing_leaves_the_whole_run_bit_identical(case, settings):
     assert (plain.structure, plain.steps, plain.happened) == (gated.structure, gated.steps, gated.happened)
 
 
-# Of a scheduler that was copied together with its optimizer, before that stepped again.
+# A scheduler gives this warning if it was copied with its optimizer, and the copy has not stepped yet.
 @pytest.mark.filterwarnings("ignore:Seems like `optimizer.step:UserWarning")
 @pytest.mark.parametrize("grows", [True, False], ids=["growing", "refining"])
 @pytest.mark.parametrize("case", [case for case in LOOPS if case.resume], ids=lambda case: case.name)

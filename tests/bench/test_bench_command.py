@@ -76,6 +76,6 @@ def test_names_of_views_are_no_formulas(finished, tmp_path):
 
 
 def test_visit_map_has_a_column_for_each_epoch():
-    # Epochs of three views: iterations 3 to 5 and 6 to 8; refinement begins at 4.
+    # There are three views, so epochs are iterations 3 to 5 and 6 to 8. Refinement begins at 4.
     trace = Trace(start=4, view=[2, 0, 1, 2, 0], loss=[0.0] * 5, mean=[None] * 5, codes="wdDDd")
     assert np.array_equal(visit_map(trace, 3), [[RUN, RUN], [NOT_VISITED, SKIPPED], [RUN, SKIPPED]])

@@ -186,7 +186,7 @@ def test_a_killed_bench_continues_where_it_stopped(scene, finished, tmp_path):
 
     def die_after_three(line: str) -> None:
         lines.append(line)
-        if len(lines) == 4:  # densification, then three runs
+        if len(lines) == 4:  # one line of densification, then three of runs
             raise Killed
 
     with early_floor(), pytest.raises(Killed):
@@ -214,7 +214,7 @@ def test_a_killed_bench_continues_where_it_stopped(scene, finished, tmp_path):
 
 def test_a_run_that_diverges_is_named_and_its_copies_are_not_run(scene, tmp_path):
     bench = make_bench(scene, tmp_path, seeds=(5,))
-    turn = 1 + (MAX_STEPS - START) // PARTS  # compilation, and the iterations of a part
+    turn = 1 + (MAX_STEPS - START) // PARTS  # one iteration compiles, and a part has the others
     bench.backend = failing_backend(
         1 + START + turn + 1 + 3
     )  # densification, the own run's turn, the gate's third loss

@@ -15,7 +15,7 @@ from benchmarks.script_rows import Row
 from benchmarks.script_table import table
 from benchmarks.sized_scene import sized_scene
 
-# In place of Python: logs its arguments, and leaves a report and the pictures that a gsplat run would have written.
+# Stands for Python: it logs its arguments, and writes the report and the pictures of a run of gsplat.
 STAND_IN = """#!/bin/sh
 echo "$@"
 for last; do :; done
@@ -132,7 +132,7 @@ def test_table_has_means_over_draws_of_the_points_and_each_difference():
     assert table(runs).splitlines()[4] == (
         "| Tiny | 100 | 40 | 2 | 1 | 50 | 10 |  | 30.00 (0.5000) | 31.00 (0.5000) | +1.00 |"
     )
-    runs += [one("own", 1, 32.0, seconds=4.0, ssim=0.6), one("own", 2, 20.0)]  # the last has no partner
+    runs += [one("own", 1, 32.0, seconds=4.0, ssim=0.6), one("own", 2, 20.0)]  # the last one lacks the other mode
     runs += [one("auto", 1, 31.5, gaussians=30, iterations_run=50, busy_core=True)]
     assert table(runs).splitlines()[4] == (
         "| Tiny | 100 | 45 | 3 | 2* | 50 | 10 |  | 31.00 (0.5500) | 31.25 (0.5000) | +0.25 (+1.00, -0.50) |"

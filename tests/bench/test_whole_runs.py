@@ -177,7 +177,7 @@ def test_exact_views_are_told(whole):
 
 
 @given(st.integers(1, 300), st.data())
-def test_thinning_keeps_events_and_so_many_numbers(n, data):
+def test_controls_keep_all_events_and_the_given_number_of_iterations(n, data):
     numbers = range(5, 5 + n)
     forced = data.draw(st.sets(st.sampled_from(numbers), max_size=20))
     count = data.draw(st.integers(0, n))
@@ -234,6 +234,6 @@ def test_a_run_after_another_needs_as_much_memory():
             with peak_memory(trainer, record):
                 trainer.train(until=trainer.step + 5, progress=False)
     first, second = (record.peak_memory for record in records)
-    held = sum(parameter.nbytes for parameter in trainers[1].splats.values()) * 3  # with moments
+    held = sum(parameter.nbytes for parameter in trainers[1].splats.values()) * 3  # parameters and two moments
     assert second > 1.5 * held
     assert second > 0.4 * first  # the first run loaded the kernels too

@@ -24,7 +24,7 @@ def test_a_backend_that_cannot_run_says_why() -> None:
             "import sys; sys.stderr.write('LLVM ERROR: no assembler\\n'); sys.exit(3)",
             "ended with exit code 3: LLVM ERROR",
         ),
-        ("import os; os._exit(0)", "ended with exit code 0"),  # it never said that it rendered
+        ("import os; os._exit(0)", "ended with exit code 0"),  # it ends before it reports a result
     ],
 )
 def test_a_crash_is_a_sentence(

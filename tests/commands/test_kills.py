@@ -29,7 +29,7 @@ def whole(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run.out
 
 
-# A run writes, in this order: owner of the lock, cfg.yml, two checkpoints, two renders, stats, PLY, report.
+# A run writes nine files in this order: owner of the lock, cfg.yml, two checkpoints, two renders, stats, PLY, report.
 @pytest.mark.parametrize("fault", [("killed before", 4), ("killed after", 5), ("disk full", 4)])
 def test_killed_while_a_file_is_written(scene: Path, tmp_path: Path, whole: Path, fault: tuple[str, int]) -> None:
     run = Run(scene, tmp_path / "run", gated=True, save_every=50)

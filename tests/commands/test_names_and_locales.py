@@ -20,7 +20,7 @@ from skipgs_plug.trainer.loaders.native import import_pycolmap
 from skipgs_plug.trainer.synthetic import make_scene
 
 SHORT = ["--max-steps", "6", "--no-progress"]
-LATIN = os.fsdecode(b"sc\xe9ne")  # as arguments arrive that are no UTF-8
+LATIN = os.fsdecode(b"sc\xe9ne")  # Python passes arguments that are not UTF-8 in this form
 
 
 def write_colmap(root: Path, name: str = "view", binary: bool = False) -> Path:

@@ -208,7 +208,7 @@ def test_a_full_disk_that_leaves_no_checkpoint_does_not_promise_to_resume(
         assert train(packed, tmp_path / "run") == 2
     error = capsys.readouterr().err
     assert "no checkpoint" in error and "without --resume" in error and "--resume writes them" not in error
-    assert train(packed, tmp_path / "run", "--max-steps", "4") == 0  # as the sentence says
+    assert train(packed, tmp_path / "run", "--max-steps", "4") == 0  # the sentence gives this command
 
 
 def test_the_next_command_can_be_pasted(tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -228,7 +228,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(
     assert train(packed, out, "--resume") == 0
     assert "Trying ckpt_39_rank0.pt" in caplog.text and "iterations 40 to 60" in capsys.readouterr().out
     assert_same(out, whole)
-    content = torch.load(newest, weights_only=True)  # damaged inside, where only the gate can see it
+    content = torch.load(newest, weights_only=True)  # only the gate's part is damaged, which only the gate checks
     content["registered"]["skipgs"]["policy"]["budget"]["floor"] = "high"
     torch.save(content, newest)
     assert train(packed, out, "--resume") == 0
@@ -278,7 +278,7 @@ def test_two_processes_do_not_share_a_folder(tmp_path: Path, packed: str, capsys
         assert train(packed, tmp_path) == 2
         assert f"is in use by process {other.pid} on {os.uname().nodename}" in capsys.readouterr().err
         other.kill()
-    assert (tmp_path / ".owner.json").is_file()  # left behind, and no obstacle
+    assert (tmp_path / ".owner.json").is_file()  # the killed process left it behind, which does no harm
     assert train(packed, tmp_path, "--max-steps", "2") == 0
     assert not (tmp_path / ".owner.json").exists()
 

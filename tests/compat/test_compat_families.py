@@ -197,7 +197,7 @@ def test_sparse_adam_moves_visible_rows_only():
     for _ in range(2):
         param.grad = torch.full_like(param, 0.5)
         optimizer.step(visible, 6)
-    # Without bias correction: 0.1 g / sqrt(0.001 g^2), then 0.19 g / sqrt(0.001999 g^2).
+    # Two steps without bias correction: 0.1 g / sqrt(0.001 g^2), then 0.19 g / sqrt(0.001999 g^2).
     moved = 0.1 * (0.1 / 0.001**0.5 + 0.19 / 0.001999**0.5)
     torch.testing.assert_close(param.data[visible], values[visible] - moved)
     assert torch.equal(param.data[~visible], values[~visible])
@@ -209,7 +209,7 @@ def test_modules_are_served_and_taken_away(family):
     other_module = object()
     names = list(FAMILIES[family])
     before = set(sys.modules)
-    sys.modules[names[0]] = other_module  # the earlier modules come back
+    sys.modules[names[0]] = other_module  # modules from before are restored
     try:
         with serve(family):
             for name, (_, offered) in FAMILIES[family].items():

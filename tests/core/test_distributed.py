@@ -95,7 +95,7 @@ def test_ranks_agree(tmp_path: Path) -> None:
     assert one["gradients"] == two["gradients"]
     assert all(math.isfinite(gradient) for gradient in one["gradients"])
     assert len(one["gradients"]) == 20 + one["skips"].count(False)
-    # Disagreement happened, and was settled in favour of the backward, on either side.
+    # The ranks disagreed, each at some time, and the backward pass ran on both.
     assert "other rank" in one["reasons"]
     assert "other rank" in two["reasons"]
     assert one["reasons"][130] == two["reasons"][130] == "non-finite"
@@ -127,7 +127,7 @@ def trouble(rank: int, folder: str, size: int, kind: str, loaded: Barrier) -> No
     except SkipGSError as error:
         said = str(error)
     Path(folder, f"{rank}.txt").write_text(said)
-    os._exit(0)  # the group is broken: leaving it in order would wait for the dead
+    os._exit(0)  # an orderly exit would wait for the dead rank
 
 
 @pytest.mark.timeout(120)
@@ -175,10 +175,10 @@ def release(rank: int, folder: str, place: str, ranks: tuple[int, ...]) -> None:
     except (ZeroDivisionError, SkipGSError) as error:
         said = str(error)
     Path(folder, f"{rank}.json").write_text(json.dumps({"ran": ran, "said": said, "released": gate.released}))
-    os._exit(0)  # a broken group is not left in order
+    os._exit(0)  # an orderly exit would wait for the other rank
 
 
-# By name: a function of the gate that fails, and the refine_share of the gate; None for losses that are not finite.
+# Function of the gate that fails, and the gate's refine_share, by name. None: losses are not finite.
 PLACES: dict[str, Any] = {
     "decision": (SkipPolicy, "decide", None),
     "decision with a share": (RefinementPolicy, "decide", 0.5),
@@ -261,7 +261,7 @@ def refine(rank: int, folder: str, share: float | str, nothing_on_the_cpu: bool)
     """Replicas whose views show different shares of the Gaussians, and whose reduced gradients are the same."""
     start(rank, folder)
     if nothing_on_the_cpu:
-        distributed._devices = lambda: {"cuda"}  # as a group of cuda:nccl says
+        distributed._devices = lambda: {"cuda"}  # the answer of a group of cuda:nccl
     torch.manual_seed(0)
     value = torch.nn.Parameter(torch.zeros(40, 3))
     optimizer = torch.optim.Adam([{"params": [value], "lr": 0.01, "name": "means"}])
@@ -283,7 +283,7 @@ def refine(rank: int, folder: str, share: float | str, nothing_on_the_cpu: bool)
     result = {"ran": ran, "shown": report["gaussians_shown"], "share": report["refine_share"], "end": value.tolist()}
     Path(folder, f"{rank}.json").write_text(json.dumps(result))
     dist.destroy_process_group()
-    # A group of ours that outlived the trainer's would end in the interpreter's last moments, and could abort it.
+    # If the gate's group outlived the trainer's, it would end with the interpreter, and could abort it.
     assert not any(own() for own in distributed._own_groups.values())
 
 
@@ -316,11 +316,11 @@ def grow(rank: int, folder: str, bound: int | None) -> None:
 
 
 @pytest.mark.timeout(120)
-@pytest.mark.parametrize("bound, events", [(60, False), (None, True)])  # the second rank alone is above 60
+@pytest.mark.parametrize("bound, events", [(60, False), (None, True)])  # only the second rank has more than 60
 def test_ranks_agree_on_the_bound_on_gaussians(tmp_path: Path, bound: int | None, events: bool) -> None:
     mp.spawn(grow, args=(str(tmp_path), bound), nprocs=2)
     one, two = (json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2))
-    # The first event is asked about before any step showed how many there are.
+    # The first event comes before a step has shown the number of Gaussians.
     assert one == two and (one["events"] > 1) == events
 
 

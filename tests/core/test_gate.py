@@ -183,7 +183,7 @@ def test_a_saved_state_holds_plain_values_whatever_the_loop_counts_with() -> Non
     saved = io.BytesIO()
     torch.save(gate.state_dict(), saved)
     saved.seek(0)
-    state = torch.load(saved, weights_only=True)  # refuses anything else
+    state = torch.load(saved, weights_only=True)  # it refuses all but plain values
     SkipGate(start_iter=0, warmup=0).load_state_dict(json.loads(json.dumps(state)))
 
 
@@ -195,7 +195,7 @@ def test_optimizer_steps_on_pending_gradients_only() -> None:
     assert gate.step({"one": first, "two": second})
     assert parameter.tolist() == [0.0, 0.0]
     assert other.tolist() == [1.0, 1.0]
-    # Not zeroed: still pending in the next iteration, though that one was skipped.
+    # The gradient was not zeroed, so it is still pending in the next iteration, which was skipped.
     gate.backward(parameter.sum(), view="a", step=1)
     assert gate.step(first)
     assert parameter.tolist() == [-1.0, -1.0]
@@ -282,7 +282,7 @@ def test_the_processors_clock_is_read_every_10_ms_and_counts_all_of_it(monkeypat
         gate.backward(loss_of(1.0), view="a", step=step)
         counts.append(readings)
         wall += 0.004
-    # Also in the first iteration, and where the part after `start_iter` begins.
+    # This holds in the first iteration too, and where the time after `start_iter` begins.
     assert counts == [1, 1, 1, 2, 3, 3, 3, 4]
     stats = gate.stats()
     assert (stats["t_total"], stats["t_post"]) == pytest.approx((0.028, 0.012))

@@ -360,7 +360,7 @@ def test_a_second_training_in_a_script_releases_the_gate() -> None:
         trainer.train()
         with pytest.warns(RuntimeWarning, match="The gate is released: iterations went back from 99 to 0"):
             trainer.train()
-    assert trainer.noise == 200 - gate.stats()["backwards_skipped"]  # none was left out of the second training
+    assert trainer.noise == 200 - gate.stats()["backwards_skipped"]  # the second training was not gated
 
 
 def test_what_the_adapter_knows_of_numbers_holds_beside_what_the_user_chose() -> None:

@@ -70,7 +70,7 @@ def test_a_name_that_somebody_else_removed_keeps_nothing_from_being_put_back() -
     original, player, patches = Base.work, Player(), Patches()
     patches.wrap(Base, "work", twice)
     patches.wrap(player, "play", twice)
-    del player.play  # of the instance: the class keeps its own
+    del player.play  # deletes it from the instance; the class keeps its own
     patches.restore()
     assert patches.names == []
     assert Base.work is original

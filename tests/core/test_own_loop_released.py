@@ -126,7 +126,7 @@ def test_second_part_of_a_loop_that_cannot_be_planned_releases_the_gate(recwarn)
         if step == upcoming:
             upcoming += 10
     assert loop.stepped == list(range(LAST)) and "(step == upcoming)" in gate.released
-    assert [str(one.message) for one in recwarn][1:] == [gate.released]  # the first names gate.iterations()
+    assert [str(one.message) for one in recwarn][1:] == [gate.released]  # the first warning asks for gate.iterations()
 
 
 def test_an_error_of_the_loops_own_backward_stays_its_own():

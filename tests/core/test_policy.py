@@ -171,7 +171,7 @@ def test_event_pauses_without_recording() -> None:
     before = policy.budget.state_dict(), policy.means.state_dict()
     assert Counter(policy.decide(v, 9.0, s).reason for s, v in enumerate("ab" * 5, start=1)) == {"pause": 10}
     assert (policy.budget.state_dict(), policy.means.state_dict()) == before
-    # The old mean stands: the peak was neither averaged in nor taken as a seed.
+    # The mean is the old one: the losses of the peak neither changed it nor seeded a new one.
     assert policy.decide("a", 0.9, 11).skip
     assert policy.decide("b", 0.9, 12).reason == "new view"
 
@@ -205,7 +205,7 @@ def test_warm_up_counts_from_the_first_gated_iteration_seen() -> None:
     ("loss", "answer", "counted"),
     [
         (0.5, decision.OTHER_RANK, (2, 0)),  # a skip became a backward
-        (0.5, decision.NON_FINITE, (1, 0)),  # another process's loss is not finite: nothing counts
+        (0.5, decision.NON_FINITE, (1, 0)),  # the loss of another process is not finite, so neither count rises
         (2.0, decision.NON_FINITE, (1, 0)),
     ],
 )

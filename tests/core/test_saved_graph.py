@@ -90,7 +90,9 @@ def peak(skips, update=True):
 def test_a_skipped_graph_does_not_raise_the_peak():
     assert peak([False] * 4) == 3 * N
     assert peak([False, True, False]) == peak([False, True, True, True, False]) == 3 * N
-    assert peak([False, True, False], update=False) > 3 * N  # backwards that share a graph may come until the next step
+    assert (
+        peak([False, True, False], update=False) > 3 * N
+    )  # until the next step, other backward passes may need the graph
 
 
 @pytest.mark.parametrize("skips", [[False, True, False, True]])
@@ -166,7 +168,7 @@ def test_what_others_hold_keeps_its_values():
     loss = (image * image).mean()
     kept, target = image.detach(), image.detach().clone()
     free_graph(loss)
-    free_graph(loss)  # nothing is left
+    free_graph(loss)  # a second call finds no tensors
     assert torch.equal(kept, target) and torch.equal(image, target)
 
 

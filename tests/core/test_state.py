@@ -149,7 +149,7 @@ def resumed(
     """A gate that learnt means of 1 and goes on with losses of `factor`; with an event before it is saved or after."""
     settings: dict = {"start_iter": 0, "warmup": 2, "refine_share": share}
     first = SkipGate(**settings)
-    for step in first.iterations(range(100)):  # half of them takes the first ones
+    for step in first.iterations(range(100)):  # with a share, the first iterations run
         if step == 20:
             break
         first.backward(torch.tensor(1.0, requires_grad=True), view=step % 3, step=step)
@@ -215,5 +215,5 @@ def test_a_state_from_before_shares_were_looked_at_has_seen_no_step() -> None:
     gate = SkipGate(start_iter=0, warmup=2)
     gate.load_state_dict(state)
     assert gate.state_dict()["visibility"] == [0.0, 0.0, 0, 0.0, 0.0]
-    gate.load_state_dict({**state, "shown": [1.5, 3]})  # and from before sums could wait on a device
+    gate.load_state_dict({**state, "shown": [1.5, 3]})  # a version without unread sums
     assert gate.state_dict()["visibility"] == [1.5, 3.0, 3, 0.0, 0.0]

@@ -49,7 +49,7 @@ def test_shared_names_are_found() -> None:
 def test_an_index_on_a_device_is_read_from_the_start_on_alone() -> None:
     there = torch.tensor(7, device="meta")
     with pytest.raises(SkipGSError, match="view key"):
-        view_key(there)  # reading it raises an error
+        view_key(there)  # a tensor without a value cannot be read
     gate = SkipGate(start_iter=3, warmup=0)
     for step in range(3):
         assert gate.backward(torch.tensor(1.0, requires_grad=True), view=there, step=step)
@@ -72,7 +72,7 @@ def test_keys_that_do_not_recur_are_warned_about_once_and_forgotten(monkeypatch)
     state = gate.state_dict()
     assert 75 <= len(state["policy"]["means"]) == len(state["stats"]["views"]) <= 150
     assert gate.stats()["reasons"] == {"new view": 1000}
-    train(gate, [999])  # the latest are the ones kept
+    train(gate, [999])  # the latest views are kept
     assert gate.skipped
 
 

@@ -99,7 +99,9 @@ def test_watched_views_are_few_and_always_the_same():
     assert watched_views(names, 3750) == watched_views(reversed(names), 3000) and len(watched_views(names, 3000)) == 12
     assert len(watched_views(names[:46], 1000)) == 4 and len(watched_views(names[:31], 1000)) == 3
     assert watched_views(names[:17], 1000) == watched_views(names[:1], 1000) == frozenset()
-    assert len(watched_views(names, 8 * 255)) == 12 and not watched_views(names, 8 * 255 - 1)  # a cycle shows not all
+    assert len(watched_views(names, 8 * 255)) == 12 and not watched_views(
+        names, 8 * 255 - 1
+    )  # the first cycle is too short
     assert why_none_watched(255, 8 * 255) is None
     assert "254 iterations is too short to show each of 255" in str(why_none_watched(255, 8 * 255 - 1))
 
@@ -107,7 +109,7 @@ def test_watched_views_are_few_and_always_the_same():
 def test_gain_in_decibels():
     assert mean_gain({"a": 0.1, "b": 0.1}, {"a": 0.01, "b": 0.01, "c": 1.0}) == pytest.approx((20.0, 0.0))
     assert mean_gain({"a": 0.1}, {"a": 0.1}) is None
-    # 0, 20 and 40 dB: their deviation is 20, the error of their mean 20 / sqrt(3)
+    # gains of 0, 20 and 40 dB: the deviation is 20, the standard error 20 / sqrt(3)
     before, after = dict.fromkeys("abc", 0.1), {"a": 0.1, "b": 0.01, "c": 0.001}
     assert mean_gain(before, after) == pytest.approx((20.0, 20.0 / 3**0.5))
 

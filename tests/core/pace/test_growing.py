@@ -97,7 +97,7 @@ def test_rates_stay_while_the_scene_grows_unless_longer_steps_replace_iterations
     loop.optimizer.register_step_pre_hook(note)
     with SkipGate(start_iter=START, share=0.25) as gate:
         loop.train(gate)
-    # Every view shows all: once that is measured, steps are 3 times as long, and at most 4 times for positions.
+    # Every view shows all Gaussians. Once that is measured, steps are 3 times as long, those of positions 4 times.
     factors = [seen[step] / 0.1 for step in sorted(seen) if step < START]
     assert factors[0] == pytest.approx(1.0) and factors[-1] == pytest.approx(4.0)
     assert gate.report()["growing"]["rate_factor"] == pytest.approx(3.0)
@@ -127,7 +127,7 @@ def test_opacities_take_the_root_of_the_path_until_refinement(share, longer):
     with SkipGate(start_iter=START + 100, share=share) as gate:
         loop.train(gate)
     assert gate.report()["growing"]["opacity_rate_factor"] == pytest.approx(share**-0.5)
-    # Once visibility is measured. The last event is in iteration 380, and refinement begins in iteration 500.
+    # Visibility is measured by then. The last event is in iteration 380, and refinement begins in iteration 500.
     assert loop.between(200, START + 100) == {(round(longer, 3), round(share**-0.5, 3))}
 
 
@@ -261,9 +261,9 @@ def test_what_shares_its_number_with_events_keeps_it_if_it_is_rarer():
         for step in gate.iterations(range(900), events=range(20, 800, 20), views=VIEWS):
             gate.backward(value(), VIEWS[step % 4], step)
             ran.append(step)
-            if step % 100 == 0:  # rarer than events
+            if step % 100 == 0:  # this condition holds less often than events happen
                 saved.append(step)
-            if step % 20 == 0:  # as often as events, as a line in a log
+            if step % 20 == 0:  # this one holds as often, like that of a line in a log
                 logged.append(step)
     assert set(range(100, 800, 100)) <= set(ran)
     assert len(set(range(20, 800, 20)) & set(ran)) < 25
@@ -289,14 +289,14 @@ def kept(needs, visible, every, numbers=range(100, 2001, 100), share=0.1, length
 def test_needs_of_an_event():
     assert kept("nothing", 0.3, 10) == list(range(100, 2001, 100))
     assert kept("visits", 1.0, 1) == list(range(100, 2001, 100))
-    assert kept("visits", 0.3, 5)[:2] == [300, 500]  # 55 * 0.7 ** 0.4 = 47.7 iterations; the third 100 has surplus ones
+    assert kept("visits", 0.3, 5)[:2] == [300, 500]  # 55 * 0.7 ** 0.4 = 47.7 are needed; the third event uses surplus
     # Where a view shows all Gaussians, a tenth of the iterations keeps each event.
     assert kept("visits", 0.999, 10)[:3] == [100, 200, 300]
-    assert kept("visits", 0.95, 20)[:2] == [400, 800]  # 16 iterations, of 4 per event
+    assert kept("visits", 0.95, 20)[:2] == [400, 800]  # 16 iterations are needed, and 4 run per event
     assert kept("iterations", 0.95, 5)[:2] == [600, 1200]
-    # At least 16 events are kept, or all of fewer.
+    # At least 16 events are kept, or all if there are fewer.
     assert len(kept("visits", 0.3, 10, range(100, 1301, 100), length=1300)) == 13
-    assert kept("visits", 0.3, 5, length=4000)[:2] == [200, 300]  # 25 iterations each, of 20 and 40
+    assert kept("visits", 0.3, 5, length=4000)[:2] == [200, 300]  # 25 needed; 20 and 40 ran
 
 
 def test_a_larger_share_asks_for_more_iterations_per_event_unless_the_scene_grows_strongly():
@@ -361,7 +361,7 @@ def test_a_scene_that_grows_strongly_gets_more_iterations_in_both_phases():
     assert (factor := for_new_gaussians(little["growing"]["times_grown"])) > 1.0
     assert little["refine_share"] == pytest.approx(factor * still["refine_share"], rel=0.02)
     assert much["refine_share"] == 0.4 < for_new_gaussians(100.0) * still["refine_share"]  # the bound
-    with SkipGate(start_iter=3000, share=0.2) as gate:  # a number is a promise
+    with SkipGate(start_iter=3000, share=0.2) as gate:  # a given share is not raised
         Multiplies(0.1).train(gate)
     assert gate.report()["refine_share"] == 0.2
     assert gate.report()["growing"]["iterations_run"] == pytest.approx(600, abs=3)
@@ -372,11 +372,11 @@ def test_shares_that_auto_chooses():
     assert growing_share(15_000, 1000, longer=True) == growing_share(15_000, 1000, longer=False) == pytest.approx(1 / 3)
     assert growing_share(1500, 17, longer=True) == 0.4
     assert growing_share(1500, 17, longer=False) == 0.8
-    # Longer schedules run more iterations, and a smaller share.
+    # Longer schedules run more iterations, but a smaller share of them.
     assert growing_share(3000, 46, longer=True) == pytest.approx(765 / 3000, abs=1e-3)
     assert growing_share(6000, 46, longer=True) == pytest.approx(975 / 6000, abs=1e-3)
     assert refining_share(3000, 17, grown=3000) == pytest.approx(701 / 3000, abs=1e-3)
-    # Where all events run, each needs 14 iterations, as far as all need more than that and no more than 1,200.
+    # Where all events run, each needs 14 iterations, but all together at most 1,200.
     assert growing_share(2500, 17, longer=True, events=10) == pytest.approx(717.5 / 2500, abs=1e-4)
     assert growing_share(2500, 17, longer=True, events=58) == 14 * 58 / 2500
     assert growing_share(2500, 17, longer=True, events=97) == growing_share(2500, 17, longer=False) == 1200 / 2500
@@ -386,7 +386,7 @@ def test_shares_that_auto_chooses():
     assert refining_share(500, 17, grown=500) == 0.8
     assert refining_share(15_000, 255, grown=15_000) == pytest.approx(0.1733, abs=1e-3)
     assert refining_share(15_000, 17, grown=15_000) == 0.12 < refining_share(15_000, 17) == 0.2
-    # Refinement of a sixth of the schedule runs as many iterations as that of a half, but not all of its own.
+    # Refinement of a sixth of the schedule runs as many iterations as one of a half, but never all of its own.
     assert 5000 * refining_share(5000, 100, grown=25_000) == pytest.approx(15_000 * refining_share(15_000, 100, 15_000))
     assert refining_share(5000, 100, grown=5000) < 0.2 < refining_share(5000, 100, grown=25_000)
     assert refining_share(500, 17, grown=2500) == refining_share(300, 255, grown=2700) == 0.8
@@ -396,7 +396,7 @@ def test_factors_while_the_scene_grows():
     assert growing_factor(1500, 0.4, None) == growing_factor(1500, 1.0, 0.96) == 1.0
     assert growing_factor(1500, 0.25, 0.96) == 3.0  # the longest that pay
     assert growing_factor(1500, 0.25, 0.96, by_budget=True) == 4.0  # the number of Gaussians does not rise with them
-    assert growing_factor(700, 0.9, 1 / 3) == pytest.approx(1 / 0.9)  # the path of the iterations left out, no more
+    assert growing_factor(700, 0.9, 1 / 3) == pytest.approx(1 / 0.9)  # steps conserve the path, and are not longer
     assert growing_factor(15_000, 0.12, 0.96) == pytest.approx((2100 / 1800) ** 2)
     assert growing_factor(15_000, 0.2, 0.96) == growing_factor(15_000, 0.2, 0.96, times_grown=math.e) == 1.0
     assert growing_factor(15_000, 0.2, 0.96, times_grown=math.e**1.5) == pytest.approx((1.5 * 2100 / 3000) ** 2)
@@ -425,24 +425,24 @@ def test_events_wait_longer_the_fewer_gaussians_a_view_shows():
 
 
 def test_events_need_more_iterations_if_a_larger_share_of_them_runs():
-    # 31.6 iterations with a tenth, and 8 ** (0.75**2 / 2) times as many with eight tenths
+    # 31.6 iterations with a share of 0.1, and 8 ** (0.75**2 / 2) times as many with 0.8.
     assert len(kept("visits", 0.75, 5, LONG)) == pytest.approx(60 * 20 / 31.6, abs=2)
     assert len(kept("visits", 0.75, 5, LONG, share=0.8)) == pytest.approx(60 * 20 / 56.7, abs=2)
-    # Where a view shows a third, they hardly need more.
+    # Where a view shows a third of the Gaussians, events hardly need more.
     few = len(kept("visits", 1 / 3, 5, LONG))
     assert few - 3 <= len(kept("visits", 1 / 3, 5, LONG, share=0.8)) <= few
 
 
 def test_surplus_iterations_count_for_the_following_event_alone():
     gaps = {after - before for before, after in itertools.pairwise(kept("visits", 0.75, 5, LONG))}
-    assert gaps == {100, 200}  # without the surplus, every second event
+    assert gaps == {100, 200}  # without surplus, only every second event would run
     events = DensificationEvents(range(100, 1001, 100), Densification())
     for number in range(1, 400):
         events.ran(number) if number % 100 else events.skipped()
     needed = events.needed(400, 0.75, 0.1, 1_000_000)
     assert needed == 31 and events.behind > 10 * needed
     events.ran(400, needed)
-    assert events.state_dict()["behind"] <= 32  # hundreds of iterations do not pay for several events
+    assert events.state_dict()["behind"] <= 32  # the surplus of one event is bounded
     resumed = DensificationEvents(range(100, 1001, 100), Densification())
     resumed.load_state_dict(events.state_dict())
     assert resumed.state_dict() == events.state_dict()

@@ -42,7 +42,7 @@ class Loop:
 def test_a_share_of_the_iterations_runs_with_all_that_hangs_on_numbers():
     with SkipGate(start_iter=40, refine_share=0.25) as gate:
         loop = Loop().train(gate)
-    assert loop.ran == [*range(55), 75, 99]  # steps have shrunk to nothing; a save and the last one follow
+    assert loop.ran == [*range(55), 75, 99]  # steps have shrunk to 0, then a save and the last iteration run
     assert loop.saved == [0, 25, 50, 75]
     assert loop.rates == [0.1 * 0.99**step for step in loop.ran]
     report = gate.report()
@@ -68,7 +68,7 @@ def test_parts_before_refinement_leave_out_the_same_as_one_loop(refine_share, op
 def test_without_larger_steps_they_are_spread_evenly():
     with SkipGate(start_iter=40, refine_share=0.25, compensate=False) as gate:
         loop = Loop().train(gate)
-    assert loop.ran[:40] == list(range(40)) and len(loop.ran) == 40 + 16  # the last one comes on top
+    assert loop.ran[:40] == list(range(40)) and len(loop.ran) == 40 + 16  # the last iteration is beyond the share
     assert loop.saved == [0, 25, 50, 75] and loop.ran[-1] == 99
     assert all(2 <= sum(begin <= n < begin + 15 for n in loop.ran) <= 6 for begin in (40, 55, 70, 85))
     assert gate.report()["reasons"] == {"full": 16}
@@ -91,7 +91,7 @@ def test_a_change_while_the_model_recovers_is_recovered_from_as_well():
         for step in gate.iterations(range(100), always=[70]):
             if gate.backward(torch.ones((), requires_grad=True) * 1.0, view="a", step=step) and step >= 55:
                 trained.append(step)
-            if step in (70, 73, 79):  # the last one in the last iteration that still trains
+            if step in (70, 73, 79):  # 79 is the last iteration that still trains
                 gate.notify_event("prune")
     assert trained == list(range(71, 86))
 
@@ -133,7 +133,7 @@ def test_steps_are_larger_while_the_gate_is_attached():
     loop.train(gate)
     assert all(moved[step] == pytest.approx(1.0) for step in range(40))
     assert all(moved[step] == pytest.approx(path_factor(0.4, (step - 40) / 24)) for step in range(40, 64))
-    assert loop.ran[64:] == [75, 99] and not {75, 99} & set(moved)  # nothing to step
+    assert loop.ran[64:] == [75, 99] and not {75, 99} & set(moved)  # these two have no step
     gate.detach()
     before = loop.value.detach().clone()
     loop.value.grad = torch.ones(2)
@@ -163,7 +163,7 @@ def test_interrupted_and_resumed_goes_as_uninterrupted(settings):
         whole = Loop(end=400).train(gate, **options)
     middle = 200
     with SkipGate(start_iter=40, **settings) as gate:
-        # A save belongs to an iteration that runs. The resumed run decides on the iterations after it.
+        # The loop saves in an iteration that runs. The resumed run decides on the iterations after it.
         first = Loop(end=400)
         state = None
         for step in first_part(first, gate, middle, options):
@@ -263,7 +263,7 @@ def test_auto_ends_where_nothing_is_gained_and_goes_on_with_what_hangs_on_number
             if step % 500 == 0:
                 reached.append(step)
     report = gate.report()
-    # A quarter of a fifth of 2,000 iterations, then 500, 1,000, 1,500, 2,000 and the last.
+    # A quarter of a fifth of 2,000 iterations runs, and iterations 500, 1,000, 1,500, 2,000 and the last.
     assert report["iterations_run"] == 100 + 5 and ran[-4:] == [1000, 1500, 2000, 2099]
     assert report["early_stopping"]["ended_early"] and "ended early, in cycle 2" in gate.summary()
     assert report["early_stopping"]["rest_worth_db"] == 0.0
@@ -280,7 +280,7 @@ def test_auto_runs_the_whole_share_where_views_are_too_few_to_watch():
                 optimizer.step()
     report = gate.report()
     assert report["iterations_run"] == 400 + 1 and report["early_stopping"]["watched"] == []
-    assert report["backwards_skipped"] == 1  # of the last iteration, when steps have shrunk to nothing
+    assert report["backwards_skipped"] == 1  # that of the last iteration, when steps have shrunk to 0
     assert "no view is watched" in gate.summary()
     assert "a twelfth of 20 training views is less than 3 views" in gate.summary()
 
@@ -425,7 +425,7 @@ def test_a_loop_that_forgot_iterations_is_told_in_the_first_and_trains_on():
     with pytest.warns(RuntimeWarning, match="released in iteration 10, .* the gate must count them"):
         assert gate.backward(loss, view="a", step=10)  # the loop is over
     early = SkipGate(start_iter=3, refine_share=0.5)
-    for step in list(early.iterations(range(10), always=())):  # run through beforehand
+    for step in list(early.iterations(range(10), always=())):  # the list exhausts the loop before training
         with pytest.warns(RuntimeWarning, match="the gate must count them") if step in (0, 3) else nullcontext():
             assert early.backward(loss, view="a", step=step)
     with pytest.raises(SkipGSError, match=r"refine_share leave out iterations, so the gate must count them"):

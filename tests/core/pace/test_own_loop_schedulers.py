@@ -19,13 +19,13 @@ def final_rate(settings, make, step):
                 optimizer.step()
             step(scheduler, number, before)
             before = number
-            # A scheduler that is made in an iteration begins there.
+            # A scheduler that an iteration creates starts to count there.
             inner = torch.optim.SGD([torch.zeros(1)], lr=1.0)
             inner_scheduler = ExponentialLR(inner, 0.5)
             inner.step()
             inner_scheduler.step()
             assert inner_scheduler.get_last_lr() == [0.5]
-    scheduler.step()  # after the loop, once for each call
+    scheduler.step()  # after the loop each call is one step
     return optimizer.param_groups[0]["lr"]
 
 

@@ -72,4 +72,4 @@ def test_a_share_that_is_given_is_not_stretched() -> None:
 def test_reasons_of_iterations_that_must_run() -> None:
     phase = Refining(SkipConfig(refine_share=0.25), ScaledRates())
     phase.begin(plan(Phase(), frozenset({12})))
-    assert phase.always == {NAMED_FOR_TRAINER: {12}}  # a condition that never holds is no reason
+    assert phase.always == {NAMED_FOR_TRAINER: {12}}  # a condition that never holds is not listed

@@ -34,8 +34,8 @@ def test_each_prune_is_followed_by_its_share_of_the_way_to_the_next():
     for prune in prunes[1:-1]:
         after = [step for step in ran if prune < step < prune + 300]
         assert after == list(range(prune + 1, prune + 61))  # a fifth of 300
-    assert [step for step in ran if step > 1700] == list(range(1701, 2001))  # no other is expected
-    # How far the second one is away is not known at the first one.
+    assert [step for step in ran if step > 1700] == list(range(1701, 2001))  # no further change is expected
+    # At the first change, the distance to the second one is not known.
     assert len([step for step in ran if 500 < step < 800]) == 299
     stats = gate.stats()
     assert stats["ran_for"]["share"] == 401 == len([step for step in ran if step < 500])
@@ -47,7 +47,7 @@ def test_a_long_schedule_and_many_views_bound_it():
     _, ran = train(8000, [5000])
     assert [step for step in ran if step > 5000] == [*range(5001, 5501), 8000]
     _, ran = train(1000, [600, 700, 800], views=60)
-    assert [step for step in ran if 700 < step < 800] == list(range(701, 761))  # each view once
+    assert [step for step in ran if 700 < step < 800] == list(range(701, 761))  # one visit of each view
 
 
 def test_where_no_other_comes_as_expected_the_model_recovers_then():

@@ -129,7 +129,9 @@ def test_the_path_is_conserved():
         ran = round(share * steps)
         path = sum(path_factor(share, i / ran) for i in range(ran))
         assert path == pytest.approx(steps, rel=0.01)
-    assert path_factor(0.1, 0.0) == path_factor(0.25, 0.0) == pytest.approx(8.0)  # a tenth goes less far
+    assert (
+        path_factor(0.1, 0.0) == path_factor(0.25, 0.0) == pytest.approx(8.0)
+    )  # a share below 0.25 gets the steps of 0.25
     assert path_factor(0.4, 1.0) == 0.0
     assert path_factor(0.4, 0.5, peak=3.0) == 1.5
 
@@ -285,7 +287,7 @@ def test_a_wrapped_optimizer_with_the_same_groups_is_scaled_once(rates):
     assert base.param_groups[0]["lr"] == 0.1
 
 
-EXTENSION = types.ModuleType("extension")  # stands for one in CUDA
+EXTENSION = types.ModuleType("extension")  # stands for an extension in CUDA
 
 
 class Constant(torch.optim.Optimizer):
@@ -382,11 +384,11 @@ def test_a_second_one_that_scales_the_same_optimizers_is_refused(rates):
         with pytest.raises(SkipGSError, match=r"each gate would scale the steps of both: detach\(\) it first"):
             other.scale(2.0)
     rates.pause()
-    second.scale(2.0)  # one after the other
+    second.scale(2.0)  # allowed: the first gate no longer scales
     second.remove()
     rates.only = list
     rates.scale(3.0)
-    own.scale(2.0)  # each knows its own
+    own.scale(2.0)  # allowed: each gate knows its own optimizers
     own.remove()
 
 

@@ -49,7 +49,7 @@ def test_methods_of_objects_that_exist_before_the_loop():
             saver.step(step)
             step_with(step)
             new = Saver(7)
-            new.step(step)  # nothing is known of it
+            new.step(step)  # the object does not exist before the loop
 
     assert numbers(loop) == [66, 80, 99]
     assert numbers(Trainer().train) == [50, 60, 75, 77, 90]
@@ -230,7 +230,7 @@ def test_constant_that_a_function_may_switch_counts_as_on():
 def test_names_of_a_function_are_not_those_of_the_loop():
     def check(number):
         every = 45
-        for step in range(3):  # another number
+        for step in range(3):  # not the iteration's number
             print(step)
         kept = [step for step in range(60) if step == 55]
         if number % every == 0:

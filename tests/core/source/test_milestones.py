@@ -351,7 +351,7 @@ def test_gathering_over_a_few_iterations_is_nothing_to_warn_of():
         gathered, images = 0, 0
         for step in stop():
             gathered += 1
-            if gathered == 4:  # of those that run
+            if gathered == 4:  # counts the iterations that run
                 gathered = 0
             if step % 2 == 0:
                 images += 1

@@ -46,7 +46,7 @@ class State:
 
     def gather(self):
         self.gathered += 1
-        if self.gathered == 4:  # of those that run
+        if self.gathered == 4:  # counts the iterations that run
             self.gathered = 0
 
     def save_at_limit(self, step):

@@ -148,7 +148,7 @@ def loop(stop):
 def test_option_that_any_function_may_change_counts_as_on():
     def loop(stop):
         cfg = {"prune": False}
-        assert [-SAVES for SAVES in range(2)] == [0, -1]  # no variable of the function
+        assert [-SAVES for SAVES in range(2)] == [0, -1]  # SAVES here is not a variable of the function
         for step in stop(cfg=cfg):
             if SWITCHED and step % 30 == 0:
                 switch()
@@ -174,7 +174,7 @@ def test_iteration_that_ends_early_reaches_no_later_condition():
                     continue
             for _ in range(2):
                 if step == 64:
-                    break  # of the inner loop
+                    break  # ends the inner loop only
             if step in (51, 52, 61, 64, 95):
                 print("save")
 
