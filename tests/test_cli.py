@@ -70,7 +70,7 @@ def test_bad_input_is_one_sentence(tmp_path: Path, packed: str, capsys: pytest.C
     assert main(["train", packed, "--out", out, "--max-steps", "0"]) == 2
     assert not Path(out).exists()
     capsys.readouterr()
-    for arguments in (["", "--out", out], [packed, "--out", ""]):  # as of shell variables that are not set
+    for arguments in (["", "--out", out], [packed, "--out", ""]):  # shell variables that are not set give empty words
         assert main(["train", *arguments, *SHORT]) == 2
         assert "is empty" in one_sentence(capsys)
     for command in (["bench", packed, "--out", ""], ["demo", "--out", ""]):
@@ -201,7 +201,7 @@ def test_doctor_names_the_measurement_where_a_gpu_is(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "Imagined GPU")
-    assert main(["doctor"]) == 0  # warp renders; gsplat's behaviour without a driver has a line of its own
+    assert main(["doctor"]) == 0  # warp renders, which is enough; gsplat needs a driver
     named = re.search(r"python -m (benchmarks\.gpu) SCENE", capsys.readouterr().out)
     assert named and importlib.util.find_spec(named[1]) is not None
 
@@ -229,7 +229,7 @@ def test_training_loads_nothing_that_it_does_not_use(tmp_path: Path, packed: str
     arguments = ["train", packed, "--out", str(tmp_path / "run"), "--max-steps", "1", "--no-progress"]
     code = f"from skipgs_plug.cli import main\nassert main({arguments!r}) == 0"
     assert loaded_by(code, UNUSED_IN_TRAINING) == set()
-    assert loaded_by(code.replace("== 0", "== 2"), {"torch"}) == {"torch"}  # the probe sees all devices
+    assert loaded_by(code.replace("== 0", "== 2"), {"torch"}) == {"torch"}  # loaded_by finds a module that is loaded
 
 
 def test_the_collector_passes_over_what_a_program_has_loaded(packed: str, tmp_path: Path) -> None:
@@ -245,9 +245,10 @@ def test_the_collector_passes_over_what_a_program_has_loaded(packed: str, tmp_pa
         )
         return int(ended.stdout.rpartition("frozen")[2])
 
-    pythons = 1_000  # objects that Python passes over by itself: 375 with Python 3.12
+    pythons = 1_000  # more objects than Python itself exempts from collection: 375 with 3.12
     assert frozen(f"sys.argv = {arguments!r}", "main()") > 100_000
-    assert frozen("", f"main({[*arguments[1:], '--resume']!r})") < pythons  # a caller in Python goes on after it
+    # A caller in Python goes on, so nothing is exempted.
+    assert frozen("", f"main({[*arguments[1:], '--resume']!r})") < pythons
     script = tmp_path / "script.py"
     script.write_text(f"import gc\nassert gc.isenabled() and gc.get_freeze_count() < {pythons}")
     assert frozen(f"sys.argv = {['skipgs-plug', 'run', 'inria', '--no-gate', '--', str(script)]!r}", "main()") < pythons

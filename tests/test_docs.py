@@ -80,7 +80,7 @@ def test_notes_and_inner_pages_are_listed_and_out_of_the_reading_path() -> None:
 
 def test_table_of_contents_of_the_notes_names_every_section() -> None:
     folder = ROOT / "benchmarks/notes"
-    # One block a page: a heading with the page's link, then one item for each section, in the page's order.
+    # Each page has a block: a heading with a link to the page, then one item per section, in the page's order.
     blocks = re.split(r"^## ", (folder / "README.md").read_text(), flags=re.MULTILINE)[1:]
     listed = {}
     for block in blocks:

@@ -33,7 +33,7 @@ DOCUMENTED = {
 
 @pytest.mark.parametrize("module", DOCUMENTED)
 def test_examples_print_what_they_say(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_registered", {})  # an adapter that an example registers is gone afterwards
+    monkeypatch.setattr(registry, "_registered", {})  # undoes the registration of an example's adapter
     loaded = importlib.import_module(module)
     runner = doctest.DocTestRunner(verbose=False)
     with_examples = set()

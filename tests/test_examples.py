@@ -146,7 +146,7 @@ def test_installed_command_is_run_gated(example, run_example, tmp_path, monkeypa
     assert report["iterations"] == 60 and report["backwards_skipped"] > 0
 
 
-# Script, module that it imports its trainer from, and the names that it has there.
+# Script, the module from which it imports its trainer, and the names in that module.
 OBJECTS = {
     "litegs": ("example_train.py", "litegs/training/trainer.py", "start"),
     "faster_gs": ("scripts/train.py", "Methods/FasterGS/Trainer.py", "FasterGSTrainer"),

@@ -15,7 +15,7 @@ from skipgs_plug.bench import memory as meters
 from skipgs_plug.fallback_raster.runtime import buffers, memory
 from skipgs_plug.fallback_raster.runtime.cores import usable_cores
 
-LARGE = memory.POOLED_BYTES // 4 + 12_345  # elements of float32 that get pages of their own
+LARGE = memory.POOLED_BYTES // 4 + 12_345  # numbers in a tensor that is large enough for memory of its own
 
 
 def test_cores_where_a_process_cannot_be_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

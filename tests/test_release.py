@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-# Kinds of files that the package consists of. Code of others, such as a library of scripts for a page, comes
-# minified or compiled: it needs a licence beside it that `license-files` names.
+# Kinds of files in the package. Code of others, such as a library for a page, comes minified or compiled, and needs a
+# licence beside it that `license-files` names.
 OWN = {".py", ".h", ".jinja", ".css", ".js", ".html", ".json", ".typed"}
-LONGEST_LINE = 500  # characters; scripts that were put through a minifier have longer ones
+LONGEST_LINE = 500  # characters; minified scripts have longer lines
 
 
 def tracked(*folders: str) -> list[str]:

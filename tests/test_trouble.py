@@ -17,7 +17,7 @@ from skipgs_plug import cli, install
 from skipgs_plug.files import WriteError, remove_leftovers, write_aside
 from skipgs_plug.install import install_command
 
-# A Python in which the named packages do not exist, that then gives a command.
+# A Python without the named packages, which then runs a command.
 WITHOUT = """
 import sys
 missing = set(sys.argv[1].split(","))
@@ -48,7 +48,7 @@ def test_base_install_says_how_to_get_the_rest() -> None:
 
 def test_doctor_works_without_extras() -> None:
     tried = without(EXTRAS, "doctor")
-    # Backends are tried in processes of their own, which have the packages that are hidden from this one.
+    # Backends are tried in other processes, from which no package is hidden.
     assert tried.returncode == 0 and tried.stderr == ""
     assert "tyro          missing, for: command line; run: pip install tyro" in tried.stdout
     assert f"Get all missing packages with: {install_command()}" in tried.stdout
@@ -201,7 +201,7 @@ def test_a_file_that_cannot_be_written_says_how_much_it_needs(tmp_path: Path) ->
     import resource
 
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))  # as on a full disk, a write stops in the middle
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))  # a write stops in the middle, as on a full disk
     try:
         with (
             pytest.raises(

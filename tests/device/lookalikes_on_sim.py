@@ -2,7 +2,7 @@
 
     python lookalikes_on_sim.py [--mutant NAME] [--turn DAY | --turn all] [NAME ...]
 
-A process of its own: autograd counts devices at the first backward, and no other test shall see this one.
+It runs in a process of its own: autograd counts devices at the first backward pass, and other tests must not see `sim`.
 """
 
 from __future__ import annotations
@@ -26,14 +26,8 @@ FACTORIES = {
     *(torch.tensor, torch.zeros, torch.ones, torch.full, torch.empty, torch.eye),
     *(torch.rand, torch.randn, torch.arange, torch.linspace),
 }
-PASSED_ON = {
-    "around",
-    "repeated",
-    "method",
-    "function",
-    "hooked",
-    "watched",
-}  # replaced calls, on behalf of the trainer
+# Functions of the gate that call the trainer's own: reads inside them belong to the trainer.
+PASSED_ON = {"around", "repeated", "method", "function", "hooked", "watched"}
 SETTINGS: dict[str, dict[str, Any] | None] = {
     "off": {"enabled": False},
     "rule": {"warmup": 3, "min_bwd_ratio": 0.0, "pause_iters": 4},
@@ -48,7 +42,7 @@ class MadeOnSim(torch.overrides.TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         if func is torch.tensor and str(kwargs.get("device", "")).startswith("sim"):
-            return func(*args, **{**kwargs, "device": "cpu"}).to(SIM)  # as CUDA does it
+            return func(*args, **{**kwargs, "device": "cpu"}).to(SIM)  # CUDA makes it on the host too
         if func in FACTORIES and kwargs.get("device") is None and self._by_a_lookalike():
             return func(*args, **{**kwargs, "device": "cpu"}).to(SIM)
         return func(*args, **kwargs)
@@ -82,7 +76,7 @@ def rasterization_on_sim(rasterization: Any) -> Any:
 def host_reads(case: Any, settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Train a look-alike with a gate; one row per iteration: `reason skip gate trainer`.
 
-    `gate` and `trainer` list who read: [kind, file, line, how often].
+    `gate` and `trainer` list reads of the device: [kind, file, line, number of reads].
     """
     from lookalikes.splats import Log, new_log
 
@@ -92,7 +86,7 @@ def host_reads(case: Any, settings: dict[str, Any]) -> list[dict[str, Any]]:
 
     rows: list[dict[str, Any]] = []
     number: list[int | None] = [None]
-    last: list[Any] = [None]  # decision since the iteration began
+    last: list[Any] = [None]  # latest decision in the present iteration
 
     def flush() -> None:
         taken = host.take()
@@ -130,7 +124,7 @@ def host_reads(case: Any, settings: dict[str, Any]) -> list[dict[str, Any]]:
             with SkipGate(trainer, **settings) as gate:
                 train()
                 flush()
-            # Training goes on when the gate's own code fails: here that is the failure that is looked for.
+            # Training goes on when the gate's own code fails. Here, that failure fails the test.
             if gate.released is not None:
                 raise RuntimeError(gate.released)
     finally:
@@ -179,7 +173,7 @@ def mutant(name: str | None) -> Iterator[None]:
         handle = torch.optim.optimizer.register_optimizer_step_pre_hook(multiplies_gradients)
     else:
         function = mutants[name]
-        # The counts name the file that asks: it asks from within the gate.
+        # Counts name the reader's file, so the defect gets the file of the gate.
         function.__code__ = function.__code__.replace(co_filename=decide.__code__.co_filename)
         Engine.decide = function  # type: ignore[method-assign]
     try:

@@ -1,10 +1,10 @@
 """A second device in pure Python: its tensors compute on the CPU, refuse to meet the host's, and count host reads.
 
-PyTorch keeps one device type, PrivateUse1, for backends of others; here it is called `sim`. A wrapper subclass holds
+PyTorch has one device type, PrivateUse1, for external backends. Here it is called `sim`. A wrapper subclass holds
 the values in a CPU tensor, and autograd treats it as it treats a tensor of a GPU: with a device of its own, and a
-thread of its own for backwards. What would wait for a GPU (`item`, a boolean index, a copy to the host) is counted,
-with the file and line that asked. Import this module before the first backward of the process: autograd counts devices
-once.
+thread of its own for backward passes. Reads that would wait for a GPU (`item`, a boolean index, a copy to the host) are
+counted, with file and line of the reader. Import this module before the first backward pass of the process, because
+autograd counts devices once.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ INDEXING = {
     aten.index_put_.default,
     aten._index_put_impl_.default,
 }
-JOINING = {aten.stack.default, aten.cat.default}  # take scalars of the host elsewhere, but not here
+JOINING = {aten.stack.default, aten.cat.default}  # elsewhere, scalars of the host are allowed
 COPYING = {aten._to_copy.default, aten.copy_.default}
 
 
@@ -51,7 +51,7 @@ class HostReads:
     """Counts the reads for which the host would wait for a GPU.
 
     Attributes:
-        reads: how often, by kind and by file, line and function of the reader: the innermost frame that is
+        reads: Number of reads, by kind and by file, line and function of the reader: the innermost frame that is
             neither PyTorch's nor this file's.
     """
 
@@ -126,7 +126,7 @@ class SimTensor(torch.Tensor):
     """A tensor that says it lies on `sim`.
 
     Attributes:
-        elem: its values, on the CPU.
+        elem: Its values, on the CPU.
     """
 
     elem: torch.Tensor
@@ -200,7 +200,7 @@ def _count(func: Any, args: Any, kwargs: dict[str, Any], on_sim: list[SimTensor]
 
 
 def _refuse_mixed(func: Any, args: Any, on_host: list[torch.Tensor]) -> None:
-    # Scalars of the host are taken as numbers, and indices may lie there.
+    # Scalars and indices may lie on the host.
     wrong = [one for one in on_host if one.dim() > 0]
     if func in INDEXING:
         wrong = [one for one in wrong if one is args[0] or (len(args) > 2 and one is args[2])]

@@ -1,6 +1,6 @@
 """Look-alikes of all adapters on a simulated second device: nothing mixes devices, and host reads are few.
 
-Five look-alikes a day take their turn; all of them with `pytest tests/device --all-lookalikes`.
+Each day five look-alikes are tested. `pytest tests/device --all-lookalikes` tests all of them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def has_backend() -> bool:
         return False
 
 
-LONGEST = 1800  # seconds; all look-alikes take more than the 300 of other tests
+LONGEST = 1800  # time limit in seconds: all look-alikes take longer than the 300 s of other tests
 pytestmark = [
     pytest.mark.timeout(LONGEST),
     pytest.mark.skipif(
@@ -79,8 +79,8 @@ def complaints(name: str, found: dict[str, Any]) -> list[str]:
             count = Counts(row["gate"])
             looks += count.looks
             idle = settings == "off" or row["reason"] == "inactive"
-            # Waits for copies that were begun before a render, or before the backward, leave the device busy: gsplat's
-            # script has one for the id of the view.
+            # The device works on while the host waits for a copy that began before a render or a backward pass. In
+            # gsplat's script the gate waits for the id of the view in this way.
             id_waits = 0 if idle or name == "gsplat_batch" or not name.startswith("gsplat") else 1
             loss_reads = count.reads + count.waits - id_waits
             few = loss_reads <= (0 if idle or row["reason"] == "over" else 1)

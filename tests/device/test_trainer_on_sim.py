@@ -34,7 +34,10 @@ def measured() -> dict[str, Any]:
 @pytest.mark.parametrize("photographs", ["resident", "ahead"])
 def test_an_iteration_reads_its_loss_behind_the_backward_and_nothing_else(measured, photographs):
     reads = {kind: count for kind, _, _, count in measured[photographs]}
-    assert reads == {"waited for a copy": 10, "synchronize": 1}  # ten iterations and the end of the run
+    assert reads == {
+        "waited for a copy": 10,
+        "synchronize": 1,
+    }  # one wait in each of ten iterations, one synchronisation at the end
 
 
 @on_sim
@@ -43,7 +46,7 @@ def test_the_command_for_a_gpu_compares_from_one_snapshot(measured):
     assert found["runs"].keys() == GATES.keys() and not found["left_out"]
     off, gate, share = (found["runs"][name] for name in GATES)
     assert off["iterations"] == gate["iterations"] > share["iterations"] and off["backwards_skipped"] == 0
-    # Beside one in each of 20 iterations: two at the end of a `train`.
+    # One read in each of 20 iterations, and two at the end of `train`.
     assert 1.0 <= off["waits_per_iteration"] <= 1.15 and gate["backwards_skipped"] > 0
     assert gate["peak_bytes_first_skip"] is not None and off["peak_bytes_first_skip"] is None
     text = table({"device": "sim", "trainer": found, "script": None})

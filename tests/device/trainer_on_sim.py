@@ -1,6 +1,6 @@
 """The trainer of this package, and the measurements of benchmarks/gpu, on the simulated device; prints JSON.
 
-A process of its own, as `lookalikes_on_sim.py`.
+It runs in a process of its own, like `lookalikes_on_sim.py`.
 """
 
 from __future__ import annotations

@@ -104,11 +104,11 @@ def errors_against_reference(
 ) -> dict[str, float]:
     """Return errors of a float32 rendering and its gradients, compared with the float64 reference.
 
-    Pixels near a cut-off are left out of both, with an upstream gradient of zero.
+    Pixels near a cut-off are compared in neither: their upstream gradient is zero.
 
     Returns:
-        `image` and `alpha`: greatest absolute error, the image's as a share of its greatest value where that
-        is above 1. For means2d and every differentiable argument: relative L2 error of its gradient.
+        Largest absolute errors of `image` and `alpha`; that of an image with values above 1 is a share of its largest
+        value. For means2d and every differentiable argument, the relative L2 error of its gradient.
     """
     results = {}
     masked = torch.empty(0)

@@ -66,7 +66,7 @@ def test_optimizations_change_nothing(case: str) -> None:
             image, alpha, info = rasterization(**inputs, **{"packed": False, **options})
             generator = torch.Generator().manual_seed(1)
             upstream = torch.randn(image.shape, generator=generator)
-            upstream[:, : image.shape[1] // 2] = 0.0  # for the optimizations of the adjoint
+            upstream[:, : image.shape[1] // 2] = 0.0  # lets optimizations of the adjoint leave out tiles
             torch.autograd.backward([image, alpha], [upstream, upstream[..., :1]])
         gradients = [t.grad for t in inputs.values() if torch.is_tensor(t) and t.grad is not None]
         results.append(([image.detach(), alpha.detach()], gradients, info["tiles_per_gauss"].sum()))
@@ -75,7 +75,7 @@ def test_optimizations_change_nothing(case: str) -> None:
     assert len(gradients) >= 5
     for fast, plain in zip(gradients, plain_gradients, strict=True):
         assert relative_error(fast, plain) < 1e-6
-    assert tiles < plain_tiles  # some were left out
+    assert tiles < plain_tiles  # exact_tiles left out some
 
 
 def test_blocks_without_gradient_change_no_bit() -> None:

@@ -58,7 +58,7 @@ def test_exactly_the_kernels_of_a_run_are_loaded_ahead(options: dict[str, bool],
 
 
 def test_calls_are_made_in_order_and_side_by_side() -> None:
-    met = threading.Barrier(2, timeout=60)  # broken unless two threads are in calls at once
+    met = threading.Barrier(2, timeout=60)  # it breaks unless two calls run at the same time
     made: list[int] = []
 
     def call(number: int) -> None:

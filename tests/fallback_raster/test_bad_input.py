@@ -62,7 +62,7 @@ def test_arrays_that_are_no_tensors(name: str) -> None:
     [
         ("width", 0),
         ("height", -3),
-        ("sh_degree", 2),  # the colors hold degree 1
+        ("sh_degree", 2),  # the colours have coefficients up to degree 1 only
         ("sh_degree", -1),
         ("render_mode", "depth"),
         ("rasterize_mode", "sharp"),

@@ -229,7 +229,7 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Worker[Any], d
 def test_a_tensor_of_another_size_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = recorded_calls(monkeypatch)
     assert {found.name for found, _ in calls} == set(WORKERS)
-    # Sizes that no other argument of a call determines, or only up to a whole vector.
+    # No other argument of a call determines these sizes, or only up to a whole vector.
     free = {("reduce_pairs", "sums.pair_slot"), ("splat_adjoint", "sums.pair_slot")}
     for found, arguments in calls:
         for path, value in arguments.items():

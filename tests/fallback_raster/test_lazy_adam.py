@@ -47,7 +47,7 @@ def gradient(shape: tuple[int, ...], share: float, generator: torch.Generator) -
     colors *= 10.0 ** torch.randint(-14, 4, (len(rows), 1), generator=generator)
     nothing = torch.rand(len(rows), generator=generator) < 0.2
     colors[nothing | directions.isnan().any(1), :3] = 0.0
-    directions[nothing] = torch.nan  # undefined
+    directions[nothing] = torch.nan  # the kernels leave these undefined
     degree = int(torch.randint(1, 4, (), generator=generator))
     return FactoredGradient(torch.Size(shape), [Factors(rows, directions, colors, degree)])
 
@@ -215,7 +215,7 @@ def test_its_state_dict_is_adams() -> None:
     assert_equal(lazy, other)
 
 
-@pytest.mark.filterwarnings("ignore:You are using `torch.load`:FutureWarning")  # pickle does, with torch 2.4
+@pytest.mark.filterwarnings("ignore:You are using `torch.load`:FutureWarning")  # torch 2.4 warns so when it unpickles
 @pytest.mark.parametrize("again", [copy.deepcopy, lambda lazy: pickle.loads(pickle.dumps(lazy))])
 def test_a_copy_goes_on_as_the_original(again: Callable[[LazyAdam], LazyAdam]) -> None:
     generator = torch.Generator().manual_seed(4)

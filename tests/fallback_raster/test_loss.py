@@ -73,7 +73,7 @@ def beyond_one(shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
 
 
 PICTURES = [noisy, unrelated, nearly_constant, offset_constant, offset_colours, half_black, beyond_one]
-# Around one vector (16 floats), the window (11), one band (128 rows) and one chunk (256 floats).
+# Sizes around those of a vector (16 floats), the window (11), a band (128 rows) and a chunk (256 floats).
 SHAPES = [
     (1, 1, 3),
     (1, 40, 3),

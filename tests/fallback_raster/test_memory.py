@@ -71,7 +71,7 @@ def test_little_more_is_mapped_than_was_in_use_at_one_time(pool: Pool) -> None:
     both = numbers(pool), numbers(pool, 3 * PAGE)
     most = pool.mapped
     del both
-    for count in (2 * PAGE, 4 * PAGE, PAGE // 2, 3 * PAGE):  # as densification makes them
+    for count in (2 * PAGE, 4 * PAGE, PAGE // 2, 3 * PAGE):  # sizes change like this in densification
         tensor = numbers(pool, count)
         assert pool.mapped <= most + most // memory.SPARE_DIVISOR
         del tensor

@@ -19,7 +19,7 @@ from skipgs_plug.fallback_raster import get_num_threads, set_num_threads
 from skipgs_plug.fallback_raster.training.optimizer import Adam, instead_of_torchs_adam
 
 SHAPES = [(1,), (16,), (33, 3), (700, 15, 3), (0, 3), (40_001,)]
-# Torch's own, which are an ulp of a step apart from each other.
+# Torch's own implementations, which differ by an ulp of a step.
 TORCHS = {"default": {"foreach": False}, "foreach": {"foreach": True}, "fused": {"fused": True}}
 LEFT_TO_TORCH: dict[str, dict[str, Any]] = {
     "weight decay": {"weight_decay": 0.1},
@@ -210,7 +210,7 @@ def test_hooks_see_every_step_once_and_may_change_the_rate() -> None:
 
     grads = gradients((30,), 7, 4)
     hooked, plain = Adam([parameter((30,))], lr=0.01), Adam([parameter((30,))], lr=0.01)
-    torch.optim.Adam([parameter((30,))])  # torch wraps `step` of the base class when one is made
+    torch.optim.Adam([parameter((30,))])  # torch wraps `step` of the base class in the constructor
     hooked.register_step_pre_hook(double)
     hooked.register_step_post_hook(lambda *_: seen.append("after"))
     ours = train(hooked, grads)
@@ -282,7 +282,7 @@ def test_torchs_optimizers_step_by_it_inside_the_block_alone() -> None:
     module = importlib.import_module("torch.optim.adam")
     before = module.adam
     grads = gradients((40_000,), 8, 6)
-    # Made outside, and one of a class of its own.
+    # The optimizer is made outside the block, and is of a subclass.
     optimizer = type("Own", (torch.optim.Adam,), {})([parameter((40_000,))], lr=0.01)
     with instead_of_torchs_adam():
         replaced = train(optimizer, grads)
@@ -327,7 +327,7 @@ def test_it_leaves_torchs_compiler_alone() -> None:
 def test_numbers_that_never_had_a_gradient_are_torchs(eps: float) -> None:
     """They do not change, not even negative zeros. Without `eps` all become NaN, 0 / 0.
 
-    Others may differ in the last bit: torch rounds otherwise on ARM.
+    Other numbers may differ in the last bit, because torch rounds differently on ARM.
     """
     generator = torch.Generator().manual_seed(4)
     values = torch.randn(200, 16, generator=generator)

@@ -29,7 +29,7 @@ ROOT = HERE.parents[1]
 def run(*command: str, **environment: str) -> str:
     """Run Python in a new process, which must succeed, and return its output.
 
-    Its time limit is that of the test: pytest's option --timeout. The end of a test kills it.
+    It has no time limit of its own: pytest's --timeout ends the test, which kills it.
     """
     found = subprocess.run(
         [sys.executable, *command],
@@ -284,7 +284,7 @@ def test_kernels_are_kept_in_a_temporary_folder_if_the_cache_cannot_be_written(t
     assert "  ok  warp" in line and line.endswith("set WARP_CACHE_PATH to a folder that can be written.")
 
 
-# Warp begins with a folder that exists, and finds only later that it cannot write there.
+# The folder exists when Warp starts. Warp finds later that it cannot write there.
 LATER = """
 import warp
 from skipgs_plug.fallback_raster.runtime.native import _warp
@@ -329,7 +329,8 @@ def test_what_does_not_load_is_compiled_again_once(tmp_path: Path) -> None:
     assert load_or_rebuild(folder, load, forget) == "kernel" and calls == ["load"]
     assert load_or_rebuild(folder, load, forget) == "kernel" and calls == ["load"] * 2
     (folder / "kernel.o").write_bytes(b"bad")
-    assert load_or_rebuild(folder, load, forget) == "kernel" and calls == ["load"] * 3  # the checksum tells
+    # The checksum differs, so the kernel is built again before it is loaded.
+    assert load_or_rebuild(folder, load, forget) == "kernel" and calls == ["load"] * 3
     (folder / "kernel.o").write_bytes(b"bad")
     (folder / "kernel.sha256").unlink()
     calls.clear()

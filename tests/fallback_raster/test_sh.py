@@ -11,9 +11,9 @@ from torch import Tensor
 
 from skipgs_plug.fallback_raster import rasterization
 
-# Rows that end within 16, within a block of 512, and behind one.
+# Numbers of rows that end inside 16 rows, inside a block of 512, and after it.
 ROWS = (1, 37, 517)
-# Degree and coefficients of a row, of which some are not used, or more than any degree has.
+# Degree, and number of coefficients in a row: some are not used, or no degree has as many.
 BANDS = ((0, 1), (0, 16), (1, 4), (1, 9), (2, 9), (2, 16), (3, 16), (3, 20))
 
 
@@ -69,4 +69,4 @@ def test_a_row_has_the_colour_that_it_has_alone(degree: int, coefficients: int) 
         where = slice(8 * row, 8 * row + 8)
         assert torch.equal(alone[0, :, where], image[0, :, where])
         lit += bool(alone[0, :, where].any())
-    assert lit > 30  # the others are as dark as colours can be
+    assert lit > 30  # the others are clamped at 0

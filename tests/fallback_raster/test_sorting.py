@@ -32,10 +32,10 @@ def test_order(case: str, n: int) -> None:
     depths: Tensor = DEPTHS[case](n, generator)
     one = torch.ones(n, 2)
     conics = torch.tensor([1.0, 0.0, 1.0]).expand(n, 3).contiguous()
-    # All in one tile of an image of two.
+    # All Gaussians are in one of two tiles.
     splats = Splats(6.0 * one, depths, conics, torch.full((n,), 0.9), sigmas=one)
     bins = bin_gaussians(all_rows(n).rows, splats, torch.zeros(n, 3), width=32, height=16)
     bins.sort()
     assert bins.tile_start.tolist() == [0, n, n]
     assert torch.equal(bins.tile_record.long(), torch.argsort(depths, stable=True))
-    assert torch.equal(bins.tile_pair, bins.tile_record)  # one pair each
+    assert torch.equal(bins.tile_pair, bins.tile_record)  # each Gaussian has one pair

@@ -92,7 +92,7 @@ def test_raw_parameters_are_their_activations(case: str) -> None:
         if name in ("gaussian_ids", "radii"):
             assert torch.equal(fast[name], value)
         else:
-            # One rounding of an activation more or less; a pixel at a cut-off may take another Gaussian.
+            # An activation rounds once more or less, so a pixel at a cut-off may blend another Gaussian.
             assert relative_error(fast[name], value) < 2e-5, name
 
 

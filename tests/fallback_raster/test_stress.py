@@ -1,6 +1,6 @@
 """Extreme but finite inputs give finite images and gradients, and nothing crashes.
 
-The default run is a sample. The long one:
+The default run is a sample. The long run is
 `pytest tests/fallback_raster/test_stress.py --stress-examples 10000`.
 """
 

@@ -16,7 +16,7 @@ from skipgs_plug import fallback_raster
 from skipgs_plug.fallback_raster.runtime.native import Kernel
 from skipgs_plug.fallback_raster.runtime.thread_pool import ThreadPool
 
-SPIN_SECONDS = 2e-4  # time after which spinning threads sleep, about
+SPIN_SECONDS = 2e-4  # approximate time after which spinning threads sleep
 
 
 class Arguments(ctypes.Structure):
@@ -61,7 +61,7 @@ def test_all_that_began_are_done_when_a_launch_returns(pool: ThreadPool) -> None
         mine = [thread for launch, thread in ended if launch == number]
         assert threading.get_ident() in mine
         assert len(set(mine)) == len(mine) <= 1 + pool._count
-        if number % 3 == 0:  # let helpers fall asleep, or not
+        if number % 3 == 0:  # helpers fall asleep before some launches
             time.sleep(lengths.choice([SPIN_SECONDS / 10, 3 * SPIN_SECONDS]))
     assert len({thread for _, thread in ended}) == 1 + pool._count
 

@@ -33,7 +33,7 @@ def rendered(scene: dict[str, Any], **options: Any) -> tuple[list[Tensor], list[
 def assert_same(one: tuple[list[Tensor], list[Tensor]], other: tuple[list[Tensor], list[Tensor]]) -> None:
     for value, truth in zip(one[0], other[0], strict=True):
         assert torch.equal(value, truth)
-    # Pairs of a row are added up in another order.
+    # The pairs of a row are added in another order, so gradients round differently.
     for value, truth in zip(one[1], other[1], strict=True):
         assert relative_error(value, truth) < 2e-6
 
@@ -78,13 +78,13 @@ def test_any_end_of_the_first_lists_gives_the_same_image(
     generator = torch.Generator().manual_seed(seed)
     lists = ending_at(monkeypatch, lambda count: 1.5 + 7 * torch.rand(count, generator=generator))
     assert_same(rendered(scene, **options), whole)
-    assert lists[0] > 0  # some tiles went on
+    assert lists[0] > 0  # some tiles needed the second pass
 
 
 def test_what_only_just_reaches_an_open_tile_is_listed_there(monkeypatch: pytest.MonkeyPatch) -> None:
     generator = torch.Generator().manual_seed(3)
     scene = deep_scene(600)
-    # As wide as tiles, and so faint that no pixel is finished.
+    # The Gaussians are as wide as tiles, and so faint that no pixel is finished.
     scene["scales"] = 0.1 + 0.4 * torch.rand(600, 3, generator=generator)
     scene["opacities"] = 0.02 + 0.08 * torch.rand(600, generator=generator)
     with without_optimizations("two_pass"):

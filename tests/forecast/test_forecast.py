@@ -127,6 +127,6 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert any(line.startswith("Errors of such estimates on ") for line in shown)
     assert [entry.name for entry in tmp_path.iterdir()] == ["tiny.npz"]  # nothing is written
     for wrong in (["--seconds", "0"], ["--steps", "0"], ["--seconds", str(math.nan)]):
-        with pytest.raises(SystemExit, match="2"):  # as for all options that are out of their range
+        with pytest.raises(SystemExit, match="2"):  # exit code of options that are out of their range
             main(["estimate", str(path), *wrong])
         assert "give" in capsys.readouterr().err

@@ -15,7 +15,7 @@ from skipgs_plug.photos.video import sharpest_frames, sharpness
 from skipgs_plug.trainer import InputError
 from skipgs_plug.trainer.loaders.images import ORIENTATION
 
-# imageio-ffmpeg leaves the pipes of a decoder that has ended to the garbage collector.
+# imageio-ffmpeg does not close the pipes of a finished decoder; the garbage collector does.
 LEAVES_PIPES = "ignore:unclosed file:ResourceWarning"
 
 
@@ -137,7 +137,7 @@ def test_linked_folders_and_transparency(pattern, tmp_path):
     alpha[:, :40] = 0
     Image.fromarray(np.dstack([pattern, alpha])).save(store / "c.png")
     (source / "day2").symlink_to(store)
-    (store / "round").symlink_to(source)  # a circle ends
+    (store / "round").symlink_to(source)  # a circle of links is followed once
     gathered = gather(source, tmp_path / "work" / "photos", 0, lambda _: None)
     assert gathered.names == ["day1/a.png", "day1/b.png", "day2/c.png"]
     assert [path.name for path in gathered.masks.rglob("*.png")] == ["c.png.png"]

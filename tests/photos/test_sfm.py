@@ -25,7 +25,7 @@ from skipgs_plug.photos.reconstruct import key_pairs
 from skipgs_plug.trainer import load_scene
 from skipgs_plug.view.model import open_model
 
-# imageio-ffmpeg leaves the pipes of a decoder that has ended to the garbage collector.
+# imageio-ffmpeg does not close the pipes of a finished decoder; the garbage collector does.
 LEAVES_PIPES = "ignore:unclosed file:ResourceWarning"
 
 
@@ -96,7 +96,7 @@ def test_a_video_is_trained_on_with_one_command(fern, tmp_path, capsys):
     last = shown.splitlines()[-1]
     assert f"{program()} view {run}; share it: {run / 'walk.spz'} (" in last and (run / "walk.spz").is_file()
     assert (run / "scene/sparse/0").is_dir() and (run / "ply/point_cloud_5.ply").is_file()
-    video.unlink()  # the scene is there
+    video.unlink()  # resuming needs only the scene
     assert main([*train, "--max-steps", "8", "--sfm", "--resume"]) == 0
     assert "placed" not in capsys.readouterr().out
     run = run.rename(tmp_path / "moved")
@@ -151,7 +151,7 @@ def test_where_all_at_once_fails_photographs_are_placed_one_after_another(fern, 
     for path in fern[:5]:
         shutil.copy(path, photos)
     monkeypatch.setattr(reconstruct, "ALL_AT_ONCE_BEYOND", 4)
-    monkeypatch.setattr(global_mapping, "LEAST_POINTS", 1_000_000)  # so that no photograph counts as placed
+    monkeypatch.setattr(global_mapping, "LEAST_POINTS", 1_000_000)  # with this bound no photograph counts as placed
     assert main(["sfm", str(photos), str(scene), "--no-progress"]) == 0
     shown = capsys.readouterr().out
     assert "Global mapping placed 0 of 5 photographs; placing them one after another now." in shown
@@ -176,7 +176,7 @@ def test_an_interrupt_ends_the_process_that_places_all_at_once(fern, tmp_path, m
     with pytest.raises(KeyboardInterrupt):
         global_mapping.map_globally(tmp_path / "database.db", fern[0].parent, tmp_path / "work", interrupt)
     (process,) = started
-    assert process.returncode not in (None, 0)  # killed, and waited for
+    assert process.returncode not in (None, 0)  # the process was killed, and its end awaited
 
 
 def test_a_terminated_run_leaves_nothing(photos, tmp_path, capsys, monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-# Runs in a copy of the page only: the page itself holds no script.
+# The script is added to a copy of the page. The page itself holds no script.
 COUNT_IMAGES = """<script>addEventListener("load", () => {
   const images = [...document.images];
   document.body.dataset.images = images.length;

@@ -129,7 +129,7 @@ def test_browser_compares_several_runs(train_folder, ungated_folder, script_fold
     expected = [json.loads((f / "stats/val_step39.json").read_text()) for f in (train_folder, ungated_folder)]
     assert rows["SSIM"] == [*(f"{stats['ssim']:.4f}" for stats in expected), "-"]
     assert rows["Gaussians"] == [*(f"{stats['num_GS']:,}" for stats in expected), "-"]
-    # Three of the comparison, then those of each run and of the bench.
+    # Three pictures of the comparison, then those of each run and of the bench.
     assert body_count(dom, "images") == body_count(dom, "decoded") == 3 + 12 + 9 + 3 + 6
 
 

@@ -112,7 +112,7 @@ def resolved(name: str, default: object) -> object:
 
 @pytest.mark.skipif(not hasattr(torch, "accelerator"), reason="this torch has no torch.accelerator")
 def test_torch_itself_finds_no_device(monkeypatch):
-    # As a build with CUDA says where there is no GPU, once `torch.cuda.is_available` is replaced.
+    # A build with CUDA gives this answer without a GPU once `torch.cuda.is_available` is replaced.
     monkeypatch.setattr(torch.accelerator, "current_accelerator", lambda check_available=False: torch.device("cuda"))
     with cuda_on_cpu():
         leaf = torch.ones(2, device="cuda", requires_grad=True)

@@ -120,7 +120,7 @@ def test_a_module_is_run_as_python_does_with_m(checkout, monkeypatch, capfd):
     (checkout / "neighbour_of_script" / "train.py").write_text(
         "import sys\nfrom neighbour_of_script import VALUE\nprint(VALUE, __name__, sys.argv[1:])\n"
     )
-    monkeypatch.chdir(checkout)  # which is not on the path of the installed command `skipgs-plug`
+    monkeypatch.chdir(checkout)  # the installed command has no current folder on its path
     assert run_script(["-m", "neighbour_of_script.train", "-i", "3"]) == 0
     assert capfd.readouterr().out == "own __main__ ['-i', '3']\n"
 
@@ -209,7 +209,7 @@ def test_missing_module_is_named(checkout, capfd):
     assert run_script([write(checkout, "import absent_module_of_script.part\n")]) == 1
     error = capfd.readouterr().err
     assert "Traceback" in error and "train.py needs the module absent_module_of_script, which is not" in error
-    assert "pip install" not in error  # it may be a file that the checkout lacks, and an index may hold that name
+    assert "pip install" not in error  # a file may be missing whose name is another package's
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ def opaque_scene(tiny_scene: Scene) -> Scene:
 
 @pytest.fixture
 def tiny_config() -> TrainConfig:
-    # Milestones are given for 30,000 steps: refinement ends at 30, SH rises every 10.
+    # Milestones are given for 30,000 iterations. Here, densification ends at 30, and the SH degree rises every 10.
     return TrainConfig(max_steps=60, refine_every=4, sh_degree_interval=5000)
 
 

@@ -61,7 +61,7 @@ def test_counts_that_no_file_holds(folder: Path, name: str, count: int) -> None:
     patch(folder / "sparse/0" / name, 0, "<Q", count)
     with pytest.raises(InputError, match=rf"{name} ends early"):
         load_scene(folder)
-    if name == "points3D.bin":  # the length of a track
+    if name == "points3D.bin":  # it also counts the elements of each track
         patch(folder / "sparse/0" / name, 0, "<Q", 160)
         patch(folder / "sparse/0" / name, 8 + 43, "<Q", count)
         with pytest.raises(InputError, match=rf"{name} ends early"):
@@ -91,7 +91,7 @@ def test_camera_values(folder: Path, offset: int, kind: str, value: float, sente
 def test_rotations_that_are_none(folder: Path, value: float) -> None:
     patch(folder / "sparse/0/images.bin", 12, "<4d", *[value] * 4)
     frames = folder / "sparse/0/frames.bin"
-    if frames.is_file():  # newer versions take the pose from there
+    if frames.is_file():  # newer versions read the pose from frames.bin
         patch(frames, 16, "<4d", *[value] * 4)
     with pytest.raises(InputError, match=r"sparse/0: the pose of '.*' is not valid|cannot be read"):
         load_scene(folder)

@@ -51,7 +51,7 @@ def test_rows_and_moments_are_those_of_gsplat(tiny_config: TrainConfig, tiny_sce
     assert_same(ours, theirs)
     n, parameters = ours.num_gaussians, dict(ours.splats.items())
     for trainer in (ours, theirs):
-        trainer.strategy_state["more"] = torch.arange(n)  # gsplat lets every tensor there follow the rows
+        trainer.strategy_state["more"] = torch.arange(n)  # gsplat moves the rows of every tensor in its state
     info = seen(n)
     torch.manual_seed(5)
     densify(ours.strategy, ours.splats, ours.optimizers, ours.strategy_state, 8, copy.copy(info), in_order)

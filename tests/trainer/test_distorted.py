@@ -75,7 +75,7 @@ def write_lens(root: Path, model: str) -> Path:
 
 def assert_straight(view: View) -> None:
     expected = picture(pinhole_rays(view)) * 255
-    assert np.abs(view.image.numpy() - expected).max() < 3  # levels; rounded, distorted, sampled, rounded again
+    assert np.abs(view.image.numpy() - expected).max() < 3  # of 255: rounded, distorted, sampled and rounded again
     assert view.width > 80 and view.height > 60
 
 
@@ -89,7 +89,7 @@ def test_colmap(tmp_path: Path, model: str, caplog: pytest.LogCaptureFixture) ->
     mask = scene.train[0].mask
     assert mask is not None and scene.train[1].mask is None
     wrong = mask.numpy() != right_half(pinhole_rays(scene.train[0]))
-    assert wrong.mean() < 0.01  # the column at the edge
+    assert wrong.mean() < 0.01  # only pixels at the edge differ
 
 
 def test_no_pinhole_sees_a_sphere(tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_nerfstudio(tmp_path: Path, model: str) -> None:
     assert [view.name for view in scene.train] == [f"images/frame_{i}.png" for i in range(3)]
     for i, view in enumerate(scene.train):
         assert_straight(view)
-        # OpenGL poses look along -z with y up; ours along +z with y down.
+        # OpenGL cameras look along -z with y up; cameras of a Scene look along +z with y down.
         torch.testing.assert_close(scene.frame.dataset_pose(view.viewmat), torch.tensor(
             [[1.0, 0, 0, -i], [0, -1, 0, 2], [0, 0, -1, 3], [0, 0, 0, 1]]).double())  # fmt: skip
     assert scene.train[0].mask is not None and scene.train[1].mask is None

@@ -67,7 +67,8 @@ def test_changes_of_exposure_cost_less_with_it(changing: Scene) -> None:
     affine = trainer.exposure.affine.detach()
     light = affine[:, :, :3].sum(dim=2).mean(dim=1)
     assert light[1::2].max() < light[0::2].min()
-    assert torch.allclose(affine.mean(dim=0), torch.eye(3, 4), atol=1e-5)  # nothing is left to drift
+    # The mean correction is the identity, so colours cannot drift.
+    assert torch.allclose(affine.mean(dim=0), torch.eye(3, 4), atol=1e-5)
     stats = trainer.evaluate()
     assert stats["cc_psnr"] > stats["psnr"] and "fitted per image" in stats["cc_psnr_flavour"]
     assert "cc_psnr" not in trainer.evaluate("train")
@@ -118,7 +119,7 @@ def test_a_skipped_backward_leaves_it_alone_and_larger_steps_do_not_reach_it(cha
         trainer.train(until=32, progress=False)
     assert rates[0] == pytest.approx(0.25 * rate(), rel=0.05)
     before = trainer.exposure.affine.detach().clone()
-    trainer.backward = lambda loss, view, step: None  # as a gate that skips
+    trainer.backward = lambda loss, view, step: None  # stands for a gate that skips
     trainer.train(until=40, progress=False)
     assert torch.equal(trainer.exposure.affine, before)
 

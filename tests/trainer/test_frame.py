@@ -131,7 +131,7 @@ def test_a_run_at_utm_coordinates_is_written_there(tmp_path: Path, tiny_scene: S
     assert vertices["opacity"].dtype == np.float32
     middle = np.median([vertices["x"], vertices["y"], vertices["z"]], axis=1)
     assert np.abs(middle - UTM).max() < 5
-    # The checkpoint, the PLY beside its scene and the exported PLY look alike.
+    # Checkpoint, PLY with its scene, and exported PLY hold the same model.
     assert main(["export", str(run), str(tmp_path / "out.ply")]) == 0
     torch.testing.assert_close(read_ply(tmp_path / "out.ply")["means"], read_ply(ply)["means"], rtol=0, atol=1e-6)
     of_run, of_ply = open_model(run), open_model(ply, scene=str(root))
@@ -139,13 +139,13 @@ def test_a_run_at_utm_coordinates_is_written_there(tmp_path: Path, tiny_scene: S
     for name in ("means", "scales"):
         torch.testing.assert_close(own[name], other[name], rtol=0, atol=1e-5)
     assert float(own["means"].abs().median()) < 5
-    # --init-ply begins at the same Gaussians, and a run goes on.
+    # --init-ply starts from the same Gaussians, and a resumed run continues.
     again = load_scene(root, init_ply=ply)
     torch.testing.assert_close(again.gaussians["means"], own["means"], rtol=0, atol=1e-5)
     assert main(["train", str(root), "--out", str(run), "--resume", "--gate", *length[:1], "40", *length[2:]]) == 0
     assert main(["export", str(run), str(tmp_path / "out.splat")]) == 0
     assert "single precision" in caplog.text
-    # So does a packed scene.
+    # A packed scene has the same cameras and points.
     save_packed(load_scene(root), tmp_path / "packed.npz")
     packed, loaded = load_scene(tmp_path / "packed.npz"), load_scene(root)
     for first, second in zip(packed.train, loaded.train, strict=True):
@@ -184,7 +184,7 @@ def utm_model(path: Path, n: int = 400) -> dict[str, torch.Tensor]:
         "sh0": torch.randn(n, 1, 3, generator=generator),
         "shN": torch.randn(n, 15, 3, generator=generator) / 8,
     }
-    local["means"][0] = torch.tensor([900.0, 0, 0])  # one that is far off
+    local["means"][0] = torch.tensor([900.0, 0, 0])  # one Gaussian is far off
     write_ply({**local, "means": local["means"] + torch.tensor(UTM, dtype=torch.float64)}, path)
     return local
 
@@ -200,9 +200,9 @@ def test_a_model_of_a_map_is_shown_without_its_scene(tmp_path: Path) -> None:
         torch.testing.assert_close(shown[name], local[name])
     on_page = to_gaussians(shown, 1.0)
     assert np.abs(np.median(on_page.centers, axis=0)).max() < 0.01
-    # Without moving, float32 has steps of half a unit there.
+    # If the model were not moved, float32 would have steps of half a unit.
     assert len(np.unique(on_page.centers[:, 1].round(3))) > 350
-    # All snapshots of a model are moved alike.
+    # All snapshots of a model move by the same amount.
     assert torch.equal(model.load(model.snapshots[-1])["means"], shown["means"])
 
 
@@ -220,7 +220,7 @@ def test_resuming_compares_coordinates_and_poses(tmp_path: Path, tiny_scene: Sce
         Trainer(TrainConfig(max_steps=60, sh_degree_interval=5000), scene).load_checkpoint(tmp_path / "c.pt")
 
     resume(placed(tiny_scene, 1.0, UTM))
-    resume(placed(tiny_scene, 1.0, tuple(value + 1e-7 for value in UTM)))  # rounded otherwise
+    resume(placed(tiny_scene, 1.0, tuple(value + 1e-7 for value in UTM)))  # the same poses, rounded differently
     for unit, shift in ((1.0, NOWHERE), (1.0, (500_010.0, *UTM[1:])), (1e-3, UTM)):
         with pytest.raises(InputError, match="subtracted and divided by, which is"):
             resume(placed(tiny_scene, unit, shift))

@@ -62,7 +62,7 @@ def test_a_streamed_capture_trains_bit_by_bit_as_one_in_memory(
 def test_photographs_are_decoded_before_their_turn_and_memory_is_bounded(
     folder: Path, tiny_config: TrainConfig
 ) -> None:
-    store = ImageStore(12 * PICTURE // 3)  # 3 stay, 1 is ahead
+    store = ImageStore(12 * PICTURE // 3)  # room for three that stay and one that is decoded ahead
     trainer = Trainer(tiny_config, load_scene(folder, images=store))
     most, unexpected = 0, 0
 

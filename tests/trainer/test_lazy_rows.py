@@ -170,7 +170,7 @@ def test_gradients_that_wait_for_their_step_are_sorted_with_their_rows(
     for sorts in (False, True):
         trainer.restore(snapshot)
         with monkeypatch.context() as context:
-            # As with a gate that accumulates.
+            # Stands for a gate that accumulates gradients: no optimizer steps.
             context.setattr("skipgs_plug.trainer.loop.step_optimizers", lambda *given: False)
             trainer.train_step()
         assert trainer._splats["shN"].grad.factors is not None

@@ -67,7 +67,7 @@ def test_opacities_are_reset_though_gsplat_1_5_3_does_not(trainer: Trainer) -> N
     assert torch.sigmoid(trainer.splats["opacities"]).max() > 0.05
     trainer.train_step()  # step 20, a multiple of reset_every
     assert torch.sigmoid(trainer.splats["opacities"]).max() <= 0.01001
-    # The strategy that did reset (or a second call) leaves nothing to do.
+    # After a reset by the strategy or by a first call, nothing is left to do.
     args = (trainer.strategy, trainer.splats, trainer.optimizers, trainer.strategy_state)
     assert not reset_opacity_if_missed(*args, 20)
     with torch.no_grad():
@@ -176,7 +176,7 @@ def test_densification_initialises_no_gpu(trainer: Trainer, monkeypatch: pytest.
     monkeypatch.setattr(torch.cuda, "set_rng_state", lambda state, device=None: asked.append(device))
     with pytest.warns(UserWarning, match="CUDA reports"), torch.random.fork_rng():
         pass
-    assert len(asked) == 4  # the probe sees a fork without a list of devices
+    assert len(asked) == 4  # the check notices a fork that asks all devices
     asked.clear()
     start = trainer.num_gaussians
     trainer.train(until=trainer.refine_stop_iter, progress=False)

@@ -94,7 +94,7 @@ def test_metrics_count_what_is_seen() -> None:
     wrong[:, 20:] = 0
     assert metrics.psnr(wrong, target, mask) == 100.0
     assert metrics.ssim(target, target, mask) == pytest.approx(1.0)
-    # A window around a pixel far from the hidden columns sees none of them.
+    # Windows far from the hidden columns do not contain them.
     mask[:] = False
     mask[:, :12] = True
     noisy = (target + 0.1 * torch.rand(24, 32, 3, generator=generator)).clamp(0, 1)

@@ -84,7 +84,7 @@ def test_a_gate_that_starts_early_leaves_the_moves(scene: Scene) -> None:
 
 
 def test_a_scene_of_another_size_trains_alike(scene: Scene) -> None:
-    unit = 128.0  # a power of two, so that digits stay the same
+    unit = 128.0  # a power of two, so that no digit is rounded
     views = {}
     for split in ("train", "test"):
         views[split] = []

@@ -37,7 +37,7 @@ def test_a_few_points_at_the_lens_do_not_count_but_a_close_view_does() -> None:
     stray.points[: int(NEAREST * 1000) // 2] = torch.tensor([0.0, 0.0, 0.01])
     assert nearest_depth(stray.train, stray.points) == pytest.approx(usual, rel=0.05)
     close = scene()
-    close.train[1].viewmat[2, 3] = -3.0  # three units ahead
+    close.train[1].viewmat[2, 3] = -3.0  # moves the camera three units forward
     assert nearest_depth(close.train, close.points) == pytest.approx(1.0, rel=0.1)
 
 
@@ -66,7 +66,7 @@ def test_points_that_nothing_would_ever_draw_do_not_become_gaussians() -> None:
     other = scene()
     other.points[0] = torch.tensor([0.5, 0.0, 0.2])
     assert before_a_lens(other.train, other.points, 0.4).nonzero().flatten().tolist() == [0]
-    other.train[1].viewmat[2, 3] = 3.0  # stands back, and shows the space before the lens of the other
+    other.train[1].viewmat[2, 3] = 3.0  # this camera stands back and shows the space in front of the other
     assert not before_a_lens(other.train, other.points, 0.4).any()
 
 

@@ -179,7 +179,7 @@ def test_the_first_image_does_not_depend_on_the_world(black: Scene, seed: int, s
     other = moved(black, rotation_of(seed), scale * np.array(shift), scale)
     difference = (first_image(other) - first_image(black)).abs()
     assert float(difference.mean()) < 2e-5
-    assert float(difference.max()) < 5e-3  # where a Gaussian is just below the threshold of visibility
+    assert float(difference.max()) < 5e-3  # the bound allows a Gaussian near the threshold of visibility
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -190,7 +190,7 @@ def test_a_run_does_not_depend_on_the_world(tiny_scene: Scene, seed: int) -> Non
         return trainer.evaluate()["psnr"]
 
     other = moved(tiny_scene, rotation_of(seed), np.array([5e5, -4.5e6, 120.0]), 3.0)
-    # Adam steps along axes, so a turned world takes other steps of the same length.
+    # Adam steps along the axes, so a rotated scene takes other steps of the same length.
     assert psnr(other) == pytest.approx(psnr(tiny_scene), abs=0.15)
 
 

@@ -67,7 +67,7 @@ def test_multiples_are_met_where_numbers_are_left_out(scene) -> None:
     trainer.on_step = look
     with SkipGate(trainer, refine_share=0.4):
         trainer.train(progress=False)
-    # 84 iterations up to 83, then the last one alone passes the multiples that are left.
+    # Iterations 0 to 83 run. Then only the last one does, and passes the other multiples.
     assert sum(passed) == 9 + 1 and sum(completed) == 8 + 1 and len(passed) == trainer.ran
 
 
@@ -97,7 +97,7 @@ def test_exposures_take_shorter_steps_not_larger_ones(scene) -> None:
 
 def test_a_run_that_is_trained_in_parts_is_planned_as_a_whole(scene) -> None:
     """The first loop says where it ends, not where the run does: events of later parts are known all the same."""
-    config = TrainConfig(max_steps=600, seed=3)  # densification to 300, events at 100 and 200
+    config = TrainConfig(max_steps=600, seed=3)  # densification ends at 300, with events at 100 and 200
     whole, parted = Trainer(config, scene), Trainer(config, scene)
     with SkipGate(whole, share=0.4) as one:
         whole.train(progress=False)

@@ -197,7 +197,7 @@ def test_masks_of_cameras_with_equal_names(nerf: Path) -> None:
         Image.fromarray(mask).save(nerf / "masks" / folder / name)
 
     change_frames(nerf, place)
-    for _ in range(2):  # by the frame, then by the folder
+    for _ in range(2):  # once by the frame, once by the folder
         scene = load_scene(nerf)
         for view in scene.train + scene.test:
             number = 2 * int(PurePosixPath(view.name).stem) + ("back" in view.name)
@@ -235,7 +235,7 @@ def test_cameras_that_are_none(colmap: Path, camera: str, said: str) -> None:
 
 
 def test_flat_gaussians_of_degree_0_survive_compression(tmp_path: Path) -> None:
-    splats = gaussians(0, 257)  # one more than a chunk
+    splats = gaussians(0, 257)  # one Gaussian more than a chunk holds
     splats["scales"][:, 2] = -math.inf
     splats["opacities"] = splats["opacities"].abs()
     write_model(tmp_path / "flat.ply", splats)
@@ -419,8 +419,8 @@ def test_masks_of_transparency_and_of_lossy_formats(colmap: Path) -> None:
     white = np.full((24, 32, 3), 255, dtype=np.uint8)
     Image.fromarray(np.dstack([white, half])).save(folder / "view_000.png")
     Image.fromarray(half).save(folder / "view_001.jpg", quality=30)
-    Image.fromarray(half // 255).save(folder / "view_002.png")  # 0 and 1
-    Image.fromarray(half > 0).save(folder / "view_003.png")  # bits
+    Image.fromarray(half // 255).save(folder / "view_002.png")  # grey levels 0 and 1
+    Image.fromarray(half > 0).save(folder / "view_003.png")  # one bit per pixel
     palette = Image.fromarray(half // 255, mode="L").convert("P")
     palette.putpalette([0, 0, 0, 255, 255, 255])
     palette.save(folder / "view_004.png")

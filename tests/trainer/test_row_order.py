@@ -33,7 +33,7 @@ def test_training_goes_on_with_the_same_gaussians(tiny_scene: Scene, tiny_config
     trainer.restore(before)
     parameters = dict(trainer.splats.items())
     sort_rows(trainer.splats, trainer.optimizers, trainer.strategy_state)
-    assert not torch.equal(trainer.splats["means"], before["splats"]["means"])  # they have moved since the beginning
+    assert not torch.equal(trainer.splats["means"], before["splats"]["means"])  # Gaussians have moved in training
     assert all(trainer.splats[name] is param for name, param in parameters.items())
     trainer.train(until=26, progress=False)
     for name, tensor in ranked(trainer).items():

@@ -65,7 +65,8 @@ def test_text_models_of_other_programs(colmap: Path, eol: str, encoding: str, se
 
 
 def test_a_name_of_digits_is_no_observation(colmap: Path) -> None:
-    rename_images(colmap, lambda name: name.split("_")[1].removesuffix(".png"))  # "000", ten fields
+    # A line of images.txt with the name "000" has ten fields.
+    rename_images(colmap, lambda name: name.split("_")[1].removesuffix(".png"))
     file = colmap / "sparse/0/images.txt"
     file.write_text("\n".join(line for line in file.read_text().splitlines() if line))
     for image in (colmap / "images").glob("0*"):
@@ -303,7 +304,7 @@ def test_saturated_values_are_clamped_and_counted(tmp_path: Path, caplog: pytest
     assert set(PlyData.read(tmp_path / "again.ply")["vertex"].data.dtype.names) == set(PROPERTIES)
     assert torch.equal(read_ply(tmp_path / "again.ply")["opacities"], read["opacities"])
     splats["means"][0, 0] = math.nan
-    write_ply(splats, tmp_path / "nan.ply")  # a run is not lost to it
+    write_ply(splats, tmp_path / "nan.ply")  # the file is written, so that the run is not lost
     with pytest.raises(InputError, match="NaN"):
         read_ply(tmp_path / "nan.ply")
 

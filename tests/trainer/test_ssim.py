@@ -32,5 +32,5 @@ def test_it_is_that_of_torchmetrics(height: int, width: int, noise: float) -> No
 def test_bands_of_rows_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = torch.rand(2, 53, 40, 3, generator=torch.Generator().manual_seed(0))
     whole = ssim_map(first, second)
-    monkeypatch.setattr(ssim_module, "BAND", 40 * 10)  # five of 10 rows, and one of 3
+    monkeypatch.setattr(ssim_module, "BAND", 40 * 10)  # five bands of 10 rows, and one of 3
     assert torch.equal(ssim_map(first, second), whole)

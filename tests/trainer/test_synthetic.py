@@ -26,4 +26,4 @@ def test_points_have_the_colour_of_their_pixel() -> None:
     error = (seen - scene.points_rgb[inside].float()).abs().mean(dim=1)
     assert inside.float().mean() > 0.6
     assert error.median() < 20
-    assert (seen - seen.mean(dim=0)).abs().mean() > 40  # the bound above is not met by a flat picture
+    assert (seen - seen.mean(dim=0)).abs().mean() > 40  # a flat picture would not meet the bound above

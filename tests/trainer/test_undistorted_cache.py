@@ -95,7 +95,7 @@ def test_a_damaged_file_is_written_again(folder: Path, undistorted: list[str], c
 def test_a_folder_that_cannot_be_written_is_said_once(
     folder: Path, undistorted: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    (folder / FOLDER).write_text("")  # no folder
+    (folder / FOLDER).write_text("")  # a file in place of the folder
     first = load_scene(folder, test_every=0)
     assert caplog.text.count("Lens distortion is removed anew at each load") == 1
     (folder / FOLDER).unlink()

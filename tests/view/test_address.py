@@ -17,7 +17,7 @@ from skipgs_plug.view.page import Page, require_address
         ("127.0.0.1", 65536, "port=65536 is not in 1..65535"),
         ("127.0.0.1", 0, "port=0 is not in 1..65535"),
         ("nowhere.invalid", 8080, r"Cannot listen on nowhere.invalid:8080 \("),
-        ("203.0.113.1", 8080, r"Cannot listen on 203.0.113.1:8080 \("),  # of nobody: reserved for documents
+        ("203.0.113.1", 8080, r"Cannot listen on 203.0.113.1:8080 \("),  # an address reserved for documentation
     ],
 )
 def test_an_address_that_cannot_be_is_refused_before_anything_waits_for_it(host, port, complaint):

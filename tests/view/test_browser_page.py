@@ -70,7 +70,7 @@ def test_a_run_is_shown_with_its_errors_and_checkpoints(run_folder, browser, tmp
         for expected in ("Iteration 39", gaussians, "held out", "mask", f"mean {stats['psnr']:.2f} dB"):
             wait_until(lambda expected=expected: expected in browser.text())
         pictures = "[...document.images].filter(i => i.naturalWidth == 33).length"
-        wait_until(lambda: browser.evaluate(pictures) == 3)  # render, photograph, error
+        wait_until(lambda: browser.evaluate(pictures) == 3)  # the page shows render, photograph and error
         picture = tmp_path / "page.png"
 
         def drawn() -> bool:
@@ -103,7 +103,7 @@ def test_training_is_shown_and_not_changed(scene_file, browser):
         live.page.show = lambda splats, title: (shown.append(title), show(splats, title))
         watched.on_step = live.iteration
         watched.train(until=5, progress=False)
-        assert shown == []  # nobody looks on
+        assert shown == []  # there is no visitor
         browser.open(f"http://127.0.0.1:{live.page.port}/")
         wait_until(lambda: live.page.visitors == 1)
         time.sleep(0.6)  # LiveView looks for visitors twice a second

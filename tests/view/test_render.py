@@ -17,7 +17,7 @@ from skipgs_plug.view.draw import Painter, colour_depth, depth_range
 from skipgs_plug.view.model import open_model
 from skipgs_plug.view.path import camera_path
 
-# imageio-ffmpeg leaves the pipes of a coder that has ended to the garbage collector.
+# imageio-ffmpeg does not close the pipes of a finished encoder; the garbage collector does.
 LEAVES_PIPES = "ignore:unclosed file:ResourceWarning"
 
 
@@ -139,7 +139,7 @@ def test_the_path_begins_and_ends_at_the_views_and_moves_evenly(scene_file):
     worlds = torch.linalg.inv(poses)
     turns = (worlds[1:, :3, :3].mT @ worlds[:-1, :3, :3]).diagonal(dim1=1, dim2=2).sum(1)
     steps = (worlds[1:, :3, 3] - worlds[:-1, :3, 3]).norm(dim=1)
-    assert steps.max() < 4 * steps.mean() and turns.min() > 2.5  # no jump
+    assert steps.max() < 4 * steps.mean() and turns.min() > 2.5  # the path does not jump
     single = camera_path(views[:1] * 2, 3)
     assert torch.allclose(single, views[0].viewmat.expand(3, 4, 4), atol=1e-5)
 
@@ -169,7 +169,7 @@ def test_a_film_that_cannot_be_written_is_one_sentence(run_folder, tmp_path, cap
 def test_a_film_that_does_not_fit_is_one_sentence(run_folder, tmp_path, capfd):
     resource = pytest.importorskip("resource")
     film, limits = tmp_path / "film.mp4", resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (500, limits[1]))  # the coder inherits it
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500, limits[1]))  # the encoder inherits the limit
     try:
         assert main(["render", str(run_folder), str(film), "--frames", "60", "--no-progress"]) == 2
     finally:

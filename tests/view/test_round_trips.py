@@ -74,7 +74,7 @@ def check(written: Splats, read: Splats, ending: str) -> None:
         assert torch.equal(read["shN"][:, :k], expected["shN"])
         assert not read["shN"][:, k:].any()
         return
-    rounding = {  # of positions, logarithms of scales, opacities, colours, harmonics
+    rounding = {  # errors of positions, logarithms of scales, opacities, colours, harmonics
         ".compressed.ply": (0.01, 0.01, 0.003, 0.03, 0.04),
         ".splat": (0.0, 1e-5, 0.005, 0.015, None),
         ".spz": (1e-6, 0.04, 0.003, 0.02, 0.07),
@@ -103,7 +103,7 @@ def test_every_pair_of_formats(sources: dict[str, Path], tmp_path: Path, source:
     assert main(["export", str(sources[source]), str(tmp_path / f"out{target}")]) == 0
     second = load(tmp_path / f"out{target}")
     check(first, second, target)
-    if source == target != ".splat":  # gsplat cuts bytes off there instead of rounding them
+    if source == target != ".splat":  # gsplat truncates where others round
         for name in first:
             torch.testing.assert_close(
                 second[name].abs(), first[name][partners(first, second)].abs(), rtol=0, atol=0.01
@@ -142,7 +142,7 @@ def test_scales_that_spz_does_not_hold_are_counted(splats: Splats, caplog: pytes
     to_spz(splats)
     assert not caplog.text
     scales = splats["scales"].clone()
-    scales[:7, 1] -= 9  # a scene in kilometres
+    scales[:7, 1] -= 9  # scales of a scene in kilometres
     scales[7:9] += 13
     to_spz({**splats, "scales": scales})
     assert "the scales of 9 Gaussians are cut" in caplog.text

@@ -50,7 +50,7 @@ def decode(data: bytes) -> dict[str, np.ndarray]:
         }
         if "shN" in meta:
             coefficients = (meta["shN"]["bands"] + 1) ** 2 - 1
-            palette = pixels("shN").reshape(-1, coefficients, 3)  # 64 entries in a row, one after the other
+            palette = pixels("shN").reshape(-1, coefficients, 3)  # a row of the picture holds 64 entries
             assert len(palette) % 64 == 0 and len(palette) - 64 < meta["shN"]["count"] <= len(palette)
             with Image.open(io.BytesIO(archive.read(meta["shN"]["files"][0]))) as picture:
                 assert picture.width == 64 * coefficients
@@ -89,13 +89,13 @@ def test_what_is_read_back_is_what_was_written(k: int, size: float) -> None:
     step = 2 * scaled.max() / 65535
     assert (np.abs(read["means"] - wanted["means"]) <= 0.51 * step * np.exp(scaled + step)).all()
     for name, rows in (("scales", wanted["scales"]), ("sh0", wanted["sh0"][:, 0])):
-        error = np.abs(read[name] - rows)  # 900 numbers share 256 levels, which are closer where numbers are many
+        error = np.abs(read[name] - rows)  # 900 numbers share 256 levels, which are dense where numbers are
         assert error.max() < 0.1 and np.sqrt((error**2).mean()) < 0.01
     assert np.abs(read["opacities"] - 1 / (1 + np.exp(-wanted["opacities"]))).max() <= 0.51 / 255
     quats = wanted["quats"] / np.linalg.norm(wanted["quats"], axis=1, keepdims=True)
     assert np.abs((read["quats"] * quats).sum(axis=1)).min() > 0.9999
     if k:
-        # 37 entries for rows of up to 125 kinds: each is near the entry that stands for its kind.
+        # There are 37 entries for up to 125 different rows. Each row is near its entry.
         error = np.sqrt(((read["shN"] - wanted["shN"]) ** 2).mean())
         assert error < 0.6 * np.sqrt((wanted["shN"] ** 2).mean())
     else:

@@ -30,7 +30,7 @@ def test_an_arc_of_cameras_that_look_down_stands_upright(turn):
     assert degrees_from_z(poses) < 10.0
     if turn <= np.pi:
         leaning = np.degrees(np.arccos(own[2] / np.linalg.norm(own)))
-        assert leaning > 25.0  # the mean alone would show this
+        assert leaning > 25.0  # the mean of the up directions alone would lean
 
 
 def test_cameras_that_look_the_same_way_keep_their_own_up():

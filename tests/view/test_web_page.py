@@ -94,7 +94,7 @@ def test_the_page_shows_the_model_and_a_photograph_beside_its_render(
         assert browser.evaluate(panel) < browser.evaluate(below), "the panel covers the buttons of the viewer"
         assert max(sides) <= width and browser.evaluate("document.documentElement.scrollWidth") <= width
         small = "[...document.querySelectorAll('#panel button, #open')].map(b => b.getBoundingClientRect().height)"
-        assert min(browser.evaluate(small)) >= 44  # a finger's
+        assert min(browser.evaluate(small)) >= 44  # pixels that a finger needs
         first = browser.evaluate("document.getElementById('title').innerText")
         browser.evaluate("document.getElementById('next').click()")
         wait_until(lambda: "2 of 2" in browser.text() and "PSNR" in browser.text())
