@@ -18,8 +18,7 @@ def test_page_is_up_to_date():
 
 @pytest.mark.parametrize("adapter", list(builtin_adapters()), ids=list(BUILTIN))
 def test_every_adapter_declares_itself(adapter):
-    assert all(
-        name in vars(adapter) for name in ("project", "gated", "checked")
-    )  # declared by the adapter itself, not by its base class
+    # The adapter itself has these attributes, not only its base class.
+    assert all(name in vars(adapter) for name in ("project", "gated", "checked"))
     assert adapter.gated.endswith(".") and adapter.left_alone.endswith(".")
     assert adapter.name == "reference" or "](https://" in adapter.project

@@ -36,8 +36,7 @@ def test_filter_of_mip_splatting_is_taken_into_the_unit_of_the_scene(tmp_path: P
     monkeypatch.setattr(unmodified_scripts, "rasterization", rasterization)
     monkeypatch.setattr(unmodified_scripts, "measure", lambda backend, image, photograph: {"psnr": 0.0})
     assert unmodified_scripts.measure_ply(tmp_path / "model.ply", tmp_path, 1)["gaussians"] == 1
-    assert drawn["scales"].flatten().tolist() == pytest.approx(
-        [2.5] * 3
-    )  # sqrt(6^2 + 8^2) units of the dataset, in units of 4
+    # sqrt(6^2 + 8^2) in units of the dataset, of which four are one unit of the scene.
+    assert drawn["scales"].flatten().tolist() == pytest.approx([2.5] * 3)
     assert drawn["opacities"].item() == pytest.approx(0.5 * 0.6**3)
     assert drawn["rasterize_mode"] == "antialiased"

@@ -90,9 +90,8 @@ def peak(skips, update=True):
 def test_a_skipped_graph_does_not_raise_the_peak():
     assert peak([False] * 4) == 3 * N
     assert peak([False, True, False]) == peak([False, True, True, True, False]) == 3 * N
-    assert (
-        peak([False, True, False], update=False) > 3 * N
-    )  # until the next step, other backward passes may need the graph
+    # Until the next step, other backward passes may need the graph.
+    assert peak([False, True, False], update=False) > 3 * N
 
 
 @pytest.mark.parametrize("skips", [[False, True, False, True]])

@@ -129,9 +129,8 @@ def test_the_path_is_conserved():
         ran = round(share * steps)
         path = sum(path_factor(share, i / ran) for i in range(ran))
         assert path == pytest.approx(steps, rel=0.01)
-    assert (
-        path_factor(0.1, 0.0) == path_factor(0.25, 0.0) == pytest.approx(8.0)
-    )  # a share below 0.25 gets the steps of 0.25
+    # A share below 0.25 gets the steps of 0.25.
+    assert path_factor(0.1, 0.0) == path_factor(0.25, 0.0) == pytest.approx(8.0)
     assert path_factor(0.4, 1.0) == 0.0
     assert path_factor(0.4, 0.5, peak=3.0) == 1.5
 
