@@ -22,7 +22,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 import tyro
@@ -42,13 +42,14 @@ from common import (
     write_part,
 )
 from pairs import blended_pairs
+from raster_loss import part_loss
+from raster_plot import plot
 from torch import Tensor
 
-from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
+from skipgs_plug.fallback_raster import rasterization
 from skipgs_plug.fallback_raster.runtime.cores import usable_cores
 from skipgs_plug.fallback_raster.runtime.optimizations import OPTIMIZATIONS, without_optimizations
 from skipgs_plug.fallback_raster.splats import rasterize_splats
-from skipgs_plug.trainer.loss import l1_ssim_loss as convolved_loss
 from skipgs_plug.trainer.row_order import morton_order
 from skipgs_plug.trainer.scalars import peak_memory
 
@@ -79,7 +80,6 @@ GARDEN_DOWNSCALE = {"162x105": 4, "324x210": 2, "648x420": 1}
 MULTIPLY_ADDS_PER_PAIR = 13 + 25
 
 PROCESSES = 3  # processes for each point of a growth series
-EXACT_IMAGES = 3  # images of each size for which the loss is also computed in PyTorch and in float64
 
 PHASES = {
     "project": ("project_forward", "list_visible", "sh_forward"),
@@ -334,8 +334,8 @@ def part_optimizations(quick: bool, repeats: int, only: str | None) -> list[dict
             "optimization": left_out[0] if len(left_out) == 1 else "all",
             "ms": median_ms(seconds[True]),
             "ms_without": median_ms(seconds[False]),
-            "saved": 1
-            - statistics.median(ratios),  # ratios of neighbouring passes, between which the machine hardly changes
+            # Ratios of neighbouring passes, between which the machine hardly changes.
+            "saved": 1 - statistics.median(ratios),
             "saved_error": standard_error(ratios),
             "image_difference": (fast["image"] - slow["image"]).abs().max().item(),
             "gradient_difference": max(relative_difference(fast[p].grad, slow[p].grad) for p in PARAMETERS),
@@ -350,78 +350,6 @@ def part_optimizations(quick: bool, repeats: int, only: str | None) -> list[dict
     return rows
 
 
-def part_loss(quick: bool, repeats: int, only: str | None) -> list[dict[str, Any]]:
-    """Measure time and error of the fused L1 + SSIM loss and of PyTorch's convolutions. The truth is float64.
-
-    PyTorch takes seconds for a large image, so only the first images are computed by it and in float64, on one thread.
-    """
-    print(f"{'image':>10} {'threads':>7} {'fused ms':>8} {'torch ms':>8} {'value error':>20} {'gradient error':>20}")
-    rows = []
-    for width, height in ((252, 189), (504, 378)) if quick else ((252, 189), (504, 378), (1008, 756), (1920, 1080)):
-        pairs = [image_pair(width, height, seed) for seed in range(repeats + 2)]
-        with threads(1):
-            truths = [loss_pass(convolved_loss, a.double(), b.double())[1:] for a, b in pairs[:EXACT_IMAGES]]
-            convolved = loss_figures("torch", convolved_loss, pairs[:EXACT_IMAGES], truths, warm_up=1)
-        for count in sorted({1, usable_cores()}, reverse=True):
-            with threads(count):
-                fused = loss_figures("fused", l1_ssim_loss, pairs, truths, warm_up=2)
-            row = {"size": f"{width}x{height}", "threads": count, **fused, **convolved}
-            rows.append(row)
-            both = [
-                f"{row[f'fused_{kind}']:.1e} / {row[f'torch_{kind}']:.1e}" for kind in ("value_error", "gradient_error")
-            ]
-            print(
-                f"{row['size']:>10} {count:7} {row['fused_ms']:8.2f} {row['torch_ms']:8.1f} "
-                f"{both[0]:>20} {both[1]:>20}",
-                flush=True,
-            )
-    return rows
-
-
-def image_pair(width: int, height: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Return an image with noise, and the image without."""
-    generator = torch.Generator().manual_seed(seed)
-    target = torch.rand(height, width, 3, generator=generator)
-    return (target + 0.1 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1), target
-
-
-def loss_pass(function: Callable[..., Tensor], image: Tensor, target: Tensor) -> tuple[float, float, Tensor]:
-    """Return seconds, value and gradient of a loss."""
-    leaf = image.clone().requires_grad_()
-    start = time.perf_counter()
-    loss = function(leaf, target)
-    loss.backward()
-    seconds = time.perf_counter() - start
-    assert leaf.grad is not None
-    return seconds, loss.item(), leaf.grad
-
-
-def loss_figures(
-    name: str,
-    function: Callable[..., Tensor],
-    pairs: list[tuple[Tensor, Tensor]],
-    truths: list[tuple[float, Tensor]],
-    warm_up: int,
-) -> dict[str, float]:
-    """Return times over all pairs of images without the warm-up, and the largest errors over pairs with a truth."""
-    seconds, value_errors, gradient_errors = [], [], []
-    # Gradients are compared and freed at once. New memory for each would add page faults to the time of the loss.
-    for number, (image, target) in enumerate(pairs):
-        elapsed, value, gradient = loss_pass(function, image, target)
-        seconds.append(elapsed)
-        if number < len(truths):
-            truth, true_gradient = truths[number]
-            value_errors.append(abs(value - truth))
-            gradient_errors.append(relative_difference(gradient, true_gradient))
-    seconds = seconds[warm_up:]
-    return {
-        f"{name}_ms": median_ms(seconds),
-        f"{name}_ms_min": 1000 * min(seconds),
-        f"{name}_value_error": max(value_errors),
-        f"{name}_gradient_error": max(gradient_errors),
-    }
-
-
 PARTS: dict[str, Callable[[bool, int, str | None], Any]] = {
     "scenes": part_scenes,
     "threads": part_threads,
@@ -434,65 +362,8 @@ PARTS: dict[str, Callable[[bool, int, str | None], Any]] = {
 }
 
 
-def plot(results: dict[str, Any]) -> None:
-    """Plot all measured parts to raster.png."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(2, 2, figsize=(12, 9), layout="constrained")
-    scenes, against, scaling, optimizations = axes.flat
-    for axis in axes.flat:
-        axis.grid(alpha=0.3)
-    if "scenes" in results:
-        rows = results["scenes"]["rows"]
-        counts = sorted({row["threads"] for row in rows})
-        labels = [f"{r['kind']} {r['gaussians']:,} {r['size']}" for r in rows if r["threads"] == counts[0]]
-        peers = [row["peer_ms"] for row in rows if row["threads"] == 1]
-        bars = {"OpenSplat, 1 thread": peers}
-        bars |= {f"ours, {c} thread{'s' * (c > 1)}": [r["ms"] for r in rows if r["threads"] == c] for c in counts}
-        for shift, (label, values) in enumerate(bars.items()):
-            scenes.barh([i + 0.27 * (shift - 1) for i in range(len(labels))], values, 0.25, label=label)
-        scenes.set(xscale="log", xlabel="forward + backward (ms)", yticks=range(len(labels)), yticklabels=labels)
-        scenes.invert_yaxis()
-        scenes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(bars), fontsize="small")
-    for name in ("gaussians", "pixels", "sh_terms"):
-        if name in results:
-            rows, exponent = results[name]["rows"]["points"], results[name]["rows"]["exponents"]["time"]["fitted"]
-            label = f"{name.replace('_', ' ')}, exponent {exponent:.2f}"
-            against.plot([row["x"] for row in rows], [row["ms"] for row in rows], "o-", label=label)
-    against.set(xscale="log", yscale="log", xlabel="Gaussians, pixels or SH terms", ylabel="forward + backward (ms)")
-    if against.lines:
-        against.legend()
-    if "threads" in results:
-        rows = results["threads"]["rows"]
-        counts = [row["threads"] for row in rows]
-        scaling.plot(counts, [row["speedup"] for row in rows], "o-", label="measured")
-        scaling.plot(counts, counts, "--", color="gray", label="ideal")
-        scaling.set(xlabel="threads", ylabel="times faster than one thread", xticks=counts)
-        scaling.legend()
-    if "optimizations" in results:
-        rows = results["optimizations"]["rows"]
-        # Each row alternated with a baseline of its own, so only shares are comparable.
-        saved = [100 * row["saved"] for row in rows]
-        errors = [100 * row["saved_error"] for row in rows]
-        optimizations.barh([row["optimization"] for row in rows], saved, xerr=errors, ecolor="gray")
-        optimizations.set(xlabel="time saved by the optimization (%), and its standard error")
-    figure.savefig(FILE.with_suffix(".png"), dpi=120)
-
-
 def main(
-    parts: tuple[Part, ...] = (
-        "scenes",
-        "threads",
-        "gaussians",
-        "pixels",
-        "sh_terms",
-        "order",
-        "optimizations",
-        "loss",
-    ),
+    parts: tuple[Part, ...] = get_args(Part),
     quick: bool = False,
     repeats: int = 7,
     only: str | None = None,
@@ -514,7 +385,7 @@ def main(
     for part in parts:
         about = provenance() | {"repeats": repeats, "quick": quick}
         print(f"\n{part}: {about['cpu']}, {about['cores']} cores, commit {about['commit']}")
-        plot(write_part(FILE, part, PARTS[part](quick, repeats, only), about))
+        plot(write_part(FILE, part, PARTS[part](quick, repeats, only), about), FILE.with_suffix(".png"))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """Fewer iterations and fewer densification events while the scene grows."""
 
-import itertools
 import json
 import math
 from contextlib import nullcontext
@@ -10,17 +9,12 @@ import torch
 
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.core.pace import needs
-from skipgs_plug.core.pace.densification_events import LEAST_EVENTS, DensificationEvents
+from skipgs_plug.core.pace.densification_events import LEAST_EVENTS
 from skipgs_plug.core.pace.needs import (
     for_new_gaussians,
     growing_factor,
-    growing_share,
-    opacity_factor,
     positions_part,
-    refining_share,
-    share_factor,
 )
-from skipgs_plug.core.trainer_info import Densification
 
 VIEWS = [f"{i}.png" for i in range(4)]
 INTERVAL, START, LAST = 20, 400, 600
@@ -269,62 +263,6 @@ def test_what_shares_its_number_with_events_keeps_it_if_it_is_rarer():
     assert len(set(range(20, 800, 20)) & set(ran)) < 25
 
 
-def kept(needs, visible, every, numbers=range(100, 2001, 100), share=0.1, length=100_000):
-    """Return the events that run if every `every`-th iteration runs, and each event that has enough before it."""
-    events = DensificationEvents(numbers, Densification(needs=needs))
-    found = []
-    for number in range(numbers[-1] + 1):
-        if number in events:
-            needed = events.needed(number, visible, share, length)
-            if events.behind >= needed:
-                found.append(number)
-                events.ran(number, needed)
-            else:
-                events.skipped()
-        elif number % every == 0:
-            events.ran(number)
-    return found
-
-
-def test_needs_of_an_event():
-    assert kept("nothing", 0.3, 10) == list(range(100, 2001, 100))
-    assert kept("visits", 1.0, 1) == list(range(100, 2001, 100))
-    assert kept("visits", 0.3, 5)[:2] == [300, 500]  # 55 * 0.7 ** 0.4 = 47.7 are needed; the third event uses surplus
-    # Where a view shows all Gaussians, a tenth of the iterations keeps each event.
-    assert kept("visits", 0.999, 10)[:3] == [100, 200, 300]
-    assert kept("visits", 0.95, 20)[:2] == [400, 800]  # 16 iterations are needed, and 4 run per event
-    assert kept("iterations", 0.95, 5)[:2] == [600, 1200]
-    # At least 16 events are kept, or all if there are fewer.
-    assert len(kept("visits", 0.3, 10, range(100, 1301, 100), length=1300)) == 13
-    assert kept("visits", 0.3, 5, length=4000)[:2] == [200, 300]  # 25 needed; 20 and 40 ran
-
-
-def test_a_larger_share_asks_for_more_iterations_per_event_unless_the_scene_grows_strongly():
-    events = DensificationEvents(range(100, 1001, 100), Densification())
-    assert events.needed(200, 0.7, 0.1, 100_000) == 33  # 55 * 0.3 ** 0.4
-    assert events.needed(200, 0.7, 0.4, 100_000) == 47  # times 4 ** (0.7 ** 2 / 2)
-    assert events.needed(200, 0.7, 0.4, 100_000, grows_strongly=True) == 33
-
-
-def test_growth_is_that_of_the_last_event():
-    events = DensificationEvents(range(100, 1001, 100), Densification())
-    events.rows = 1000
-    assert events.growth == 0.0  # no event yet
-    events.ran(100)
-    events.rows = 1060
-    assert events.grown == 60 and events.growth == pytest.approx(0.06)
-    events.ran(150)  # no event
-    assert events.grown == 60
-    events.rows = 900  # a prune removed more than the event added
-    assert events.grown == 0 and events.growth == 0.0
-
-
-def test_new_gaussians_ask_for_more_iterations():
-    assert share_factor(0.0) == share_factor(0.02) == 1.0 and share_factor(0.06) == pytest.approx(3.0)
-    assert for_new_gaussians(None) == for_new_gaussians(0.2) == for_new_gaussians(2.718) == 1.0
-    assert for_new_gaussians(97 / 3) == pytest.approx(1.82, abs=0.01)
-
-
 class Multiplies(Loop):
     """The same loop, in which each event adds a share of the Gaussians."""
 
@@ -367,82 +305,8 @@ def test_a_scene_that_grows_strongly_gets_more_iterations_in_both_phases():
     assert gate.report()["growing"]["iterations_run"] == pytest.approx(600, abs=3)
 
 
-def test_shares_that_auto_chooses():
-    assert growing_share(15_000, 255, longer=True) == growing_share(15_000, 255, longer=False) == 0.1
-    assert growing_share(15_000, 1000, longer=True) == growing_share(15_000, 1000, longer=False) == pytest.approx(1 / 3)
-    assert growing_share(1500, 17, longer=True) == 0.4
-    assert growing_share(1500, 17, longer=False) == 0.8
-    # Longer schedules run more iterations, but a smaller share of them.
-    assert growing_share(3000, 46, longer=True) == pytest.approx(765 / 3000, abs=1e-3)
-    assert growing_share(6000, 46, longer=True) == pytest.approx(975 / 6000, abs=1e-3)
-    assert refining_share(3000, 17, grown=3000) == pytest.approx(701 / 3000, abs=1e-3)
-    # Where all events run, each needs 14 iterations, but all together at most 1,200.
-    assert growing_share(2500, 17, longer=True, events=10) == pytest.approx(717.5 / 2500, abs=1e-4)
-    assert growing_share(2500, 17, longer=True, events=58) == 14 * 58 / 2500
-    assert growing_share(2500, 17, longer=True, events=97) == growing_share(2500, 17, longer=False) == 1200 / 2500
-    assert growing_share(500, 17, longer=True) == growing_share(0, 17, longer=True) == 1.0
-    assert refining_share(3500, 255) < refining_share(3500, 255, grown=3500) == pytest.approx(0.2494, abs=1e-3)
-    assert refining_share(1000, 17) == 0.4 and refining_share(1000, 17, grown=1000) == 0.55
-    assert refining_share(500, 17, grown=500) == 0.8
-    assert refining_share(15_000, 255, grown=15_000) == pytest.approx(0.1733, abs=1e-3)
-    assert refining_share(15_000, 17, grown=15_000) == 0.12 < refining_share(15_000, 17) == 0.2
-    # Refinement of a sixth of the schedule runs as many iterations as one of a half, but never all of its own.
-    assert 5000 * refining_share(5000, 100, grown=25_000) == pytest.approx(15_000 * refining_share(15_000, 100, 15_000))
-    assert refining_share(5000, 100, grown=5000) < 0.2 < refining_share(5000, 100, grown=25_000)
-    assert refining_share(500, 17, grown=2500) == refining_share(300, 255, grown=2700) == 0.8
-
-
-def test_factors_while_the_scene_grows():
-    assert growing_factor(1500, 0.4, None) == growing_factor(1500, 1.0, 0.96) == 1.0
-    assert growing_factor(1500, 0.25, 0.96) == 3.0  # the longest that pay
-    assert growing_factor(1500, 0.25, 0.96, by_budget=True) == 4.0  # the number of Gaussians does not rise with them
-    assert growing_factor(700, 0.9, 1 / 3) == pytest.approx(1 / 0.9)  # steps conserve the path, and are not longer
-    assert growing_factor(15_000, 0.12, 0.96) == pytest.approx((2100 / 1800) ** 2)
-    assert growing_factor(15_000, 0.2, 0.96) == growing_factor(15_000, 0.2, 0.96, times_grown=math.e) == 1.0
-    assert growing_factor(15_000, 0.2, 0.96, times_grown=math.e**1.5) == pytest.approx((1.5 * 2100 / 3000) ** 2)
-    assert growing_factor(15_000, 0.2, 0.96, times_grown=12.0) == pytest.approx((2 * 2100 / 3000) ** 2)
-    assert opacity_factor(0.25) == 2.0 and opacity_factor(1.0) == 1.0
-    assert positions_part(3.0) == pytest.approx(4 / 3) and positions_part(1.5) == 2.0 and positions_part(4.0) == 1.0
-
-
 def test_steps_conserve_the_path_in_any_schedule_if_opacities_are_never_reset():
     assert growing_factor(25_000, 0.2, 1 / 3, by_budget=True, resets=False) == pytest.approx(5.0)
     assert growing_factor(25_000, 0.1, 0.96, by_budget=True, resets=False) == 8.0  # the longest that pay
     assert growing_factor(25_000, 0.9, 1 / 3, by_budget=True, resets=False) == pytest.approx(1 / 0.9)
     assert positions_part(3.0, resets=False) == 2.0 and positions_part(8.0, resets=False) == 1.0
-
-
-LONG = range(100, 6001, 100)  # 60 events, with 20 iterations for each if every fifth runs
-
-
-def test_events_wait_longer_the_fewer_gaussians_a_view_shows():
-    assert kept("visits", 1.0, 10, LONG) == list(LONG)
-    shares = [len(kept("visits", visible, 5, LONG)) / 60 for visible in (0.3, 0.5, 0.75, 0.9, 0.999)]
-    assert shares == sorted(shares)
-    assert shares[-1] == 1.0
-    # 55 * 0.25 ** 0.4 = 31.6 iterations per event, of which 20 run between two events of the trainer
-    assert shares[2] == pytest.approx(20 / 31.6, abs=0.03)
-
-
-def test_events_need_more_iterations_if_a_larger_share_of_them_runs():
-    # 31.6 iterations with a share of 0.1, and 8 ** (0.75**2 / 2) times as many with 0.8.
-    assert len(kept("visits", 0.75, 5, LONG)) == pytest.approx(60 * 20 / 31.6, abs=2)
-    assert len(kept("visits", 0.75, 5, LONG, share=0.8)) == pytest.approx(60 * 20 / 56.7, abs=2)
-    # Where a view shows a third of the Gaussians, events hardly need more.
-    few = len(kept("visits", 1 / 3, 5, LONG))
-    assert few - 3 <= len(kept("visits", 1 / 3, 5, LONG, share=0.8)) <= few
-
-
-def test_surplus_iterations_count_for_the_following_event_alone():
-    gaps = {after - before for before, after in itertools.pairwise(kept("visits", 0.75, 5, LONG))}
-    assert gaps == {100, 200}  # without surplus, only every second event would run
-    events = DensificationEvents(range(100, 1001, 100), Densification())
-    for number in range(1, 400):
-        events.ran(number) if number % 100 else events.skipped()
-    needed = events.needed(400, 0.75, 0.1, 1_000_000)
-    assert needed == 31 and events.behind > 10 * needed
-    events.ran(400, needed)
-    assert events.state_dict()["behind"] <= 32  # the surplus of one event is bounded
-    resumed = DensificationEvents(range(100, 1001, 100), Densification())
-    resumed.load_state_dict(events.state_dict())
-    assert resumed.state_dict() == events.state_dict()

@@ -1,0 +1,59 @@
+"""Shares and factors that "auto" chooses."""
+
+import math
+
+import pytest
+
+from skipgs_plug.core.pace.needs import (
+    for_new_gaussians,
+    growing_factor,
+    growing_share,
+    opacity_factor,
+    positions_part,
+    refining_share,
+    share_factor,
+)
+
+
+def test_new_gaussians_ask_for_more_iterations():
+    assert share_factor(0.0) == share_factor(0.02) == 1.0 and share_factor(0.06) == pytest.approx(3.0)
+    assert for_new_gaussians(None) == for_new_gaussians(0.2) == for_new_gaussians(2.718) == 1.0
+    assert for_new_gaussians(97 / 3) == pytest.approx(1.82, abs=0.01)
+
+
+def test_shares_that_auto_chooses():
+    assert growing_share(15_000, 255, longer=True) == growing_share(15_000, 255, longer=False) == 0.1
+    assert growing_share(15_000, 1000, longer=True) == growing_share(15_000, 1000, longer=False) == pytest.approx(1 / 3)
+    assert growing_share(1500, 17, longer=True) == 0.4
+    assert growing_share(1500, 17, longer=False) == 0.8
+    # Longer schedules run more iterations, but a smaller share of them.
+    assert growing_share(3000, 46, longer=True) == pytest.approx(765 / 3000, abs=1e-3)
+    assert growing_share(6000, 46, longer=True) == pytest.approx(975 / 6000, abs=1e-3)
+    assert refining_share(3000, 17, grown=3000) == pytest.approx(701 / 3000, abs=1e-3)
+    # Where all events run, each needs 14 iterations, but all together at most 1,200.
+    assert growing_share(2500, 17, longer=True, events=10) == pytest.approx(717.5 / 2500, abs=1e-4)
+    assert growing_share(2500, 17, longer=True, events=58) == 14 * 58 / 2500
+    assert growing_share(2500, 17, longer=True, events=97) == growing_share(2500, 17, longer=False) == 1200 / 2500
+    assert growing_share(500, 17, longer=True) == growing_share(0, 17, longer=True) == 1.0
+    assert refining_share(3500, 255) < refining_share(3500, 255, grown=3500) == pytest.approx(0.2494, abs=1e-3)
+    assert refining_share(1000, 17) == 0.4 and refining_share(1000, 17, grown=1000) == 0.55
+    assert refining_share(500, 17, grown=500) == 0.8
+    assert refining_share(15_000, 255, grown=15_000) == pytest.approx(0.1733, abs=1e-3)
+    assert refining_share(15_000, 17, grown=15_000) == 0.12 < refining_share(15_000, 17) == 0.2
+    # Refinement of a sixth of the schedule runs as many iterations as one of a half, but never all of its own.
+    assert 5000 * refining_share(5000, 100, grown=25_000) == pytest.approx(15_000 * refining_share(15_000, 100, 15_000))
+    assert refining_share(5000, 100, grown=5000) < 0.2 < refining_share(5000, 100, grown=25_000)
+    assert refining_share(500, 17, grown=2500) == refining_share(300, 255, grown=2700) == 0.8
+
+
+def test_factors_while_the_scene_grows():
+    assert growing_factor(1500, 0.4, None) == growing_factor(1500, 1.0, 0.96) == 1.0
+    assert growing_factor(1500, 0.25, 0.96) == 3.0  # the longest that pay
+    assert growing_factor(1500, 0.25, 0.96, by_budget=True) == 4.0  # the number of Gaussians does not rise with them
+    assert growing_factor(700, 0.9, 1 / 3) == pytest.approx(1 / 0.9)  # steps conserve the path, and are not longer
+    assert growing_factor(15_000, 0.12, 0.96) == pytest.approx((2100 / 1800) ** 2)
+    assert growing_factor(15_000, 0.2, 0.96) == growing_factor(15_000, 0.2, 0.96, times_grown=math.e) == 1.0
+    assert growing_factor(15_000, 0.2, 0.96, times_grown=math.e**1.5) == pytest.approx((1.5 * 2100 / 3000) ** 2)
+    assert growing_factor(15_000, 0.2, 0.96, times_grown=12.0) == pytest.approx((2 * 2100 / 3000) ** 2)
+    assert opacity_factor(0.25) == 2.0 and opacity_factor(1.0) == 1.0
+    assert positions_part(3.0) == pytest.approx(4 / 3) and positions_part(1.5) == 2.0 and positions_part(4.0) == 1.0
