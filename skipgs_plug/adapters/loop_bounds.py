@@ -272,7 +272,7 @@ def last_calls(
     names: Collection[str],
     values: Mapping[str, Any],
     trainer: Iterable[Part],
-    stops: Iterable[str] = (),
+    stops: Iterable[str],
 ) -> dict[str, int]:
     """Return the first iteration in which the loop no longer makes each of these calls, for calls that have an end.
 

@@ -63,7 +63,7 @@ def looks_at_losses(run: RunRecord) -> bool:
     return run.trace is not None and any(mean is not None for mean in run.trace.mean)
 
 
-def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row], whole: bool = False) -> Figure:
+def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row], whole: bool) -> Figure:
     """Plot the mean held-out PSNR over seeds against seconds of the whole run or of refinement, a curve per policy."""
     figure, axes = new_figure(9.0, 4.6)
     for row in rows:
@@ -81,7 +81,7 @@ def psnr_over_time(records: Sequence[RunRecord], rows: Sequence[Row], whole: boo
     return figure
 
 
-def time_against_error(rows: Sequence[Row], whole: bool = False) -> Figure:
+def time_against_error(rows: Sequence[Row], whole: bool) -> Figure:
     """Plot final PSNR against time, absolute and relative to the own run of the same seed.
 
     Time is that of the whole run, or that of refinement.
@@ -122,7 +122,7 @@ def bar(quantity: Quantity) -> float:
     return quantity.spread or 0.0
 
 
-def phases(rows: Sequence[Row], whole: bool = False) -> Figure:
+def phases(rows: Sequence[Row], whole: bool) -> Figure:
     """Plot the seconds of each phase of the whole run or of refinement, one bar per policy."""
     time = "t_total" if whole else "t_post"
     rows = [row for row in rows if row.seeds]

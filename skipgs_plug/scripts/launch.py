@@ -48,7 +48,7 @@ def run_script(
 
 
 def run_in_script(
-    command: Sequence[str], attach: Attach, run: Callable[[str, dict[str, Any]], None], on_cpu: bool = False
+    command: Sequence[str], attach: Attach, run: Callable[[str, dict[str, Any]], None], on_cpu: bool
 ) -> int:
     """Like `run_script`, but call `run(file, names)` instead of running the script."""
     return _run(_resolve(command), attach, run, on_cpu, ())

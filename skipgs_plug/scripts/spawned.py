@@ -53,7 +53,7 @@ def gated_when_spawned(enter: Enter) -> Iterator[list[int]]:
         torch.multiprocessing.spawn = spawn
 
 
-def run_call(command: Sequence[str], attach: Attach, rank: int, call: bytes, on_cpu: bool = False) -> int:
+def run_call(command: Sequence[str], attach: Attach, rank: int, call: bytes, on_cpu: bool) -> int:
     """Import the script in a spawned process, as Python would, and call the function that the script spawned.
 
     Args:

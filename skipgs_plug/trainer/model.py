@@ -20,7 +20,7 @@ from skipgs_plug.trainer.sh0 import sh0_of
 ADAM_EPS = 1e-15  # as in gsplat's and Inria's trainers: the root of a second moment can be far below torch's 1e-8
 
 
-def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near: float = 0.0) -> nn.ParameterDict:
+def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near: float) -> nn.ParameterDict:
     """Return the Gaussians that training starts from: the scene's, or an isotropic Gaussian per point.
 
     They are `means [N, 3]`, `scales [N, 3]` (log), `quats [N, 4]` (wxyz), `opacities [N]` (logit), `sh0 [N, 1, 3]` and
@@ -63,7 +63,7 @@ def one_per_point(scene: Scene, config: TrainConfig) -> dict[str, Tensor]:
     }
 
 
-def neighbour_distance(points: Tensor, scale: float = 1.0) -> Tensor:
+def neighbour_distance(points: Tensor, scale: float) -> Tensor:
     """Return the root mean square distance to the three nearest other points [M]; 0.0003 of `scale` for duplicates."""
     from scipy.spatial import cKDTree
 

@@ -31,7 +31,7 @@ def load_blender(
     test_every: int,
     init_num_pts: int,
     images: ImageStore,
-    cloud: tuple[np.ndarray, np.ndarray] | None = None,
+    cloud: tuple[np.ndarray, np.ndarray] | None,
 ) -> Scene:
     """Load a Blender scene, transparency composed onto white; see `load_scene`.
 

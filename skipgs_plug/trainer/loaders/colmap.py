@@ -31,7 +31,7 @@ MODEL_FOLDERS = ("sparse", "colmap/sparse")  # the second one is written by nerf
 Cloud = tuple[np.ndarray, np.ndarray]
 
 
-def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStore, cloud: Cloud | None = None) -> Scene:
+def load_colmap(path: Path, data_factor: int, test_every: int, images: ImageStore, cloud: Cloud | None) -> Scene:
     """Load a COLMAP reconstruction; see `load_scene`. `path` is the scene or one of its models.
 
     `cloud` (points, colours) replaces its points.

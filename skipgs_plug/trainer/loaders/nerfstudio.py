@@ -31,7 +31,7 @@ def load_nerfstudio(
     data_factor: int,
     test_every: int,
     images: ImageStore,
-    cloud: tuple[np.ndarray, np.ndarray] | None = None,
+    cloud: tuple[np.ndarray, np.ndarray] | None,
 ) -> Scene:
     """Load transforms.json. `cloud` (points, colours) replaces its point cloud. See `load_scene` for the rest."""
     source = path / FILE

@@ -90,7 +90,7 @@ def points_of(scene: Scene) -> np.ndarray:
     return points.astype(np.float64) * scene.frame.unit + scene.frame.centre if scene.frame.moves else points
 
 
-def load_packed(path: Path, cloud: tuple[np.ndarray, np.ndarray] | None = None) -> Scene:
+def load_packed(path: Path, cloud: tuple[np.ndarray, np.ndarray] | None) -> Scene:
     """Read a file of `save_packed`; `cloud` (points, colours) replaces its points."""
     content = read_archive(path)
     if int(content["version"]) != VERSION:

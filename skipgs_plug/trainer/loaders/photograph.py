@@ -29,9 +29,9 @@ def load_photograph(
     camera: Any,
     viewmat: np.ndarray,
     cache: UndistortedCache,
-    factor: int = 1,
-    mask_path: Path | None = None,
-    images: ImageStore | None = None,
+    factor: int,
+    mask_path: Path | None,
+    images: ImageStore,
 ) -> View:
     """Read a photograph. Alpha below one half and black pixels of the mask do not count in the loss.
 
@@ -42,8 +42,8 @@ def load_photograph(
         viewmat: World to camera [4, 4].
         cache: Keeps undistorted photographs.
         factor: Factor by which the photograph is reduced in memory.
-        mask_path: Picture of the same shape, black where pixels are left out.
-        images: Store for the photograph; None: it stays in memory.
+        mask_path: Picture of the same shape, black where pixels are left out; None without a mask.
+        images: Store for the photograph.
     """
     check_camera(camera, image_path)
 
@@ -52,7 +52,7 @@ def load_photograph(
 
     pixels, mask, K = read()
     view = View(name, pixels, torch.from_numpy(K), torch.from_numpy(viewmat), mask)
-    return view if images is None else images.keep(view, lambda: read()[:2])
+    return images.keep(view, lambda: read()[:2])
 
 
 def read_straight(
