@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.trainer.backend import Backend, resolve_backend, single_precision
-from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.ply import sh_degree
 from skipgs_plug.view.model import Model
 
@@ -20,6 +19,7 @@ class Painter:
     """Renders models of the raw parameters that a trainer holds.
 
     Args:
+        backend: Rasterizer.
         background: Colour in [0, 1] behind the model.
         near_plane: Near clipping plane in scene units.
         antialiased: Whether the model was trained with antialiasing.
@@ -31,8 +31,8 @@ class Painter:
         backend: Backend,
         background: tuple[float, float, float],
         near_plane: float,
-        antialiased: bool = False,
-        far_plane: float = TrainConfig.far_plane,
+        antialiased: bool,
+        far_plane: float,
     ) -> None:
         self._backend = backend
         self._background = background

@@ -6,7 +6,6 @@ from typing import Any
 
 from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.densification_events import DensificationEvents
 from skipgs_plug.core.pace.needs import (
     LEAST_GROWING_SHARE,
@@ -79,12 +78,8 @@ class Growing(Phase):
         Raises:
             SkipGSError: "auto" needs the number of views, and it is unknown.
         """
-        if self.share is None and plan.epoch is None:
-            needed = 'share="auto" must know the training views'
-            raise SkipGSError(
-                f"{needed}; give their names to gate.iterations() as views=, or a share.",
-                in_script=f"{needed}, which this trainer does not tell; give a share, such as 0.2.",
-            )
+        if self.share is None:
+            plan.epoch_for("share")  # refuses a run of unknown views here, before `_settle` needs their number
         numbers, found, densification, named = plan.numbers, plan.conditions, plan.densification, plan.named
         assert densification is not None
         if (plan.accumulates or plan.steps_each) and self._config.grow_share is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.trainer_info import Densification
 
 # Reason of iterations that must run and that no condition of the loop names.
@@ -37,6 +38,20 @@ class PhasePlan(NamedTuple):
     densification: Densification | None
     accumulates: bool
     steps_each: bool = False
+
+    def epoch_for(self, setting: str) -> int:
+        """Return `epoch` for a setting that needs it.
+
+        Raises:
+            SkipGSError: It is unknown.
+        """
+        if self.epoch is not None:
+            return self.epoch
+        needed = f'{setting}="auto" must know the training views'
+        raise SkipGSError(
+            f"{needed}; give their names to gate.iterations() as views=, or a share.",
+            in_script=f"{needed}, which this trainer does not tell; give a share, such as 0.2.",
+        )
 
 
 class Phase:

@@ -8,7 +8,7 @@ from typing import Any
 
 from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.errors import GateStateError, SkipGSError
+from skipgs_plug.core.errors import GateStateError
 from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, ONE_CYCLE, EarlyStopping, watched_views, why_none_watched
 from skipgs_plug.core.pace.needs import MOST_RAISED_SHARE, refining_share
 from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
@@ -96,13 +96,7 @@ class Refining(Phase):
         self._must = frozenset().union(*self.always.values())
         total = plan.last + 1 - self._first
         if self._auto and self.share is None:
-            if plan.epoch is None:
-                needed = 'refine_share="auto" must know the training views'
-                raise SkipGSError(
-                    f"{needed}; give their names to gate.iterations() as views=, or a share.",
-                    in_script=f"{needed}, which this trainer does not tell; give a share, such as 0.2.",
-                )
-            self.share = refining_share(total, plan.epoch, grown)
+            self.share = refining_share(total, plan.epoch_for("refine_share"), grown)
         assert self.share is not None
         if self._judges:
             self._why_none_watched = self._unwatchable(plan, self.share * total)
