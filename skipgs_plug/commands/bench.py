@@ -14,7 +14,6 @@ from skipgs_plug.bench.runner import Bench
 from skipgs_plug.bench.store import BenchFolder
 from skipgs_plug.bench.summary import Row, row_from_dict
 from skipgs_plug.bench.table import legend, markdown, notes, tables
-from skipgs_plug.commands.names import require_names
 from skipgs_plug.commands.options.bench import Args
 from skipgs_plug.install import next_command
 from skipgs_plug.trainer import load_scene
@@ -30,7 +29,6 @@ def run(args: Args) -> int:
 
 def compare(args: Args) -> list[Row]:
     """Run the missing policies, print the table, write bench.json, decisions.json, table.md and plots; return rows."""
-    require_names(("SCENE", args.scene), ("--out", args.out))
     whole, known = args.whole, known_policies(args.whole)
     policies = tuple(known) if args.policies is None else args.policies
     check_policies(policies, lambda name: find_policy(name, whole), known)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from skipgs_plug import SkipGate
-from skipgs_plug.commands.names import require_folder, require_names
+from skipgs_plug.commands.names import require_folder
 from skipgs_plug.commands.options.demo import Args
 from skipgs_plug.core.report import write_report
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
@@ -46,7 +46,6 @@ LEAST = {"max_steps": 2, "views": 2, "width": 15, "points": 4}
 
 def run(args: Args) -> int:
     """Run the demo in its folder; see `Args`."""
-    require_names(("--out", args.out))
     require_folder(args.out)
     for name, least in LEAST.items():
         if getattr(args, name) < least:

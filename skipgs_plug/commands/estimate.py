@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from skipgs_plug.commands.names import require_names
 from skipgs_plug.commands.options.estimate import Args
 from skipgs_plug.forecast.errors import measured_errors, spread
 from skipgs_plug.forecast.pilot import Pilot, run_pilot
@@ -18,7 +17,6 @@ SHOWN = ("seconds", "seconds_auto", "gaussians", "memory")  # quantities of the 
 
 def run(args: Args) -> int:
     """Train for half a minute and print the table; see `Args`."""
-    require_names(("SCENE", args.scene))
     config = args.train
     prepare_kernels(config)
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)

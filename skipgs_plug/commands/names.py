@@ -8,13 +8,6 @@ from pathlib import Path
 from skipgs_plug.trainer.errors import InputError
 
 
-def require_names(*given: tuple[str, str]) -> None:
-    """Raise InputError for the first (option, folder) whose name is empty: pathlib would use the current folder."""
-    for option, name in given:
-        if not name:
-            raise InputError(f"{option} is empty; give the name of a folder.")
-
-
 def require_folder(out: str) -> None:
     """Raise InputError if a folder cannot be made, before hours of work for it."""
     folder = Path(out).expanduser().absolute()

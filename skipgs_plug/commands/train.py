@@ -10,7 +10,7 @@ from typing import Any
 
 from skipgs_plug import SkipConfig, SkipGate
 from skipgs_plug.commands.gate_settings import GateSettings
-from skipgs_plug.commands.names import require_folder, require_names
+from skipgs_plug.commands.names import require_folder
 from skipgs_plug.commands.options.sfm import Args as SfmArgs
 from skipgs_plug.commands.options.train import Args
 from skipgs_plug.commands.session import Session
@@ -91,7 +91,6 @@ def check(args: Args, checkpoints: list[Path]) -> None:
             not fit SCENE.
         SkipGSError: A setting of the gate is out of its range.
     """
-    require_names(("SCENE", args.scene), ("--out", args.out))
     require_folder(args.out)
     SkipConfig(**args.gate_options.given())
     given = Path(args.scene).expanduser()

@@ -146,6 +146,19 @@ def test_the_home_folder_in_every_option(command: str, monkeypatch: pytest.Monke
             assert values_of(seen[-1], name) == [f"/home/somebody/{name}"], (name, spelling)
 
 
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "doctor"])
+def test_an_empty_argument_is_refused(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A shell variable that is not set leaves one. pathlib takes the current folder for it."""
+    known = text_options(importlib.import_module(f"skipgs_plug.commands.options.{command}").Args)
+    positional = [name for name, argument in known if not argument]
+    for name, argument in known:
+        spellings = [[*positional, argument, ""], [*positional, f"{argument}="]]
+        for words in spellings if argument else [["" if word == name else word for word in positional]]:
+            assert main([command, *words]) == 2
+            named = argument or f"Argument {words.index('') + 1}"
+            assert f"skipgs-plug: {named} is empty; give" in capsys.readouterr().err
+
+
 def test_the_script_of_another_project_gets_its_arguments_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
     monkeypatch.setattr(importlib.import_module("skipgs_plug.commands.run"), "run", lambda args: seen.append(args) or 0)

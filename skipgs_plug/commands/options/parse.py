@@ -7,18 +7,42 @@ uses typeguard, which loads unittest and asyncio and takes 0.1 s of each command
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from skipgs_plug.trainer.errors import InputError
+
 T = TypeVar("T")
 
 
 def parse_as(kind: type[T], argv: list[str], command: str) -> T:
-    """Return the options of `skipgs-plug COMMAND`. On `--help` or a mistake, tyro prints text and exits."""
+    """Return the options of `skipgs-plug COMMAND`. On `--help` or a mistake, tyro prints text and exits.
+
+    Raises:
+        InputError: An argument is empty.
+    """
+    refuse_empty(argv)
     return tyro.cli(kind, args=argv, prog=f"skipgs-plug {command}", config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def refuse_empty(argv: Sequence[str]) -> None:
+    """Raise InputError for the first empty argument, as a shell variable that is not set leaves it.
+
+    pathlib would take the current folder for it, and an option would be ignored.
+    """
+    for number, (before, argument) in enumerate(itertools.pairwise(("", *argv)), 1):
+        if argument and not (argument.startswith("--") and argument.endswith("=")):
+            continue
+        option = argument[:-1] or (before if before.startswith("--") and "=" not in before else "")
+        raise InputError(
+            f"{option} is empty; give it a value, or leave it out."
+            if option
+            else f"Argument {number} is empty; give the name of a file or folder."
+        )
 
 
 def shown(kind: str, default: str) -> Any:
