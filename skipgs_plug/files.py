@@ -30,6 +30,8 @@ def printable(name: str) -> str:
 def write_aside(path: str | Path, size: int | None = None) -> Iterator[Path]:
     """Yield a temporary path next to `path`. It is renamed to `path` on success and removed on failure.
 
+    A link stays, and the file that it names is written.
+
     Args:
         path: The file to write.
         size: Approximate size in bytes, if it is known beforehand.
@@ -38,12 +40,15 @@ def write_aside(path: str | Path, size: int | None = None) -> Iterator[Path]:
         WriteError: The file cannot be written. The message says why, and how much space it needs.
     """
     path = Path(path)
-    temporary = path.parent / f".{path.name}.{os.getpid()}.tmp"
+    target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_file() and not target.is_dir():
+        raise WriteError(f"{path} is a device or a pipe, which a file would replace; give the name of a file.")
+    temporary = target.parent / f".{target.name}.{os.getpid()}.tmp"
     try:
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            target.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
-            os.replace(temporary, path)
+            os.replace(temporary, target)
         finally:
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)

@@ -222,6 +222,25 @@ def test_only_leftovers_are_removed(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == [".hidden", ".lock", ".owner.json", "x.4711.tmp"]
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_device_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")  # like /dev/null, which root could replace
+    (tmp_path / "link").symlink_to("pipe")
+    for name in ("pipe", "link"):
+        with pytest.raises(WriteError, match="a device or a pipe"), write_aside(tmp_path / name) as temporary:
+            temporary.write_text("new")
+    assert (tmp_path / "pipe").is_fifo() and (tmp_path / "link").is_symlink()
+
+
+def test_a_link_stays_and_its_file_is_written(tmp_path: Path) -> None:
+    (tmp_path / "large disk").mkdir()
+    (tmp_path / "link").symlink_to("large disk/model")
+    with write_aside(tmp_path / "link") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "large disk/model").read_text() == "new"
+    assert [path.name for path in (tmp_path / "large disk").iterdir()] == ["model"]
+
+
 @pytest.mark.parametrize(
     ("target", "cure"),
     [
