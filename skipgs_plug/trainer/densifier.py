@@ -10,6 +10,7 @@ from torch import nn
 from skipgs_plug.trainer.backend import Backend
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.densification import densify
+from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.mcmc import Mcmc
 from skipgs_plug.trainer.order import derive_seed
 from skipgs_plug.trainer.row_order import sort_rows, sorts_rows
@@ -41,7 +42,7 @@ class Densifier:
         splats: nn.ParameterDict,
         optimizers: dict[str, torch.optim.Optimizer],
     ) -> None:
-        self._seed, self._backend = config.seed, backend
+        self._seed, self._prune_opa, self._backend = config.seed, config.prune_opa, backend
         self._splats, self._optimizers = splats, optimizers
         self._stop = config.scaled(config.recipe.refine_stop_iter)
         self.mcmc = Mcmc(config, scene_scale) if config.strategy == "mcmc" else None
@@ -69,6 +70,9 @@ class Densifier:
             step: Number of the iteration.
             info: Dictionary of the rasterizer.
             updated: Whether positions were updated.
+
+        Raises:
+            InputError: No Gaussian would be left.
         """
         if self.mcmc is not None:
             self._move(self.mcmc, step, updated)
@@ -84,12 +88,15 @@ class Densifier:
             self._backend.catch_up(self._optimizers)
             with seeded(derive_seed(self._seed, step), self._backend.device):
                 densify(self.strategy, *args, info, in_order=sorts_rows(self.strategy, step))
+            require_some(len(self._splats["means"]) > 0, step, "lower prune_opa or raise prune_scale3d")
         reset_opacity_if_missed(self.strategy, *args)
 
     def _move(self, mcmc: Mcmc, step: int, updated: bool) -> None:
         # The noise belongs to the update: without an update it is a random walk.
         moves = mcmc.moves(step)
         if moves:
+            alive = self._splats["opacities"].detach().sigmoid() > self._prune_opa  # others move to them
+            require_some(bool(alive.any()), step, "lower prune_opa")
             self._backend.release_memory()  # gsplat copies all rows
             self._backend.catch_up(self._optimizers)
         if updated or moves:
@@ -99,3 +106,9 @@ class Densifier:
         if sorts_rows(mcmc, step):
             self._backend.catch_up(self._optimizers)
             sort_rows(self._splats, self._optimizers, self.state)
+
+
+def require_some(left: bool, step: int, cure: str) -> None:
+    """Raise InputError unless Gaussians are left after the densification in an iteration."""
+    if not left:
+        raise InputError(f"Densification in iteration {step} leaves no Gaussian; {cure}.")

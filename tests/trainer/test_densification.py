@@ -13,7 +13,7 @@ from test_resume import assert_same
 from torch import nn
 
 from skipgs_plug.fallback_raster.training.gradient_norms import sum_norms
-from skipgs_plug.trainer import Scene, TrainConfig, Trainer
+from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.densification import densify
 from skipgs_plug.trainer.loop import Iteration
 from skipgs_plug.trainer.row_order import sort_rows
@@ -166,3 +166,11 @@ def test_a_run_moves_its_rows_once_at_every_densification(
     trainer.train(until=30, progress=False)
     changed = [step for step in range(1, 30) if sizes[step] != sizes[step - 1]]
     assert changed and set(changed) <= set(at)
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_a_model_without_gaussians_is_refused(tiny_scene: Scene, strategy: str) -> None:
+    config = TrainConfig(max_steps=40, strategy=strategy, refine_start_iter=0, refine_every=1, prune_opa=1.0)
+    trainer = Trainer(config, tiny_scene)
+    with pytest.raises(InputError, match="Densification in iteration 2 leaves no Gaussian; lower prune_opa"):
+        trainer.train(progress=False)
