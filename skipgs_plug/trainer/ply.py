@@ -279,6 +279,8 @@ def plain_names(vertices: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def check_header(path: Path) -> None:
     """Refuse counts that the file cannot hold: each value takes at least one byte, and vertices have no lists."""
+    if os.path.isdir(path):
+        raise InputError(f"PLY {path} is a folder; give the path of a PLY file.")
     if not os.path.isfile(path):
         raise MissingFileError(f"PLY {path} does not exist; give the path of a PLY file.")
     try:

@@ -41,6 +41,11 @@ def test_point_cloud(tmp_path: Path, folder: Path) -> None:
         load_scene(folder, init_ply=tmp_path / "cloud.ply")
 
 
+def test_a_folder_is_no_point_cloud(tmp_path: Path, folder: Path) -> None:
+    with pytest.raises(InputError, match="is a folder; give the path of a PLY"):
+        load_scene(folder, init_ply=tmp_path)
+
+
 @pytest.mark.parametrize("degree", [1, 3])
 def test_model_goes_on_where_it_was(tmp_path: Path, folder: Path, trainer: Trainer, degree: int) -> None:
     trainer.train(until=25, progress=False)
