@@ -209,7 +209,7 @@ def loss_and_mean(run: RunRecord, view_names: Sequence[str]) -> Figure:
         panel.plot(steps[out], loss[out], linestyle="none", marker="o", markersize=3.6, color="#D55E00",
                    markerfacecolor="white", label="loss, backward skipped")  # fmt: skip
         count = f"{out.sum()} of {len(out)} visits skipped"
-        panel.set_title(f"{view_names[view]}: {count}", loc="left", fontsize=SMALL + 1, parse_math=False)
+        panel.set_title(f"{label_of(view_names[view])}: {count}", loc="left", fontsize=SMALL + 1)
         panel.set_ylabel("loss")
     panels[-1].set_xlabel("iteration")
     handles, labels = panels[0].get_legend_handles_labels()
@@ -220,6 +220,18 @@ def loss_and_mean(run: RunRecord, view_names: Sequence[str]) -> Figure:
 def seeds_text(rows: Sequence[Row]) -> str:
     seeds = {seed for row in rows for seed in row.seeds}
     return "one seed" if len(seeds) == 1 else f"mean of {len(seeds)} seeds"
+
+
+def label_of(name: str) -> str:
+    """Return the name of a file or folder as matplotlib's text.
+
+    Characters that its font lacks become escapes, `$` begins no formula, and a legend shows a name that begins with _.
+    """
+    from matplotlib.font_manager import FontProperties, findfont, get_font
+
+    known = get_font(findfont(FontProperties())).get_charmap()
+    shown = "".join(c if ord(c) in known else c.encode("ascii", "backslashreplace").decode() for c in name)
+    return shown.replace("$", r"\$").replace("_", " _", shown.startswith("_"))
 
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **shared: Any) -> Any:

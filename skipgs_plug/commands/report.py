@@ -20,7 +20,8 @@ def run(args: Args) -> int:
     suffix = Path(args.out).suffix
     if suffix.lower() not in ("", *SUFFIXES):
         raise SkipGSError(f"--out {args.out}: a page is HTML, not {suffix}; give a name that ends in .html.")
-    page = build_page([read_source(run) for run in args.runs])
+    sources = {source.path: source for source in map(read_source, args.runs)}  # a run that is given twice is one run
+    page = build_page(list(sources.values()))
     with write_aside(args.out) as temporary:
         temporary.write_text(page, encoding="utf-8", errors="backslashreplace")
     print(args.out)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skipgs_plug.bench.plots import COLOURS, MARKERS, SMALL, new_figure, style
+from skipgs_plug.bench.plots import COLOURS, MARKERS, SMALL, label_of, new_figure, style
 from skipgs_plug.bench.record import Trace
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def loss_over_time(curves: Mapping[str, Mapping[str, list[float]]]) -> Figure:
     """Plot the training loss of each run over iterations. Each point is a mean over a part of the run."""
     figure, axes = new_figure(WIDTH, 3.4)
     for i, (name, curve) in enumerate(curves.items()):
-        axes.plot(curve["step"], curve["loss"], color=COLOURS[i % len(COLOURS)], linewidth=1.2, label=name)
+        axes.plot(curve["step"], curve["loss"], color=COLOURS[i % len(COLOURS)], linewidth=1.2, label=label_of(name))
     axes.set_xlabel("iteration")
     axes.set_ylabel("training loss")
     if len(curves) > 1:
@@ -68,7 +68,7 @@ def gaussians_over_time(curves: Mapping[str, Mapping[str, list[float]]], ends: M
     figure, axes = new_figure(WIDTH, 3.4)
     for i, (name, curve) in enumerate(curves.items()):
         colour = COLOURS[i % len(COLOURS)]
-        axes.plot(curve["seconds"], curve["num_GS"], color=colour, linewidth=1.2, label=name)
+        axes.plot(curve["seconds"], curve["num_GS"], color=colour, linewidth=1.2, label=label_of(name))
         if name in ends:
             axes.axvline(ends[name], color=colour, linewidth=0.8, linestyle="--")
     axes.set_ylim(bottom=0)
@@ -86,7 +86,9 @@ def quality_of_views(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
     for i, (name, views) in enumerate(runs.items()):
         values = [row["psnr"] for row in views]
         colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
-        axes.plot(range(len(views)), values, linestyle="none", marker=marker, markersize=5, color=colour, label=name)
+        axes.plot(
+            range(len(views)), values, linestyle="none", marker=marker, markersize=5, color=colour, label=label_of(name)
+        )
         axes.axhline(float(np.mean(values)), color=colour, linewidth=0.8, linestyle="--")
     axes.set_xlabel("held-out view, by name")
     axes.set_ylabel("PSNR (dB)")

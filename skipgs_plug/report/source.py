@@ -101,6 +101,8 @@ def read_source(path: str | Path) -> RunSource | BenchSource:
     if not path.exists():
         raise SkipGSError(f"{path} does not exist; give the folder of a run or of a bench.")
     if path.is_file():
+        if path.suffix.lower() != ".json":
+            raise SkipGSError(f"{path} is not the skipgs.json or bench.json of a run; give the run's folder.")
         folder, file = path.parent, path
     else:
         folder = path

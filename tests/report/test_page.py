@@ -10,6 +10,7 @@ from report_browser import body_count
 
 from skipgs_plug.cli import main
 from skipgs_plug.report.phases import phases
+from skipgs_plug.report.plots import inline_svg, loss_over_time
 from skipgs_plug.trainer import TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.curve import LossCurve
 
@@ -140,6 +141,20 @@ def test_runs_of_one_name_are_told_apart_by_their_paths(ungated_folder, tmp_path
     assert f">{ungated_folder}<" in text and f">{copy}<" in text
 
 
+def test_a_run_that_is_given_twice_is_shown_once(ungated_folder, tmp_path):
+    text = make_page(tmp_path, ungated_folder, f"{ungated_folder}/").read_text()
+    assert text.count("<table") == make_page(tmp_path, ungated_folder).read_text().count("<table")
+
+
+@pytest.mark.parametrize("name", ["_run", "a$^$", "\u732b"])
+def test_every_name_is_in_the_legend(name):
+    """matplotlib hides names that begin with _, reads formulas, and warns of letters that its font lacks."""
+    curve = {"step": [0, 9], "loss": [0.5, 0.1]}
+    figure = loss_over_time({name: curve, "other": curve})
+    inline_svg(figure)
+    assert len(figure.legends[0].get_texts()) == 2
+
+
 def test_page_loads_nothing_from_elsewhere(train_folder, bench_folder, tmp_path):
     text = make_page(tmp_path, train_folder, bench_folder).read_text()
     sources = re.findall(r'(?:src|href)="([^"]*)"', text)
@@ -181,6 +196,9 @@ def test_folders_without_a_run_are_named(tmp_path, capsys):
     (tmp_path / "stats/train_curve.json").write_text('{"step": [1]}')
     assert main(["report", str(tmp_path)]) == 2
     assert "train_curve.json is damaged" in capsys.readouterr().err
+    (tmp_path / "model.spz").write_bytes(b"\x1f\x8b")
+    assert main(["report", str(tmp_path / "model.spz")]) == 2
+    assert "model.spz is not the skipgs.json or bench.json of a run; give the run's folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
