@@ -30,7 +30,7 @@ def run(args: Args) -> int:
     ending = next((ending for ending in ENDINGS if out.name.lower().endswith(ending)), None)
     if ending is None:
         known = f"{', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
-        raise InputError(f"{out.name} has an unknown ending; use {known}.")
+        raise InputError(f"{out} has an unknown ending; use {known}.")
     source = Path(args.model).expanduser()
     splats = open_snapshots(source)[-1].load()
     if ending == ".ply":

@@ -74,4 +74,5 @@ def serve_cameras(model: Model, draw: Draw, args: Args) -> None:
 
 
 def print_address(model: Model, host: str, port: int) -> None:
+    host = f"[{host}]" if ":" in host else host  # IPv6
     print(f"{model.name}: http://{host}:{port} (Ctrl-C ends)", flush=True)

@@ -29,6 +29,7 @@ STEP_BACK = 2.0  # distance of the first viewpoint behind the first camera, in u
 THUMBNAIL = 96  # longer side of the photograph in a frustum, in pixels; small, since a scene may have hundreds
 ERROR_GAIN = 4.0  # factor on absolute errors: at 1, an error of 0.05 would look black
 TRAIN_COLOUR, TEST_COLOUR = (90, 110, 140), (230, 120, 20)
+PORTS = 50  # ports that are tried, from the given one on
 WORST_SHOWN = 8  # held-out views in the list of the worst ones, which then fits the page
 
 Splats = Mapping[str, Tensor]
@@ -222,22 +223,30 @@ class Page:
 
 
 def require_address(host: str, port: int) -> None:
-    """Raise InputError unless a server can listen there; the port may be taken.
+    """Raise InputError unless a server can listen there, or on one of the next ports.
 
     Viser binds the port in a thread; if that fails, its caller waits forever.
     """
     if not 1 <= port <= 65535:
         raise InputError(f"port={port} is not in 1..65535.")
-    try:
-        for family, kind, protocol, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
-            with socket.socket(family, kind, protocol) as trial:
-                trial.bind(address)
-    except OSError as error:
-        if error.errno != errno.EADDRINUSE:
-            raise InputError(
-                f"Cannot listen on {host}:{port} ({error.strerror or error}); give --host an address of this machine, "
-                "such as 127.0.0.1, and --port a number above 1023."
-            ) from None
+    for tried in ports_from(port):
+        try:
+            for family, kind, protocol, _, address in socket.getaddrinfo(host, tried, type=socket.SOCK_STREAM):
+                with socket.socket(family, kind, protocol) as trial:
+                    trial.bind(address)
+            return
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise InputError(
+                    f"Cannot listen on {host}:{port} ({error.strerror or error}); give --host an address of this "
+                    "machine, such as 127.0.0.1, and --port a number above 1023."
+                ) from None
+    raise InputError(f"Cannot listen on {host}:{port}, which is taken, as are the next ports; give another --port.")
+
+
+def ports_from(port: int) -> range:
+    """Return the ports that a page tries."""
+    return range(port, min(port + PORTS, 65536))
 
 
 def field_of_view(view: View) -> float:

@@ -1,14 +1,25 @@
 """Where the page in the browser may listen, and that it hears its visitors."""
 
+import re
 import socket
 import threading
+import urllib.request
 
 import pytest
 import torch
 
+from skipgs_plug.commands.view import print_address
 from skipgs_plug.trainer import InputError
 from skipgs_plug.view import page as module
+from skipgs_plug.view.model import Model
 from skipgs_plug.view.page import Page, require_address
+from skipgs_plug.view.web.server import WebPage
+
+
+def splats_of(n):
+    """Return the raw parameters of n grey Gaussians at the origin."""
+    splats = {"means": torch.zeros(n, 3), "quats": torch.ones(n, 4), "scales": torch.zeros(n, 3)}
+    return {**splats, "opacities": torch.zeros(n), "sh0": torch.zeros(n, 1, 3), "shN": torch.zeros(n, 15, 3)}
 
 
 @pytest.mark.parametrize(
@@ -34,14 +45,30 @@ def test_what_is_chosen_while_a_model_is_prepared_is_not_forgotten(monkeypatch):
         return convert(*arguments)
 
     monkeypatch.setattr(module, "to_gaussians", while_somebody_chooses)
-    splats = {"means": torch.zeros(2, 3), "quats": torch.ones(2, 4), "scales": torch.zeros(2, 3)}
     try:
-        page.show({**splats, "opacities": torch.zeros(2), "sh0": torch.zeros(2, 1, 3)}, "Iteration 300")
+        page.show(splats_of(2), "Iteration 300")
         waiting = threading.Thread(target=page.wait, daemon=True)
         waiting.start()
         waiting.join(10)
         assert not waiting.is_alive() and page.chosen_step == 100
         assert not page._asked.is_set()
+    finally:
+        page.stop()
+
+
+def test_the_last_port_being_taken_is_said_before_anything_waits_for_it():
+    with socket.create_server(("127.0.0.1", 65535)), pytest.raises(InputError, match=r"taken.* give another --port"):
+        Page(None, lambda splats, view: None, port=65535)
+
+
+@pytest.mark.skipif(not socket.has_ipv6, reason="this system has no IPv6")
+def test_an_address_of_ipv6_is_served(capsys):
+    model = Model("statue", [], None)
+    page = WebPage(model, splats_of(2), lambda splats, view: None, "::1", 18472)
+    try:
+        print_address(model, "::1", page.port)
+        url = re.search(r"http://\S+", capsys.readouterr().out).group()
+        assert urllib.request.urlopen(url).status == 200
     finally:
         page.stop()
 

@@ -7,6 +7,7 @@ import functools
 import io
 import json
 import logging
+import socket
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -23,7 +24,7 @@ from skipgs_plug.trainer.metrics import psnr
 from skipgs_plug.trainer.scene import View
 from skipgs_plug.view.draw import to_bytes
 from skipgs_plug.view.model import Model
-from skipgs_plug.view.page import ERROR_GAIN, RADIUS, Splats, field_of_view, require_address
+from skipgs_plug.view.page import ERROR_GAIN, RADIUS, Splats, field_of_view, ports_from, require_address
 from skipgs_plug.view.sog import to_sog
 from skipgs_plug.view.upright import up_direction
 from skipgs_plug.view.web.rotate_model import rotated, upright
@@ -32,7 +33,6 @@ log = logging.getLogger(__name__)
 
 PAIRS = 5e7  # see `to_sog`; a tenth of its default, so that the page opens sooner
 KEPT = 32  # comparisons that stay in memory, at most; a visitor who goes back and forth looks at fewer
-PORTS = 50  # ports that are tried, from the given one on; hardly anyone serves as many pages at once
 TO_PAGE = np.diag([-1.0, -1.0, 1.0])  # the viewer turns a model half a turn about z
 POSE = ([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 60.0)  # position, target, degrees of the first view without a scene
 FILES = {
@@ -199,17 +199,18 @@ def listen(host: str, port: int, page: WebPage) -> ThreadingHTTPServer:
             log.debug(format, *arguments)
 
     class Server(ThreadingHTTPServer):
+        address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         daemon_threads = True
         allow_reuse_address = False
 
         def handle_error(self, request: Any, client_address: Any) -> None:
             log.debug("A visitor left before the answer.", exc_info=True)
 
-    for tried in range(port, min(port + PORTS, 65536)):
+    for tried in ports_from(port):
         try:
             return Server((host, tried), Handler)
         except OSError:
-            if tried + 1 == min(port + PORTS, 65536):
+            if tried == ports_from(port)[-1]:
                 raise
     raise AssertionError("no port was tried")
 
