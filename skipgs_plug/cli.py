@@ -176,7 +176,11 @@ def explain(error: Exception, extra: str) -> str | None:
     This imports no module that may be missing, or that a Ctrl-C may have left half loaded.
     """
     if any(one.__name__ in OURS and one.__module__.startswith("skipgs_plug.") for one in type(error).__mro__):
-        return str(error)
+        # A file of the user that may not be read is neither damaged nor gone.
+        denied = next((cause for cause in chain(error.__cause__) if isinstance(cause, PermissionError)), None)
+        if denied is None or isinstance(error, OSError):
+            return str(error)
+        error = denied
     if isinstance(error, ModuleNotFoundError) and not (error.name or "").startswith("skipgs_plug"):
         from skipgs_plug.install import install_command
 

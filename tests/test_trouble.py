@@ -16,6 +16,7 @@ import pytest
 from skipgs_plug import cli, install
 from skipgs_plug.files import WriteError, remove_leftovers, write_aside
 from skipgs_plug.install import install_command
+from skipgs_plug.trainer.errors import InputError
 
 # A Python without the named packages, which then runs a command.
 WITHOUT = """
@@ -123,7 +124,7 @@ def test_ctrl_c_that_an_import_turned_into_another_error(monkeypatch: pytest.Mon
     assert cli.main(["train"]) == 130
 
 
-def failing(error: OSError) -> type:
+def failing(error: Exception) -> type:
     """Return the module of a command that ends with this error."""
 
     class Command:
@@ -268,3 +269,15 @@ def test_a_copy_that_does_not_fit_names_the_copy(
     monkeypatch.setattr(cli.importlib, "import_module", lambda name: failing(error))
     assert cli.main(["sfm"]) == 2
     assert capsys.readouterr().err.startswith("skipgs-plug: /scene/a.jpg: No space left on device; make room there")
+
+
+def test_a_file_that_may_not_be_read_is_not_called_damaged(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = InputError("transforms.json is not valid JSON; restore the file.")
+    error.__cause__ = PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/scene/transforms.json")
+    monkeypatch.setattr(cli.importlib, "import_module", lambda name: failing(error))
+    assert cli.main(["train"]) == 2
+    assert capsys.readouterr().err == (
+        "skipgs-plug: /scene/transforms.json: Permission denied; change its permissions or give another path.\n"
+    )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,9 @@ import torch
 from PIL import Image
 from scene_folders import write_colmap, write_points
 
+from skipgs_plug.files import WriteError
 from skipgs_plug.trainer import InputError, MissingFileError, Scene, load_scene
+from skipgs_plug.trainer.loaders import colmap
 
 
 @pytest.fixture
@@ -106,4 +110,18 @@ def test_empty_and_non_finite_points(folder: Path) -> None:
     xyz[2, 1] = np.nan
     write_points(points, xyz, np.zeros((6, 3), dtype=np.uint8))
     with pytest.raises(InputError, match=r"sparse/0 (has 1 points with NaN, infinite|cannot be read)"):
+        load_scene(folder)
+
+
+@pytest.mark.parametrize("name", ["simplify", "tempfile.TemporaryDirectory"])
+def test_a_full_temporary_folder_is_not_blamed_on_the_model(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    def fail(*given: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(f"{colmap.__name__}.{name}", fail)
+    with pytest.raises(
+        WriteError, match=r"copy of .*sparse/0 cannot be written \(No space left on device\); set TMPDIR"
+    ):
         load_scene(folder)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import re
 import struct
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from skipgs_plug.files import OUT_OF_SPACE, WriteError
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders.colmap_files import check_lengths, leave_out_points
@@ -180,12 +183,12 @@ def read_model(model: Path) -> tuple[Any, dict[int, str]]:
         say_if_both(model)
         if is_complete(model, ".bin") and (model / "points3D.bin").is_file():
             return pycolmap.Reconstruction(str(model)), {}
-        with tempfile.TemporaryDirectory() as folder:
+        with temporary_copy(model) as folder:
             if is_complete(model, ".bin"):
-                leave_out_points(model, Path(folder))
-                return pycolmap.Reconstruction(folder), {}
-            names, points = simplify(model, Path(folder), dict(models.values()))
-            reconstruction = pycolmap.Reconstruction(folder)
+                leave_out_points(model, folder)
+                return pycolmap.Reconstruction(str(folder)), {}
+            names, points = simplify(model, folder, dict(models.values()))
+            reconstruction = pycolmap.Reconstruction(str(folder))
         for what, listed, read in (
             ("images", len(names), len(reconstruction.images)),
             ("points", points, len(reconstruction.points3D)),
@@ -193,10 +196,28 @@ def read_model(model: Path) -> tuple[Any, dict[int, str]]:
             if listed != read:
                 raise InputError(f"{model} lists {listed} {what}, but only {read} can be read; export it again.")
         return reconstruction, names
-    except InputError:
+    except (InputError, WriteError):
         raise
     except Exception as error:  # pycolmap raises RuntimeError, ValueError or IndexError
         raise InputError(f"COLMAP model {model} cannot be read ({reason(error)}); export it again.") from error
+
+
+@contextlib.contextmanager
+def temporary_copy(model: Path) -> Iterator[Path]:
+    """Yield a temporary folder for a copy of a model.
+
+    Raises:
+        WriteError: The copy cannot be written. Errors of reading the model pass.
+    """
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            yield Path(folder)
+    except OSError as error:
+        if error.errno not in OUT_OF_SPACE and error.filename is not None:
+            raise
+        raise WriteError(
+            f"A temporary copy of {model} cannot be written ({error.strerror}); set TMPDIR to a folder with room."
+        ) from error
 
 
 def camera_models(pycolmap: Any) -> dict[int, tuple[str, int]]:
