@@ -194,7 +194,16 @@ def explain(error: Exception, extra: str) -> str | None:
         if error.errno in (errno.EACCES, errno.EPERM):
             cure = "change its permissions or "
         return f"{where}: {error.strerror}; {cure}give another path."
+    if is_out_of_memory(error):
+        cause = str(error).partition("\n")[0]
+        return f"There is not enough memory ({cause}); give smaller numbers, or a larger --data-factor."
     return None
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Whether Python, NumPy, or torch on the CPU or a GPU could not allocate memory."""
+    names = {one.__name__ for one in type(error).__mro__}
+    return bool(names & {"MemoryError", "OutOfMemoryError"}) or "DefaultCPUAllocator" in str(error)
 
 
 def chain(error: BaseException | None) -> Iterator[BaseException]:

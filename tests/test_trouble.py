@@ -11,7 +11,9 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from skipgs_plug import cli, install
 from skipgs_plug.files import WriteError, remove_leftovers, write_aside
@@ -281,3 +283,15 @@ def test_a_file_that_may_not_be_read_is_not_called_damaged(
     assert capsys.readouterr().err == (
         "skipgs-plug: /scene/transforms.json: Permission denied; change its permissions or give another path.\n"
     )
+
+
+def test_too_little_memory_is_one_sentence(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    too_large = 1 << 55
+    for allocate in (bytes, np.empty, torch.empty):
+        with pytest.raises((MemoryError, RuntimeError)) as raised:
+            allocate(too_large)
+        error = raised.value
+        monkeypatch.setattr(cli.importlib, "import_module", lambda name, error=error: failing(error))
+        assert cli.main(["train"]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("skipgs-plug: There is not enough memory (") and len(said.splitlines()) == 1

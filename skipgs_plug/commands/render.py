@@ -17,6 +17,7 @@ from skipgs_plug.view.film import write_film, write_pictures
 from skipgs_plug.view.model import open_model
 from skipgs_plug.view.path import camera_path
 
+FASTEST = 1000  # frames per second: encoders refuse numbers that are much larger
 RANGE_FRAMES = 8  # frames that set the depth range; with all of them, the whole path would be rendered twice
 
 
@@ -25,6 +26,8 @@ def run(args: Args) -> int:
     for name in ("frames", "fps"):
         if getattr(args, name) < 1:
             raise InputError(f"--{name} {getattr(args, name)} is too small; give at least 1.")
+    if args.fps > FASTEST:
+        raise InputError(f"--fps {args.fps} is too large; give at most {FASTEST:,}.")
     model = open_model(args.model, args.scene, args.data_factor)
     if model.scene is None:
         raise InputError(f"{args.model} names no cameras to render from; add --scene with the scene it shows.")

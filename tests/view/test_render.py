@@ -75,6 +75,7 @@ def test_a_ply_needs_a_scene_and_may_lack_normals(ply, scene_file, tmp_path, cap
         (("{run}", "film.gif"), "is neither a film (.mp4) nor a folder"),
         (("{run}", "{run}"), "not an empty folder"),
         (("{run}", "out", "--frames", "0"), "--frames 0 is too small"),
+        (("{run}", "out.mp4", "--fps", "1001"), "--fps 1001 is too large"),
         (("{run}", "out", "--data-factor", "0"), "data_factor=0 is not an integer in 1..64"),
         (("{run}", "out", "--scene", "gone"), "Scene gone does not exist"),
     ],
