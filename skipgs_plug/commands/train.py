@@ -128,6 +128,9 @@ def configure(args: Args, checkpoints: list[Path]) -> tuple[list[Path], TrainCon
     """Return the checkpoints from the newest readable one on, and the settings of the run.
 
     A resumed run keeps its schedule. It keeps its length too, unless the options give another one.
+
+    Raises:
+        InputError: The run would be extended, but its learning rates fall to 0 at the end of its schedule.
     """
     run: dict[str, Any] = {"max_steps": REFERENCE_STEPS}
     if checkpoints:
@@ -137,4 +140,11 @@ def configure(args: Args, checkpoints: list[Path]) -> tuple[list[Path], TrainCon
     # Later commands may run in another folder.
     paths = (args.scene, args.train.init_ply)
     scene, start = (os.path.abspath(Path(path).expanduser()) if path else "" for path in paths)
-    return checkpoints, dataclasses.replace(args.train, data_dir=scene, init_ply=start, result_dir=args.out, **run)
+    config = dataclasses.replace(args.train, data_dir=scene, init_ply=start, result_dir=args.out, **run)
+    compensates = SkipConfig(**args.gate_options.given()).compensates
+    if args.max_steps is not None and args.max_steps > config.schedule and compensates:
+        raise InputError(
+            f"Under this gate, learning rates fall to 0 at iteration {config.schedule:,}, and more iterations change "
+            f"nothing; leave out --max-steps, or train anew with --max-steps {config.max_steps} and another --out."
+        )
+    return checkpoints, config

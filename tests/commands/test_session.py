@@ -253,6 +253,19 @@ def test_a_run_is_extended(tmp_path: Path, packed: str, whole: Path, capsys: pyt
     assert "more than max_steps=50" in capsys.readouterr().err
 
 
+def test_a_run_whose_rates_fall_to_0_is_not_extended(
+    tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train = ["train", packed, "--out", str(tmp_path / "run"), "--max-steps", "20", "--no-progress"]
+    share = ["--share", "0.5"]
+    assert main([*train, *share]) == 0
+    assert main([*train, *share, "--resume", "--max-steps", "30"]) == 2
+    assert "learning rates fall to 0 at iteration 20" in capsys.readouterr().err
+    own_rates = ["--refine-share", "0.5", "--compensate", "False"]
+    train[3] = str(tmp_path / "own rates")
+    assert main([*train, *own_rates]) == main([*train, *own_rates, "--resume", "--max-steps", "30"]) == 0
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
