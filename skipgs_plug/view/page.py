@@ -29,7 +29,7 @@ STEP_BACK = 2.0  # distance of the first viewpoint behind the first camera, in u
 THUMBNAIL = 96  # longer side of the photograph in a frustum, in pixels; small, since a scene may have hundreds
 ERROR_GAIN = 4.0  # factor on absolute errors: at 1, an error of 0.05 would look black
 TRAIN_COLOUR, TEST_COLOUR = (90, 110, 140), (230, 120, 20)
-PORTS = 50  # ports that are tried, from the given one on
+PORTS = 50  # ports that are tried, from the given one on; hardly anyone serves as many pages at once
 WORST_SHOWN = 8  # held-out views in the list of the worst ones, which then fits the page
 
 Splats = Mapping[str, Tensor]
