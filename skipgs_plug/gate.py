@@ -294,7 +294,7 @@ class SkipGate:
         """Counters, and times in seconds, under their names in skipgs.json; see `skipgs_plug.core.report`."""
         own = None if self.adapter is None else self.adapter.timing()
         times = self._engine.clock.times if own is None else own
-        return counters(self._engine.stats, self._floor, times, self._engine.pace.report())
+        return counters(self._engine.stats, self._floor, times, self._engine.pace.report(), self.released)
 
     def report(self) -> dict[str, Any]:
         """The content of skipgs.json: settings, counters, seconds, per-view table."""

@@ -31,7 +31,11 @@ class Reporting(Protocol):
 
 
 def counters(
-    stats: GateStats, floor: float | None, times: Times, left_out: dict[str, Any] | None = None
+    stats: GateStats,
+    floor: float | None,
+    times: Times,
+    left_out: dict[str, Any] | None = None,
+    released: str | None = None,
 ) -> dict[str, Any]:
     """Return counters and times.
 
@@ -40,9 +44,11 @@ def counters(
         floor: Least share of backward passes that must run; None if the policy has no floor.
         times: Seconds of training.
         left_out: Result of `Pace.report`; None if no iteration is left out.
+        released: Why the gate released the run; None if it did not.
 
     Returns:
-        `iterations` (training backward passes seen, run or skipped); `gated_iterations` (backward passes seen from
+        `released` (the argument; the counters are those until then); `iterations` (training backward passes seen, run
+        or skipped); `gated_iterations` (backward passes seen from
         start_iter on, which is `backwards_run` + `backwards_skipped`); `min_bwd_ratio_effective` (floor in force; None
         if the policy has no floor); `paused`, `non_finite` (gated iterations with that reason); `reasons` (gated
         iterations by reason); `events` (structural changes by kind); `t_total`, `t_post` (seconds of all iterations,
@@ -53,6 +59,7 @@ def counters(
         `growing` (see `Growing.report`; None if all iterations before the end of densification run).
     """
     return {
+        "released": released,
         "iterations": stats.iterations,
         "gated_iterations": stats.gated,
         "backwards_run": stats.backwards,
@@ -87,6 +94,12 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
     """
     if not config.enabled:
         return f"SkipGS: off, {counted['iterations']:,} backwards seen."
+    if counted["released"] is not None:
+        left_out = counted["iterations_skipped"] + (counted["growing"] or {}).get("iterations_skipped", 0)
+        return (
+            f"SkipGS: {counted['iterations']:,} iterations seen, {counted['backwards_skipped']:,} backwards skipped, "
+            f"{left_out:,} iterations left out whole.\n  {counted['released']}"
+        )
     if config.leaves_out:
         return _summarise_refinement(config, counted)
     gated, skipped, reasons = counted["gated_iterations"], counted["backwards_skipped"], counted["reasons"]

@@ -77,7 +77,9 @@ def test_an_error_in_any_verb_releases_the_gate_once(entry, batch, monkeypatch, 
     assert len(said) == 1 and f"ZeroDivisionError: of {REACHED[entry][1]}" in said[0] and gate.released == said[0]
     later = range(FAILS + 6, LAST)
     assert len(loop.stepped) < LAST and [step for step in loop.stepped if step in later] == list(later)
-    assert "of" in gate.summary() and gate.stats()["iterations"] >= FAILS
+    seen, why = gate.summary().splitlines()
+    assert f"{gate.stats()['iterations']} iterations seen" in seen and gate.stats()["iterations"] >= FAILS
+    assert why.strip() == gate.report()["released"] == gate.released
 
 
 def test_optimizers_that_cannot_be_read_step_all_the_same(monkeypatch, recwarn):

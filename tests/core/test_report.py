@@ -14,6 +14,7 @@ from skipgs_plug.core.report import write_report
 KEYS = {
     "schema_version",
     "settings",
+    "released",
     "iterations",
     "gated_iterations",
     "backwards_run",
