@@ -11,7 +11,7 @@ import torch
 from skipgs_plug.core.clock import Times
 from skipgs_plug.core.drift_check import DriftCheck
 from skipgs_plug.core.engine import Engine
-from skipgs_plug.core.errors import AdapterMismatchError
+from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.gaussian_count import GaussianCount
 from skipgs_plug.core.intercept import Around, Original, Patches, intercept_tensor_backward
 from skipgs_plug.core.loop_hooks import LoopHooks
@@ -129,10 +129,8 @@ class Hooks(LoopHooks):
                 return
             before = self._iteration.step
             if before is not None and step < before and (self._release.in_script or not self._engine.config.enabled):
-                self._release.let_go(
-                    f"The gate is released: iterations went back from {before} to {step}, as in a second training run "
-                    "of one process. Training goes on without it, in all its iterations"
-                )
+                back = f"iterations went back from {before} to {step}, as in a second training run of one process"
+                self._release.release(SkipGSError(back), step)
                 return
             self._iterations += 1
             self._odd_iterations += 1  # until its backward is seen
@@ -198,7 +196,7 @@ class Hooks(LoopHooks):
         """Whether this backward is the first of an iteration."""
         self._backwards += 1
         if self._iterations == 0:
-            if self._backwards >= CHECKED_ITERATIONS:
+            if self._engine.config.enabled and self._backwards >= CHECKED_ITERATIONS:
                 raise self._mismatch(f"{self._backwards} training backwards ran in no iteration")
             return False
         now = self._iteration
@@ -376,7 +374,7 @@ class Hooks(LoopHooks):
             self._require_one_backward_each()
 
     def _require_one_backward_each(self) -> None:
-        if self._odd_iterations:
+        if self._engine.config.enabled and self._odd_iterations:
             raise self._mismatch(
                 f"{self._backwards} training backwards were seen in {self._iterations} iterations, "
                 f"where one per iteration was expected"

@@ -91,7 +91,10 @@ class Release:
         why = str(error) if expected else f"{type(error).__name__}: {error}; report it to the project skipgs_plug"
         where = "" if step is None else f" in iteration {step}"
         log.debug("The error that releases the gate:", exc_info=error)
-        self.let_go(f"The gate is released{where}, and training goes on without it, in all its iterations ({why})")
+        released = f"The gate is released{where}, and training goes on without it, in all its iterations"
+        self.let_go(
+            f"{released if self._enabled else f'Training goes on, but its counts and times end{where}'} ({why})"
+        )
 
     def agreed(
         self, decide: Callable[[], Decision], step: int, device: torch.device | None
