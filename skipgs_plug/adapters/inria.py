@@ -21,7 +21,7 @@ from skipgs_plug.adapters import registry
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import last_calls
-from skipgs_plug.adapters.loop_code import LOOP, LoopCode
+from skipgs_plug.adapters.loop_code import LOOP, LoopCode, loop_around
 from skipgs_plug.adapters.unknown_forks import BY_HAND, CALLS, Unrecognised, begin_after, left_alone, unrecognised
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
@@ -163,7 +163,7 @@ class InriaFamily(AbstractAdapter):
         self.examine(code, self._renderers(names), names["GaussianModel"])
         self._attach_to_renderer(hooks, names)
         self._attach_to_model(hooks, names)
-        self._attach_to_loop(hooks, names)
+        self._attach_to_loop(hooks, names, code)
 
     def attach_script(self, hooks: Hooks) -> None:
         code = LoopCode.of_script(Path(sys.argv[0]))
@@ -186,7 +186,7 @@ class InriaFamily(AbstractAdapter):
 
         when_imported(hooks, MODEL, lambda module: examined(module, self._attach_to_model))
         when_imported(hooks, RENDERER, lambda module: examined(module, self._attach_to_renderer))
-        self._attach_to_loop(hooks, hooks.script_globals)
+        self._attach_to_loop(hooks, hooks.script_globals, code)
 
     def _renderers(self, names: Mapping[str, Any]) -> list[Callable[..., Any]]:
         """Return the renderers of a namespace that the adapter uses.
@@ -221,17 +221,18 @@ class InriaFamily(AbstractAdapter):
         model = names["GaussianModel"]
 
         def rate_updated(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            self._begins(hooks, args[0], sys._getframe(2))  # frame 2 is the loop's
+            self._begins(hooks, args[0], sys._getframe(2))  # frame 2 is the caller's
             return original(*args, **kwargs)
 
         hooks.wrap(model, "update_learning_rate", rate_updated)
         hooks.events(model, *(name for name in self.structural if hasattr(model, name)))
 
-    def _begins(self, hooks: Hooks, model: Any, frame: types.FrameType) -> None:
-        """An iteration begins in the loop of this frame. The first one reads the run."""
+    def _begins(self, hooks: Hooks, model: Any, caller: types.FrameType) -> None:
+        """An iteration begins in the loop around this frame. The first one reads the run."""
         with hooks.guarded():
             # Variables of the loop are read once, before they hold the graph of an iteration.
             if self._model() is not model:
+                frame = loop_around(caller)
                 self._refuse_fork(LoopCode.of_module(frame.f_globals))
                 self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
                 self._model = weakref.ref(model)
@@ -243,9 +244,9 @@ class InriaFamily(AbstractAdapter):
     def _optimizers_of_model(self) -> list[torch.optim.Optimizer]:
         return [one for one in vars(self._model()).values() if isinstance(one, torch.optim.Optimizer)]
 
-    def _attach_to_loop(self, hooks: Hooks, script: dict[str, Any]) -> None:
+    def _attach_to_loop(self, hooks: Hooks, script: dict[str, Any], code: LoopCode) -> None:
         """Attach to the loop's backward and to its range."""
-        hooks.gate_tensor_backward(LOOP)
+        hooks.gate_tensor_backward(*code.callers)
         hooks.loop(
             script, LOOP, always=self.always_run, pure=self.pure, densification=self.densification, known=self._known
         )
@@ -284,7 +285,7 @@ class InriaFamily(AbstractAdapter):
 
     def _refuse_loop_elsewhere(self, code: LoopCode) -> None:
         """Refuse a script whose loop is in a function that `training` calls, such as the two stages of 4DGaussians."""
-        if LOOP not in code.backward:
+        if not code.callers:
             where = ", ".join(f"{name}()" for name in sorted(code.backward & code.used)) or "another module"
             raise AdapterMismatchError(
                 f"{self.difference(code)}: its training loop is in {where}, not in {LOOP}(), as in 4DGaussians, and is "
@@ -294,11 +295,12 @@ class InriaFamily(AbstractAdapter):
     def _read_run(self, hooks: Hooks, loop: Mapping[str, Any]) -> None:
         """Read options, views and first iteration from the loop's variables."""
         scene = next((loop[name] for name in self.scenes if name in loop), None)
-        missing = [name for name in ("opt", "iteration") if name not in loop]
+        number = "iteration" if self._code is None else self._code.number
+        missing = [name for name in ("opt", number) if name not in loop]
         if scene is None or missing:
             wanted = ", ".join(missing or self.scenes)
             raise self.mismatch(f"{wanted} among the variables of {LOOP}()")
-        opt, self._step = loop["opt"], int(loop["iteration"])
+        opt, self._step = loop["opt"], int(loop[number])
         self.output_folder = getattr(scene, "model_path", None)
         cameras = scene.getTrainCameras()
         names = [camera.image_name for camera in cameras]
@@ -328,7 +330,7 @@ class InriaFamily(AbstractAdapter):
             return start
         awaited = self._unknown.calls.union(self.structural, self.changes).difference(self.pausing)
         parts = [part for part in (self._model_class, undecorated(loop.get(LOOP))) if part is not None]
-        ends = last_calls(self._code.syntax, awaited, loop, parts, stops=self._known_calls())
+        ends = last_calls(self._code.syntax, self._code.number, awaited, loop, parts, stops=self._known_calls())
         return begin_after(start, opt.iterations, ends)
 
     def _known_calls(self) -> frozenset[str]:

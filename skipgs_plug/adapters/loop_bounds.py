@@ -40,7 +40,6 @@ from skipgs_plug.core.source.functions import (
 )
 from skipgs_plug.core.source.substitution import returned
 
-NUMBER = "iteration"  # variable that holds the iteration's number in every loop of the Inria family
 ASSIGNED = "data ="  # represents an assignment to a tensor's `data` among the names of calls
 # Largest depth of nested calls that are read. A trainer's loop reaches its strategy in three; deeper calls reach
 # libraries.
@@ -269,6 +268,7 @@ class CallReader:
 
 def last_calls(
     function: ast.FunctionDef,
+    number: str,
     names: Collection[str],
     values: Mapping[str, Any],
     trainer: Iterable[Part],
@@ -278,6 +278,7 @@ def last_calls(
 
     Args:
         function: The function that holds the loop.
+        number: Variable of the loop that holds the iteration's number.
         names: Names of the methods.
         values: Values of the loop's names when it begins.
         trainer: Functions and classes of the trainer. Its other functions are read if the loop calls them.
@@ -286,7 +287,7 @@ def last_calls(
     reader = CallReader(frozenset(names).union(stops))
     for part in trainer:
         reader.trainer.add(part)
-    reader.read_loops(function, Scope(frozenset({NUMBER}), values))
+    reader.read_loops(function, Scope(frozenset({number}), values))
     return {name: end for name, end in reader.ends.items() if name in names and end is not None}
 
 

@@ -24,7 +24,9 @@ class LoopCode(NamedTuple):
         source: File of the script, or name of the module, for sentences.
         names: Global names of the script, and every global and attribute that its function `training` uses.
         functions: Names of its functions and classes.
-        backward: Names of its functions that call `backward`.
+        backward: Names of its functions that call `backward`, themselves or in a function inside them.
+        callers: Names of the functions that call the training backward: `training`, functions inside it, or else
+            functions of the script that its loop calls. Empty if its loop is elsewhere.
         used: Every global and attribute that `training` and the functions that it calls use. Empty if there is no
             function `training`.
         repeated: The subset of `used` inside the loop itself and in functions that the loop calls.
@@ -37,11 +39,21 @@ class LoopCode(NamedTuple):
     names: frozenset[str]
     functions: frozenset[str]
     backward: frozenset[str] = frozenset()
+    callers: frozenset[str] = frozenset()
     used: frozenset[str] = frozenset()
     repeated: frozenset[str] = frozenset()
     keywords: frozenset[str] = frozenset()
     stored: frozenset[str] = frozenset()
     syntax: ast.FunctionDef | None = None
+
+    @property
+    def number(self) -> str:
+        """Name of the variable that holds the iteration's number: the one that `update_learning_rate` receives."""
+        for node in () if self.syntax is None else ast.walk(self.syntax):
+            match node:
+                case ast.Call(ast.Attribute(_, "update_learning_rate"), [ast.Name(name), *_]):
+                    return name
+        return "iteration"
 
     @classmethod
     def of_module(cls, namespace: Mapping[str, Any]) -> LoopCode:
@@ -75,9 +87,7 @@ class LoopCode(NamedTuple):
     def _made(
         cls, source: str, own: set[str], functions: Mapping[str, types.CodeType], syntax: ast.FunctionDef | None
     ) -> LoopCode:
-        backward = {
-            name for name, code in functions.items() if any("backward" in part.co_names for part in _with_inner(code))
-        }
+        backward = {name for name, code in functions.items() if _callers(code)}
         if LOOP not in functions:
             return cls(source, frozenset(own), frozenset(functions), frozenset(backward))
         training = functions[LOOP]
@@ -99,12 +109,21 @@ class LoopCode(NamedTuple):
             frozenset(own | of_loop),
             frozenset(functions),
             frozenset(backward),
+            frozenset(_callers(training) or backward.intersection(_called_in_loops(syntax))),
             frozenset(of_loop | of_called),
             frozenset(repeated | of_called),
             keywords,
             frozenset(stored),
             syntax,
         )
+
+
+def loop_around(frame: types.FrameType) -> types.FrameType:
+    """Return the innermost frame of `training` around a frame; the frame itself if there is none."""
+    around: types.FrameType | None = frame
+    while around is not None and around.f_code.co_name != LOOP:
+        around = around.f_back
+    return around or frame
 
 
 def function_names(function: Callable[..., Any]) -> dict[str, Any]:
@@ -123,6 +142,18 @@ def _called(used: set[str], functions: Mapping[str, types.CodeType]) -> list[typ
             inner = {used for part in _with_inner(functions[name]) for used in part.co_names}
             waiting += [one for one in inner if one in functions and one != LOOP]
     return list(found.values())
+
+
+def _callers(code: types.CodeType) -> set[str]:
+    """Names of a function, and of the functions inside it, that call `backward`."""
+    return {part.co_name for part in _with_inner(code) if "backward" in part.co_names}
+
+
+def _called_in_loops(syntax: ast.FunctionDef | None) -> set[str]:
+    """Names of the functions that a function calls in its loops."""
+    loops = [] if syntax is None else [node for node in ast.walk(syntax) if isinstance(node, (ast.For, ast.While))]
+    called = [node.func for loop in loops for node in ast.walk(loop) if isinstance(node, ast.Call)]
+    return {function.id for function in called if isinstance(function, ast.Name)}
 
 
 def _in_loop(code: types.CodeType, syntax: ast.FunctionDef | None) -> tuple[set[str], set[str]]:

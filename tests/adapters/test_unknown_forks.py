@@ -32,6 +32,16 @@ def training(dataset, opt, pipe):
 """
 
 
+INNER = "def inner(loss):\n        loss.backward()"
+HELPERS = """
+def set_rates(gaussians, number):
+    gaussians.update_learning_rate(number)
+
+def optimise(loss):
+    loss.backward()
+"""
+
+
 class GaussianModel(SplatModel):
     def shake(self):
         self.values["xyz"].add_(0.01)
@@ -247,11 +257,45 @@ def test_failure_of_the_gates_own_code_loses_no_run(monkeypatch):
     assert log.backwards == [*range(1, 41)]
 
 
+def test_a_gate_that_is_off_counts_iterations_with_several_backwards(recwarn):
+    fork = unknown_fork(extra="with torch.enable_grad(): render(viewpoint_cam, gaussians)['render'].sum().backward()")
+    with SkipGate(fork, enabled=False) as gate:
+        train(fork)
+    assert not list(recwarn) and gate.report()["iterations"] == 40
+    with SkipGate(fork) as gate, pytest.warns(RuntimeWarning, match="20 training backwards were seen in 10 iterations"):
+        train(fork)
+
+
 def test_a_gate_that_is_off_refuses_nothing_in_the_first_iteration(monkeypatch):
     monkeypatch.setattr(Inria, "scenes", ("no_scene",))
     sentence = "expects no_scene among the variables"
-    with SkipGate(unknown_fork(), enabled=False) as gate, pytest.warns(RuntimeWarning, match=sentence):
+    off = f"Training goes on, but its counts and times end .*{sentence}"
+    with SkipGate(unknown_fork(), enabled=False) as gate, pytest.warns(RuntimeWarning, match=off):
         train(gate.adapter.trainer)
     assert log.backwards == [*range(1, 41)]
     with SkipGate(unknown_fork()) as gate, pytest.raises(AdapterMismatchError, match="expects no_scene"):
         train(gate.adapter.trainer)
+
+
+OTHER_WAYS = {
+    "number of another name": [("iteration", "it"), ("opt.its", "opt.iterations")],
+    "rates in a helper": [("gaussians.update_learning_rate(iteration)", "set_rates(gaussians, iteration)")],
+    "backward in a helper": [("loss.backward()", "optimise(loss)")],
+    "backward in an inner function": [("loss.backward()", "inner(loss)"), ("\n    pass", f"\n    {INNER}")],
+    "backward in a lambda": [
+        ("loss.backward()", "inner(loss)"),
+        ("\n    pass", "\n    inner = lambda one: one.backward()"),
+    ],
+}
+
+
+@pytest.mark.parametrize("way", OTHER_WAYS)
+def test_a_loop_that_does_the_same_in_other_words_is_gated(way, tmp_path, monkeypatch):
+    source = TRAIN
+    for old, new in (("{before}", "pass"), *OTHER_WAYS[way]):
+        source = source.replace(old, new)
+    monkeypatch.setattr("test_unknown_forks.TRAIN", source)
+    fork = unknown_fork(helper=HELPERS, file=tmp_path / "train.py")
+    with SkipGate(fork, policy=SkipAlways()) as gate:
+        train(fork)
+    assert gate.released is None and gate.report()["backwards_skipped"] == 21
