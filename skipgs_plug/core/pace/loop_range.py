@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.intercept import Patches
-from skipgs_plug.core.source.lines import is_looped_over
+from skipgs_plug.core.source.lines import frame_of, is_looped_over
 
 
 class Owner(Protocol):
@@ -37,12 +37,13 @@ class Owner(Protocol):
 class LoopRange:
     """Counts like the range that it replaces, but asks its owner about each number.
 
-    `len()` is the number of iterations that a progress bar should expect. Everything else is that of the range.
+    `len()` is the number of iterations that a progress bar should expect; the function that asked for the range gets
+    the range's own length. Everything else is that of the range.
 
     Attributes:
         numbers: The range that the loop asked for.
-        source: Code of the function that asked, with the names and values that it had; None if its conditions need not
-            be read.
+        source: Code of the function that asked, with the names and values that it had before the loop; None if its
+            conditions need not be read.
         current: The number that was returned last; None before the first and after the last.
         around: Returns a block that the loop runs in.
     """
@@ -52,8 +53,10 @@ class LoopRange:
         self.current: int | None = None
         self.around: Callable[[], AbstractContextManager[None]] = nullcontext
         self._owner = owner
+        self._asked_by = None if source is None else source[0]
 
     def __iter__(self) -> Iterator[int]:
+        self._read_names()
         with self.around():
             try:
                 for number in self.numbers:
@@ -64,8 +67,17 @@ class LoopRange:
                 self.current = None
                 self._owner.ended(self)
 
+    def _read_names(self) -> None:
+        """Read the names again right before the loop: some may be assigned after the range is made."""
+        frame = None if self.source is None else frame_of(self.source[0])
+        if frame is not None:
+            names = {**frame.f_globals, **frame.f_locals}
+            plain = {name: value.numbers for name, value in names.items() if isinstance(value, LoopRange)}
+            self.source = frame.f_code, {**names, **plain}
+
     def __len__(self) -> int:
-        return self._owner.expected(self)
+        inside = sys._getframe(1).f_code is self._asked_by
+        return len(self.numbers) if inside else self._owner.expected(self)
 
     # Without this method Python would use the length.
     def __bool__(self) -> bool:

@@ -8,7 +8,7 @@ import inspect
 import sys
 import textwrap
 from collections.abc import Container
-from types import CodeType
+from types import CodeType, FrameType
 
 # How messages describe a loop of which iterations can be left out. A data loader must not set its pace.
 GATED_LOOP = (
@@ -58,12 +58,16 @@ def _names(node: ast.AST) -> set[str]:
 
 def line_of(code: CodeType) -> int:
     """Return the present line of the innermost running function with this code; 0 if none is running."""
-    frame = sys._getframe(1)
-    while frame is not None:
-        if frame.f_code is code:
-            return frame.f_lineno
-        frame = frame.f_back  # type: ignore[assignment]
-    return 0
+    frame = frame_of(code)
+    return 0 if frame is None else frame.f_lineno
+
+
+def frame_of(code: CodeType) -> FrameType | None:
+    """Return the frame of the innermost running function with this code; None if none is running."""
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None and frame.f_code is not code:
+        frame = frame.f_back
+    return frame
 
 
 def running_loop(functions: Container[str]) -> str:

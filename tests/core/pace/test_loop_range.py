@@ -126,3 +126,30 @@ def test_a_range_that_a_module_has_of_its_own_is_used_and_comes_back():
     patches.restore()
     assert names["range"] is own
     assert names["train"](3) == [0, 1, 2]
+
+
+def own_length(end):
+    numbers = range(0, end)
+    bar, ran = Bar(numbers), []
+    for number in numbers:
+        ran.append(number)
+    return bar, [*ran, len(numbers)]
+
+
+def test_the_function_itself_gets_the_length_of_its_range():
+    bar, (*ran, length) = train(own_length)
+    assert bar.total == len(ran) == 10 and length == 30
+
+
+def named_between(end):
+    numbers = range(0, end)
+    saves = [7]
+    for number in numbers:
+        return numbers, saves, number
+
+
+def test_names_that_a_function_assigns_after_its_range_are_read():
+    numbers, saves, _ = train(named_between)
+    code, names = numbers.source
+    assert code is named_between.__code__ and names["saves"] is saves
+    assert names["numbers"] == range(0, 30)
