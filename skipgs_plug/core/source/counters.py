@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from types import MethodType
 from typing import Any
 
 from skipgs_plug.core.source.assignments import assignments_in
@@ -17,7 +18,8 @@ def counters(
 ) -> Iterator[str]:
     """Yield the names and attributes to which a loop adds a constant in every iteration, and that it never sets back.
 
-    They are those of the loop, and those of objects whose methods the loop calls in every iteration: `saver.count()`.
+    They are those of the loop, and those of objects that the loop calls in every iteration, as in `saver.count()`, or
+    in `is_due()` for an object that can be called.
 
     Args:
         body: The loop's statements.
@@ -26,12 +28,14 @@ def counters(
         project: The user's project. Methods of libraries are not read.
     """
     yield from _counted(body)
-    for method in (part.func for one in unconditional(body) for part in _always_reached(one)):
-        if isinstance(method, ast.Attribute):
-            function = undecorated(called_function(method, names, lambda place: value_of(place, names, assigned)))
+    for called in (part.func for one in unconditional(body) for part in _always_reached(one)):
+        found = called_function(called, names, lambda place: value_of(place, names, assigned))
+        if isinstance(found, MethodType):
+            function = undecorated(found)
             syntax = None if function is None or function not in project else syntax_of(function)
             if syntax is not None and syntax.args.args:
-                own, owner = f"{syntax.args.args[0].arg}.", ast.unparse(method.value)
+                own = f"{syntax.args.args[0].arg}."
+                owner = ast.unparse(called).removesuffix(f".{syntax.name}")  # an object that is called has no suffix
                 counted = (text for text in _counted(syntax.body) if text.startswith(own))
                 yield from (f"{owner}.{text.removeprefix(own)}" for text in counted)
 
@@ -46,6 +50,7 @@ def _counted(body: Sequence[ast.stmt]) -> Iterator[str]:
 
 
 def _always_reached(statement: ast.stmt) -> Iterator[ast.Call]:
-    """Yield the calls in a statement that has no block."""
-    if isinstance(statement, (ast.Expr, ast.Assign, ast.AnnAssign)):
-        yield from (part for part in ast.walk(statement) if isinstance(part, ast.Call))
+    """Yield the calls in a statement that has no block, or in the condition of an `if`."""
+    reached = statement.test if isinstance(statement, ast.If) else statement
+    if isinstance(reached, (ast.expr, ast.Expr, ast.Assign, ast.AnnAssign)):
+        yield from (part for part in ast.walk(reached) if isinstance(part, ast.Call))

@@ -128,7 +128,7 @@ class InlinedFunctions:
             return ast.copy_location(ast.Call(node, [], []), node), getter
         return None, None
 
-    def _held(self, loop: ast.For) -> list[ast.expr]:
+    def _held(self, loop: ast.For | ast.comprehension) -> list[ast.expr]:
         """Return names for the functions or objects that a loop runs over, such as callbacks; empty if unknown."""
         held, place = callbacks(self._value(loop.iter)), ast.unparse(loop.iter)
         return [self._named(f"{place}[{index}]", one) for index, one in enumerate(held)]
@@ -155,7 +155,7 @@ class InlinedFunctions:
         given = [*call.args, *(keyword.value for keyword in call.keywords)]
         if any(self._is_of(value, numbers) for value in given):
             return True
-        given += [call.func.value] if isinstance(call.func, ast.Attribute) else []
+        given.append(call.func.value if isinstance(call.func, ast.Attribute) else call.func)
         return any(isinstance(one, (ast.Name, ast.Attribute)) and ast.unparse(one) in holders for one in given)
 
     def _is_of(self, value: ast.expr, numbers: Collection[str]) -> bool:
@@ -242,8 +242,8 @@ class InlinedFunctions:
         hidden = len(values) < len(call.args) or any(keyword.arg is None for keyword in call.keywords)
         if isinstance(function, MethodType):
             owner = call.func.value if isinstance(call.func, ast.Attribute) else call.func
-            # super().name(...), a name of the bound method, or an object that is called itself
-            if not self._is_plain(owner) or self._value(owner) is not function.__self__ or owner is call.func:
+            # super().name(...), or a name of the bound method
+            if not self._is_plain(owner) or self._value(owner) is not function.__self__:
                 own = self._names.get("self") is function.__self__
                 owner = ast.Name("self", ast.Load()) if own else self._named(f"{prefix}.self", function.__self__)
             values.insert(0, owner)
@@ -278,9 +278,12 @@ class _Renamed(ast.NodeTransformer):
 
 
 class _Repeated(ast.NodeTransformer):
-    """Replaces a loop over known objects by its statements, once for each object, with the object's name."""
+    """Replaces a loop over known objects by its statements, once for each object, with the object's name.
 
-    def __init__(self, held: Callable[[ast.For], list[ast.expr]]) -> None:
+    So it does with the element of a comprehension, as in `[callback(step) for callback in callbacks]`.
+    """
+
+    def __init__(self, held: Callable[[ast.For | ast.comprehension], list[ast.expr]]) -> None:
         self._held = held
 
     def visit_all(self, body: list[ast.stmt]) -> None:
@@ -293,6 +296,18 @@ class _Repeated(ast.NodeTransformer):
             return self.generic_visit(node)  # type: ignore[return-value]
         name = ast.unparse(node.target)
         return [_Renamed({name: one}).visit(copy.deepcopy(part)) for one in held for part in node.body]
+
+    def visit_ListComp(self, node: ast.ListComp | ast.SetComp | ast.GeneratorExp) -> ast.AST:
+        values, *further = node.generators
+        plain = isinstance(values.target, ast.Name) and not values.ifs and not further
+        held = self._held(values) if plain else []
+        if not held:
+            return self.generic_visit(node)
+        name = ast.unparse(values.target)
+        parts = [_Renamed({name: one}).visit(copy.deepcopy(node.elt)) for one in held]
+        return ast.copy_location(ast.Tuple(parts, ast.Load()), node)
+
+    visit_SetComp = visit_GeneratorExp = visit_ListComp
 
 
 def _bound(syntax: ast.FunctionDef) -> set[str]:

@@ -215,7 +215,7 @@ class TrainingLoop:
     def _moving_limits(self) -> Iterator[Condition]:
         """Yield all comparisons as in `if step >= next_save: next_save += 100`."""
         for function, node in self._nodes():
-            if not isinstance(node, ast.If):
+            if not isinstance(node, (ast.If, ast.While)):
                 continue
             moved = assignments_in(node.body).changed
             for leaf in leaves(node.test):

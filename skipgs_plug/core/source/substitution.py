@@ -7,7 +7,7 @@ import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from skipgs_plug.core.source.evaluator import Evaluator
-from skipgs_plug.core.source.inlining import InlinedFunction
+from skipgs_plug.core.source.inlining import PLACES, InlinedFunction
 
 
 class Substitution(ast.NodeTransformer):
@@ -20,7 +20,7 @@ class Substitution(ast.NodeTransformer):
         functions: Inlined functions by the id of the call, or of the attribute if it is a property. Their statements
             are changed too.
         evaluator: Tells which expressions have values that are known before the loop.
-        assigned_once: Returns whether the loop assigns a name or attribute in one place only.
+        assigned_once: Returns whether the loop assigns a name, attribute or entry in one place only.
     """
 
     def __init__(
@@ -43,16 +43,16 @@ class Substitution(ast.NodeTransformer):
             self.visit(statement)
             for target, value in assigned_values(statement):
                 name = ast.unparse(target)
-                once = isinstance(target, (ast.Name, ast.Attribute)) and self._assigned_once(name)
+                once = isinstance(target, PLACES) and self._assigned_once(name)
                 if once and self._evaluator.is_known(value):
                     self._meanings[name] = value
 
-    def visit_Name(self, node: ast.Name | ast.Attribute) -> ast.AST:
+    def visit_Name(self, node: ast.Name | ast.Attribute | ast.Subscript) -> ast.AST:
         if isinstance(node.ctx, ast.Load) and (meaning := self._meanings.get(ast.unparse(node))) is not None:
             return ast.copy_location(copy.deepcopy(meaning), node)
         return self._result(node)
 
-    visit_Attribute = visit_Name
+    visit_Attribute = visit_Subscript = visit_Name
 
     def visit_NamedExpr(self, node: ast.NamedExpr) -> ast.AST:
         self.generic_visit(node)
@@ -83,7 +83,7 @@ class Substitution(ast.NodeTransformer):
 
 
 def assigned_values(statement: ast.stmt) -> Iterator[tuple[ast.expr, ast.expr]]:
-    """Yield the names and attributes that a statement assigns, with their values."""
+    """Yield the names, attributes and entries that a statement assigns, with their values."""
     match statement:
         case ast.AnnAssign(target, _, ast.expr() as value):
             yield target, value

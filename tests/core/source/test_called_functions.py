@@ -107,6 +107,15 @@ def test_each_of_several_callbacks_is_read():
     assert numbers(loop) == [66, 71, 80]
 
 
+def test_callbacks_in_a_comprehension_are_read_one_by_one():
+    def loop(stop):
+        hooks = [Every(40), lambda step: step == 71 and print("save")]
+        for step in stop(hooks=hooks):
+            [hook(step) for hook in hooks]
+
+    assert numbers(loop) == [71, 80]
+
+
 def test_a_long_list_of_objects_is_no_list_of_callbacks():
     def loop(stop):
         views = [Every(40)] * 17

@@ -1,6 +1,7 @@
 """Milestones read from a loop's source: iterations that must run."""
 
 import re
+from collections import deque
 from types import SimpleNamespace
 
 import numpy as np
@@ -328,6 +329,28 @@ def test_what_the_loop_counts_by_itself_is_warned_of():
     for loop, condition in ((counting, "images % 20"), (attribute, "run.done in (10, 20)")):
         with pytest.warns(RuntimeWarning, match=rf"Line \d+ of .*\({re.escape(condition)}\) counts the iterations"):
             found(loop)
+
+
+def test_a_number_that_is_kept_in_an_entry_of_a_table_is_the_number():
+    def loop(stop):
+        state = {"step": 0, "loss": 0.0}
+        for step in stop(state=state):
+            state["step"] = step
+            if state["step"] % 40 == 0:
+                print("save")
+
+    assert found(loop) == {"step % 40 == 0": [80]}
+
+
+def test_a_queue_that_a_condition_empties_is_warned_of():
+    def loop(stop):
+        saves = deque([70, 80])
+        for step in stop(saves=saves):
+            while saves and step >= saves[0]:
+                saves.popleft()
+
+    with pytest.warns(RuntimeWarning, match=r"\(step >= saves\[0\]\) moves its own limit"):
+        assert found(loop) == {}
 
 
 def test_a_limit_that_a_condition_moves_is_warned_of():

@@ -197,3 +197,24 @@ def test_a_limit_that_an_object_moves_is_warned_of():
 
     with pytest.warns(RuntimeWarning, match=r"Line 53 of \S*tables.py \(step >= state.limit\) moves its own limit"):
         found(loop)
+
+
+class Every20th:
+    """An object that is called in each iteration, and counts the calls."""
+
+    calls = 0
+
+    def __call__(self):
+        self.calls += 1
+        return self.calls % 20 == 0
+
+
+def test_an_object_that_counts_its_own_calls_is_warned_of():
+    def loop(stop):
+        is_due = Every20th()
+        for _step in stop(is_due=is_due):
+            if is_due():
+                print("save")
+
+    with pytest.warns(RuntimeWarning, match=r"\(is_due.calls % 20 == 0\) counts the iterations"):
+        found(loop)
