@@ -7,6 +7,7 @@ import copy
 import dis
 import inspect
 import itertools
+import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from types import CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
@@ -103,9 +104,11 @@ class InlinedFunctions:
         """
         nodes = [node for statement in body for node in _reached(statement)]
         for node in nodes:
-            if isinstance(node, ast.Assign) and self._is_of(node.value, numbers):
-                numbers |= {ast.unparse(target) for target in node.targets if isinstance(target, PLACES)}
-        holders = {holder for text in numbers for holder in itertools.accumulate(text.split(".")[:-1], "{}.{}".format)}
+            if isinstance(node, ast.Assign):
+                texts = [ast.unparse(target) for target in node.targets if isinstance(target, PLACES)]
+                held = [found for text in texts for found in held_in(text, node.value).items()]
+                numbers |= {text for text, value in held if self._is_of(value, numbers)}
+        holders = {text[: end.start()] for text in numbers for end in re.finditer(r"[.[]", text)}
         for node in nodes:
             call, function = self._called(node, numbers, holders)
             plain = undecorated(function)
@@ -308,6 +311,14 @@ class _Repeated(ast.NodeTransformer):
         return ast.copy_location(ast.Tuple(parts, ast.Load()), node)
 
     visit_SetComp = visit_GeneratorExp = visit_ListComp
+
+
+def held_in(name: str, value: ast.expr) -> dict[str, ast.expr]:
+    """Return the values that a name holds, as source text: its own, and those of the entries of a dictionary."""
+    if not isinstance(value, ast.Dict):
+        return {name: value}
+    entries = zip(value.keys, value.values, strict=True)
+    return {f"{name}[{ast.unparse(key)}]": one for key, one in entries if isinstance(key, ast.Constant)}
 
 
 def _bound(syntax: ast.FunctionDef) -> set[str]:

@@ -7,7 +7,7 @@ import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from skipgs_plug.core.source.evaluator import Evaluator
-from skipgs_plug.core.source.inlining import PLACES, InlinedFunction
+from skipgs_plug.core.source.inlining import PLACES, InlinedFunction, held_in
 
 
 class Substitution(ast.NodeTransformer):
@@ -44,8 +44,9 @@ class Substitution(ast.NodeTransformer):
             for target, value in assigned_values(statement):
                 name = ast.unparse(target)
                 once = isinstance(target, PLACES) and self._assigned_once(name)
-                if once and self._evaluator.is_known(value):
-                    self._meanings[name] = value
+                if once:
+                    known = {text: one for text, one in held_in(name, value).items() if self._evaluator.is_known(one)}
+                    self._meanings |= known
 
     def visit_Name(self, node: ast.Name | ast.Attribute | ast.Subscript) -> ast.AST:
         if isinstance(node.ctx, ast.Load) and (meaning := self._meanings.get(ast.unparse(node))) is not None:

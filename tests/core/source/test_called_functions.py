@@ -107,6 +107,22 @@ def test_each_of_several_callbacks_is_read():
     assert numbers(loop) == [66, 71, 80]
 
 
+def test_a_function_that_gets_the_number_in_a_table_is_read():
+    def evaluate(info, state):
+        if info["step"] % 45 == 0 or state["late"] == 25:
+            print("evaluate")
+
+    def loop(stop):
+        state = {}
+        for step in stop(state=state, evaluate=evaluate):
+            loss = len(str(step))
+            state["late"] = step - 50
+            info = {"step": step, "loss": loss}
+            evaluate(info, state)
+
+    assert numbers(loop) == [75, 90]
+
+
 def test_callbacks_in_a_comprehension_are_read_one_by_one():
     def loop(stop):
         hooks = [Every(40), lambda step: step == 71 and print("save")]
