@@ -10,7 +10,6 @@ from __future__ import annotations
 import sys
 import types
 import weakref
-from collections import ChainMap
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,7 +20,7 @@ from skipgs_plug.adapters import registry
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import last_calls
-from skipgs_plug.adapters.loop_code import LOOP, LoopCode, loop_around
+from skipgs_plug.adapters.loop_code import LOOP, LoopCode, names_around
 from skipgs_plug.adapters.unknown_forks import BY_HAND, CALLS, Unrecognised, begin_after, left_alone, unrecognised
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
@@ -232,9 +231,8 @@ class InriaFamily(AbstractAdapter):
         with hooks.guarded():
             # Variables of the loop are read once, before they hold the graph of an iteration.
             if self._model() is not model:
-                frame = loop_around(caller)
-                self._refuse_fork(LoopCode.of_module(frame.f_globals))
-                self._read_run(hooks, ChainMap(frame.f_locals, frame.f_globals))
+                self._refuse_fork(LoopCode.of_module(caller.f_globals))
+                self._read_run(hooks, names_around(caller))
                 self._model = weakref.ref(model)
                 hooks.check_drift(self._optimizers_of_model)
             else:
@@ -248,7 +246,12 @@ class InriaFamily(AbstractAdapter):
         """Attach to the loop's backward and to its range."""
         hooks.gate_tensor_backward(*code.callers)
         hooks.loop(
-            script, LOOP, always=self.always_run, pure=self.pure, densification=self.densification, known=self._known
+            script,
+            *{LOOP, *code.callers},
+            always=self.always_run,
+            pure=self.pure,
+            densification=self.densification,
+            known=self._known,
         )
 
     def _known(self, names: Mapping[str, Any]) -> Mapping[str, Any]:

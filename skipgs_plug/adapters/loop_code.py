@@ -7,6 +7,7 @@ import dis
 import inspect
 import platform
 import types
+from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -118,12 +119,14 @@ class LoopCode(NamedTuple):
         )
 
 
-def loop_around(frame: types.FrameType) -> types.FrameType:
-    """Return the innermost frame of `training` around a frame; the frame itself if there is none."""
-    around: types.FrameType | None = frame
-    while around is not None and around.f_code.co_name != LOOP:
-        around = around.f_back
-    return around or frame
+def names_around(caller: types.FrameType) -> Mapping[str, Any]:
+    """Return the names of the function that calls, of the functions around it up to `training`, and of the script."""
+    frames = [caller]
+    while frames[-1].f_code.co_name != LOOP and (outer := frames[-1].f_back) is not None:
+        frames.append(outer)
+    if frames[-1].f_code.co_name != LOOP:
+        frames = [caller]
+    return ChainMap(*(dict(frame.f_locals) for frame in frames), frames[-1].f_globals)
 
 
 def function_names(function: Callable[..., Any]) -> dict[str, Any]:

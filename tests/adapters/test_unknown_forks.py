@@ -282,6 +282,10 @@ OTHER_WAYS = {
     "rates in a helper": [("gaussians.update_learning_rate(iteration)", "set_rates(gaussians, iteration)")],
     "backward in a helper": [("loss.backward()", "optimise(loss)")],
     "backward in an inner function": [("loss.backward()", "inner(loss)"), ("\n    pass", f"\n    {INNER}")],
+    "loop in an inner function": [
+        ("    for iteration", "    def run(*, opt=opt, scene=scene):\n     for iteration"),
+        ("{after}", "run()"),
+    ],
     "backward in a lambda": [
         ("loss.backward()", "inner(loss)"),
         ("\n    pass", "\n    inner = lambda one: one.backward()"),
