@@ -7,6 +7,8 @@ wraps these names, whichever module imported them.
 
 from __future__ import annotations
 
+import functools
+import inspect
 import sys
 import types
 import weakref
@@ -204,16 +206,18 @@ class InriaFamily(AbstractAdapter):
     def _attach_to_renderer(self, hooks: Hooks, names: dict[str, Any]) -> None:
         """Learn the training view from calls of the renderers."""
 
-        def rendered(original: Callable[..., Any], camera: Any, *args: Any, **kwargs: Any) -> Any:
+        def rendered(first: str, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            camera = args[0] if args else kwargs.get(first)
             # A camera without a name is the viewer's, which renders before the training view.
-            if self.is_training_render(args, kwargs) and (key := self.view_key(camera)) is not None:
+            if self.is_training_render(args[1:], kwargs) and (key := self.view_key(camera)) is not None:
                 hooks.view(key)
-            return original(camera, *args, **kwargs)
+            return original(*args, **kwargs)
 
         self._renderers(names)
         for name in self.renders:
             if name in names:
-                hooks.wrap(names, name, rendered)
+                first = next(iter(inspect.signature(names[name]).parameters), "")
+                hooks.wrap(names, name, functools.partial(rendered, first))
 
     def _attach_to_model(self, hooks: Hooks, names: dict[str, Any]) -> None:
         """Learn iterations and structural changes from calls of the model's methods."""

@@ -36,8 +36,19 @@ CALLS = frozenset(
         "update_learning_rate",
     }
 )
-# Arguments that these loops pass to `render` by name.
-ARGUMENTS = frozenset({"scaling_modifier", "override_color", "separate_sh", "use_trained_exp"})
+# Arguments that these loops pass to `render`.
+ARGUMENTS = frozenset(
+    {
+        "viewpoint_camera",
+        "pc",
+        "pipe",
+        "bg_color",
+        "scaling_modifier",
+        "override_color",
+        "separate_sh",
+        "use_trained_exp",
+    }
+)
 BY_HAND = "Gate it by hand with SkipGate(start_iter=...), or write an adapter (CONTRIBUTING.md)."
 
 

@@ -16,7 +16,7 @@ from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
 from skipgs_plug.commands.options.run import Args
 from skipgs_plug.compat import FAMILIES, serve
-from skipgs_plug.core.errors import BrokenTrainingError
+from skipgs_plug.core.errors import AdapterMismatchError, BrokenTrainingError
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster import ADAM_REPLACED, instead_of_torchs_adam
 from skipgs_plug.files import WriteError
@@ -64,7 +64,7 @@ def find_adapter(args: Args, command: list[str]) -> str | None:
     """
     try:
         return find_script_adapter(source_of(command)).name
-    except UnknownTrainerError as error:
+    except (UnknownTrainerError, AdapterMismatchError) as error:  # the script may be compiled, or a zip archive
         if not args.no_gate:
             raise
         if args.cpu:

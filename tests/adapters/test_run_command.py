@@ -4,6 +4,7 @@ import errno
 import io
 import json
 import os
+import py_compile
 import subprocess
 import sys
 import textwrap
@@ -302,6 +303,15 @@ def test_a_checkpoint_may_be_an_open_file(checkout, train, capfd):
     assert f"The gate takes its state from {whole / 'chkpnt40.pth.skipgs.json'}." in capfd.readouterr().err
 
 
+def test_no_gate_runs_a_compiled_script(tmp_path, capfd):
+    source, script = tmp_path / "train.py", tmp_path / "train.pyc"
+    source.write_text("print('trained')")
+    py_compile.compile(str(source), str(script))
+    assert cli.main(["run", "auto", "--no-gate", "--", str(script)]) == 0
+    assert capfd.readouterr().out == "trained\n"
+    assert cli.main(["run", "auto", "--", str(script)]) == cli.BAD_INPUT
+
+
 def test_no_gate_runs_a_script_that_no_adapter_knows(tmp_path, capfd):
     script = tmp_path / "train.py"
     script.write_text("import pathlib, sys\npathlib.Path(sys.argv[1]).write_text('trained')\nsys.exit(3)\n")
@@ -500,7 +510,7 @@ def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
     forget()
     script = Path(checkout)
     script.write_text(script.read_text().replace("loss.backward()", "loss.mul_(1); loss.backward()"))
-    with pytest.warns(RuntimeWarning, match=r"goes on without it.* itself changes values \(mul_\)"):
+    with pytest.warns(RuntimeWarning, match=r"Training goes on, but its counts.* itself changes values \(mul_\)"):
         assert cli.main(["run", "auto", "--no-gate", "--cpu", "--", checkout, str(tmp_path)]) == 0
     forget()
     assert cli.main(["run", "auto", "--cpu", "--", checkout, str(tmp_path)]) == cli.BAD_INPUT

@@ -54,8 +54,8 @@ class GaussianModel(SplatModel):
             one["params"][0] = self.values[one["name"]] = torch.nn.Parameter(one["params"][0].detach()[:-1])
 
 
-def render(camera, gaussians, kernel_size=0.3):
-    return draw(camera, gaussians.values)
+def render(viewpoint_camera, pc, kernel_size=0.3):
+    return draw(viewpoint_camera, pc.values)
 
 
 @pytest.fixture
@@ -280,6 +280,7 @@ def test_a_gate_that_is_off_refuses_nothing_in_the_first_iteration(monkeypatch):
 OTHER_WAYS = {
     "number of another name": [("iteration", "it"), ("opt.its", "opt.iterations")],
     "rates in a helper": [("gaussians.update_learning_rate(iteration)", "set_rates(gaussians, iteration)")],
+    "camera by keyword": [("render(viewpoint_cam, gaussians", "render(viewpoint_camera=viewpoint_cam, pc=gaussians")],
     "backward in a helper": [("loss.backward()", "optimise(loss)")],
     "backward in an inner function": [("loss.backward()", "inner(loss)"), ("\n    pass", f"\n    {INNER}")],
     "loop in an inner function": [
