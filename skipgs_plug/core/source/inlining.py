@@ -283,7 +283,7 @@ class _Renamed(ast.NodeTransformer):
 class _Repeated(ast.NodeTransformer):
     """Replaces a loop over known objects by its statements, once for each object, with the object's name.
 
-    So it does with the element of a comprehension, as in `[callback(step) for callback in callbacks]`.
+    The element of a comprehension is replaced in the same way, as in `[callback(step) for callback in callbacks]`.
     """
 
     def __init__(self, held: Callable[[ast.For | ast.comprehension], list[ast.expr]]) -> None:
