@@ -16,6 +16,7 @@ from skipgs_plug.adapters.loop_bounds import function_of
 from skipgs_plug.core.errors import AdapterMismatchError
 
 LOOP = "training"  # name of the function that holds the loop, in the whole Inria family
+RATES = "update_learning_rate"  # method of the model that each iteration calls with its number
 
 
 class LoopCode(NamedTuple):
@@ -27,7 +28,7 @@ class LoopCode(NamedTuple):
         functions: Names of its functions and classes.
         backward: Names of its functions that call `backward`, themselves or in a function inside them.
         callers: Names of the functions that call the training backward: `training`, functions inside it, or else
-            functions of the script that its loop calls. Empty if its loop is elsewhere.
+            functions of the script that its loop calls. Empty if the loop that sets the rates is in another function.
         used: Every global and attribute that `training` and the functions that it calls use. Empty if there is no
             function `training`.
         repeated: The subset of `used` inside the loop itself and in functions that the loop calls.
@@ -52,7 +53,7 @@ class LoopCode(NamedTuple):
         """Name of the variable that holds the iteration's number: the one that `update_learning_rate` receives."""
         for node in () if self.syntax is None else ast.walk(self.syntax):
             match node:
-                case ast.Call(ast.Attribute(_, "update_learning_rate"), [ast.Name(name), *_]):
+                case ast.Call(ast.Attribute(_, attr), [ast.Name(name), *_]) if attr == RATES:
                     return name
         return "iteration"
 
@@ -65,8 +66,7 @@ class LoopCode(NamedTuple):
             for name, value in namespace.items()
             if isinstance(value, types.FunctionType) and value.__globals__ is namespace
         }
-        syntax = function_of(namespace[LOOP], LOOP) if LOOP in functions else None
-        return cls._made(source, set(namespace), functions, syntax)
+        return cls._made(source, set(namespace), functions, lambda name: function_of(namespace[name], name))
 
     @classmethod
     def of_script(cls, path: Path) -> LoopCode:
@@ -82,16 +82,23 @@ class LoopCode(NamedTuple):
                 f"{path} is not a script for Python {platform.python_version()}: {error}."
             ) from error
         functions = {const.co_name: const for const in script.co_consts if isinstance(const, types.CodeType)}
-        return cls._made(str(path), {*script.co_names, *functions}, functions, function_of(path, LOOP))
+        return cls._made(str(path), {*script.co_names, *functions}, functions, lambda name: function_of(path, name))
 
     @classmethod
     def _made(
-        cls, source: str, own: set[str], functions: Mapping[str, types.CodeType], syntax: ast.FunctionDef | None
+        cls,
+        source: str,
+        own: set[str],
+        functions: Mapping[str, types.CodeType],
+        syntax_of: Callable[[str], ast.FunctionDef | None],
     ) -> LoopCode:
         backward = {name for name, code in functions.items() if _callers(code)}
         if LOOP not in functions:
             return cls(source, frozenset(own), frozenset(functions), frozenset(backward))
-        training = functions[LOOP]
+        training, syntax = functions[LOOP], syntax_of(LOOP)
+        helpers = [
+            name for name in _called_in_loops(syntax) & backward if RATES not in _called_in_loops(syntax_of(name))
+        ]
         repeated, stored = _in_loop(training, syntax)
         called = _called(repeated, functions)
         parts = [part for code in (training, *called) for part in _with_inner(code)]
@@ -110,7 +117,7 @@ class LoopCode(NamedTuple):
             frozenset(own | of_loop),
             frozenset(functions),
             frozenset(backward),
-            frozenset(_callers(training) or backward.intersection(_called_in_loops(syntax))),
+            frozenset(_callers(training) or helpers),
             frozenset(of_loop | of_called),
             frozenset(repeated | of_called),
             keywords,
@@ -153,10 +160,14 @@ def _callers(code: types.CodeType) -> set[str]:
 
 
 def _called_in_loops(syntax: ast.FunctionDef | None) -> set[str]:
-    """Names of the functions that a function calls in its loops."""
+    """Names of the functions and methods that a function calls in its loops."""
     loops = [] if syntax is None else [node for node in ast.walk(syntax) if isinstance(node, (ast.For, ast.While))]
     called = [node.func for loop in loops for node in ast.walk(loop) if isinstance(node, ast.Call)]
-    return {function.id for function in called if isinstance(function, ast.Name)}
+    return {
+        function.id if isinstance(function, ast.Name) else function.attr
+        for function in called
+        if isinstance(function, (ast.Name, ast.Attribute))
+    }
 
 
 def _in_loop(code: types.CodeType, syntax: ast.FunctionDef | None) -> tuple[set[str], set[str]]:
