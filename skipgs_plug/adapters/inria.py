@@ -291,12 +291,13 @@ class InriaFamily(AbstractAdapter):
             )
 
     def _refuse_loop_elsewhere(self, code: LoopCode) -> None:
-        """Refuse a script whose loop is in a function that `training` calls, such as the two stages of 4DGaussians."""
+        """Refuse a script whose `training` calls no backward; in 4DGaussians, another function has the loop."""
         if not code.callers:
-            where = ", ".join(f"{name}()" for name in sorted(code.backward & code.used)) or "another module"
+            callers = ", ".join(f"{name}()" for name in sorted(code.backward & code.used))
+            calls = f"{callers} calls backward in its place" if callers else "nor does another function in this file"
             raise AdapterMismatchError(
-                f"{self.difference(code)}: its training loop is in {where}, not in {LOOP}(), as in 4DGaussians, and is "
-                f"not supported. {BY_HAND}"
+                f"{self.difference(code)}: {LOOP}() does not call loss.backward(), {calls}, and such a loop is not "
+                f"supported. {BY_HAND}"
             )
 
     def _read_run(self, hooks: Hooks, loop: Mapping[str, Any]) -> None:

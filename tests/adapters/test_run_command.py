@@ -433,7 +433,7 @@ def test_loop_outside_of_training_is_refused_before_anything_is_imported(checkou
     Path(checkout).write_text(source.replace("if __name__", stages))
     assert cli.main(["run", "auto", "--cpu", "--", checkout, str(tmp_path)]) == cli.BAD_INPUT
     error = capfd.readouterr().err
-    assert "its training loop is in scene_reconstruction(), not in training(), as in 4DGaussians, and is not" in error
+    assert "loss.backward(), scene_reconstruction() calls backward in its place, and such a loop is not" in error
     assert "gaussian_renderer" not in sys.modules
 
 
