@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import time
 import weakref
 from collections.abc import Iterator
 from typing import Any
@@ -22,6 +23,9 @@ from skipgs_plug.core.errors import BrokenTrainingError, SkipGSError
 _END, _RELEASE, _POISONED, _RUN, _SKIP = range(5)
 
 _failures = itertools.count()  # number of the next call of `all_failed`
+
+# Seconds for which a rank waits in its first iteration until all ranks have gates. Before, they load the same scene.
+GATES_AWAITED = 120.0
 
 _AVAILABLE = dist.is_available()  # whether this build of PyTorch has torch.distributed
 
@@ -41,6 +45,37 @@ def refuse_unreachable_ranks(world_size: int | None = None) -> None:
             f"{world} processes train together, but torch.distributed is not initialised, so their gates "
             "cannot agree; call init_process_group() first, or train in one process."
         )
+
+
+def require_gates() -> None:
+    """Raise SkipGSError unless all processes that train together have gates. All ranks must call it before they train.
+
+    A launcher that starts a script again, such as Lightning's, leaves its copies without gates. Their reductions would
+    meet those of the gates. The ranks meet once in a process group, through its store.
+    """
+    refuse_unreachable_ranks()
+    size = group_size()
+    if size == 1 or _world() in _have_gates:
+        return
+    store = dist.distributed_c10d._get_default_store()
+    shown = [f"skipgs_plug/gate of rank {rank}" for rank in range(size)]
+    end = time.monotonic() + GATES_AWAITED
+    with _answered():
+        store.set(shown[dist.get_rank()], "1")
+        while not store.check(shown):
+            if time.monotonic() > end:
+                missing = ", ".join(str(rank) for rank in range(size) if not store.check([shown[rank]]))
+                sentence = (
+                    f"{size} processes train together, and rank {missing} began no iteration with a gate within "
+                    f"{GATES_AWAITED:g} s"
+                )
+                start = f"torchrun --nproc_per_node {size} -m skipgs_plug run"
+                raise SkipGSError(
+                    f"{sentence}; create a gate in every process, or train in one process.",
+                    in_script=f"{sentence}; start all by {start} ADAPTER -- SCRIPT, or train in one process.",
+                )
+            time.sleep(0.01)
+    _have_gates.add(_world())
 
 
 def refuse_several(because: str, instead: str) -> None:
@@ -133,6 +168,7 @@ def united(found: dict[str, set[int]]) -> dict[str, set[int]]:
     size = group_size()
     if size == 1:
         return found
+    require_gates()  # conditions are read before the first iteration
     of_ranks: list[Any] = [None] * size
     with _answered():
         dist.all_gather_object(of_ranks, found, group=None if "cpu" in _devices() else _gloo_group())
@@ -178,6 +214,8 @@ def _devices() -> set[str]:
 def _world() -> Any:
     return dist.group.WORLD
 
+
+_have_gates: weakref.WeakSet[Any] = weakref.WeakSet()  # process groups whose ranks all have gates
 
 # Our gloo group by the trainer's group. Both references are weak: `destroy_process_group` must be able to end our
 # group's threads. A group that lives until the interpreter ends can abort the process there.

@@ -94,7 +94,6 @@ class Engine:
         self._saved_state = saved_state
         self._view_names: list[str] | None = None
         self._pending_state: dict[str, Any] | None = None
-        self._ranks_checked = False
         self._scene_check = SceneCheck()
 
     def configure(self, info: TrainerInfo, given: frozenset[str] = frozenset()) -> None:
@@ -165,7 +164,10 @@ class Engine:
 
         Raises:
             GateOrderError: The number is smaller than that of the previous iteration.
+            SkipGSError: This is the first iteration, and a process that trains together with this one has no gate.
         """
+        if not self.iteration.opened and self.config.enabled:
+            distributed.require_gates()
         if self.iteration.step is None:
             self._go_on_from_saved(step)
             self._saved_state = None
@@ -369,9 +371,6 @@ class Engine:
 
     def _agreed(self, view: str, loss: float, step: int, signal: float | Tensor | HostCopy) -> Decision:
         if distributed.group_size() == 1:
-            if not self._ranks_checked:
-                distributed.refuse_unreachable_ranks()
-                self._ranks_checked = True
             return self._own(view, loss, step)
         device = signal.device if isinstance(signal, Tensor) else None
         own, answer = self.release.agreed(lambda: self._own(view, loss, step), step, device)

@@ -228,6 +228,32 @@ def test_losses_that_stay_non_finite_on_one_rank_end_loops_of_ones_own_on_all(tm
     assert "like the 9 losses before it" in two["said"] and one["said"] and one["released"] is None
 
 
+def train_beside_no_gate(rank: int, folder: str, share: float | None) -> None:
+    """Rank 1 has no gate, like the processes in which Lightning 2.6.6 runs a script (`Fabric(devices=2)`) again."""
+    start(rank, folder, seconds=20)
+    distributed.GATES_AWAITED = 1.0
+    parameter = torch.nn.Parameter(torch.ones(1))
+    try:
+        gate = None if rank else SkipGate(start_iter=20, share=share)
+        for step in range(40) if gate is None else gate.iterations(range(40), events=[5, 10]):
+            if gate is None:
+                parameter.sum().backward()
+            else:
+                gate.backward(parameter.sum(), view=f"v{step % 3}", step=step)
+            dist.all_reduce(parameter.grad)
+    except RuntimeError as error:  # on rank 1 the error of a group whose other process has ended
+        Path(folder, f"{rank}.txt").write_text(str(error))
+    os._exit(0)  # a broken group is not left in order
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("share", [None, 0.5])
+def test_a_rank_without_a_gate_is_refused_before_training(tmp_path: Path, share: float | None) -> None:
+    mp.spawn(train_beside_no_gate, args=(str(tmp_path), share), nprocs=2)
+    assert "rank 1 began no iteration with a gate within 1 s; create" in (tmp_path / "0.txt").read_text()
+    assert (tmp_path / "1.txt").exists()
+
+
 class Inactive(SkipPolicy):
     """A policy that begins later than the gate."""
 
