@@ -62,19 +62,19 @@ def require_gates() -> None:
     end = time.monotonic() + GATES_AWAITED
     with _answered():
         store.set(shown[dist.get_rank()], "1")
-        while not store.check(shown):
-            if time.monotonic() > end:
-                missing = ", ".join(str(rank) for rank in range(size) if not store.check([shown[rank]]))
-                sentence = (
-                    f"{size} processes train together, and rank {missing} began no iteration with a gate within "
-                    f"{GATES_AWAITED:g} s"
-                )
-                start = f"torchrun --nproc_per_node {size} -m skipgs_plug run"
-                raise SkipGSError(
-                    f"{sentence}; create a gate in every process, or train in one process.",
-                    in_script=f"{sentence}; start all by {start} ADAPTER -- SCRIPT, or train in one process.",
-                )
+        while not store.check(shown) and time.monotonic() < end:
             time.sleep(0.01)
+        missing = [str(rank) for rank in range(size) if not store.check([shown[rank]])]
+    if missing:
+        sentence = (
+            f"{size} processes train together, and rank {', '.join(missing)} began no iteration with a gate within "
+            f"{GATES_AWAITED:g} s"
+        )
+        start = f"torchrun --nproc_per_node {size} -m skipgs_plug run"
+        raise SkipGSError(
+            f"{sentence}; create a gate in every process, or train in one process.",
+            in_script=f"{sentence}; start all by {start} ADAPTER -- SCRIPT, or train in one process.",
+        )
     _have_gates.add(_world())
 
 
