@@ -58,6 +58,8 @@ def require_gates() -> None:
     if size == 1 or _world() in _have_gates:
         return
     store = dist.distributed_c10d._get_default_store()
+    if store is None:  # MPI starts all ranks with the same command
+        return
     shown = [f"skipgs_plug/gate of rank {rank}" for rank in range(size)]
     end = time.monotonic() + GATES_AWAITED
     with _answered():
