@@ -35,10 +35,14 @@ class Pace:
     Attributes:
         number: Number of the iteration that the training loop is in; None while the loop is unknown, and after it.
         gap: Number of iterations that were left out right before the present one.
+        ran: Number of iterations of the training loop that ran in this process, with the present one.
+        left_out: Number of iterations of the training loop that were left out before the present one.
     """
 
     number: int | None = None
     gap: int = 0
+    ran: int = 0
+    left_out: int = 0
 
     def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
         """Receive the facts about the trainer.

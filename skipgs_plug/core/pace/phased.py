@@ -48,7 +48,7 @@ class Phased(Pace):
         self._finder = LoopFinder()
         self._facts = LoopFacts(config.always)
         self._planned: LoopRange | None = None  # loop whose conditions were read; nothing in it is refused after that
-        self._left_out = 0
+        self._left_out = 0  # since the last iteration that ran
         self._attached = False  # whether an adapter described the loop
         self._asked = False  # whether the user was told, in the first iteration, that the loop is not known
         self._configured = self._removed = False
@@ -116,8 +116,10 @@ class Phased(Pace):
         if not self._attached and self.number is None and not self._removed:
             self._ask_for_loop(needed)
         self._asked = True
-        if self._finder.begins(step, needed) and step >= self._facts.start:
-            self.refining.count_first(step)
+        if self._finder.begins(step, needed):
+            self.ran += 1  # the loop asked about it before it was known
+            if step >= self._facts.start:
+                self.refining.count_first(step)
 
     # Questions of loops.
 
@@ -133,13 +135,23 @@ class Phased(Pace):
             SkipGSError: The loop's conditions cannot be evaluated ahead. It is raised at the first number that could be
                 left out, never later, and before any training.
         """
-        if self._removed:
-            return True
-        try:
-            return self._runs(loop, number)
-        except Exception as error:
-            self._release.on_error(error, number, refuses=self._planned is not loop)
-            return True
+        runs = True
+        if not self._removed:
+            try:
+                runs = self._runs(loop, number)
+            except Exception as error:
+                self._release.on_error(error, number, refuses=self._planned is not loop)
+        if loop is self._finder.found:
+            self._count(runs)
+        return runs
+
+    def _count(self, runs: bool) -> None:
+        if not runs:
+            self._left_out += 1
+            return
+        self.gap, self._left_out = self._left_out, 0
+        self.ran += 1
+        self.left_out += self.gap
 
     def _runs(self, loop: LoopRange, number: int) -> bool:
         if number == loop.numbers.start > 0 and self.wants_loop:
@@ -150,11 +162,9 @@ class Phased(Pace):
             self._read(loop, number)
         runs = self._phase(number).runs(number)
         if runs:
-            self.gap, self._left_out = self._left_out, 0
-            if self.gap:
+            if self._left_out:
                 self._facts.bars.catch_up()
         else:
-            self._left_out += 1
             self._facts.bars.left_out(number)
         return runs
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import weakref
 from collections.abc import Callable, Iterator
+from fractions import Fraction
 from threading import Lock, get_ident
 from typing import Any, NamedTuple
 
@@ -69,7 +70,7 @@ class _Schedulers:
         number = self._pace.number
         if self._under_way or number is None or args or kwargs:  # a step to a given epoch counts nothing
             return original(scheduler, *args, **kwargs)
-        steps = self._known.setdefault(scheduler, _Steps())
+        steps = self._known.setdefault(scheduler, _Steps(self._pace))
         self._under_way = True
         try:
             for _ in range(steps.due(self._pace, number, scheduler)):
@@ -112,42 +113,63 @@ class _Steps:
     A scheduler steps in every iteration if it steps in one that no condition of the loop names. Until then it may step
     in every hundredth iteration, for example. Such a scheduler lacks no step, because its iterations are not left out.
 
+    A library may count iterations itself, and step a scheduler in every fourth that runs. Each step is then one for
+    four iterations, so the iterations left out since the last step count a quarter each.
+
     A loop of the user's own can make up for left-out iterations itself: by further calls of `step`, which then do
-    nothing here, or by setting the epoch of the scheduler.
+    nothing here, or by setting the epoch of the scheduler. Another loop may step twice in each iteration. The first
+    iteration without a gap shows the usual number of calls; until then, second calls do nothing and are noted down.
+
+    A new scheduler counts as one that stepped in the iteration before.
+
+    Args:
+        pace: Leaves out iterations.
 
     Attributes:
         at: Epoch of the scheduler after its last step here; None if it has none.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, pace: Pace) -> None:
         self.at: Any = None
         self._in_every_iteration = False
-        self._left_out = 0
-        self._made_in: int | None = None  # iteration that made the scheduler, if the loop did
         self._number: int | None = None  # last iteration with a call
+        self._ran, self._left_out = pace.ran - 1, pace.left_out - pace.gap  # as of that iteration
+        self._lacks = Fraction(0)  # steps that each call in that iteration lacks
         self._calls = 0  # calls in that iteration
         self._ahead = 0  # steps in that iteration that were made before the loop asked for them
-        self._usual = 1  # calls in an iteration that follows on the one before it
+        self._missing = Fraction(0)
+        self._usual: int | None = None  # calls in an iteration without a gap; None while unknown
+        self._noted = Fraction(0)  # steps for the calls that did nothing while it was unknown
 
     def due(self, pace: Pace, number: int, scheduler: Any) -> int:
         """Return the number of steps to make at a call in iteration `number`, the present one."""
         if not hasattr(scheduler, "_last_lr"):  # its first step, which its class makes
-            self._made_in = number
+            self._number, self._ran, self._left_out = number, pace.ran, pace.left_out
             return 1
-        gap = 0 if number == self._made_in else pace.gap
         if number != self._number:
-            self._number, self._calls, self._ahead = number, 0, 0
+            self._begin(pace, number)
         self._calls += 1
-        if not gap:
-            self._usual = max(self._usual, self._calls)
-        elif self._calls > self._usual and self._ahead:
+        if self._lacks and self._calls > (self._usual or 1) and self._ahead:
             self._ahead -= 1
+            if self._usual is None:
+                self._noted += 1 + self._lacks
             return 0
         moved_by_loop = self.at is not None and scheduler.last_epoch != self.at
-        self._left_out = 0 if moved_by_loop else self._left_out + gap
+        self._missing = Fraction(0) if moved_by_loop else self._missing + self._lacks
         self._in_every_iteration = self._in_every_iteration or not pace.is_named(number)
         if not self._in_every_iteration:
             return 1
-        missing, self._left_out = self._left_out, 0
+        missing = int(self._missing)
+        self._missing -= missing
         self._ahead += missing
         return 1 + missing
+
+    def _begin(self, pace: Pace, number: int) -> None:
+        """Begin an iteration, and learn from the calls in the last one."""
+        if self._calls and not self._lacks:
+            if self._usual is None and self._calls > 1:
+                self._missing += self._noted
+            self._usual = max(self._usual or 1, self._calls)
+        self._lacks = Fraction(pace.left_out - self._left_out, pace.ran - self._ran)
+        self._number, self._ran, self._left_out = number, pace.ran, pace.left_out
+        self._calls = self._ahead = 0
