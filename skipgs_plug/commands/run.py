@@ -48,7 +48,8 @@ def run(args: Args) -> int:
     with spawned.gated_when_spawned(functools.partial(run_spawned, args, command)) as processes:
         stand_ins = FAMILIES.get(get_adapter(args.adapter).stand_ins_for(command), {})
         execute = functools.partial(run_script, command, on_cpu=args.cpu, stand_ins=stand_ins)
-        code, gate = run_gated(args, command, execute)
+        rank = int(os.environ.get("RANK") or 0)  # torchrun sets it
+        code, gate = run_gated(args, command, execute, rank)
     verify(code, gate)
     seen = args.no_gate if gate is None else gate.trained or gate.released
     if code == 0 and not processes and not seen:

@@ -187,6 +187,13 @@ def test_failing_script_keeps_its_code_and_leaves_a_report(checkout, tmp_path):
     assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 4
 
 
+@pytest.mark.parametrize("rank", [0, 1])
+def test_only_the_first_process_of_torchrun_reports(checkout, tmp_path, monkeypatch, capfd, rank):
+    monkeypatch.setenv("RANK", str(rank))
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 0
+    assert (tmp_path / "skipgs.json").exists() == ("SkipGS: " in capfd.readouterr().err) == (rank == 0)
+
+
 class FullDisk(io.StringIO):
     def write(self, text):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
