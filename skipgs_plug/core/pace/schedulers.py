@@ -170,6 +170,7 @@ class _Steps:
             if self._usual is None and self._calls > 1:
                 self._missing += self._noted
             self._usual = max(self._usual or 1, self._calls)
-        self._lacks = Fraction(pace.left_out - self._left_out, pace.ran - self._ran)
+        ran = max(1, pace.ran - self._ran)  # a number may be reported that the loop was not asked about
+        self._lacks = Fraction(pace.left_out - self._left_out, ran)
         self._number, self._ran, self._left_out = number, pace.ran, pace.left_out
         self._calls = self._ahead = 0
