@@ -6,12 +6,12 @@ import ast
 import copy
 import dis
 import inspect
-import itertools
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from types import CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
+from skipgs_plug.core.source.bindings import arguments, assigned_values, held_in, initialiser, spread
 from skipgs_plug.core.source.functions import (
     callbacks,
     called_function,
@@ -46,10 +46,12 @@ class InlinedFunction(NamedTuple):
         body: Its statements, in the names of the loop. Parameters are replaced by the arguments, and names that the
             loop does not know get the name of the function or of its module in front.
         code: Its code.
+        held: Entries and attributes of arguments that are new dictionaries, tuples or objects, as source text.
     """
 
     body: list[ast.stmt]
     code: CodeType
+    held: dict[str, ast.expr]
 
 
 class InlinedFunctions:
@@ -104,10 +106,9 @@ class InlinedFunctions:
         """
         nodes = [node for statement in body for node in _reached(statement)]
         for node in nodes:
-            if isinstance(node, ast.Assign):
-                texts = [ast.unparse(target) for target in node.targets if isinstance(target, PLACES)]
-                held = [found for text in texts for found in held_in(text, node.value).items()]
-                numbers |= {text for text, value in held if self._is_of(value, numbers)}
+            for target, value in assigned_values(node):
+                if isinstance(target, PLACES):
+                    numbers |= self._numbers_in(self.held_in(ast.unparse(target), value), numbers)
         holders = {text[: end.start()] for text in numbers for end in re.finditer(r"[.[]", text)}
         for node in nodes:
             call, function = self._called(node, numbers, holders)
@@ -115,15 +116,27 @@ class InlinedFunctions:
             if call is not None and plain is not None and plain.__code__ not in self._open and plain in self._project:
                 read = self._read(call, function, plain, numbers)
                 if read is not None:
-                    self.by_call[id(node)] = InlinedFunction(read, plain.__code__)
+                    self.by_call[id(node)] = read
                     self._open.append(plain.__code__)
-                    self._follow(read, set(numbers))
+                    self._follow(read.body, numbers | self._numbers_in(read.held, numbers))
                     self._open.pop()
+
+    def held_in(self, name: str, value: ast.expr) -> dict[str, ast.expr]:
+        """Return the values that a name holds, as source text; see `bindings.held_in`."""
+        return held_in(name, value, lambda call: self._function(call.func))
+
+    def _numbers_in(self, held: Mapping[str, ast.expr], numbers: Collection[str]) -> set[str]:
+        """Return the texts whose values are computed from the number."""
+        return {text for text, value in held.items() if self._is_of(value, numbers)}
+
+    def _function(self, named: ast.expr) -> Any:
+        return called_function(named, self._names, self._value, self._open[-1])
 
     def _called(self, node: ast.AST, numbers: Collection[str], holders: Collection[str]) -> tuple[ast.Call | None, Any]:
         """Return the call and the function if a node calls a function with the number, or reads such a property."""
         if isinstance(node, ast.Call) and self._is_read(node):
-            found = called_function(node.func, self._names, self._value, self._open[-1])
+            found = self._function(node.func)
+            found = initialiser(found) if inspect.isclass(found) else found
             if self._receives(node, numbers, holders) or self._shares_number(undecorated(found)):
                 return without_partial(node, found, self._named)
         if isinstance(node, ast.Attribute) and ast.unparse(node.value) in holders:
@@ -155,9 +168,11 @@ class InlinedFunctions:
 
     def _receives(self, call: ast.Call, numbers: Collection[str], holders: Collection[str]) -> bool:
         """Whether a function receives the number, or an object that holds it in an attribute."""
+        call = spread(call)
         given = [*call.args, *(keyword.value for keyword in call.keywords)]
-        if any(self._is_of(value, numbers) for value in given):
+        if any(self._numbers_in(self.held_in("", value), numbers) for value in given):
             return True
+        given = [one.value if isinstance(one, ast.Starred) else one for one in given]
         given.append(call.func.value if isinstance(call.func, ast.Attribute) else call.func)
         return any(isinstance(one, (ast.Name, ast.Attribute)) and ast.unparse(one) in holders for one in given)
 
@@ -180,23 +195,33 @@ class InlinedFunctions:
 
     def _read(
         self, call: ast.Call, function: Any, plain: FunctionType, numbers: Collection[str]
-    ) -> list[ast.stmt] | None:
-        """Return the statements of a function, in names of the loop; None if they cannot be read, or lie too deep."""
+    ) -> InlinedFunction | None:
+        """Return a function, in names of the loop; None if it cannot be read, or lies too deep."""
         syntax = read_syntax(plain) if len(self._open) <= MAX_DEPTH else None
         if syntax is None:
             return None
-        renamed = _Renamed(self._meanings(call, function, plain, syntax, numbers))
+        held: dict[str, ast.expr] = {}
+        renamed = _Renamed(self._meanings(call, function, plain, syntax, numbers, held))
         body = [renamed.visit(statement) for statement in syntax.body]
         _Repeated(self._held).visit_all(body)
-        return body
+        return InlinedFunction(body, plain.__code__, held)
 
     def _meanings(
-        self, call: ast.Call, function: Any, plain: FunctionType, syntax: ast.FunctionDef, numbers: Collection[str]
+        self,
+        call: ast.Call,
+        function: Any,
+        plain: FunctionType,
+        syntax: ast.FunctionDef,
+        numbers: Collection[str],
+        held: dict[str, ast.expr],
     ) -> dict[str, ast.expr]:
-        """Return the expressions, in names of the loop, that the names in a function stand for."""
+        """Return the expressions, in names of the loop, that the names in a function stand for.
+
+        Entries and attributes of arguments that stay in names of the function are added to `held`.
+        """
         times = sum(one.code.co_name == syntax.name for one in self.by_call.values())
         prefix = f"{syntax.name}{times + 1}" if times else syntax.name  # each call has local variables of its own
-        given, defaults = self._given(call, function, plain, syntax.args, prefix)
+        given, defaults = self._given(call, function, plain, prefix)
         bound = _bound(syntax)
         own = bound.union(inspect.signature(plain).parameters)
         inner = {node.id for node in comprehended(ast.walk(syntax))}
@@ -215,6 +240,8 @@ class InlinedFunctions:
                 self.unknown.add(f"{prefix}.{name}")
                 if name in given and self._is_of(given[name], numbers):
                     self.counted.add(f"{prefix}.{name}")
+                elif name in given and name not in bound:
+                    held |= self.held_in(f"{prefix}.{name}", given[name])
         return found
 
     def _from_outside(self, name: str, plain: FunctionType, prefix: str) -> dict[str, ast.expr]:
@@ -238,27 +265,23 @@ class InlinedFunctions:
         return {name: self._named(own, value)}
 
     def _given(
-        self, call: ast.Call, function: Any, plain: FunctionType, parameters: ast.arguments, prefix: str
+        self, call: ast.Call, function: Any, plain: FunctionType, prefix: str
     ) -> tuple[dict[str, ast.expr], dict[str, Any]]:
         """Return the arguments of a call, and the default values of further parameters if no argument is hidden."""
-        values = [*itertools.takewhile(lambda value: not isinstance(value, ast.Starred), call.args)]
-        hidden = len(values) < len(call.args) or any(keyword.arg is None for keyword in call.keywords)
+        call, signature = spread(call), inspect.signature(plain)
         if isinstance(function, MethodType):
             owner = call.func.value if isinstance(call.func, ast.Attribute) else call.func
             # super().name(...), or a name of the bound method
             if not self._is_plain(owner) or self._value(owner) is not function.__self__:
                 own = self._names.get("self") is function.__self__
                 owner = ast.Name("self", ast.Load()) if own else self._named(f"{prefix}.self", function.__self__)
-            values.insert(0, owner)
-        names = [one.arg for one in (*parameters.posonlyargs, *parameters.args)]
-        given = dict(zip(names, values, strict=False))
-        given |= {keyword.arg: keyword.value for keyword in call.keywords if keyword.arg is not None}
-        defaults = {
-            name: one.default
-            for name, one in inspect.signature(plain).parameters.items()
-            if name not in given and one.default is not inspect.Parameter.empty
-        }
-        return given, {} if hidden else defaults
+            call = ast.copy_location(ast.Call(call.func, [owner, *call.args], call.keywords), call)
+        given = arguments(call, signature)
+        hidden = any(isinstance(value, ast.Starred) for value in call.args)
+        if hidden or any(keyword.arg is None for keyword in call.keywords):
+            return given, {}
+        absent = (one for name, one in signature.parameters.items() if name not in given)
+        return given, {one.name: one.default for one in absent if one.default is not one.empty}
 
     def _named(self, name: str, value: Any) -> ast.expr:
         self._names[name] = value
@@ -278,6 +301,13 @@ class _Renamed(ast.NodeTransformer):
         if isinstance(meaning, ast.Name):
             return ast.copy_location(ast.Name(meaning.id, node.ctx), node)
         return ast.copy_location(copy.deepcopy(meaning), node)
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
+        self.generic_visit(node)
+        match node:
+            case ast.Subscript(ast.Tuple(values) | ast.List(values), ast.Constant(int(index))) if index < len(values):
+                return ast.copy_location(values[index], node)
+        return node
 
 
 class _Repeated(ast.NodeTransformer):
@@ -311,14 +341,6 @@ class _Repeated(ast.NodeTransformer):
         return ast.copy_location(ast.Tuple(parts, ast.Load()), node)
 
     visit_SetComp = visit_GeneratorExp = visit_ListComp
-
-
-def held_in(name: str, value: ast.expr) -> dict[str, ast.expr]:
-    """Return the values that a name holds, as source text: its own, and those of the entries of a dictionary."""
-    if not isinstance(value, ast.Dict):
-        return {name: value}
-    entries = zip(value.keys, value.values, strict=True)
-    return {f"{name}[{ast.unparse(key)}]": one for key, one in entries if isinstance(key, ast.Constant)}
 
 
 def _bound(syntax: ast.FunctionDef) -> set[str]:

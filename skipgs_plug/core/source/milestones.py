@@ -85,8 +85,8 @@ class TrainingLoop:
         self._evaluator = Evaluator(target, functions.counted, self._names, changing, options)
         self._evaluator_of_loop = Evaluator(target, (), self._names, by_loop, options)
         self._bar_ifs = _outermost_bar_ifs(statement.body, names, around)
-        assigned = Counter([*own.assigned, *inlined.assigned])
-        Substitution(functions.by_call, self._evaluator, lambda text: assigned[text] == 1).apply(self._body)
+        times = Counter([*own.assigned, *inlined.assigned])
+        Substitution(functions, self._evaluator, times).apply(self._body)
         self._all = list(conditions_in(self._body, functions.by_call))
         self._functions = [*functions.by_call.values()]
         self._warned_of: set[str] = set()  # conditions that warnings have named

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import ast
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
+from skipgs_plug.core.source.bindings import assigned_values
 from skipgs_plug.core.source.evaluator import Evaluator
-from skipgs_plug.core.source.inlining import PLACES, InlinedFunction, held_in
+from skipgs_plug.core.source.inlining import PLACES, InlinedFunctions
 
 
 class Substitution(ast.NodeTransformer):
@@ -17,19 +18,18 @@ class Substitution(ast.NodeTransformer):
     is replaced after its assignment only. Before the assignment, its value is the previous iteration's.
 
     Args:
-        functions: Inlined functions by the id of the call, or of the attribute if it is a property. Their statements
-            are changed too.
+        functions: Inlined functions. Their statements are changed too.
         evaluator: Tells which expressions have values that are known before the loop.
-        assigned_once: Returns whether the loop assigns a name, attribute or entry in one place only.
+        times: How often the loop and the functions assign each name, attribute and entry.
     """
 
     def __init__(
         self,
-        functions: Mapping[int, InlinedFunction],
+        functions: InlinedFunctions,
         evaluator: Evaluator,
-        assigned_once: Callable[[str], bool],
+        times: Mapping[str, int],
     ) -> None:
-        self._functions, self._evaluator, self._assigned_once = functions, evaluator, assigned_once
+        self._functions, self._evaluator, self._times = functions, evaluator, times
         self._meanings: dict[str, ast.expr] = {}
 
     def apply(self, body: Sequence[ast.stmt]) -> None:
@@ -43,10 +43,13 @@ class Substitution(ast.NodeTransformer):
             self.visit(statement)
             for target, value in assigned_values(statement):
                 name = ast.unparse(target)
-                once = isinstance(target, PLACES) and self._assigned_once(name)
-                if once:
-                    known = {text: one for text, one in held_in(name, value).items() if self._evaluator.is_known(one)}
-                    self._meanings |= known
+                if isinstance(target, PLACES) and self._times.get(name) == 1:
+                    entry = isinstance(value, ast.Subscript)  # of a tuple that is unpacked
+                    self._learn(self._functions.held_in(name, self.visit(value) if entry else value))
+
+    def _learn(self, held: Mapping[str, ast.expr]) -> None:
+        """Note the values that names, attributes and entries have from now on, if they are known before the loop."""
+        self._meanings |= {text: one for text, one in held.items() if self._evaluator.is_known(one)}
 
     def visit_Name(self, node: ast.Name | ast.Attribute | ast.Subscript) -> ast.AST:
         if isinstance(node.ctx, ast.Load) and (meaning := self._meanings.get(ast.unparse(node))) is not None:
@@ -58,7 +61,7 @@ class Substitution(ast.NodeTransformer):
     def visit_NamedExpr(self, node: ast.NamedExpr) -> ast.AST:
         self.generic_visit(node)
         name, value = node.target.id, node.value
-        if not (self._assigned_once(name) and self._evaluator.is_known(value)):
+        if not (self._times.get(name) == 1 and self._evaluator.is_known(value)):
             return node
         self._meanings[name] = value
         return value
@@ -69,10 +72,11 @@ class Substitution(ast.NodeTransformer):
     def _result(self, node: ast.expr) -> ast.AST:
         """Return the value that a call or a property has, as an expression; the node itself if it has none."""
         self.generic_visit(node)
-        function = self._functions.get(id(node))
+        function = self._functions.by_call.get(id(node))
         if function is None:
             return node
         before = dict(self._meanings)
+        self._learn({text: self.visit(copy.deepcopy(one)) for text, one in function.held.items()})
         self.apply(function.body)
         self._meanings = before
         value = returned(function.body)
@@ -81,20 +85,6 @@ class Substitution(ast.NodeTransformer):
         for part in ast.walk(value):
             ast.copy_location(part, node)
         return value
-
-
-def assigned_values(statement: ast.stmt) -> Iterator[tuple[ast.expr, ast.expr]]:
-    """Yield the names, attributes and entries that a statement assigns, with their values."""
-    match statement:
-        case ast.AnnAssign(target, _, ast.expr() as value):
-            yield target, value
-        case ast.Assign([ast.Tuple(targets)], ast.Tuple(values)) if len(targets) == len(values):
-            yield from zip(targets, values, strict=True)
-        case ast.Assign([ast.Tuple([whole, rest])], ast.Call(ast.Name("divmod"), [number, by], [])):
-            yield whole, ast.copy_location(ast.BinOp(number, ast.FloorDiv(), by), statement.value)
-            yield rest, ast.copy_location(ast.BinOp(number, ast.Mod(), by), statement.value)
-        case ast.Assign(targets, value):
-            yield from ((target, value) for target in targets)
 
 
 def returned(body: Sequence[ast.stmt]) -> ast.expr | None:
