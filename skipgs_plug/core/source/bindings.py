@@ -74,6 +74,33 @@ def arguments(call: ast.Call, signature: inspect.Signature) -> dict[str, ast.exp
     return given
 
 
+def handed_over(call: ast.Call, is_function: Callable[[ast.expr], bool]) -> ast.Call | None:
+    """Return the call that will be made of a function that is an argument, as in `submit(function, step)`.
+
+    Its arguments are those after the function. A tuple or dictionary stands for the arguments that it holds, as in
+    `Thread(target=function, args=(step,))`.
+
+    Args:
+        call: A call in the source.
+        is_function: Whether an argument is a function.
+    """
+    given = [*call.args, *(one.value for one in call.keywords)]
+    index = next((index for index, one in enumerate(given) if is_function(one)), None)
+    if index is None:
+        return None
+    made = ast.Call(given[index], [], [one for one in call.keywords if one.value is not given[index]])
+    held: list[ast.expr] = [*call.args[index + 1 :], *(one.value for one in made.keywords)]
+    for one in held:
+        entries = _entries(one)
+        if entries is not None:
+            made.keywords += [ast.keyword(name, value) for name, value in entries.items()]
+        elif isinstance(one, (ast.Tuple, ast.List)):
+            made.args += one.elts
+        elif one in call.args:
+            made.args.append(one)
+    return ast.copy_location(made, call)
+
+
 def held_in(name: str, value: ast.expr, class_of: Callable[[ast.Call], Any]) -> dict[str, ast.expr]:
     """Return the values that a name holds, as source text: its own, and those of its entries and attributes.
 
@@ -97,6 +124,8 @@ def held_in(name: str, value: ast.expr, class_of: Callable[[ast.Call], Any]) -> 
 def initialiser(cls: type) -> MethodType | None:
     """Return `__init__` of a new object of a class, whose attributes are not set; None without such a method."""
     found, plain = inspect.getattr_static(cls, "__init__", None), cls.__new__ is object.__new__
+    # An object that was never set up must not be taken down.
+    plain = plain and not hasattr(cls, "__del__")
     return MethodType(found, object.__new__(cls)) if isinstance(found, FunctionType) and plain else None
 
 

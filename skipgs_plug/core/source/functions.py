@@ -26,7 +26,8 @@ def value_of(place: ast.expr, names: Mapping[str, Any], unknown: Collection[str]
     """Return the value that a name, attribute or entry has before the loop and in it; None if unknown.
 
     Args:
-        place: The name, attribute or entry, as an expression. Properties are not evaluated.
+        place: The name, attribute or entry, as an expression such as `table["key"]` or `table.get("key")`. Properties
+            are not evaluated.
         names: Names and values before the loop.
         unknown: Names and attributes that the loop assigns.
     """
@@ -38,7 +39,7 @@ def value_of(place: ast.expr, names: Mapping[str, Any], unknown: Collection[str]
         case ast.Attribute(holder, name):
             found = inspect.getattr_static(value_of(holder, names, unknown), name, None)
             return None if hasattr(type(found), "__get__") else found
-        case ast.Subscript(holder, ast.Constant(key)):
+        case ast.Subscript(holder, ast.Constant(key)) | ast.Call(ast.Attribute(holder, "get"), [ast.Constant(key), *_]):
             held = value_of(holder, names, unknown)
             return held.get(key) if isinstance(held, dict) else None
     return None
@@ -108,7 +109,7 @@ def _named(
                 in_class = inspect.getattr_static(type(owner), name, None) is found
                 return MethodType(found, owner) if in_class else found
             return found.__func__ if isinstance(found, staticmethod) else found
-    return None
+    return value(function)
 
 
 def _inherited(name: str, owner: Any, code: CodeType | None) -> Any:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import ast
-import copy
 import dis
 import inspect
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from types import CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
-from skipgs_plug.core.source.bindings import arguments, assigned_values, held_in, initialiser, spread
+from skipgs_plug.core.source.bindings import arguments, assigned_values, handed_over, held_in, initialiser, spread
 from skipgs_plug.core.source.functions import (
     callbacks,
     called_function,
@@ -23,6 +22,7 @@ from skipgs_plug.core.source.functions import (
     without_partial,
 )
 from skipgs_plug.core.source.project import Project
+from skipgs_plug.core.source.rewriting import Renamed, Repeated, Stored
 from skipgs_plug.core.source.run_options import assigned_globals, comprehended
 
 # Largest depth of nested calls that are read: a loop calls its trainer, which calls a logger, which opens a file.
@@ -89,8 +89,10 @@ class InlinedFunctions:
         self.unknown, self.counted, self.shared = set(unknown), set[str](), set[str]()
         self._names, self._target, self._pure = names, target, pure
         self._project = Project(code, names)
+        stores = "STORE_GLOBAL" if code.co_flags & inspect.CO_NEWLOCALS else "STORE_NAME"
+        self._globals = {one.argval for one in dis.get_instructions(code) if one.opname == stores}
         self._open = [code]  # code of the loop and of the functions that are being read, outermost first
-        _Repeated(self._held).visit_all(body)
+        Repeated(self._held).visit_all(body)
         self._follow(body, {target, *counters})
 
     def __iter__(self) -> Iterator[ast.stmt]:
@@ -113,7 +115,7 @@ class InlinedFunctions:
         for node in nodes:
             call, function = self._called(node, numbers, holders)
             plain = undecorated(function)
-            if call is not None and plain is not None and plain.__code__ not in self._open and plain in self._project:
+            if call is not None and plain is not None and plain.__code__ not in self._open and self._is_own(plain):
                 read = self._read(call, function, plain, numbers)
                 if read is not None:
                     self.by_call[id(node)] = read
@@ -136,13 +138,25 @@ class InlinedFunctions:
         """Return the call and the function if a node calls a function with the number, or reads such a property."""
         if isinstance(node, ast.Call) and self._is_read(node):
             found = self._function(node.func)
-            found = initialiser(found) if inspect.isclass(found) else found
-            if self._receives(node, numbers, holders) or self._shares_number(undecorated(found)):
-                return without_partial(node, found, self._named)
+            if self._receives(node, numbers, holders) or self._shares_number(undecorated(found), numbers):
+                found = initialiser(found) if inspect.isclass(found) else found
+                call, found = without_partial(node, found, self._named)
+                handed = None if self._is_own(found) else handed_over(node, self._is_function)
+                return (call, found) if handed is None else (handed, self._function(handed.func))
         if isinstance(node, ast.Attribute) and ast.unparse(node.value) in holders:
             getter = property_of(self._value(node.value), node.attr)
             return ast.copy_location(ast.Call(node, [], []), node), getter
         return None, None
+
+    def _is_own(self, function: Any) -> bool:
+        """Whether this is a function of the project."""
+        plain = undecorated(function)
+        return plain is not None and plain in self._project
+
+    def _is_function(self, argument: ast.expr) -> bool:
+        """Whether an argument is a function of the project. An object that can be called, as a model, is none."""
+        function = self._function(argument)
+        return self._is_own(function) and function.__name__ != "__call__"
 
     def _held(self, loop: ast.For | ast.comprehension) -> list[ast.expr]:
         """Return names for the functions or objects that a loop runs over, such as callbacks; empty if unknown."""
@@ -154,16 +168,17 @@ class InlinedFunctions:
         name = call.func.id if isinstance(call.func, ast.Name) else None
         return name not in self._pure and name not in self.unknown
 
-    def _shares_number(self, plain: FunctionType | None) -> bool:
-        """Whether a function reads the variable of the loop that holds the number: a closure, or a global name."""
+    def _shares_number(self, plain: FunctionType | None, numbers: Collection[str]) -> bool:
+        """Whether a function reads a variable of the loop that holds a number: a closure, or a global name."""
         loop = self._open[0]
         if plain is None:
             return False
-        if loop.co_flags & inspect.CO_NEWLOCALS:
-            return self._target in plain.__code__.co_freevars and self._target in loop.co_cellvars
+        if not set(numbers).isdisjoint({*plain.__code__.co_freevars} & {*loop.co_cellvars}):
+            return True
+        written = self._globals.intersection(numbers)
         of_module = plain.__module__ == self._names.get("__name__")
         return of_module and any(
-            one.opname == "LOAD_GLOBAL" and one.argval == self._target for one in dis.get_instructions(plain)
+            one.opname == "LOAD_GLOBAL" and one.argval in written for one in dis.get_instructions(plain)
         )
 
     def _receives(self, call: ast.Call, numbers: Collection[str], holders: Collection[str]) -> bool:
@@ -201,9 +216,10 @@ class InlinedFunctions:
         if syntax is None:
             return None
         held: dict[str, ast.expr] = {}
-        renamed = _Renamed(self._meanings(call, function, plain, syntax, numbers, held))
+        renamed = Renamed(self._meanings(call, function, plain, syntax, numbers, held))
         body = [renamed.visit(statement) for statement in syntax.body]
-        _Repeated(self._held).visit_all(body)
+        Stored(self._value).visit_all(body)
+        Repeated(self._held).visit_all(body)
         return InlinedFunction(body, plain.__code__, held)
 
     def _meanings(
@@ -246,7 +262,7 @@ class InlinedFunctions:
 
     def _from_outside(self, name: str, plain: FunctionType, prefix: str) -> dict[str, ast.expr]:
         """Return the meaning of a name that a function does not assign; nothing if it means the same in the loop."""
-        if name == self._target and self._shares_number(plain):
+        if name in {self._target, *self._globals} and self._shares_number(plain, {name}):
             return {}
         surrounding, loop = closure(plain), self._open[0]
         if name in surrounding:
@@ -288,61 +304,6 @@ class InlinedFunctions:
         return ast.Name(name, ast.Load())
 
 
-class _Renamed(ast.NodeTransformer):
-    """Puts expressions in place of names."""
-
-    def __init__(self, meanings: Mapping[str, ast.expr]) -> None:
-        self._meanings = meanings
-
-    def visit_Name(self, node: ast.Name) -> ast.expr:
-        meaning = self._meanings.get(node.id)
-        if meaning is None:
-            return node
-        if isinstance(meaning, ast.Name):
-            return ast.copy_location(ast.Name(meaning.id, node.ctx), node)
-        return ast.copy_location(copy.deepcopy(meaning), node)
-
-    def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
-        self.generic_visit(node)
-        match node:
-            case ast.Subscript(ast.Tuple(values) | ast.List(values), ast.Constant(int(index))) if index < len(values):
-                return ast.copy_location(values[index], node)
-        return node
-
-
-class _Repeated(ast.NodeTransformer):
-    """Replaces a loop over known objects by its statements, once for each object, with the object's name.
-
-    The element of a comprehension is replaced in the same way, as in `[callback(step) for callback in callbacks]`.
-    """
-
-    def __init__(self, held: Callable[[ast.For | ast.comprehension], list[ast.expr]]) -> None:
-        self._held = held
-
-    def visit_all(self, body: list[ast.stmt]) -> None:
-        """Change these statements."""
-        body[:] = self.visit(ast.Module(body, [])).body
-
-    def visit_For(self, node: ast.For) -> ast.stmt | list[ast.stmt]:
-        held = self._held(node) if isinstance(node.target, ast.Name) else []
-        if not held:
-            return self.generic_visit(node)  # type: ignore[return-value]
-        name = ast.unparse(node.target)
-        return [_Renamed({name: one}).visit(copy.deepcopy(part)) for one in held for part in node.body]
-
-    def visit_ListComp(self, node: ast.ListComp | ast.SetComp | ast.GeneratorExp) -> ast.AST:
-        values, *further = node.generators
-        plain = isinstance(values.target, ast.Name) and not values.ifs and not further
-        held = self._held(values) if plain else []
-        if not held:
-            return self.generic_visit(node)
-        name = ast.unparse(values.target)
-        parts = [_Renamed({name: one}).visit(copy.deepcopy(node.elt)) for one in held]
-        return ast.copy_location(ast.Tuple(parts, ast.Load()), node)
-
-    visit_SetComp = visit_GeneratorExp = visit_ListComp
-
-
 def _bound(syntax: ast.FunctionDef) -> set[str]:
     """Return the names that a function gives to values of its own."""
     found: set[str | None] = set()
@@ -362,7 +323,7 @@ def _bound(syntax: ast.FunctionDef) -> set[str]:
 
 def _reached(node: ast.AST) -> Iterator[ast.AST]:
     """Iterate over a statement, without the functions and classes that it defines."""
-    if isinstance(node, (*_DEFINITIONS, ast.Lambda)):
+    if isinstance(node, _DEFINITIONS):
         return
     yield node
     for child in ast.iter_child_nodes(node):

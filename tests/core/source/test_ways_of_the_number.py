@@ -1,5 +1,7 @@
-"""Conditions are found if a function gets the number inside a table, a tuple or a new object."""
+"""Conditions are found if the number reaches them inside a value, through another function, or through a kept value."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -95,3 +97,56 @@ def test_new_objects():
             save(progress, 33)
 
     assert numbers(loop) == [50, 66, 71, 80, 90, 99]
+
+
+def test_functions_that_are_handed_over_with_the_number():
+    def save(step, every):
+        if step % every == 0:
+            print("save")
+
+    def loop(stop):
+        hooks = [lambda step: step == 71 and print("save")]
+        pool = ThreadPoolExecutor(1)
+        for step in stop(save=save, hooks=hooks, pool=pool):
+            threading.Thread(target=save, args=(step,), kwargs={"every": 40}).start()
+            pool.submit(save, step, every=45)
+            pool.submit(lambda: save(step, 33))  # noqa: B023
+            list(map(lambda hook: hook(step), hooks))  # noqa: C417
+
+    assert numbers(loop) == [66, 71, 80, 90, 99]
+
+
+def test_functions_in_a_registry():
+    def loop(stop):
+        hooks = {"step": [save_every_40], "end": lambda step: step == 99 and print("end")}
+        for step in stop(hooks=hooks):
+            for hook in hooks.get("step", []):
+                hook(step)
+            hooks["end"](step)
+            hooks.get("none", print)(step)
+
+    assert numbers(loop) == [80, 99]
+
+
+current = 0
+
+
+def save_current(every):
+    if current % every == 0:
+        print("save")
+
+
+def test_calls_and_global_names_that_keep_the_number():
+    def loop(stop):
+        global current
+        state, steps, run = {}, [0], SimpleNamespace()
+        for step in stop(state=state, steps=steps, run=run):
+            state.update(step=step)
+            steps.append(step - 1)
+            setattr(run, "last", step)  # noqa: B010
+            if state["step"] == 71 or steps[-1] == 71 or run.last == 73:
+                print("save")
+            current = step
+            save_current(40)
+
+    assert numbers(loop) == [71, 72, 73, 80]

@@ -1,0 +1,101 @@
+"""Rewrites of a loop's statements that keep their meaning: other names, repeated statements, and plain assignments."""
+
+from __future__ import annotations
+
+import ast
+import copy
+from collections.abc import Callable, Mapping
+from typing import Any
+
+
+class Renamed(ast.NodeTransformer):
+    """Puts expressions in place of names."""
+
+    def __init__(self, meanings: Mapping[str, ast.expr]) -> None:
+        self._meanings = meanings
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        meaning = self._meanings.get(node.id)
+        if meaning is None:
+            return node
+        if isinstance(meaning, ast.Name):
+            return ast.copy_location(ast.Name(meaning.id, node.ctx), node)
+        return ast.copy_location(copy.deepcopy(meaning), node)
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
+        self.generic_visit(node)
+        match node:
+            case ast.Subscript(ast.Tuple(values) | ast.List(values), ast.Constant(int(index))) if index < len(values):
+                return ast.copy_location(values[index], node)
+        return node
+
+
+class Repeated(ast.NodeTransformer):
+    """Replaces a loop over known objects by its statements, once for each object, with the object's name.
+
+    The element of a comprehension is replaced in the same way, as in `[callback(step) for callback in callbacks]`.
+    """
+
+    def __init__(self, held: Callable[[ast.For | ast.comprehension], list[ast.expr]]) -> None:
+        self._held = held
+
+    def visit_all(self, body: list[ast.stmt]) -> None:
+        """Change these statements."""
+        body[:] = self.visit(ast.Module(body, [])).body
+
+    def visit_For(self, node: ast.For) -> ast.stmt | list[ast.stmt]:
+        held = self._held(node) if isinstance(node.target, ast.Name) else []
+        if not held:
+            return self.generic_visit(node)  # type: ignore[return-value]
+        name = ast.unparse(node.target)
+        return [Renamed({name: one}).visit(copy.deepcopy(part)) for one in held for part in node.body]
+
+    def visit_ListComp(self, node: ast.ListComp | ast.SetComp | ast.GeneratorExp) -> ast.AST:
+        values, *further = node.generators
+        plain = isinstance(values.target, ast.Name) and not values.ifs and not further
+        held = self._held(values) if plain else []
+        if not held:
+            return self.generic_visit(node)
+        name = ast.unparse(values.target)
+        parts = [Renamed({name: one}).visit(copy.deepcopy(node.elt)) for one in held]
+        return ast.copy_location(ast.Tuple(parts, ast.Load()), node)
+
+    visit_SetComp = visit_GeneratorExp = visit_ListComp
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        match node:
+            case ast.Call(ast.Name("map"), [ast.Lambda(ast.arguments([], [parameter]), element), values], []):
+                value = ast.comprehension(ast.Name(parameter.arg, ast.Store()), values, [], 0)
+                return self.visit_ListComp(ast.copy_location(ast.GeneratorExp(element, [value]), node))
+        return self.generic_visit(node)
+
+
+class Stored(ast.NodeTransformer):
+    """Adds the assignments that calls make, as `state["step"] = step` after `state.update(step=step)`.
+
+    Further such calls are `steps.append(step)`, which assigns `steps[-1]`, and `setattr(run, "step", step)`.
+
+    Args:
+        value: Returns the value of a name, attribute or entry before the loop; None if it is unknown.
+    """
+
+    def __init__(self, value: Callable[[ast.expr], Any]) -> None:
+        self._value = value
+
+    def visit_all(self, body: list[ast.stmt]) -> None:
+        """Change these statements."""
+        body[:] = self.visit(ast.Module(body, [])).body
+
+    def visit_Expr(self, node: ast.Expr) -> list[ast.stmt]:
+        stores: list[tuple[ast.expr, ast.expr]] = []
+        match node.value:
+            case ast.Call(ast.Attribute(held, "update"), [], entries) if isinstance(self._value(held), dict):
+                named = ((entry.arg, entry.value) for entry in entries if entry.arg is not None)
+                stores = [(ast.Subscript(held, ast.Constant(name), ast.Store()), value) for name, value in named]
+            case ast.Call(ast.Attribute(held, "append"), [value], []) if isinstance(self._value(held), list):
+                last = ast.UnaryOp(ast.USub(), ast.Constant(1))
+                stores = [(ast.Subscript(held, last, ast.Store()), value)]
+            case ast.Call(ast.Name("setattr"), [held, ast.Constant(str(name)), value], []):
+                stores = [(ast.Attribute(held, name, ast.Store()), value)]
+        added = [ast.Assign([target], copy.deepcopy(value)) for target, value in stores]
+        return [node, *(ast.fix_missing_locations(ast.copy_location(one, node)) for one in added)]
