@@ -123,9 +123,9 @@ def held_in(name: str, value: ast.expr, class_of: Callable[[ast.Call], Any]) -> 
 
 def initialiser(cls: type) -> MethodType | None:
     """Return `__init__` of a new object of a class, whose attributes are not set; None without such a method."""
-    found, plain = inspect.getattr_static(cls, "__init__", None), cls.__new__ is object.__new__
-    # An object that was never set up must not be taken down.
-    plain = plain and not hasattr(cls, "__del__")
+    found = inspect.getattr_static(cls, "__init__", None)
+    # An object without attributes cannot run `__del__`.
+    plain = cls.__new__ is object.__new__ and not hasattr(cls, "__del__") and not inspect.isabstract(cls)
     return MethodType(found, object.__new__(cls)) if isinstance(found, FunctionType) and plain else None
 
 
