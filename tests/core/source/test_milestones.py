@@ -288,7 +288,7 @@ def test_a_loop_over_more_than_the_number_is_named():
             print(index, step)
 
     with pytest.raises(
-        SkipGSError, match=r"one number \(for index, step in enumerate\(stop\(\)\)\); .* next\(batches\)"
+        SkipGSError, match=r"one number \(for \(?index, step\)? in enumerate\(stop\(\)\)\); .* next\(batches\)"
     ):
         found(loop)
 
