@@ -96,9 +96,10 @@ class LoopCode(NamedTuple):
         if LOOP not in functions:
             return cls(source, frozenset(own), frozenset(functions), frozenset(backward))
         training, syntax = functions[LOOP], syntax_of(LOOP)
-        helpers = [
-            name for name in _called_in_loops(syntax) & backward if RATES not in _called_in_loops(syntax_of(name))
-        ]
+        callers = _callers(training)
+        if not callers:  # functions that hold a loop of their own, which sets the rates, are no helpers of this one
+            called_here = _called_in_loops(syntax) & backward
+            callers = {name for name in called_here if RATES not in _called_in_loops(syntax_of(name))}
         repeated, stored = _in_loop(training, syntax)
         called = _called(repeated, functions)
         parts = [part for code in (training, *called) for part in _with_inner(code)]
@@ -117,7 +118,7 @@ class LoopCode(NamedTuple):
             frozenset(own | of_loop),
             frozenset(functions),
             frozenset(backward),
-            frozenset(_callers(training) or helpers),
+            frozenset(callers),
             frozenset(of_loop | of_called),
             frozenset(repeated | of_called),
             keywords,

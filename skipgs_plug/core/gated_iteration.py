@@ -10,7 +10,7 @@ from skipgs_plug.core.decision import Decision
 
 
 class GatedIteration:
-    """Facts about the present iteration. Only `begin` resets them.
+    """Facts about the present iteration, which `begin` resets. `opened`, `passes` and `running` outlast it.
 
     Attributes:
         step: Number of the iteration; None before the first.
@@ -19,6 +19,7 @@ class GatedIteration:
         decision: The last decision in the iteration.
         ran: Whether a real backward pass ran in the iteration.
         running: Whether a real backward pass has begun and has not returned, so that an error comes from the trainer.
+            `OwnLoop.backward` resets it at the start of each call.
         passes: Number of real backward passes that have returned with this gate.
         view, signal: View and value that the trainer's hooks reported for the coming backward pass.
         backwards: Number of training backward passes that the hooks saw.
@@ -36,6 +37,7 @@ class GatedIteration:
         self.keys: set[str] = set()
         self.stepped: set[int] = set()
         self.opened = self.passes = 0
+        self.running = False
         self.begin(None, gated=False)
 
     def begin(self, step: int | None, gated: bool) -> None:
@@ -43,7 +45,7 @@ class GatedIteration:
         self.step = step
         self.gated = gated
         self.decision: Decision = decision.INACTIVE
-        self.ran = self.running = False
+        self.ran = False
         self.view: Any = None
         self.signal: Any = None
         self.backwards = 0

@@ -48,15 +48,15 @@ def counters(
 
     Returns:
         `released` (the argument; the counters are those until then); `iterations` (training backward passes seen, run
-        or skipped); `gated_iterations` (backward passes seen from
-        start_iter on, which is `backwards_run` + `backwards_skipped`); `min_bwd_ratio_effective` (floor in force; None
-        if the policy has no floor); `paused`, `non_finite` (gated iterations with that reason); `reasons` (gated
-        iterations by reason); `events` (structural changes by kind); `t_total`, `t_post` (seconds of all iterations,
-        and of the iterations from start_iter on), `t_total_processor`, `t_post_processor` (the same in processor
-        seconds, see `Times`); `refine_share` (share of the iterations from start_iter on that run or may run; None if
-        no iteration is left out), `gaussians_shown` (share of the Gaussians that a view shows; None if unknown),
-        `iterations_run`, `iterations_skipped`, `ran_for`, `always_run`, `early_stopping` (see `Refining.report`),
-        `growing` (see `Growing.report`; None if all iterations before the end of densification run).
+        or skipped); `gated_iterations` (backward passes seen from start_iter on, which is `backwards_run` +
+        `backwards_skipped`); `min_bwd_ratio_effective` (floor in force; None if the policy has no floor); `paused`,
+        `non_finite` (gated iterations with that reason); `reasons` (gated iterations by reason); `events` (structural
+        changes by kind); `t_total`, `t_post` (seconds of all iterations, and of the iterations from start_iter on),
+        `t_total_processor`, `t_post_processor` (the same in processor seconds, see `Times`); `refine_share` (share of
+        the iterations from start_iter on that run or may run; None if no iteration is left out), `gaussians_shown`
+        (share of the Gaussians that a view shows; None if unknown), `iterations_run`, `iterations_skipped`, `ran_for`,
+        `always_run`, `early_stopping` (see `Refining.report`), `growing` (see `Growing.report`; None if all iterations
+        before the end of densification run).
     """
     return {
         "released": released,
