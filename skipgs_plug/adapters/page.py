@@ -38,7 +38,7 @@ _WRAP = textwrap.TextWrapper(118, subsequent_indent="  ", break_long_words=False
 
 
 def adapters_page() -> str:
-    """Return the page: for each trainer, from when on the gate acts, special behaviour, and the version checked."""
+    """Return the page: for each trainer, the first gated iteration, special behaviour, and the checked version."""
     parts = [HEAD]
     for adapter in builtin_adapters():
         entries = {

@@ -29,7 +29,7 @@ class Outputs(tuple[Any, ...]):
         try:
             return super().__getitem__(index)
         except IndexError:
-            raise MissingOutputError(f"output {index} of a rasterizer that has {len(self)} outputs") from None
+            raise MissingOutputError(f"no output {index}: the rasterizer has {len(self)} outputs") from None
 
 
 class RasterizerModule(torch.nn.Module):

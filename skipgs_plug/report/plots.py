@@ -12,6 +12,7 @@ import numpy as np
 
 from skipgs_plug.bench.plots import COLOURS, MARKERS, SMALL, label_of, new_figure, style
 from skipgs_plug.bench.record import Trace
+from skipgs_plug.trainer.pictures import jpeg_uri
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -179,13 +180,4 @@ def split_render(path: Path) -> list[tuple[str, str]]:
     truth, render = both[:, :half], both[:, half : 2 * half]
     error = np.abs(truth.astype(np.int16) - render) * ERROR_GAIN
     pictures = {"Photograph": truth, "Render": render, f"Error x{ERROR_GAIN}": error.clip(0, 255).astype(np.uint8)}
-    return [(inline_jpeg(picture), title) for title, picture in pictures.items()]
-
-
-def inline_jpeg(picture: np.ndarray) -> str:
-    """Return a picture [H, W, 3] uint8 as the data URI of a JPEG, which needs a tenth of the bytes of a PNG."""
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(picture).save(stream, format="JPEG", quality=88)
-    return "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode()
+    return [(jpeg_uri(picture), title) for title, picture in pictures.items()]

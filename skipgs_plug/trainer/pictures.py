@@ -1,7 +1,9 @@
-"""Pictures of a comparison: truth, renders and their errors; loss and skips over iterations."""
+"""Pictures of a comparison: truth, renders and their errors; loss and skips over iterations; pictures inside a page."""
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -98,3 +100,12 @@ def smooth(values: list[float]) -> list[float]:
         weight = SMOOTH * weight + (1 - SMOOTH)
         out.append(total / weight)
     return out
+
+
+def jpeg_uri(picture: np.ndarray) -> str:
+    """Return a picture [H, W, 3] uint8 as the data URI of a JPEG, which needs a tenth of the bytes of a PNG."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, format="JPEG", quality=88)
+    return "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode()

@@ -306,7 +306,7 @@ def check_header(path: Path) -> None:
                 raise InputError(f"PLY {path} has lists in its vertices, so it is neither a model nor a point cloud.")
     if needed > size:
         raise InputError(
-            f"PLY {path} is damaged: it claims {needed:,} bytes at least, but has {size:,}; export it again."
+            f"PLY {path} is damaged: its header claims at least {needed:,} bytes, but it has {size:,}; export it again."
         )
 
 

@@ -141,7 +141,7 @@ def check_view(view: View, source: Path) -> None:
         raise InputError(f"{source}: the pose of {view.name!r} cannot be inverted; reconstruct it again.")
     if min(view.width, view.height) < MIN_SIDE:
         raise InputError(
-            f"{source}: {view.name!r} is {view.width}x{view.height}, SSIM needs {MIN_SIDE} pixels on each side; "
+            f"{source}: {view.name!r} is {view.width}x{view.height}, but SSIM needs {MIN_SIDE} pixels on each side; "
             "use larger images or a smaller data_factor."
         )
     if view.blank:
@@ -152,7 +152,7 @@ def check_points(points: np.ndarray, source: Path) -> None:
     """Raise InputError for a point cloud that training cannot start from."""
     if len(points) < MIN_POINTS:
         raise InputError(
-            f"{source} has {len(points)} points, at least {MIN_POINTS} are needed; get a larger cloud, or give "
+            f"{source} has {len(points)} points, but at least {MIN_POINTS} are needed; get a larger cloud, or give "
             "one by --init-ply."
         )
     bad = int((~(np.abs(points) < MAX_COORDINATE).all(axis=1)).sum())

@@ -304,9 +304,9 @@ def _require_same_cameras(scene: Scene, saved: Mapping[str, Any], path: str | Pa
         raise DamagedCheckpointError(f"Checkpoint {path} is damaged ({error}); use an older one.") from error
     if frame.moves and not frame.is_like(scene.frame, scene.scene_scale):
         raise InputError(
-            f"Checkpoint {path} was trained with {frame.as_dict()} subtracted and divided by, which is "
-            f"{scene.frame.as_dict()} for the scene now; resume with the scene as it was, or begin a new run with "
-            "--init-ply and the PLY of this one."
+            f"Checkpoint {path} was trained in the frame {frame.as_dict()}, but the frame of the scene is now "
+            f"{scene.frame.as_dict()}; resume with the scene as it was, or begin a new run with --init-ply and the PLY "
+            "of this one."
         )
     poses = saved.get("viewmats")  # not in checkpoints of version 0.1.0
     if poses is None:

@@ -89,7 +89,7 @@ def read_spz(path: Path) -> Spz:
     """
     data = path.read_bytes()
     if data[:4] == struct.pack("<I", MAGIC):
-        raise InputError(f"{path} is an SPZ of version 4 or later, 1 to 3 are read; export it as version 3 or as PLY.")
+        raise InputError(f"{path} is an SPZ of version 4 or later; export it as version 3 or as PLY.")
     try:
         content = gzip.decompress(data)
         magic, version, n, degree, bits, flags, _ = struct.unpack_from(HEADER, content)

@@ -548,7 +548,7 @@ def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
         (
             "image, radii = GaussianRasterizer(settings)(",
             "image, radii = (lambda *args, **kwargs: (out := GaussianRasterizer(settings)(*args, **kwargs), out[2]))(",
-            "output 2 of a rasterizer that has 2 outputs",
+            "no output 2: the rasterizer has 2 outputs",
         ),
     ],
 )

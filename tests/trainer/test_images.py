@@ -106,5 +106,5 @@ def test_wrong_shape_is_not_stretched(tmp_path: Path, tiny_scene: Scene, size: t
 
 
 def test_sides_that_ssim_cannot_measure(tmp_path: Path, tiny_scene: Scene) -> None:
-    with pytest.raises(InputError, match=r"'cam/view_001\.png' is 1x1, SSIM needs 11 pixels on each side"):
+    with pytest.raises(InputError, match=r"'cam/view_001\.png' is 1x1, but SSIM needs 11 pixels on each side"):
         load_scene(write_colmap(tiny_scene, tmp_path / "scan"), data_factor=30)

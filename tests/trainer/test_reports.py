@@ -207,8 +207,8 @@ def test_masks_of_other_suffixes_are_found_and_others_counted(colmap: Path, capl
 @pytest.mark.parametrize(
     ("camera", "said"),
     [
-        ("FULL_OPENCV 32 24 30 30 16 12 0.01 0 0 0", "camera 1 is a FULL_OPENCV of 8 parameters, which has 12"),
-        ("PINHOLE 32 24 30 16 12", "camera 1 is a PINHOLE of 3 parameters, which has 4"),
+        ("FULL_OPENCV 32 24 30 30 16 12 0.01 0 0 0", "camera 1 has 8 parameters, but its model FULL_OPENCV has 12"),
+        ("PINHOLE 32 24 30 16 12", "camera 1 has 3 parameters, but its model PINHOLE has 4"),
         ("SPHERICAL 32 24 32 24", "cannot be read"),
     ],
 )
@@ -348,7 +348,7 @@ def test_a_text_model_beside_a_binary_one(tmp_path: Path, tiny_scene: Scene, cap
     lines = (binary / "images.txt").read_text().splitlines()
     (binary / "images.txt").write_text("\n".join(lines[:12]) + "\n")
     load_scene(tmp_path / "scene")
-    assert "images.bin lists 10 images and is read, images.txt lists 6" in caplog.text
+    assert "images.bin lists 10 images and is read; images.txt lists 6" in caplog.text
 
 
 def test_a_validation_file_is_held_out_where_there_is_no_other(tmp_path: Path, tiny_scene: Scene) -> None:

@@ -37,7 +37,7 @@ class Args:
         if not self.steps or not all(1 <= steps <= LONGEST for steps in self.steps):
             raise InputError(f"--steps {' '.join(map(str, self.steps))}: give lengths of 1 to {LONGEST:,} iterations.")
         if not (math.isfinite(self.seconds) and self.seconds > 0):
-            raise InputError(f"--seconds {self.seconds:g} is no time to train for; give seconds, such as 30.")
+            raise InputError(f"--seconds {self.seconds:g} is not a positive number; give seconds, such as 30.")
 
 
 def parse(argv: list[str]) -> Args:

@@ -56,7 +56,9 @@ class GateOptions:
         shares = (self.share, self.grow_share, self.refine_share)
         if all(share is None for share in shares):
             if self.tolerance is not None:
-                raise SkipGSError("--tolerance is for --share auto; give that too, or leave it out.")
+                raise SkipGSError(
+                    "--tolerance is for --refine-share auto and --share auto; give one too, or leave it out."
+                )
             if self.always is not None:
                 raise SkipGSError("--always is for --share or --refine-share; give one too, or leave it out.")
             if self.rate_peak is not None and not self.compensate:

@@ -266,8 +266,8 @@ def bin_gaussians(
     covered = before + total
     if covered > MAX_PAIRS:
         raise ValueError(
-            f"{m:,} visible Gaussians cover {covered:,} tiles of an image of {width}x{height} pixels in all, at most "
-            f"{MAX_PAIRS:,} can be listed: render a smaller image, or fewer or smaller Gaussians."
+            f"{m:,} visible Gaussians cover {covered:,} tiles of an image of {width}x{height} pixels in all, but at "
+            f"most {MAX_PAIRS:,} can be listed: render a smaller image, or fewer or smaller Gaussians."
         )
     pairs = Pairs(pair_start, ints(total), longs(total))
     fill_pairs(

@@ -167,7 +167,7 @@ def say_if_both(model: Path) -> None:
         return
     binary, text = listed_in_binary(model), listed_in_text(model)
     if binary != text:
-        log.warning("%s: images.bin lists %d images and is read, images.txt lists %d.", model, binary, text)
+        log.warning("%s: images.bin lists %d images and is read; images.txt lists %d.", model, binary, text)
 
 
 def read_model(model: Path) -> tuple[Any, dict[int, str]]:

@@ -64,8 +64,8 @@ def check_parameters(fields: list[str], camera_models: Mapping[str, int], path: 
     expected, given = camera_models[fields[1]], len(fields) - 4
     if given != expected:
         raise InputError(
-            f"{path}: camera {fields[0]} is a {fields[1]} of {given} parameters, which has {expected}; export the "
-            "model again."
+            f"{path}: camera {fields[0]} has {given} parameters, but its model {fields[1]} has {expected}; export the "
+            "reconstruction again."
         )
 
 

@@ -1,4 +1,4 @@
-"""JSON files of a scene: every way in which one can be broken is one sentence."""
+"""JSON files of a scene, whose values are checked: each error is one sentence about the file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def read_object(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file: UTF-8 whatever the locale, or UTF-16, as PowerShell writes it.
 
     Raises:
-        InputError: the file cannot be read, is not JSON, nested too deeply, or not an object.
+        InputError: The file cannot be read, is not JSON, is nested too deeply, or does not hold an object.
     """
     try:
         content = json.loads(path.read_bytes())

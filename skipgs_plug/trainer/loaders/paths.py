@@ -181,7 +181,7 @@ def listing(folder: str, changed: int) -> dict[str, list[str]]:
 
 
 def unlisted_images(folder: Path, listed: Sequence[Path]) -> list[str]:
-    """Return the images in a folder and its subfolders that are not `listed`: sorted relative paths, none hidden."""
+    """Return the images below a folder that are not `listed` and not hidden, as sorted relative paths."""
     known = {os.path.normpath(path) for path in listed}
     suffixes = {suffix.lower() for suffix in IMAGE_SUFFIXES}
     result = []

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import functools
-import io
 import json
 import logging
 import socket
@@ -21,6 +19,7 @@ from torch import Tensor
 
 from skipgs_plug.trainer.mask import leave_out
 from skipgs_plug.trainer.metrics import psnr
+from skipgs_plug.trainer.pictures import jpeg_uri
 from skipgs_plug.trainer.scene import View
 from skipgs_plug.view.draw import to_bytes
 from skipgs_plug.view.model import Model
@@ -153,7 +152,7 @@ class WebPage:
         return {
             "psnr": psnr(shown, truth, view.mask),
             "gain": ERROR_GAIN,
-            **{name: jpeg(picture) for name, picture in pictures.items()},
+            **{name: jpeg_uri(picture) for name, picture in pictures.items()},
         }
 
 
@@ -213,12 +212,3 @@ def listen(host: str, port: int, page: WebPage) -> ThreadingHTTPServer:
             if tried == ports_from(port)[-1]:
                 raise
     raise AssertionError("no port was tried")
-
-
-def jpeg(picture: np.ndarray) -> str:
-    """Return a picture [H, W, 3] uint8 as a data URI."""
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(picture).save(stream, format="JPEG", quality=88)
-    return "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode()
