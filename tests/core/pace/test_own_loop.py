@@ -1,45 +1,18 @@
 """`for step in gate.iterations(range(...))`: loops of one's own."""
 
-import json
 import runpy
 from contextlib import nullcontext
 
 import pytest
 import torch
+from saving_loop import VIEWS, Loop
 
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.core import distributed
 from skipgs_plug.core.pace.rates import path_factor
 
-VIEWS = [f"{i}.png" for i in range(4)]
 
-
-class Loop:
-    """A training loop with a save by number, a rate by number and Adam, like real loops."""
-
-    def __init__(self, begin=0, end=100, value=None, moments=None):
-        self.begin, self.end = begin, end
-        self.value = torch.nn.Parameter(torch.tensor([2.0, -1.0]) if value is None else value.clone())
-        self.optimizer = torch.optim.Adam([self.value], lr=0.1)
-        if moments is not None:
-            self.optimizer.load_state_dict(moments)
-        self.ran, self.saved, self.rates = [], [], []
-
-    def train(self, gate, **options):
-        for step in gate.iterations(range(self.begin, self.end), **options):
-            self.ran.append(step)
-            self.optimizer.param_groups[0]["lr"] = 0.1 * 0.99**step
-            loss = (self.value - step % 3).square().sum()
-            if gate.backward(loss, view=VIEWS[step % 4], step=step):
-                self.optimizer.step()
-                self.optimizer.zero_grad(set_to_none=True)
-            self.rates.append(self.optimizer.param_groups[0]["lr"])
-            if step % 25 == 0:
-                self.saved.append(step)
-        return self
-
-
-def test_a_share_of_the_iterations_runs_with_all_that_hangs_on_numbers():
+def test_a_share_of_the_iterations_runs_and_all_that_conditions_name():
     with SkipGate(start_iter=40, refine_share=0.25) as gate:
         loop = Loop().train(gate)
     assert loop.ran == [*range(55), 75, 99]  # steps have shrunk to 0, then a save and the last iteration run
@@ -108,20 +81,6 @@ def test_a_loop_that_goes_on_after_detach_trains_in_all_its_iterations():
     assert gate.backward(torch.ones((), requires_grad=True), view="a", step=100)
 
 
-def test_after_detach_no_view_is_only_watched():
-    names = [f"{i}.png" for i in range(40)]
-    gate, trained = SkipGate(start_iter=0, refine_share="auto"), set()
-    for step in gate.iterations(range(2000), always=(), views=names):
-        ran = gate.backward(torch.ones((), requires_grad=True) * 1.0, view=names[step % 40], step=step)
-        if step == 1:
-            gate.detach()
-        elif step > 1 and ran:
-            trained.add(names[step % 40])
-        if step == 80:
-            break
-    assert trained == set(names)
-
-
 def test_steps_are_larger_while_the_gate_is_attached():
     loop, moved = Loop(), {}
 
@@ -156,135 +115,6 @@ def test_leaving_out_nothing_changes_nothing(settings):
     assert same.ran == plain.ran and torch.equal(same.value, plain.value)
 
 
-@pytest.mark.parametrize("settings", [{"refine_share": 0.4}, {"refine_share": "auto"}], ids=["share", "auto"])
-def test_interrupted_and_resumed_goes_as_uninterrupted(settings):
-    options = {} if settings["refine_share"] != "auto" else {"views": VIEWS}
-    with SkipGate(start_iter=40, **settings) as gate:
-        whole = Loop(end=400).train(gate, **options)
-    middle = 200
-    with SkipGate(start_iter=40, **settings) as gate:
-        # The loop saves in an iteration that runs. The resumed run decides on the iterations after it.
-        first = Loop(end=400)
-        state = None
-        for step in first_part(first, gate, middle, options):
-            state = step
-    last = first.ran[-1]
-    with SkipGate(start_iter=40, **settings) as gate:
-        gate.load_state_dict(json.loads(json.dumps(state)))
-        second = Loop(last + 1, 400, first.value.detach(), first.optimizer.state_dict())
-        second.train(gate, **options)
-    assert first.ran + second.ran == whole.ran
-    assert torch.equal(second.value, whole.value)
-
-
-def test_a_condition_that_holds_half_the_time_says_the_same_after_a_resume():
-    def train(first, state=None):
-        ran, reached, states = [], [], {}
-        with SkipGate(start_iter=1, refine_share=0.3) as gate:
-            if state is not None:
-                gate.load_state_dict(state)
-            for step in gate.iterations(range(first, 41)):
-                gate.backward(torch.ones((), requires_grad=True) * 0.1, view="a", step=step)
-                ran.append(step)
-                states[step] = gate.state_dict()
-                if step % 2 == 0:
-                    reached.append(step)
-        return ran, states, gate.report()["always_run"]
-
-    whole, states, always = train(0)
-    for step in (7, 11, 20):
-        rest, _, again = train(step + 1, states[step])
-        assert rest == [n for n in whole if n > step] and list(again.values()) == list(always.values())
-
-
-def test_a_state_that_is_loaded_within_the_loop_leaves_what_hangs_on_numbers():
-    with SkipGate(start_iter=10, refine_share=0.2) as gate:
-        for step in gate.iterations(range(26), always=()):
-            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
-        state = gate.state_dict()
-    loaded, saved = False, []
-    with SkipGate(start_iter=10, refine_share=0.2) as gate:
-        for step in gate.iterations(range(26, 100)):
-            if not loaded:
-                gate.load_state_dict(state)
-                loaded = True
-            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
-            if step % 25 == 0:
-                saved.append(step)
-    assert saved == [50, 75]
-
-
-def first_part(loop, gate, middle, options):
-    """Train up to `middle`, giving the gate's state at the end of each iteration."""
-    for step in gate.iterations(range(loop.begin, loop.end), always=range(0, 400, 25), **options):
-        if step > middle:
-            return
-        loop.ran.append(step)
-        loop.optimizer.param_groups[0]["lr"] = 0.1 * 0.99**step
-        loss = (loop.value - step % 3).square().sum()
-        if gate.backward(loss, view=VIEWS[step % 4], step=step):
-            loop.optimizer.step()
-            loop.optimizer.zero_grad(set_to_none=True)
-        yield gate.state_dict()
-
-
-def test_a_state_of_another_share_is_refused():
-    with SkipGate(start_iter=10, refine_share=0.4) as gate:
-        Loop().train(gate)
-        state = gate.state_dict()
-    for settings in ({"refine_share": 0.5}, {}):
-        with SkipGate(start_iter=10, **settings) as gate, pytest.raises(SkipGSError, match=r"refine_share=0\.4"):
-            gate.load_state_dict(state)
-    with SkipGate(start_iter=10, refine_share=0.4, enabled=False) as gate:
-        gate.load_state_dict(state)
-        assert Loop(begin=50).train(gate).ran == [*range(50, 100)]
-
-
-def test_a_state_with_larger_steps_does_not_go_on_without():
-    with SkipGate(start_iter=10, refine_share=0.4) as gate:
-        for step in gate.iterations(range(100), always=()):
-            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
-            if step == 20:
-                state = gate.state_dict()
-    with SkipGate(start_iter=10, refine_share=0.4, compensate=False) as gate:
-        gate.load_state_dict(state)
-        with pytest.raises(SkipGSError, match="saved with larger, shrinking steps, which are off now"):
-            next(iter(gate.iterations(range(21, 100), always=())))
-
-
-def test_auto_ends_where_nothing_is_gained_and_goes_on_with_what_hangs_on_numbers():
-    ran, reached, optimizer = [], [], torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=0.1)
-    with SkipGate(start_iter=100, refine_share="auto") as gate:
-        for step in gate.iterations(range(2100), views=[f"{i}.png" for i in range(40)]):
-            ran.append(step)
-            loss = torch.tensor(0.1, requires_grad=True)
-            if gate.backward(loss * 1.0, view=f"{step % 40}.png", step=step):
-                optimizer.step()
-            if step % 500 == 0:
-                reached.append(step)
-    report = gate.report()
-    # A quarter of a fifth of 2,000 iterations runs, and iterations 500, 1,000, 1,500, 2,000 and the last.
-    assert report["iterations_run"] == 100 + 5 and ran[-4:] == [1000, 1500, 2000, 2099]
-    assert report["early_stopping"]["ended_early"] and "ended early, in cycle 2" in gate.summary()
-    assert report["early_stopping"]["rest_worth_db"] == 0.0
-    assert report["reasons"]["over"] > 0 and report["reasons"]["watched"] > 0
-
-
-def test_auto_runs_the_whole_share_where_views_are_too_few_to_watch():
-    ran, optimizer = [], torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=0.1)
-    with SkipGate(start_iter=100, refine_share="auto") as gate:
-        for step in gate.iterations(range(2100), views=[f"{i}.png" for i in range(20)]):
-            ran.append(step)
-            loss = torch.tensor(0.1, requires_grad=True)
-            if gate.backward(loss * 1.0, view=f"{step % 20}.png", step=step):
-                optimizer.step()
-    report = gate.report()
-    assert report["iterations_run"] == 400 + 1 and report["early_stopping"]["watched"] == []
-    assert report["backwards_skipped"] == 1  # that of the last iteration, when steps have shrunk to 0
-    assert "no view is watched" in gate.summary()
-    assert "a twelfth of 20 training views is less than 3 views" in gate.summary()
-
-
 def test_the_summary_says_why_more_than_the_share_ran():
     reached = []
     with SkipGate(start_iter=100, refine_share=0.25, compensate=False) as gate:
@@ -296,39 +126,7 @@ def test_the_summary_says_why_more_than_the_share_ran():
     assert "share of 0.25: 50 ran for the share, 51 for conditions of the loop, 0 after prunes" in gate.summary()
 
 
-def test_auto_leaves_a_short_refinement_as_it_is():
-    plain, same = Loop(end=300), Loop(end=300)
-    with SkipGate(start_iter=1000) as gate:
-        plain.train(gate)
-    with SkipGate(start_iter=40, refine_share="auto") as gate:
-        same.train(gate, views=VIEWS)
-    assert same.ran == plain.ran and torch.equal(same.value, plain.value)
-    assert "refinement is too short, or views come up too seldom" in gate.summary()
-    longer = Loop(end=1040)
-    with SkipGate(start_iter=40, refine_share="auto", compensate=False) as gate:
-        longer.train(gate, views=VIEWS)
-    assert len(longer.ran) < 600 and "refinement is too short" not in gate.summary()
-
-
-def test_auto_must_know_the_views():
-    sentence = r"give their names to gate\.iterations\(\) as views=, or a share"
-    for unknown in ({}, {"views": []}):
-        with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match=sentence):
-            Loop().train(gate, **unknown)
-    with SkipGate(start_iter=10, refine_share="auto") as gate, pytest.raises(SkipGSError, match="views= takes a list"):
-        gate.iterations(range(100), views="0.png")
-
-
-def test_views_named_twice_are_known_once():
-    reports = []
-    for views in (VIEWS, VIEWS * 40):
-        with SkipGate(start_iter=40, refine_share="auto", warmup=0) as gate:
-            Loop(end=600).train(gate, views=views)
-        reports.append(gate.report()["refine_share"])
-    assert reports[0] == reports[1] < 1
-
-
-def test_what_each_process_would_find_by_itself_is_refused_in_a_group(monkeypatch):
+def test_a_floor_that_each_process_would_find_by_itself_is_refused_in_a_group(monkeypatch):
     larger = SkipGate(start_iter=10, compensate=True)
     monkeypatch.setattr(distributed, "group_size", lambda: 2)  # the group may come after the gate
     with larger, pytest.raises(SkipGSError, match=r"by itself, but 2 train together; give min_bwd_ratio"):
@@ -363,7 +161,7 @@ def test_iterations_that_come_after_the_last_one_release_the_gate_and_run(settin
 
 @pytest.mark.parametrize("settings", [{"refine_share": 0.5}, {"compensate": True}])
 @pytest.mark.parametrize("leaves", [False, True])
-def test_what_steps_after_the_loop_is_left_alone(settings, leaves):
+def test_optimizers_that_step_after_the_loop_are_left_alone(settings, leaves):
     gate = SkipGate(start_iter=4, **settings)  # never detached
     for step in gate.iterations(range(20), always=range(20)):
         gate.backward(torch.ones((), requires_grad=True), view="a", step=step)

@@ -1,0 +1,154 @@
+"""`skipgs-plug run`: the script is gated, and keeps its output, files and exit code."""
+
+import errno
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from pkgutil import resolve_name
+
+import pytest
+import torch
+from inria_checkout import forget
+
+from skipgs_plug import cli
+from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.scripts.checkpoints import Checkpoints
+
+
+def test_script_is_gated_on_the_cpu(checkout, tmp_path, capfd):
+    before = torch.Tensor.backward
+    code = cli.main(["run", "inria", "--cpu", "--warmup", "10", "--", checkout, str(tmp_path)])
+    captured = capfd.readouterr()
+    assert code == 0
+    assert captured.out.endswith("Training complete.\n")  # the gate's own output goes to stderr
+    assert "SkipGS: " in captured.err
+    report = json.loads((tmp_path / "skipgs.json").read_text())
+    assert report["iterations"] == 60 and report["gated_iterations"] == 41
+    assert report["backwards_run"] + report["backwards_skipped"] == 41 and report["backwards_skipped"] > 0
+    assert {row["view"] for row in report["views"]} <= {f"view{i}" for i in range(4)}
+    assert report["settings"]["warmup"] == 10 and report["settings"]["start_iter"] == 20
+    assert torch.Tensor.backward is before and "diff_gaussian_rasterization" not in sys.modules
+
+
+def test_patched_also_lists_names_that_are_replaced_around_the_script(checkout, tmp_path, monkeypatch):
+    names = (
+        "save",
+        "load",
+        "cuda.is_available",
+        "cuda.synchronize",
+        "cuda.Event",
+        "Tensor.backward",
+        "optim.adam.adam",
+    )
+    before = {f"torch.{name}": resolve_name(f"torch.{name}") for name in names}
+    seen = []
+
+    def note(checkpoints, path):
+        replaced = {name for name, own in before.items() if resolve_name(name) is not own}
+        seen.append((set(checkpoints.gate.patched) & set(before), replaced))
+
+    monkeypatch.setattr(Checkpoints, "_save_beside", note)
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 0
+    assert seen == [(set(before), set(before))]
+    assert all(resolve_name(name) is own for name, own in before.items())
+
+
+def test_inert_and_never_skipping_train_bit_for_bit_alike(checkout, tmp_path):
+    models = []
+    for name, option in (("off", ["--no-gate"]), ("all", ["--min-bwd-ratio", "1.0"]), ("gated", ["--warmup", "5"])):
+        (tmp_path / name).mkdir()
+        assert cli.main(["run", "inria", "--cpu", *option, "--", checkout, str(tmp_path / name)]) == 0
+        models.append(torch.load(tmp_path / name / "model.pth", weights_only=False))
+        forget()
+    off, never, gated = models
+    assert all(torch.equal(a, b) for a, b in zip(off, never, strict=True))
+    assert not torch.equal(off[0], gated[0])
+    report = json.loads((tmp_path / "off" / "skipgs.json").read_text())
+    assert report["settings"]["enabled"] is False and report["iterations"] == 60
+    assert report["t_total"] > report["t_post"] > 0
+
+
+def test_failing_script_keeps_its_code_and_leaves_a_report(checkout, tmp_path):
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path), "--fail"]) == 3
+    assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 4
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_only_the_first_process_of_torchrun_reports(checkout, tmp_path, monkeypatch, capfd, rank):
+    monkeypatch.setenv("RANK", str(rank))
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 0
+    assert (tmp_path / "skipgs.json").exists() == ("SkipGS: " in capfd.readouterr().err) == (rank == 0)
+
+
+class FullDisk(io.StringIO):
+    def write(self, text):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_messages_that_cannot_be_written_end_no_training(checkout, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", FullDisk())
+    (tmp_path / "model.pth.skipgs.json" / "in_the_way").mkdir(parents=True)  # the state cannot be written: a message
+    assert cli.main(["run", "auto", "--cpu", "--", checkout, str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 60
+
+
+def test_without_a_gate_the_given_start_still_splits_the_time(checkout, tmp_path):
+    command = ["run", "auto", "--no-gate", "--start-iter", "50", "--cpu", "--", checkout, str(tmp_path)]
+    assert cli.main(command) == 0
+    report = json.loads((tmp_path / "skipgs.json").read_text())
+    assert report["settings"]["start_iter"] == 50 and report["t_total"] > report["t_post"] > 0
+
+
+def test_script_that_ends_its_process_leaves_a_report_first(checkout, tmp_path, monkeypatch):
+    def ended(status):
+        assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 60
+        raise SystemExit(status)
+
+    monkeypatch.setattr(os, "_exit", ended)
+    text = Path(checkout).read_text().replace('print("Training complete.")', "__import__('os')._exit(4)")
+    Path(checkout).write_text(text)
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 4
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
+def test_a_forked_child_that_ends_leaves_no_report(checkout, tmp_path):
+    forks = "if iteration == 30 and os.fork() == 0: sys.exit()\n        if iteration == 40: sys.exit(os.wait()[1])\n"
+    text = Path(checkout).read_text().replace("import random", "import os, random")
+    Path(checkout).write_text(text.replace("        loss.backward()", f"        {forks}        loss.backward()"))
+    command = [sys.executable, "-m", "skipgs_plug", "run", "inria", "--cpu", "--", checkout, str(tmp_path)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0 and run.stderr.count("SkipGS: ") == 1
+    assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 39
+
+
+def test_script_that_never_trains_keeps_its_code(checkout, tmp_path, capfd):
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path), "--idle"]) == 0
+    assert "train.py ended without a training iteration; nothing was gated." in capfd.readouterr().err
+    assert not (tmp_path / "skipgs.json").exists()
+
+
+def test_torch_keeps_to_one_thread_on_the_cpu(checkout, tmp_path, capfd):
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        with open(checkout, "a") as script:
+            script.write("    print('threads', torch.get_num_threads())\n")
+        assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 0
+        assert "threads 1\n" in capfd.readouterr().out and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("options", [[], ["--share", "auto"], ["--no-gate"]], ids=lambda options: " ".join(options))
+def test_an_error_while_the_gate_attaches_lets_the_script_train(checkout, tmp_path, capfd, monkeypatch, options):
+    def fails(*args, **kwargs):
+        raise TypeError("of the adapter")
+
+    monkeypatch.setattr(Hooks, "loop", fails)
+    with pytest.warns(RuntimeWarning, match=r"goes on.*\(TypeError: of the adapter; report it to the project"):
+        assert cli.main(["run", "inria", "--cpu", *options, "--", checkout, str(tmp_path)]) == 0
+    error = capfd.readouterr().err
+    assert (tmp_path / "model.pth").exists() and "Traceback" not in error and "nothing was gated" not in error

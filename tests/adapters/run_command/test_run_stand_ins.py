@@ -1,0 +1,79 @@
+"""`skipgs-plug run --cpu`: errors of the stand-ins for CUDA modules, and errors of the script's own."""
+
+from pathlib import Path
+
+import pytest
+
+from skipgs_plug import cli
+
+
+def test_missing_extension_is_the_scripts_own_error(checkout, tmp_path, capfd):
+    assert cli.main(["run", "inria", "--", checkout, str(tmp_path)]) == 1  # without --cpu there are no stand-ins
+    error = capfd.readouterr().err
+    assert "Traceback" in error and "gaussian_renderer/__init__.py" in error and "launch.py" not in error
+    assert "diff_gaussian_rasterization is a CUDA extension of the trainer" in error
+    assert "skipgs_plug[full]" not in error
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ("sh_degree=0,", "sh_degree=0, kernel_size=0.1,", "unexpected keyword argument 'kernel_size'"),
+        ("means2D=points,", "means2D=points, means2D_densify=points,", "unexpected keyword argument 'means2D_densify'"),
+        ("image, radii =", "image, radii, depth =", "not enough values to unpack (expected 3, got 2)"),
+        (
+            "import GaussianRasterizationSettings,",
+            "import S, GaussianRasterizationSettings,",
+            "import name 'S'",
+        ),
+        ("import torch\n", "import torch, diff_gaussian_rasterization._C\n", "No module named"),
+        ("import torch\n", "import torch, diff_gaussian_rasterization as d; d._C.x\n", "no attribute '_C'"),
+        (
+            "import torch\n",
+            "import torch, simple_knn._C as k; k.distCUDA2(torch.ones(9, 3), 4)\n",
+            "takes 1 positional",
+        ),
+        ("import torch\n", "import torch, fused_ssim as f; f.fused_ssim(1, 2, window=3)\n", "argument 'window'"),
+        ("return {", "settings.kernel_size; return {", "no attribute 'kernel_size'"),
+        ("return {", "GaussianRasterizer(settings).integrate(model.xyz); return {", "no attribute 'integrate'"),
+        ("return {", "GaussianRasterizer(settings).markVisible(); return {", "markVisible() missing 1 required"),
+        (
+            "image, radii = GaussianRasterizer(settings)(",
+            "image, radii = (lambda *args, **kwargs: (out := GaussianRasterizer(settings)(*args, **kwargs), out[2]))(",
+            "no output 2: the rasterizer has 2 outputs",
+        ),
+    ],
+)
+def test_a_feature_that_the_stand_ins_lack_is_one_sentence(checkout, tmp_path, capfd, old, new, found):
+    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
+    renderer.write_text(renderer.read_text().replace(old, new))
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
+    error = capfd.readouterr().err
+    assert "The script uses a feature that the stand-ins of --cpu lack (" in error and found in error
+    assert "it needs CUDA; run it without --cpu." in error and "Traceback" not in error
+
+
+def test_an_option_that_a_stand_in_refuses_is_one_sentence(checkout, tmp_path, capfd):
+    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
+    renderer.write_text(renderer.read_text().replace("scales=", "cov3D_precomp=torch.ones(12, 6), scales="))
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
+    error = capfd.readouterr().err
+    assert "skipgs-plug: The CPU stand-in needs scales and rotations" in error and "Traceback" not in error
+
+
+@pytest.mark.parametrize("line", ["(1, 2)[2]", "len(1, 2)", "None.integrate", "import simple_knx"])
+def test_an_error_of_the_scripts_own_keeps_its_traceback(checkout, tmp_path, capfd, line):
+    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
+    renderer.write_text(f"{line}\n" + renderer.read_text())
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
+    error = capfd.readouterr().err
+    assert "Traceback" in error and "stand-ins of --cpu" not in error
+
+
+def test_no_advice_to_give_an_option_that_is_given(checkout, tmp_path, capfd):
+    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
+    renderer.write_text("import diff_plane_rasterization\n" + renderer.read_text())
+    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
+    error = capfd.readouterr().err
+    assert "diff_plane_rasterization is a CUDA extension for which this adapter has no CPU stand-in" in error
+    assert "with --cpu before" not in error
