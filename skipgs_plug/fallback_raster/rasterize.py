@@ -153,17 +153,8 @@ def rasterization(
         viewmats_rs=viewmats_rs is not None,
         rolling_shutter=rolling_shutter is not None and getattr(rolling_shutter, "name", "GLOBAL") != "GLOBAL",
     )
-    if camera_model != "pinhole":
-        raise NotImplementedError(f"The CPU rasterizer only knows camera_model='pinhole', not {camera_model!r}.")
-    if render_mode not in get_args(RenderMode):
-        raise ValueError(f"render_mode must be RGB, D, ED, RGB+D or RGB+ED, not {render_mode!r}.")
-    if rasterize_mode not in get_args(RasterizeMode):
-        raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', not {rasterize_mode!r}.")
-    shN = None
-    if isinstance(colors, tuple):
-        if sh_degree is None or len(colors) != 2:
-            raise ValueError("colors as a tuple must be a pair (sh0 [N, 1, 3], shN [N, K - 1, 3]) with sh_degree set.")
-        colors, shN = colors
+    _check_modes(camera_model, render_mode, rasterize_mode)
+    colors, shN = _bands(colors, sh_degree)
     near_plane, far_plane = planes(near_plane, far_plane)
     radius_clip, eps2d = as_float("radius_clip", radius_clip), as_float("eps2d", eps2d)
     width, height = as_int(width), as_int(height)
@@ -255,6 +246,29 @@ def rasterization(
         "n_cameras": n_cameras,
     }
     return _join(images).to(dtype), _join(alphas).to(dtype), info
+
+
+def _check_modes(camera_model: str, render_mode: RenderMode, rasterize_mode: RasterizeMode) -> None:
+    """Refuse a mode that does not exist or is not supported; raises as `rasterization` documents."""
+    if camera_model != "pinhole":
+        raise NotImplementedError(f"The CPU rasterizer only knows camera_model='pinhole', not {camera_model!r}.")
+    if render_mode not in get_args(RenderMode):
+        raise ValueError(f"render_mode must be RGB, D, ED, RGB+D or RGB+ED, not {render_mode!r}.")
+    if rasterize_mode not in get_args(RasterizeMode):
+        raise ValueError(f"rasterize_mode must be 'classic' or 'antialiased', not {rasterize_mode!r}.")
+
+
+def _bands(colors: Tensor | tuple[Tensor, Tensor], sh_degree: int | None) -> tuple[Tensor, Tensor | None]:
+    """Return colours in one tensor and None, or the constant band and the higher bands if they are a pair.
+
+    Raises:
+        ValueError: `colors` is a tuple but not a pair of bands.
+    """
+    if not isinstance(colors, tuple):
+        return colors, None
+    if sh_degree is None or len(colors) != 2:
+        raise ValueError("colors as a tuple must be a pair (sh0 [N, 1, 3], shN [N, K - 1, 3]) with sh_degree set.")
+    return colors
 
 
 def _camera_colors(
