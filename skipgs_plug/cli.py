@@ -27,10 +27,10 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "sfm": Command("turn photographs or a video into a scene", "train"),
-    "train": Command("train a scene by the 3DGS recipe, in all or in fewer iterations", "train"),
+    "train": Command("train a scene by the 3DGS recipe, with --share in fewer iterations", "train"),
     "estimate": Command("predict how long training a scene takes here, from half a minute of training", "train"),
     "view": Command("show a trained model in the browser, with its cameras, photographs and errors", "view"),
-    "render": Command("film or picture a trained model: colour and depth, along a path or held-out cameras", "view"),
+    "render": Command("make a film or pictures of a trained model, along a path or from held-out cameras", "view"),
     "export": Command("convert a trained model for web viewers", "train"),
     "report": Command("make one HTML page of finished runs: tables, plots, comparison", "report"),
     "run": Command("run an unmodified training script of another project, gated", "run"),

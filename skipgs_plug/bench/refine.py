@@ -26,7 +26,7 @@ PARTS = 10  # parts of refinement, each followed by an evaluation; policies take
 MOST_DB = 100.0  # PSNR of an image in dB, at most: an exact image, such as bare background, has an infinite PSNR
 
 
-class DivergedError(Exception):
+class RunDivergedError(Exception):
     """A loss or a metric is no longer finite. The message says where."""
 
 
@@ -38,7 +38,7 @@ def densify(trainer: Trainer, progress: bool = True, scalars: Path | None = None
     """Train up to the end of densification; `scalars` is a folder for TensorBoard scalars.
 
     Raises:
-        DivergedError: A loss is not finite.
+        RunDivergedError: A loss is not finite.
     """
     with finite_losses(trainer), logged(trainer, scalars) as log:
         trainer.on_step = None if log is None else log.iteration
@@ -66,7 +66,7 @@ def refine(
         The record, as the generator's value.
 
     Raises:
-        DivergedError: A loss or a metric is not finite.
+        RunDivergedError: A loss or a metric is not finite.
     """
     start, iterations = trainer.refine_stop_iter, spec.iterations(trainer, earlier)
     phases_before = dict(trainer.phase_seconds)
@@ -160,13 +160,13 @@ def compressed(trainer: Trainer, start: int, iterations: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def finite_losses(trainer: Trainer) -> Iterator[None]:
-    """Raise DivergedError before the backward of the first loss that is not finite."""
+    """Raise RunDivergedError before the backward of the first loss that is not finite."""
     inner, was_own = trainer.backward, "backward" in vars(trainer)
 
     def checked(loss: torch.Tensor, view: str, step: int) -> None:
         value = float(loss.detach())
         if not math.isfinite(value):
-            raise DivergedError(f"loss {value} at iteration {step} on view {view}")
+            raise RunDivergedError(f"loss {value} at iteration {step} on view {view}")
         inner(loss, view, step)
 
     trainer.backward = checked  # type: ignore[method-assign]
@@ -219,5 +219,5 @@ def point(trainer: Trainer, stats: dict[str, Any], log: ScalarLog | None, second
     metrics = {metric.name: found[metric.name] for metric in chosen()}
     for name, value in metrics.items():
         if not math.isfinite(value):
-            raise DivergedError(f"held-out {name} {value} after iteration {trainer.step - 1}")
+            raise RunDivergedError(f"held-out {name} {value} after iteration {trainer.step - 1}")
     return Point(trainer.step, seconds, metrics)

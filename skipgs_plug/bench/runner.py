@@ -14,7 +14,7 @@ from skipgs_plug.bench.choices import Clock
 from skipgs_plug.bench.find import find_policy, known_policies
 from skipgs_plug.bench.policies import BenchPolicy, Earlier, check_policies, refinement_policy, rounds
 from skipgs_plug.bench.record import RunRecord
-from skipgs_plug.bench.refine import DivergedError, NotRunError, densify, refine
+from skipgs_plug.bench.refine import NotRunError, RunDivergedError, densify, refine
 from skipgs_plug.bench.store import BenchFolder
 from skipgs_plug.bench.whole import Maker
 from skipgs_plug.bench.whole_policies import whole_policy
@@ -117,7 +117,7 @@ class Bench:
             return found
         try:
             begin = self._whole_runs(seed) if self.whole else self._refinements(seed)
-        except DivergedError as error:
+        except RunDivergedError as error:
             for spec in itertools.chain(*order):
                 if spec.name not in found:
                     note = f"{error}, during densification"
@@ -150,7 +150,7 @@ class Bench:
                 except StopIteration as finished:
                     del runs[name]
                     yield finished.value
-                except DivergedError as error:
+                except RunDivergedError as error:
                     del runs[name]
                     yield RunRecord(seed, name, "diverged", str(error))
                 except NotRunError as error:

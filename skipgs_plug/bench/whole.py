@@ -52,7 +52,7 @@ def whole_run(trainer: Trainer, gate: SkipGate | None, record: RunRecord, make: 
     A search may have trained the trainer for some iterations already. Their points are in the record.
 
     Raises:
-        DivergedError: A loss or a metric is not finite.
+        RunDivergedError: A loss or a metric is not finite.
     """
     with gate or contextlib.nullcontext():
         yield from trained_until(trainer, trainer.max_steps, record, gate, make)

@@ -29,7 +29,7 @@ class Options(TrainConfig):
 class Args:
     """Train under each policy and compare time and quality: refinement from one snapshot per seed, or whole runs.
 
-    Evaluation, loading and compilation do not count as time. After a kill, the same command continues.
+    Evaluation, loading and compilation do not count as time. The same command continues a bench that was killed.
     """
 
     scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
