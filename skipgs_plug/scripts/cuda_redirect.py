@@ -119,17 +119,32 @@ class _CpuPlacement(TorchFunctionMode):
     def __torch_function__(
         self, func: Callable, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        kwargs = dict(kwargs or {})
-        if func in (torch.Tensor.cuda, torch.Tensor.pin_memory):
+        if func in _MOVES:
             return args[0]
-        if func is torch.Tensor.to and len(args) > 1 and type(args[1]) is int:
-            args = (args[0], "cpu", *args[2:])
-        args = tuple("cpu" if _is_cuda(value) else value for value in args)
-        if _is_cuda(kwargs.get("device")) or type(kwargs.get("device")) is int:
-            kwargs["device"] = "cpu"
-        if kwargs.get("pin_memory"):
-            kwargs["pin_memory"] = False
+        kwargs = kwargs or {}
+        # A script calls hundreds of functions of torch per iteration, and few of them name a device.
+        named = not _DEVICES.isdisjoint(map(type, args)) or (kwargs and not _KEYWORDS.isdisjoint(kwargs))
+        if named or func is torch.Tensor.to:
+            args, kwargs = _placed(func, args, kwargs)
         return func(*args, **kwargs)
+
+
+_MOVES = frozenset({torch.Tensor.cuda, torch.Tensor.pin_memory})
+_DEVICES = frozenset({str, torch.device})  # types of a positional argument that can name a device
+_KEYWORDS = frozenset({"device", "pin_memory"})
+
+
+def _placed(func: Callable, args: tuple, kwargs: dict[str, Any]) -> tuple[tuple, dict[str, Any]]:
+    """Return the arguments of a call with the CPU in place of CUDA devices, and without pinned memory."""
+    if func is torch.Tensor.to and len(args) > 1 and type(args[1]) is int:
+        args = (args[0], "cpu", *args[2:])
+    args = tuple("cpu" if _is_cuda(value) else value for value in args)
+    device = kwargs.get("device")
+    if _is_cuda(device) or type(device) is int:
+        kwargs = {**kwargs, "device": "cpu"}
+    if kwargs.get("pin_memory"):
+        kwargs = {**kwargs, "pin_memory": False}
+    return args, kwargs
 
 
 def _is_cuda(value: Any) -> bool:
