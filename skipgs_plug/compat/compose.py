@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from skipgs_plug.fallback_raster.runtime.function_modes import without_function_modes
+
 from .pairs import squared_gradients
 from .statistics import Footprint
 
@@ -103,6 +105,7 @@ class Rendering(NamedTuple):
     inverse_depth: Tensor | None  # [1, H, W]
 
 
+@without_function_modes
 def render(
     settings: Any,
     gaussians: Splats,

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import adam_rows, moments
+from skipgs_plug.fallback_raster.runtime.function_modes import without_function_modes
 
 
 class SparseGaussianAdam(torch.optim.Adam):
@@ -17,6 +18,7 @@ class SparseGaussianAdam(torch.optim.Adam):
         super().__init__(params=params, lr=lr, eps=eps)
 
     @torch.no_grad()
+    @without_function_modes
     def step(self, visibility: Tensor, N: int) -> None:  # type: ignore[override]
         """Update the visible rows of every parameter that has a gradient.
 

@@ -6,7 +6,10 @@ from typing import Literal
 
 from torch import Tensor
 
+from skipgs_plug.fallback_raster.runtime.function_modes import without_function_modes
 
+
+@without_function_modes
 def fused_ssim(img1: Tensor, img2: Tensor, padding: Literal["same", "valid"] = "same", train: bool = True) -> Tensor:
     """Return the mean SSIM (Wang et al. 2004, 11x11 Gaussian window). Differentiable in `img1`.
 

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..runtime.function_modes import without_function_modes
 from .adam import adam_step
 
 ADAM_REPLACED = "torch.optim.adam.adam"
@@ -144,6 +145,7 @@ def next_step(step: Tensor, lr: float, betas: tuple[float, float]) -> tuple[floa
     return lr / (1 - betas[0] ** count), (1 - betas[1] ** count) ** 0.5
 
 
+@without_function_modes
 def adam(
     params: Sequence[Tensor],
     grads: Sequence[Tensor],  # of the same shapes
