@@ -2,7 +2,7 @@
 
 import pytest
 from cases import note_begun
-from lookalikes import inria
+from lookalikes import gsplat_runner, inria
 from lookalikes.splats import log, new_log
 from test_unknown_changes import forked
 
@@ -92,3 +92,20 @@ def test_a_later_loop_that_cannot_be_planned_runs_whole_with_one_warning(head, s
     assert [str(one.message) for one in said] == [gate.released]
     assert [n for n in begun if n < 31] != WHOLE[:30] and gate.patched == []
     assert sorted(n for n in log.backwards if n > 30) == list(range(31, max(log.backwards) + 1))
+
+
+EPOCHS = """        step = -1
+        for epoch in range((last + 1) // 5):
+          for _ in [0] * 5:
+            step += 1
+"""
+
+
+def test_a_loop_over_epochs_that_begins_with_the_same_number_leaves_out_nothing(begun, tmp_path):
+    fork = forked(gsplat_runner, [("        for step in range(last + 1):\n", EPOCHS)], tmp_path)
+    runner = fork.Runner(fork.DefaultStrategy())
+    new_log()
+    with SkipGate(runner, share=0.4) as gate, pytest.warns(RuntimeWarning, match="No loop over range") as said:
+        runner.train()
+    assert [str(one.message) for one in said] == [gate.released]
+    assert begun == list(range(gsplat_runner.LAST + 1))

@@ -24,6 +24,7 @@ class LoopFinder:
         self.found: LoopRange | None = None
         self.expected: int | None = None
         self.functions: tuple[str, ...] = ()
+        self._matched: LoopRange | None = None  # the loop that was found by its number
         self._candidates: list[LoopRange] = []
         self._without = 0
 
@@ -41,6 +42,9 @@ class LoopFinder:
     def begins(self, step: int, needed: bool) -> bool:
         """Take note that the trainer begins iteration `step`; return whether this shows the training loop.
 
+        A loop over epochs may have the number of the first iteration by chance. The next iteration shows the mistake,
+        before anything is left out.
+
         Args:
             step: Number of the iteration.
             needed: Whether the iteration belongs to a phase that leaves out iterations.
@@ -49,7 +53,9 @@ class LoopFinder:
             AdapterMismatchError: No loop over a range counts the trainer's iterations.
         """
         if self.found is not None:
-            return False
+            if self.found is not self._matched or self.found.current == step:
+                return False
+            self.found = self.expected = None
         loop = next((loop for loop in self._candidates if loop.current == step), None)
         self._candidates.clear()
         if loop is not None:
@@ -78,4 +84,5 @@ class LoopFinder:
         return True
 
     def _find(self, loop: LoopRange) -> None:
-        self.found, self._without = loop, 0
+        self.found = self._matched = loop
+        self._without = 0
