@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import copy
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from skipgs_plug.core.source.inlining import InlinedFunction
@@ -104,9 +104,8 @@ def unconditional(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:
 def case_test(subject: ast.expr, case: ast.match_case) -> ast.expr:
     """Return a condition that holds if a case of a `match` is taken; true if its pattern has no values."""
     names = [part for part in ast.walk(case.pattern) if isinstance(part, ast.MatchAs)]
-    values = [part.value for part in ast.walk(case.pattern) if isinstance(part, ast.MatchValue)]
-    parts: list[ast.expr] = [ast.Compare(subject, [ast.Eq()], [value]) for value in values]
-    if not values or any(one.pattern is None for one in names):  # a name alone, and `_`, take every value
+    parts: list[ast.expr] = [*_compared(case.pattern, subject)]
+    if not parts or any(one.pattern is None for one in names):  # a name alone, and `_`, take every value
         parts = [ast.Constant(True)]
     elif len(parts) > 1:
         parts = [ast.BoolOp(ast.Or(), parts)]
@@ -155,27 +154,45 @@ def _ends_early(body: Sequence[ast.stmt]) -> ast.expr | None:
 
 def _cases(statement: ast.Match) -> Iterator[ast.expr]:
     for case in statement.cases:
-        for part in ast.walk(case.pattern):
-            if isinstance(part, ast.MatchValue):
-                yield ast.copy_location(ast.Compare(statement.subject, [ast.Eq()], [part.value]), part.value)
+        yield from _compared(case.pattern, statement.subject)
         if case.guard is not None:
             yield _guard(case.pattern, case.guard, statement.subject)
 
 
 def _guard(pattern: ast.pattern, guard: ast.expr, subject: ast.expr) -> ast.expr:
     """Return the guard of a case, with the subject in place of the names that the pattern gives to it."""
-    names = {part.name for part in ast.walk(pattern) if isinstance(part, ast.MatchAs)}
-    return _Captured(names, subject).visit(copy.deepcopy(guard))
+    named = {one.name: part for one, part in _matched(pattern, subject) if isinstance(one, ast.MatchAs)}
+    return _Captured(named).visit(copy.deepcopy(guard))
+
+
+def _compared(pattern: ast.pattern, subject: ast.expr) -> Iterator[ast.expr]:
+    """Yield a comparison for each value of a pattern."""
+    for one, part in _matched(pattern, subject):
+        if isinstance(one, ast.MatchValue):
+            yield ast.copy_location(ast.Compare(part, [ast.Eq()], [one.value]), one.value)
+
+
+def _matched(pattern: ast.pattern, subject: ast.expr) -> Iterator[tuple[ast.pattern, ast.expr]]:
+    """Yield a pattern and those inside it, each with the part of the subject that it takes."""
+    yield pattern, subject
+    inner = [one for one in ast.iter_child_nodes(pattern) if isinstance(one, ast.pattern)]
+    parts = [subject] * len(inner)
+    match pattern, subject:
+        case ast.MatchSequence(), ast.Tuple(shown) if len(shown) == len(inner):
+            parts = shown
+    for one, part in zip(inner, parts, strict=True):
+        yield from _matched(one, part)
 
 
 class _Captured(ast.NodeTransformer):
     """Puts the subject of a `match` in place of the names that a pattern gives to it."""
 
-    def __init__(self, names: Collection[str | None], subject: ast.expr) -> None:
-        self._names, self._subject = names, subject
+    def __init__(self, named: Mapping[str | None, ast.expr]) -> None:
+        self._named = named
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
-        return ast.copy_location(copy.deepcopy(self._subject), node) if node.id in self._names else node
+        part = self._named.get(node.id)
+        return node if part is None else ast.copy_location(copy.deepcopy(part), node)
 
 
 def _deciding(expression: ast.BoolOp) -> ast.expr:

@@ -106,6 +106,19 @@ def test_cases_of_the_number():
     assert found(loop) == {"step % 40 == 0": [80], "step % 40 == 13": [53, 93]}
 
 
+def test_cases_of_a_tuple():
+    def loop(stop):
+        rank = 0
+        for step in stop(rank=rank):
+            match rank, step % 40:
+                case 0, 13:
+                    print("save")
+                case _, n if n == 20:
+                    print("evaluate")
+
+    assert found(loop) == {"step % 40 == 13": [53, 93], "step % 40 == 20": [60]}
+
+
 def test_guards_of_cases():
     def loop(stop):
         for step in stop():
