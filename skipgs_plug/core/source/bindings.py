@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import inspect
 import itertools
 from collections.abc import Callable, Iterator
@@ -121,12 +122,25 @@ def held_in(name: str, value: ast.expr, class_of: Callable[[ast.Call], Any]) -> 
     return {name: value}
 
 
-def initialiser(cls: type) -> MethodType | None:
-    """Return `__init__` of a new object of a class, whose attributes are not set; None without such a method."""
+def initialiser(call: ast.Call, cls: type) -> tuple[ast.Call, MethodType | FunctionType | None]:
+    """Return the method of the user's that sets up a new object, and its call; None without such a method.
+
+    It is `__init__` of an object whose attributes are not set, or `__post_init__(object, ...)` of a dataclass.
+
+    Args:
+        call: The call that makes the object.
+        cls: Its class.
+    """
+    after = inspect.getattr_static(cls, "__post_init__", None)
+    if dataclasses.is_dataclass(cls) and isinstance(after, FunctionType):
+        further = inspect.signature(after).parameters
+        given = arguments(call, inspect.signature(cls)).items()
+        passed = [ast.keyword(name, value) for name, value in given if name in further]
+        return ast.copy_location(ast.Call(call.func, [call], passed), call), after
     found = inspect.getattr_static(cls, "__init__", None)
     # An object without attributes cannot run `__del__`.
     plain = cls.__new__ is object.__new__ and not hasattr(cls, "__del__") and not inspect.isabstract(cls)
-    return MethodType(found, object.__new__(cls)) if isinstance(found, FunctionType) and plain else None
+    return call, MethodType(found, object.__new__(cls)) if isinstance(found, FunctionType) and plain else None
 
 
 def _attributes(call: ast.Call, cls: type) -> dict[str, ast.expr]:

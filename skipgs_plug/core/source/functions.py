@@ -26,8 +26,8 @@ def value_of(place: ast.expr, names: Mapping[str, Any], unknown: Collection[str]
     """Return the value that a name, attribute or entry has before the loop and in it; None if unknown.
 
     Args:
-        place: The name, attribute or entry, as an expression such as `table["key"]` or `table.get("key")`. Properties
-            are not evaluated.
+        place: The name, attribute or entry, as an expression such as `table["key"]` or `table.get("key")`, or all
+            entries as `table.values()`. Properties are not evaluated.
         names: Names and values before the loop.
         unknown: Names and attributes that the loop assigns.
     """
@@ -36,12 +36,15 @@ def value_of(place: ast.expr, names: Mapping[str, Any], unknown: Collection[str]
     match place:
         case ast.Name(name):
             return names.get(name)
-        case ast.Attribute(holder, name):
+        case ast.Attribute(holder, name) | ast.Call(ast.Name("getattr"), [holder, ast.Constant(str(name)), *_]):
             found = inspect.getattr_static(value_of(holder, names, unknown), name, None)
             return None if hasattr(type(found), "__get__") else found
         case ast.Subscript(holder, ast.Constant(key)) | ast.Call(ast.Attribute(holder, "get"), [ast.Constant(key), *_]):
             held = value_of(holder, names, unknown)
             return held.get(key) if isinstance(held, dict) else None
+        case ast.Call(ast.Attribute(holder, "values"), []):
+            held = value_of(holder, names, unknown)
+            return [*held.values()] if isinstance(held, dict) else None
     return None
 
 
@@ -102,12 +105,14 @@ def _named(
             return names.get(name)
         case ast.Attribute(ast.Call(ast.Name("super"), []), name):
             return _inherited(name, names.get("self"), code)
-        case ast.Attribute(place, name):
+        case ast.Attribute(place, name) | ast.Call(ast.Name("getattr"), [place, ast.Constant(str(name)), *_]):
             owner = value(place)
             found = inspect.getattr_static(owner, name, None)
             if isinstance(found, FunctionType) and not inspect.isclass(owner) and not inspect.ismodule(owner):
                 in_class = inspect.getattr_static(type(owner), name, None) is found
                 return MethodType(found, owner) if in_class else found
+            if isinstance(found, classmethod):
+                return MethodType(found.__func__, owner if inspect.isclass(owner) else type(owner))
             return found.__func__ if isinstance(found, staticmethod) else found
     return value(function)
 
@@ -150,7 +155,7 @@ def closure(function: Any) -> dict[str, Any]:
 def read_syntax(function: FunctionType) -> ast.FunctionDef | None:
     """Return the syntax of a function, whose first line is line 1; None if there is no source.
 
-    A lambda is returned as a function that returns its expression.
+    A lambda is returned as a function that returns its expression, and an `async` function as one without `async`.
     """
     if function.__name__ == "<lambda>":
         return _lambda_syntax(function)
@@ -159,7 +164,11 @@ def read_syntax(function: FunctionType) -> ast.FunctionDef | None:
     except (OSError, TypeError, ValueError, SyntaxError):
         return None
     name = function.__code__.co_name
-    return next((node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name), None)
+    definitions = (node for node in tree.body if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)))
+    found = next((node for node in definitions if node.name == name), None)
+    if isinstance(found, ast.AsyncFunctionDef):
+        return ast.copy_location(ast.FunctionDef(**dict(ast.iter_fields(found))), found)
+    return found
 
 
 def _lambda_syntax(function: FunctionType) -> ast.FunctionDef | None:

@@ -22,7 +22,7 @@ from skipgs_plug.core.source.functions import (
     without_partial,
 )
 from skipgs_plug.core.source.project import Project
-from skipgs_plug.core.source.rewriting import Renamed, Repeated, Stored
+from skipgs_plug.core.source.rewriting import Plain, Renamed, Repeated, Stored
 from skipgs_plug.core.source.run_options import assigned_globals, comprehended
 
 # Largest depth of nested calls that are read: a loop calls its trainer, which calls a logger, which opens a file.
@@ -139,8 +139,8 @@ class InlinedFunctions:
         if isinstance(node, ast.Call) and self._is_read(node):
             found = self._function(node.func)
             if self._receives(node, numbers, holders) or self._shares_number(undecorated(found), numbers):
-                found = initialiser(found) if inspect.isclass(found) else found
-                call, found = without_partial(node, found, self._named)
+                call, found = initialiser(node, found) if inspect.isclass(found) else (node, found)
+                call, found = without_partial(call, found, self._named)
                 handed = None if self._is_own(found) else handed_over(node, self._is_function)
                 return (call, found) if handed is None else (handed, self._function(handed.func))
         if isinstance(node, ast.Attribute) and ast.unparse(node.value) in holders:
@@ -215,6 +215,7 @@ class InlinedFunctions:
         syntax = read_syntax(plain) if len(self._open) <= MAX_DEPTH else None
         if syntax is None:
             return None
+        Plain(plain.__code__).visit_all(syntax.body)
         held: dict[str, ast.expr] = {}
         renamed = Renamed(self._meanings(call, function, plain, syntax, numbers, held))
         body = [renamed.visit(statement) for statement in syntax.body]

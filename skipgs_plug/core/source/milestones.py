@@ -36,7 +36,7 @@ from skipgs_plug.core.source.inlining import PLACES, InlinedFunction, InlinedFun
 from skipgs_plug.core.source.lines import GATED_LOOP, head_of
 from skipgs_plug.core.source.progress_bars import Moves, moves, only_shows
 from skipgs_plug.core.source.project import Project
-from skipgs_plug.core.source.rewriting import Stored
+from skipgs_plug.core.source.rewriting import Plain, Stored
 from skipgs_plug.core.source.run_options import PURE, RunOptions
 from skipgs_plug.core.source.substitution import Substitution
 
@@ -68,6 +68,7 @@ class TrainingLoop:
         assert isinstance(statement.target, ast.Name)
         self._code, self._body, self._names = code, statement.body, dict(names)
         self._target = target = statement.target.id
+        Plain(code).visit_all(statement.body)
         Stored(lambda place: value_of(place, self._names, ())).visit_all(statement.body)
         own = assignments_in(statement.body)
         self._counters = {*counters(statement.body, self._names, own.assigned, Project(code, self._names))}

@@ -1,10 +1,12 @@
-"""Rewrites of a loop's statements that keep their meaning: other names, repeated statements, and plain assignments."""
+"""Rewrites of a loop's statements that keep their meaning: other names, repeated statements, and plainer ones."""
 
 from __future__ import annotations
 
 import ast
 import copy
+import inspect
 from collections.abc import Callable, Mapping
+from types import CodeType
 from typing import Any
 
 
@@ -28,6 +30,46 @@ class Renamed(ast.NodeTransformer):
             case ast.Subscript(ast.Tuple(values) | ast.List(values), ast.Constant(int(index))) if index < len(values):
                 return ast.copy_location(values[index], node)
         return node
+
+
+class Plain(ast.NodeTransformer):
+    """Writes `locals()` and `vars()` as the dictionary that they return, and `await call` as the call.
+
+    They are written so as arguments of calls and as values of assignments, which hand the number on. Elsewhere, as in
+    `"mask" in locals()`, their values do not matter.
+
+    Args:
+        code: Code of the function that contains the statements.
+    """
+
+    def __init__(self, code: CodeType) -> None:
+        local = (*code.co_varnames, *code.co_cellvars, *code.co_freevars)
+        self._local = local if code.co_flags & inspect.CO_NEWLOCALS else code.co_names
+
+    def visit_all(self, body: list[ast.stmt]) -> None:
+        """Change these statements."""
+        body[:] = self.visit(ast.Module(body, [])).body
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        node.args = [*map(self._written, node.args)]
+        for keyword in node.keywords:
+            keyword.value = self._written(keyword.value)
+        return self.generic_visit(node)
+
+    def visit_Assign(self, node: ast.Assign) -> ast.AST:
+        node.value = self._written(node.value)
+        return self.generic_visit(node)
+
+    def _written(self, value: ast.expr) -> ast.expr:
+        match value:
+            case ast.Call(ast.Name("locals" | "vars"), [], []):
+                names: list[ast.expr] = [ast.Name(name, ast.Load()) for name in self._local]
+                entries = ast.Dict([ast.Constant(name) for name in self._local], names)
+                return ast.fix_missing_locations(ast.copy_location(entries, value))
+        return value
+
+    def visit_Await(self, node: ast.Await) -> ast.AST:
+        return self.visit(node.value)  # type: ignore[no-any-return]
 
 
 class Repeated(ast.NodeTransformer):

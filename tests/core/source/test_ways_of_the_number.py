@@ -1,8 +1,9 @@
 """Conditions are found if the number reaches them inside a value, through another function, or through a kept value."""
 
+import asyncio
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from types import SimpleNamespace
 
 from read_milestones import found
@@ -99,6 +100,65 @@ def test_new_objects():
     assert numbers(loop) == [50, 66, 71, 80, 90, 99]
 
 
+@dataclass
+class Due:
+    """Acts when it is made, by its fields and by a value that is no field."""
+
+    step: int
+    every: InitVar[int]
+
+    def __post_init__(self, every):
+        if self.step == 71 or self.step % every == 0:
+            print("save")
+
+
+def test_dataclasses_that_act_when_they_are_made():
+    def loop(stop):
+        for step in stop():
+            Due(step, every=40)
+
+    assert numbers(loop) == [71, 80]
+
+
+def test_dictionaries_of_the_local_names():
+    def save(names):
+        if names["step"] % 40 == 0:
+            print("save")
+
+    def by_name(step, **others):
+        if step % 45 == 0:
+            print("save", others, vars())
+
+    def loop(stop):
+        for step in stop(save=save, by_name=by_name):
+            save(locals())
+            by_name(**vars())
+            if step > 60 and "loss" in locals():  # no condition on the number alone
+                print("late")
+
+    assert numbers(loop) == [80, 90]
+
+
+def test_async_functions():
+    async def save(step):
+        if step % 40 == 0:
+            print("save")
+
+    async def due(step):
+        return step % 45 == 0
+
+    async def work(step):
+        await save(step)
+        if await due(step):
+            print("save")
+
+    def loop(stop):
+        for step in stop(work=work, save=save, due=due):
+            asyncio.run(work(step))
+
+    assert numbers(loop) == [80, 90]
+
+
 def test_functions_that_are_handed_over_with_the_number():
     def save(step, every):
         if step % every == 0:
@@ -126,6 +186,41 @@ def test_functions_in_a_registry():
             hooks.get("none", print)(step)
 
     assert numbers(loop) == [80, 99]
+
+
+def test_all_functions_of_a_registry():
+    def loop(stop):
+        hooks = {"save": save_every_40, "end": lambda step: step == 99 and print("end")}
+        for step in stop(hooks=hooks):
+            for hook in hooks.values():
+                hook(step)
+
+    assert numbers(loop) == [80, 99]
+
+
+class Schedule:
+    """Its methods need no object, or are looked up by name."""
+
+    every = 40
+
+    @classmethod
+    def is_due(cls, step):
+        return step % cls.every == 0
+
+    def save(self, step):
+        if step == 71:
+            print("save")
+
+
+def test_methods_of_classes_and_methods_by_name():
+    def loop(stop):
+        schedule = Schedule()
+        for step in stop(schedule=schedule):
+            if Schedule.is_due(step) or schedule.is_due(step - 1):
+                print("save")
+            getattr(schedule, "save")(step)  # noqa: B009
+
+    assert numbers(loop) == [71, 80, 81]
 
 
 current = 0
