@@ -14,12 +14,13 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from numbers import Integral
 from pathlib import Path
-from types import CodeType
+from types import CodeType, ModuleType
 from typing import Any
 
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.source.assignments import assignments_in
+from skipgs_plug.core.source.bindings import assigned_values
 from skipgs_plug.core.source.conditions import (
     Condition,
     conditions_in,
@@ -34,10 +35,10 @@ from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator
 from skipgs_plug.core.source.functions import value_of
 from skipgs_plug.core.source.inlining import PLACES, InlinedFunction, InlinedFunctions
 from skipgs_plug.core.source.lines import GATED_LOOP, head_of
-from skipgs_plug.core.source.progress_bars import Moves, moves, only_shows
+from skipgs_plug.core.source.progress_bars import Moves, moves, outermost_bar_ifs
 from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.rewriting import Plain, Stored
-from skipgs_plug.core.source.run_options import PURE, RunOptions
+from skipgs_plug.core.source.run_options import PURE, RunOptions, root_of
 from skipgs_plug.core.source.substitution import Substitution
 
 # Functions that take all numbers from a range at once, before any iteration has run.
@@ -88,7 +89,7 @@ class TrainingLoop:
         options = RunOptions(code, around, self._names, no_options, functions.shared, pure | PURE)
         self._evaluator = Evaluator(target, functions.counted, self._names, changing, options)
         self._evaluator_of_loop = Evaluator(target, (), self._names, by_loop, options)
-        self._bar_ifs = _outermost_bar_ifs(statement.body, names, around)
+        self._bar_ifs = outermost_bar_ifs(statement.body, names, around)
         times = Counter([*own.assigned, *inlined.assigned])
         Substitution(functions, self._evaluator, times).apply(self._body)
         self._all = list(conditions_in(self._body, functions.by_call))
@@ -109,22 +110,31 @@ class TrainingLoop:
 
         Warns:
             RuntimeWarning: A condition depends on a counter of the loop's own, or compares the number with a limit that
-                it moves, so it holds less often if iterations are left out; or a condition cannot be evaluated ahead
-                because of a function that the loop calls.
+                it moves, so it holds less often if iterations are left out; or a module keeps the number; or a
+                condition cannot be evaluated ahead because of a function that the loop calls.
 
         Raises:
             SkipGSError: A condition cannot be evaluated ahead because of the loop itself.
         """
-        for location in self._without_warning(map(self._location, self._counted_by_itself())):
-            caution(
-                f"Line {location} counts the iterations that run, so it holds less often if others are left out. "
-                f"Decide by {self._target} if that matters."
-            )
-        for location in self._without_warning(map(self._location, self._moving_limits())):
-            caution(
-                f"Line {location} moves its own limit, so it can hold later and less often if iterations are left out; "
-                "name the iterations that must run (--always, always=)."
-            )
+        for conditions, sentence in (
+            (
+                self._counted_by_itself(),
+                "counts the iterations that run, so it holds less often if others are left out. "
+                f"Decide by {self._target} if that matters.",
+            ),
+            (
+                self._moving_limits(),
+                "moves its own limit, so it can hold later and less often if iterations are left out; "
+                "name the iterations that must run (--always, always=).",
+            ),
+            (
+                self._kept_in_modules(),
+                "keeps the iteration's number in a module, where conditions on it are not read; "
+                "name the iterations that must run (--always, always=).",
+            ),
+        ):
+            for location in self._without_warning(map(self._location, conditions)):
+                caution(f"Line {location} {sentence}")
         found: dict[str, set[int]] = {}
         uncertain: list[str] = []
         for condition in self._conditions():
@@ -226,6 +236,14 @@ class TrainingLoop:
                 if isinstance(leaf, ast.Compare) and self._evaluator.mentions(leaf) and not is_point(leaf):
                     yield from [Condition(leaf, (), function)] if _read(leaf) & moved else []
 
+    def _kept_in_modules(self) -> Iterator[Condition]:
+        """Yield all places in modules that hold the number, as `os.environ["STEP"]` after `... = str(step)`."""
+        for function, node in self._nodes():
+            for target, value in assigned_values(node):
+                holder = value_of(root_of(target), self._names, ())
+                if isinstance(holder, ModuleType) and self._evaluator.mentions(value):
+                    yield Condition(target, (), function)
+
     def _lists(self) -> Iterator[ast.expr]:
         """Yield names that are passed to a function together with the number, and may be lists of iterations."""
         for call in (node for statement in self._body for node in ast.walk(statement)):
@@ -290,17 +308,6 @@ def _rarer(evaluator: Evaluator, condition: Condition, numbers: range) -> set[in
             found |= holds if len(holds) <= len(others) else others
     except DependsOnLoop:
         return None
-    return found
-
-
-def _outermost_bar_ifs(body: list[ast.stmt], names: Mapping[str, Any], around: ast.AST) -> list[ast.If]:
-    """Return each `if` that only advances a progress bar, without those inside another one."""
-    found: list[ast.If] = []
-    for node in (part for statement in body for part in ast.walk(statement)):  # outer statements come first
-        if not isinstance(node, ast.If) or any(is_inside(node, outer) for outer in found):
-            continue
-        if only_shows(node, names, around):
-            found.append(node)
     return found
 
 

@@ -6,6 +6,8 @@ import ast
 from collections.abc import Container, Iterator, Mapping
 from typing import Any, NamedTuple
 
+from skipgs_plug.core.source.conditions import is_inside
+
 # Methods of a progress bar that show text, and the method that advances it.
 SHOWS = frozenset({"refresh", "set_description", "set_description_str", "set_postfix", "set_postfix_str"})
 MOVES = "update"
@@ -58,6 +60,17 @@ def is_bar(node: ast.AST, names: Mapping[str, Any]) -> bool:
     return isinstance(node, ast.Name) and any(
         kind.__module__.partition(".")[0] == "tqdm" for kind in type(names.get(node.id)).__mro__
     )
+
+
+def outermost_bar_ifs(body: list[ast.stmt], names: Mapping[str, Any], around: ast.AST) -> list[ast.If]:
+    """Return each `if` that only advances a progress bar, without those inside another one."""
+    found: list[ast.If] = []
+    for node in (part for statement in body for part in ast.walk(statement)):  # outer statements come first
+        if not isinstance(node, ast.If) or any(is_inside(node, outer) for outer in found):
+            continue
+        if only_shows(node, names, around):
+            found.append(node)
+    return found
 
 
 def only_shows(statement: ast.If, names: Mapping[str, Any], around: ast.AST) -> bool:

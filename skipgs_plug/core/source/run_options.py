@@ -97,9 +97,8 @@ class RunOptions:
 
     def _is_own(self, node: ast.expr) -> bool:
         """Whether a value is that of a variable of the function itself, or is held by one."""
-        while isinstance(node, (ast.Attribute, ast.Subscript)):
-            node = node.value
-        return isinstance(node, ast.Name) and node.id in self._own
+        root = root_of(node)
+        return isinstance(root, ast.Name) and root.id in self._own
 
     def _look_up(self, node: ast.expr) -> Any:
         """Return the value of an option, or of an object that holds options; `_UNKNOWN` if it is neither."""
@@ -119,6 +118,13 @@ class RunOptions:
             case ast.Subscript(holder, ast.Constant(key)):
                 return _item(self._look_up(holder), key, _UNKNOWN)
         return _UNKNOWN
+
+
+def root_of(place: ast.expr) -> ast.expr:
+    """Return the name, or other expression, whose attribute or entry a place is."""
+    while isinstance(place, (ast.Attribute, ast.Subscript)):
+        place = place.value
+    return place
 
 
 def assigned_globals(file: str) -> set[str]:

@@ -1,11 +1,13 @@
 """Conditions are found if the number reaches them inside a value, through another function, or through a kept value."""
 
 import asyncio
+import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import InitVar, dataclass
 from types import SimpleNamespace
 
+import pytest
 from read_milestones import found
 
 
@@ -221,6 +223,18 @@ def test_methods_of_classes_and_methods_by_name():
             getattr(schedule, "save")(step)  # noqa: B009
 
     assert numbers(loop) == [71, 80, 81]
+
+
+def test_a_number_that_a_module_keeps_gets_a_warning():
+    def keep(step):
+        os.environ["STEP"] = str(step)
+
+    def loop(stop):
+        for step in stop(keep=keep):
+            keep(step)
+
+    with pytest.warns(RuntimeWarning, match=r"Line \d+ of .* \(os.environ\['STEP'\]\) keeps the iteration's number"):
+        assert found(loop) == {}
 
 
 current = 0
