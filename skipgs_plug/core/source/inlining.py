@@ -22,7 +22,7 @@ from skipgs_plug.core.source.functions import (
     without_partial,
 )
 from skipgs_plug.core.source.project import Project
-from skipgs_plug.core.source.rewriting import Plain, Renamed, Repeated, Stored
+from skipgs_plug.core.source.rewriting import Managed, Plain, Renamed, Repeated, Stored
 from skipgs_plug.core.source.run_options import assigned_globals, comprehended
 
 # Largest depth of nested calls that are read: a loop calls its trainer, which calls a logger, which opens a file.
@@ -57,7 +57,8 @@ class InlinedFunction(NamedTuple):
 class InlinedFunctions:
     """The functions that a loop calls with its number, or that read its number, and the functions that they call.
 
-    Only functions of the user's own project are read, and methods of objects that exist before the loop.
+    Only functions of the user's own project are read, and methods of objects that exist before the loop or are made in
+    it by a call of their class.
 
     Args:
         body: The loop's statements.
@@ -92,7 +93,9 @@ class InlinedFunctions:
         stores = "STORE_GLOBAL" if code.co_flags & inspect.CO_NEWLOCALS else "STORE_NAME"
         self._globals = {one.argval for one in dis.get_instructions(code) if one.opname == stores}
         self._open = [code]  # code of the loop and of the functions that are being read, outermost first
+        self._made: dict[str, type] = {}  # classes of new objects, by the names that hold them
         Repeated(self._held).visit_all(body)
+        Managed(self._new).visit_all(body)
         self._follow(body, {target, *counters})
 
     def __iter__(self) -> Iterator[ast.stmt]:
@@ -110,7 +113,9 @@ class InlinedFunctions:
         for node in nodes:
             for target, value in assigned_values(node):
                 if isinstance(target, PLACES):
-                    numbers |= self._numbers_in(self.held_in(ast.unparse(target), value), numbers)
+                    held = self.held_in(ast.unparse(target), value)
+                    numbers |= self._numbers_in(held, numbers)
+                    self._note_new(held)
         holders = {text[: end.start()] for text in numbers for end in re.finditer(r"[.[]", text)}
         for node in nodes:
             call, function = self._called(node, numbers, holders)
@@ -119,6 +124,7 @@ class InlinedFunctions:
                 read = self._read(call, function, plain, numbers)
                 if read is not None:
                     self.by_call[id(node)] = read
+                    self._note_new(read.held)
                     self._open.append(plain.__code__)
                     self._follow(read.body, numbers | self._numbers_in(read.held, numbers))
                     self._open.pop()
@@ -140,6 +146,8 @@ class InlinedFunctions:
             found = self._function(node.func)
             if self._receives(node, numbers, holders) or self._shares_number(undecorated(found), numbers):
                 call, found = initialiser(node, found) if inspect.isclass(found) else (node, found)
+                if found is None and isinstance(call.func, ast.Attribute):
+                    call, found = self._method_of_new(call, call.func)
                 call, found = without_partial(call, found, self._named)
                 handed = None if self._is_own(found) else handed_over(node, self._is_function)
                 return (call, found) if handed is None else (handed, self._function(handed.func))
@@ -147,6 +155,24 @@ class InlinedFunctions:
             getter = property_of(self._value(node.value), node.attr)
             return ast.copy_location(ast.Call(node, [], []), node), getter
         return None, None
+
+    def _note_new(self, held: Mapping[str, ast.expr]) -> None:
+        """Note the names that hold new objects."""
+        self._made |= {text: cls for text, value in held.items() if (cls := self._new(value)) is not None}
+
+    def _new(self, value: ast.expr) -> type | None:
+        """Return the class of a new object; None for any other value."""
+        if (cls := self._made.get(ast.unparse(value))) is not None:
+            return cls
+        made = self._function(value.func) if isinstance(value, ast.Call) else None
+        return made if inspect.isclass(made) else None
+
+    def _method_of_new(self, call: ast.Call, method: ast.Attribute) -> tuple[ast.Call, Any]:
+        """Return a call `Saver(step).save()` with the object as first argument, and its method; None if unknown."""
+        found = inspect.getattr_static(self._new(method.value), method.attr, None)
+        if not isinstance(found, FunctionType):
+            return call, None
+        return ast.copy_location(ast.Call(call.func, [method.value, *call.args], call.keywords), call), found
 
     def _is_own(self, function: Any) -> bool:
         """Whether this is a function of the project."""
@@ -184,11 +210,11 @@ class InlinedFunctions:
     def _receives(self, call: ast.Call, numbers: Collection[str], holders: Collection[str]) -> bool:
         """Whether a function receives the number, or an object that holds it in an attribute."""
         call = spread(call)
-        given = [*call.args, *(keyword.value for keyword in call.keywords)]
+        owner = call.func.value if isinstance(call.func, ast.Attribute) else call.func
+        given = [*call.args, *(keyword.value for keyword in call.keywords), owner]
         if any(self._numbers_in(self.held_in("", value), numbers) for value in given):
             return True
         given = [one.value if isinstance(one, ast.Starred) else one for one in given]
-        given.append(call.func.value if isinstance(call.func, ast.Attribute) else call.func)
         return any(isinstance(one, (ast.Name, ast.Attribute)) and ast.unparse(one) in holders for one in given)
 
     def _is_of(self, value: ast.expr, numbers: Collection[str]) -> bool:
@@ -221,6 +247,7 @@ class InlinedFunctions:
         body = [renamed.visit(statement) for statement in syntax.body]
         Stored(self._value).visit_all(body)
         Repeated(self._held).visit_all(body)
+        Managed(self._new).visit_all(body)
         return InlinedFunction(body, plain.__code__, held)
 
     def _meanings(

@@ -72,6 +72,29 @@ class Plain(ast.NodeTransformer):
         return self.visit(node.value)  # type: ignore[no-any-return]
 
 
+class Managed(ast.NodeTransformer):
+    """Adds the calls that `with Saver(step):` makes of the new object's methods, around the block.
+
+    Args:
+        new: Returns the class of a new object; None for any other value.
+    """
+
+    def __init__(self, new: Callable[[ast.expr], type | None]) -> None:
+        self._new = new
+
+    def visit_all(self, body: list[ast.stmt]) -> None:
+        """Change these statements."""
+        body[:] = self.visit(ast.Module(body, [])).body
+
+    def visit_With(self, node: ast.With) -> ast.AST:
+        self.generic_visit(node)
+        made = [item.context_expr for item in node.items if self._new(item.context_expr) is not None]
+        begin = [_call_of(one, "__enter__", 0) for one in made]
+        end = [_call_of(one, "__exit__", 3) for one in reversed(made)]
+        node.body = [*begin, *node.body, *end]
+        return node
+
+
 class Repeated(ast.NodeTransformer):
     """Replaces a loop over known objects by its statements, once for each object, with the object's name.
 
@@ -141,3 +164,10 @@ class Stored(ast.NodeTransformer):
                 stores = [(ast.Attribute(held, name, ast.Store()), value)]
         added = [ast.Assign([target], copy.deepcopy(value)) for target, value in stores]
         return [node, *(ast.fix_missing_locations(ast.copy_location(one, node)) for one in added)]
+
+
+def _call_of(owner: ast.expr, method: str, arguments: int) -> ast.stmt:
+    """Return a call of a method with so many times None."""
+    nothing: list[ast.expr] = [ast.Constant(None) for _ in range(arguments)]
+    call = ast.Call(ast.Attribute(copy.deepcopy(owner), method, ast.Load()), nothing, [])
+    return ast.fix_missing_locations(ast.copy_location(ast.Expr(call), owner))

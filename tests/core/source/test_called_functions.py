@@ -41,17 +41,17 @@ def test_functions_of_the_same_file_and_of_the_project():
     }
 
 
-def test_methods_of_objects_that_exist_before_the_loop():
+def test_methods_of_objects():
     def loop(stop):
         saver = Saver(40)
         step_with = Saver(33).step
         for step in stop(saver=saver, step_with=step_with):
             saver.step(step)
             step_with(step)
-            new = Saver(7)
-            new.step(step)  # the object does not exist before the loop
+            new = Saver(45)
+            new.step(step)
 
-    assert numbers(loop) == [66, 80, 99]
+    assert numbers(loop) == [66, 80, 90, 99]
     assert numbers(Trainer().train) == [50, 60, 75, 77, 90]
 
 

@@ -122,6 +122,35 @@ def test_dataclasses_that_act_when_they_are_made():
     assert numbers(loop) == [71, 80]
 
 
+class Saving:
+    """Saves at the end of a block, or when it is told."""
+
+    def __init__(self, number, every):
+        self.number, self.every = number, every
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.save()
+
+    def save(self):
+        if self.number % self.every == 0:
+            print("save")
+
+
+def test_methods_of_new_objects():
+    def loop(stop):
+        for step in stop():
+            with Saving(step, 40), Saving(step, 45) as late:
+                print(late)
+            Saving(step, 33).save()
+            saving = Saving(step, 71)
+            saving.save()
+
+    assert numbers(loop) == [66, 71, 80, 90, 99]
+
+
 def test_dictionaries_of_the_local_names():
     def save(names):
         if names["step"] % 40 == 0:
