@@ -53,8 +53,9 @@ def test_the_server_gives_the_model_compressed_and_compares_views(page: WebPage,
         assert found["psnr"] == pytest.approx(row["psnr"], abs=1e-3)
         assert all(found[name].startswith("data:image/jpeg;base64,") for name in ("photograph", "render", "error"))
     for path in ("/compare/2.json", "/compare/-1.json", "/compare/x.json", "/../pyproject.toml", "/page"):
-        with pytest.raises(urllib.error.HTTPError, match="404"):
+        with pytest.raises(urllib.error.HTTPError, match="404") as refused:
             get(page, path)
+        refused.value.close()  # it holds the body of the answer
 
 
 def test_the_page_loads_nothing_from_elsewhere(page: WebPage) -> None:
