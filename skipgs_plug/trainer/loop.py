@@ -19,6 +19,7 @@ from skipgs_plug.trainer.densifier import Densifier
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.evaluation import evaluate
 from skipgs_plug.trainer.exposure import Exposure
+from skipgs_plug.trainer.half_size import half_size
 from skipgs_plug.trainer.image_store import ReadAhead
 from skipgs_plug.trainer.iteration import Iteration
 from skipgs_plug.trainer.model import create_optimizers, create_splats, step_optimizers
@@ -192,6 +193,8 @@ class Trainer:
         if not self._warm:
             self._warm_up(view)
         densifying = step < self.refine_stop_iter
+        if self.config.half_size and densifying and step < self.config.schedule / 2:  # mcmc densifies for longer
+            view = half_size(view)
         self.set_learning_rate(step)
 
         self.clock.start()

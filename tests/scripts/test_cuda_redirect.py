@@ -71,7 +71,7 @@ def test_a_checkpoint_saved_on_cuda_loads(tmp_path):
     torch.save({"a": torch.ones(2)}, tmp_path / "a.pt")
     with cuda_on_cpu():
         for place in ({}, {"map_location": "cuda"}, {"map_location": torch.device("cuda:0")}):
-            assert torch.load(tmp_path / "a.pt", **place)["a"].device.type == "cpu"
+            assert torch.load(tmp_path / "a.pt", **place, weights_only=True)["a"].device.type == "cpu"
 
 
 def test_optimizers_run_inside():
