@@ -37,7 +37,7 @@ def test_point_cloud(tmp_path: Path, folder: Path) -> None:
     assert float(torch.sigmoid(trainer.splats["opacities"].detach()).max()) == pytest.approx(0.1)
     trainer.train(progress=False)
     write_cloud(tmp_path / "cloud.ply", 3)
-    with pytest.raises(InputError, match=r"cloud\.ply has 3 points, at least 4"):
+    with pytest.raises(InputError, match=r"cloud\.ply has 3 points, but at least 4"):
         load_scene(folder, init_ply=tmp_path / "cloud.ply")
 
 

@@ -104,7 +104,7 @@ def test_damaged_model(folder: Path) -> None:
 def test_empty_and_non_finite_points(folder: Path) -> None:
     points = folder / "sparse/0/points3D.txt"
     points.write_text("")
-    with pytest.raises(InputError, match=r"sparse/0 has 0 points, at least 4"):
+    with pytest.raises(InputError, match=r"sparse/0 has 0 points, but at least 4"):
         load_scene(folder)
     xyz = np.ones((6, 3))
     xyz[2, 1] = np.nan

@@ -22,12 +22,15 @@ from skipgs_plug.adapters.speedy_splat import SpeedySplat
         ),
         (["inria"], "no script to run"),
         (["inria", "--", "absent.py"], "absent.py: name the training script after '--'"),
-        (["inria", "--resume-gate", __file__, "--", __file__], "does not hold a gate state: give a file that ends in"),
-        (["inria", "--ema-decay", "2", "--", __file__], "ema_decay must be in [0, 1)"),
+        (["inria", "--resume-gate", "SCRIPT", "--", "SCRIPT"], "does not hold a gate state: give a file that ends in"),
+        (["inria", "--ema-decay", "2", "--", "SCRIPT"], "ema_decay must be in [0, 1)"),
     ],
 )
-def test_bad_input_is_one_sentence(arguments, sentence, capfd):
-    assert cli.main(["run", *arguments]) == cli.BAD_INPUT
+def test_bad_input_is_one_sentence(arguments, sentence, tmp_path, capfd):
+    script = tmp_path / "train.py"
+    script.write_text("")
+    given = [str(script) if argument == "SCRIPT" else argument for argument in arguments]
+    assert cli.main(["run", *given]) == cli.BAD_INPUT
     error = capfd.readouterr().err
     assert sentence in error and error.count("\n") == 1
 
