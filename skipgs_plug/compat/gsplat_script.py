@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import rasterization
-from skipgs_plug.fallback_raster.install import install_as_gsplat
+from skipgs_plug.fallback_raster.runtime.function_modes import without_function_modes
 
 from .lpips import AbsentLpips
 from .packages import usable
@@ -38,13 +38,14 @@ def gsplat_on_cpu() -> Iterator[None]:
     replaced: list[tuple[Any, str, Any]] = []
     if not usable("torchvision"):
         replaced.append((torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", AbsentLpips))
-    if tuple(map(int, gsplat.__version__.split(".")[:2])) < (1, 5):
-        replaced += [(module, "rasterization", rasterization_1_4) for module in (gsplat, gsplat.rendering)]
+    old = tuple(map(int, gsplat.__version__.split(".")[:2])) < (1, 5)
+    rasterize = without_function_modes(rasterization_1_4 if old else rasterization)
+    replaced += [(module, "rasterization", rasterize) for module in (gsplat, gsplat.rendering)]
     if usable("PIL.Image") and usable("pycolmap"):  # in this order: the reverse order crashes Python later
         pycolmap = importlib.import_module("pycolmap")
         if not hasattr(pycolmap, "SceneManager"):
             replaced.append((pycolmap, "SceneManager", SceneManager))
-    with install_as_gsplat(), strategy_on_cpu(), stand_ins(replaced):
+    with strategy_on_cpu(), stand_ins(replaced):
         yield
 
 

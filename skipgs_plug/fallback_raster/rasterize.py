@@ -17,14 +17,12 @@ from .runtime.arguments import (
     refuse_unsupported,
 )
 from .runtime.constants import MAX_CHANNELS, TILE, tiles
-from .runtime.function_modes import without_function_modes
 from .stages.rows import all_rows
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
 
 
-@without_function_modes
 def rasterization(
     means: Tensor,  # [N, 3]
     quats: Tensor,  # [N, 4]
