@@ -32,7 +32,15 @@ class Renamed(ast.NodeTransformer):
         return node
 
 
-class Plain(ast.NodeTransformer):
+class _Rewrite(ast.NodeTransformer):
+    """Changes statements in place."""
+
+    def visit_all(self, body: list[ast.stmt]) -> None:
+        """Change these statements."""
+        body[:] = self.visit(ast.Module(body, [])).body
+
+
+class Plain(_Rewrite):
     """Writes `locals()` and `vars()` as the dictionary that they return, and `await call` as the call.
 
     They are written so as arguments of calls and as values of assignments, which hand the number on. Elsewhere, as in
@@ -45,10 +53,6 @@ class Plain(ast.NodeTransformer):
     def __init__(self, code: CodeType) -> None:
         local = (*code.co_varnames, *code.co_cellvars, *code.co_freevars)
         self._local = local if code.co_flags & inspect.CO_NEWLOCALS else code.co_names
-
-    def visit_all(self, body: list[ast.stmt]) -> None:
-        """Change these statements."""
-        body[:] = self.visit(ast.Module(body, [])).body
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
         node.args = [*map(self._written, node.args)]
@@ -72,7 +76,7 @@ class Plain(ast.NodeTransformer):
         return self.visit(node.value)  # type: ignore[no-any-return]
 
 
-class Managed(ast.NodeTransformer):
+class Managed(_Rewrite):
     """Adds the calls that `with Saver(step):` makes of the new object's methods, around the block.
 
     Args:
@@ -81,10 +85,6 @@ class Managed(ast.NodeTransformer):
 
     def __init__(self, new: Callable[[ast.expr], type | None]) -> None:
         self._new = new
-
-    def visit_all(self, body: list[ast.stmt]) -> None:
-        """Change these statements."""
-        body[:] = self.visit(ast.Module(body, [])).body
 
     def visit_With(self, node: ast.With) -> ast.AST:
         self.generic_visit(node)
@@ -95,7 +95,7 @@ class Managed(ast.NodeTransformer):
         return node
 
 
-class Repeated(ast.NodeTransformer):
+class Repeated(_Rewrite):
     """Replaces a loop over known objects by its statements, once for each object, with the object's name.
 
     The element of a comprehension is replaced in the same way, as in `[callback(step) for callback in callbacks]`.
@@ -103,10 +103,6 @@ class Repeated(ast.NodeTransformer):
 
     def __init__(self, held: Callable[[ast.For | ast.comprehension], list[ast.expr]]) -> None:
         self._held = held
-
-    def visit_all(self, body: list[ast.stmt]) -> None:
-        """Change these statements."""
-        body[:] = self.visit(ast.Module(body, [])).body
 
     def visit_For(self, node: ast.For) -> ast.stmt | list[ast.stmt]:
         held = self._held(node) if isinstance(node.target, ast.Name) else []
@@ -135,7 +131,7 @@ class Repeated(ast.NodeTransformer):
         return self.generic_visit(node)
 
 
-class Stored(ast.NodeTransformer):
+class Stored(_Rewrite):
     """Adds the assignments that calls make, as `state["step"] = step` after `state.update(step=step)`.
 
     Further such calls are `steps.append(step)`, which assigns `steps[-1]`, and `setattr(run, "step", step)`.
@@ -146,10 +142,6 @@ class Stored(ast.NodeTransformer):
 
     def __init__(self, value: Callable[[ast.expr], Any]) -> None:
         self._value = value
-
-    def visit_all(self, body: list[ast.stmt]) -> None:
-        """Change these statements."""
-        body[:] = self.visit(ast.Module(body, [])).body
 
     def visit_Expr(self, node: ast.Expr) -> list[ast.stmt]:
         stores: list[tuple[ast.expr, ast.expr]] = []
