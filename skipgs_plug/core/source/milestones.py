@@ -116,25 +116,21 @@ class TrainingLoop:
         Raises:
             SkipGSError: A condition cannot be evaluated ahead because of the loop itself.
         """
-        for conditions, sentence in (
-            (
-                self._counted_by_itself(),
-                "counts the iterations that run, so it holds less often if others are left out. "
-                f"Decide by {self._target} if that matters.",
-            ),
-            (
-                self._moving_limits(),
-                "moves its own limit, so it can hold later and less often if iterations are left out; "
-                "name the iterations that must run (--always, always=).",
-            ),
-            (
-                self._kept_in_modules(),
-                "keeps the iteration's number in a module, where conditions on it are not read; "
-                "name the iterations that must run (--always, always=).",
-            ),
-        ):
-            for location in self._without_warning(map(self._location, conditions)):
-                caution(f"Line {location} {sentence}")
+        self._warn_of(
+            self._counted_by_itself(),
+            "counts the iterations that run, so it holds less often if others are left out. "
+            f"Decide by {self._target} if that matters.",
+        )
+        self._warn_of(
+            self._moving_limits(),
+            "moves its own limit, so it can hold later and less often if iterations are left out; "
+            "name the iterations that must run (--always, always=).",
+        )
+        self._warn_of(
+            self._kept_in_modules(),
+            "keeps the iteration's number in a module, where conditions on it are not read; "
+            "name the iterations that must run (--always, always=).",
+        )
         found: dict[str, set[int]] = {}
         uncertain: list[str] = []
         for condition in self._conditions():
@@ -284,6 +280,11 @@ class TrainingLoop:
         """Return the number of the line, the file and the text of a condition, as warnings show them."""
         code = self._code_of(condition)
         return f"{_line(condition.test, code)} of {code.co_filename} ({ast.unparse(condition.test)})"
+
+    def _warn_of(self, conditions: Iterable[Condition], sentence: str) -> None:
+        """Warn of each condition that no warning has named. The sentence follows "Line ..."."""
+        for location in self._without_warning(map(self._location, conditions)):
+            caution(f"Line {location} {sentence}", stacklevel=3)
 
     def _without_warning(self, locations: Iterable[str]) -> list[str]:
         """Return the conditions that no warning has named; they are evaluated for each phase."""

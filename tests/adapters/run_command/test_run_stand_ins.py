@@ -7,6 +7,19 @@ import pytest
 from skipgs_plug import cli
 
 
+@pytest.fixture
+def error_of(checkout, tmp_path, capfd):
+    """Change the source of the look-alike's renderer, run its script with --cpu, and return what stderr gets."""
+
+    def run(change):
+        renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
+        renderer.write_text(change(renderer.read_text()))
+        assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
+        return capfd.readouterr().err
+
+    return run
+
+
 def test_missing_extension_is_the_scripts_own_error(checkout, tmp_path, capfd):
     assert cli.main(["run", "inria", "--", checkout, str(tmp_path)]) == 1  # without --cpu there are no stand-ins
     error = capfd.readouterr().err
@@ -44,36 +57,24 @@ def test_missing_extension_is_the_scripts_own_error(checkout, tmp_path, capfd):
         ),
     ],
 )
-def test_a_feature_that_the_stand_ins_lack_is_one_sentence(checkout, tmp_path, capfd, old, new, found):
-    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
-    renderer.write_text(renderer.read_text().replace(old, new))
-    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
-    error = capfd.readouterr().err
+def test_a_feature_that_the_stand_ins_lack_is_one_sentence(error_of, old, new, found):
+    error = error_of(lambda text: text.replace(old, new))
     assert "The script uses a feature that the stand-ins of --cpu lack (" in error and found in error
     assert "it needs CUDA; run it without --cpu." in error and "Traceback" not in error
 
 
-def test_an_option_that_a_stand_in_refuses_is_one_sentence(checkout, tmp_path, capfd):
-    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
-    renderer.write_text(renderer.read_text().replace("scales=", "cov3D_precomp=torch.ones(12, 6), scales="))
-    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
-    error = capfd.readouterr().err
+def test_an_option_that_a_stand_in_refuses_is_one_sentence(error_of):
+    error = error_of(lambda text: text.replace("scales=", "cov3D_precomp=torch.ones(12, 6), scales="))
     assert "skipgs-plug: The CPU stand-in needs scales and rotations" in error and "Traceback" not in error
 
 
 @pytest.mark.parametrize("line", ["(1, 2)[2]", "len(1, 2)", "None.integrate", "import simple_knx"])
-def test_an_error_of_the_scripts_own_keeps_its_traceback(checkout, tmp_path, capfd, line):
-    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
-    renderer.write_text(f"{line}\n" + renderer.read_text())
-    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
-    error = capfd.readouterr().err
+def test_an_error_of_the_scripts_own_keeps_its_traceback(error_of, line):
+    error = error_of(lambda text: f"{line}\n{text}")
     assert "Traceback" in error and "stand-ins of --cpu" not in error
 
 
-def test_no_advice_to_give_an_option_that_is_given(checkout, tmp_path, capfd):
-    renderer = Path(checkout).parent / "gaussian_renderer" / "__init__.py"
-    renderer.write_text("import diff_plane_rasterization\n" + renderer.read_text())
-    assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 1
-    error = capfd.readouterr().err
+def test_no_advice_to_give_an_option_that_is_given(error_of):
+    error = error_of(lambda text: f"import diff_plane_rasterization\n{text}")
     assert "diff_plane_rasterization is a CUDA extension for which this adapter has no CPU stand-in" in error
     assert "with --cpu before" not in error

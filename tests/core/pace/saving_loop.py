@@ -18,13 +18,16 @@ class Loop:
 
     def train(self, gate, **options):
         for step in gate.iterations(range(self.begin, self.end), **options):
-            self.ran.append(step)
-            self.optimizer.param_groups[0]["lr"] = 0.1 * 0.99**step
-            loss = (self.value - step % 3).square().sum()
-            if gate.backward(loss, view=VIEWS[step % 4], step=step):
-                self.optimizer.step()
-                self.optimizer.zero_grad(set_to_none=True)
+            self.train_step(gate, step)
             self.rates.append(self.optimizer.param_groups[0]["lr"])
             if step % 25 == 0:
                 self.saved.append(step)
         return self
+
+    def train_step(self, gate, step):
+        self.ran.append(step)
+        self.optimizer.param_groups[0]["lr"] = 0.1 * 0.99**step
+        loss = (self.value - step % 3).square().sum()
+        if gate.backward(loss, view=VIEWS[step % 4], step=step):
+            self.optimizer.step()
+            self.optimizer.zero_grad(set_to_none=True)

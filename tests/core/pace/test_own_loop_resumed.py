@@ -72,12 +72,7 @@ def first_part(loop, gate, middle, options):
     for step in gate.iterations(range(loop.begin, loop.end), always=range(0, 400, 25), **options):
         if step > middle:
             return
-        loop.ran.append(step)
-        loop.optimizer.param_groups[0]["lr"] = 0.1 * 0.99**step
-        loss = (loop.value - step % 3).square().sum()
-        if gate.backward(loss, view=VIEWS[step % 4], step=step):
-            loop.optimizer.step()
-            loop.optimizer.zero_grad(set_to_none=True)
+        loop.train_step(gate, step)
         yield gate.state_dict()
 
 
