@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from types import CodeType
 from typing import Any
 
@@ -61,13 +61,24 @@ class Evaluator:
 
     def depends_on_loop(self, node: ast.expr) -> bool:
         """Whether an expression depends on the number and on values that the loop changes."""
+        return self.mentions(node) and not self.is_of_number(node)
+
+    def is_of_number(self, node: ast.expr, is_foreign: Callable[[ast.Call], bool] = lambda call: False) -> bool:
+        """Whether an expression is computed from the number, and from values that the loop does not change.
+
+        Args:
+            node: The expression.
+            is_foreign: Whether a call may be part of it although it cannot be evaluated ahead.
+        """
         if not self.mentions(node):
             return False
         parts = list(ast.walk(node))
         inner = {name.id for name in comprehended(parts)}
         read = {ast.unparse(part) for part in parts if isinstance(part, PLACES)} - inner
-        reads = all(self._options.only_reads(part) for part in parts if isinstance(part, ast.Call))
-        return not reads or not read.isdisjoint(self._changing)
+        calls = [part for part in parts if isinstance(part, ast.Call)]
+        return read.isdisjoint(self._changing) and all(
+            self._options.only_reads(one) or is_foreign(one) for one in calls
+        )
 
     def value(self, node: ast.expr) -> Any:
         """Return the value that a name, attribute or entry has in all iterations; None if it is not known."""

@@ -7,10 +7,11 @@ import dis
 import inspect
 import re
 from collections.abc import Collection, Iterator, Mapping
-from types import CodeType, FunctionType, MethodType
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
 from skipgs_plug.core.source.bindings import arguments, assigned_values, handed_over, held_in, initialiser, spread
+from skipgs_plug.core.source.conversions import is_conversion
 from skipgs_plug.core.source.functions import (
     callbacks,
     called_function,
@@ -31,6 +32,7 @@ PLACES = (ast.Name, ast.Attribute, ast.Subscript)  # syntax that holds a value, 
 # Syntax that changes nothing and may be evaluated several times.
 _READS = (
     *(*PLACES, ast.BinOp, ast.BoolOp, ast.Compare, ast.Constant, ast.List, ast.Tuple, ast.UnaryOp),
+    *(ast.FormattedValue, ast.JoinedStr, ast.keyword),
     *(ast.boolop, ast.cmpop, ast.expr_context, ast.operator, ast.unaryop),
 )
 _DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
@@ -217,19 +219,29 @@ class InlinedFunctions:
         given = [one.value if isinstance(one, ast.Starred) else one for one in given]
         return any(isinstance(one, (ast.Name, ast.Attribute)) and ast.unparse(one) in holders for one in given)
 
+    def is_foreign(self, call: ast.Call) -> bool:
+        """Whether a call is of a library's function, which is no method."""
+        function = self._function(call.func)
+        return isinstance(function, (FunctionType, BuiltinFunctionType)) and not self._is_own(function)
+
     def _is_of(self, value: ast.expr, numbers: Collection[str]) -> bool:
-        """Whether a value is computed from the number alone."""
-        places = (part for part in ast.walk(value) if isinstance(part, PLACES))
-        return self._is_plain(value) and any(ast.unparse(one) in numbers for one in places)
+        """Whether a value is computed from the number alone, perhaps by functions of libraries."""
+        parts = [*ast.walk(value)]
+        plain = all(self._only_reads(one) or (isinstance(one, ast.Call) and self.is_foreign(one)) for one in parts)
+        return plain and any(isinstance(one, PLACES) and ast.unparse(one) in numbers for one in parts)
 
     def _is_plain(self, value: ast.expr) -> bool:
         """Whether an expression only reads names, attributes and entries, so that it can stand in several places."""
-        return all(
-            part.func.id in self._pure and not part.keywords
-            if isinstance(part, ast.Call) and isinstance(part.func, ast.Name)
-            else isinstance(part, _READS)
-            for part in ast.walk(value)
-        )
+        return all(map(self._only_reads, ast.walk(value)))
+
+    def _only_reads(self, part: ast.AST) -> bool:
+        """Whether a part of an expression, apart from the parts inside it, changes nothing."""
+        match part:
+            case ast.Call(ast.Name(name), _, keywords) if name in self._pure:
+                return not keywords
+            case ast.Call():
+                return is_conversion(part, self._function)
+        return isinstance(part, _READS)
 
     def _value(self, place: ast.expr) -> Any:
         return value_of(place, self._names, self.unknown)

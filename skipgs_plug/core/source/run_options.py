@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import inspect
 import linecache
-import math
 import re
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -13,6 +12,8 @@ from types import CodeType
 from typing import Any
 
 import torch
+
+from skipgs_plug.core.source.conversions import is_conversion
 
 # Built-in functions that conditions may call. They change nothing.
 PURE = frozenset({"abs", "all", "any", "bool", "divmod", "float", "frozenset", "getattr", "int", "isinstance", "len"})
@@ -69,12 +70,16 @@ class RunOptions:
 
     def only_reads(self, call: ast.Call) -> bool:
         """Whether a call changes nothing, whatever its arguments are."""
-        if isinstance(call.func, ast.Name):
-            return call.func.id in self._pure
-        if isinstance(call.func, ast.Attribute):
-            holder = self._look_up(call.func.value)
-            return holder is math or (isinstance(holder, dict) and call.func.attr == "get")
-        return False
+        match call.func:
+            case ast.Name(name) if name in self._pure:
+                return True
+            case ast.Attribute(holder, "get") if isinstance(self._look_up(holder), dict):
+                return True
+        return is_conversion(call, self._function)
+
+    def _function(self, named: ast.expr) -> Any:
+        found = self._look_up(named)
+        return None if found is _UNKNOWN else found
 
     def _holds(self, node: object, lengths: bool) -> bool:
         if isinstance(node, ast.Constant):

@@ -48,8 +48,13 @@ class Substitution(ast.NodeTransformer):
                     self._learn(self._functions.held_in(name, self.visit(value) if entry else value))
 
     def _learn(self, held: Mapping[str, ast.expr]) -> None:
-        """Note the values that names, attributes and entries have from now on, if they are known before the loop."""
-        self._meanings |= {text: one for text, one in held.items() if self._evaluator.is_known(one)}
+        """Note the values that names, attributes and entries have from now on.
+
+        They are values that are known before the loop, and values that functions of libraries compute from the number.
+        """
+        for text, value in held.items():
+            if self._evaluator.is_known(value) or self._evaluator.is_of_number(value, self._functions.is_foreign):
+                self._meanings[text] = value
 
     def visit_Name(self, node: ast.Name | ast.Attribute | ast.Subscript) -> ast.AST:
         if isinstance(node.ctx, ast.Load) and (meaning := self._meanings.get(ast.unparse(node))) is not None:

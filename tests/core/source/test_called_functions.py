@@ -115,7 +115,7 @@ def test_a_function_that_gets_the_number_in_a_table_is_read():
     def loop(stop):
         state = {}
         for step in stop(state=state, evaluate=evaluate):
-            loss = len(str(step))
+            loss = len(hex(step))
             state["late"] = step - 50
             info = {"step": step, "loss": loss}
             evaluate(info, state)
@@ -206,7 +206,7 @@ def test_condition_that_cannot_be_evaluated_is_one_warning_with_its_place():
         saver = Saver(40)
         for step in stop(saver=saver):
             saver.by_account(step)
-            maybe_save(step, [*saver.saved, len(str(step))])
+            maybe_save(step, [*saver.saved, len(hex(step))])
 
     sentence = (
         r"line \d+ of \S*project_helpers.py \(step - saver.last == 20\), line \d+ of \S*test_called_functions.py "

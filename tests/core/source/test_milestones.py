@@ -57,7 +57,7 @@ def test_the_rarer_side_of_a_condition_counts():
 def test_what_cannot_be_known_but_the_number_may_hold():
     def loop(stop):
         for step in stop():
-            size = len(str(step))
+            size = len(hex(step))
             if size > 1 and step % 30 == 0:
                 print("depends on the model too")
 

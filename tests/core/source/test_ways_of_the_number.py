@@ -1,14 +1,21 @@
 """Conditions are found if the number reaches them inside a value, through another function, or through a kept value."""
 
 import asyncio
+import math
+import operator
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import InitVar, dataclass
+from decimal import Decimal
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import torch
 from read_milestones import found
+
+from skipgs_plug import SkipGSError
 
 
 def numbers(loop):
@@ -38,7 +45,7 @@ def test_further_arguments():
     def loop(stop):
         for step in stop(by_name=by_name, by_place=by_place, pass_on=pass_on):
             by_place("scene", step, 71)
-            pass_on(step, step=step, loss=len(str(step)))
+            pass_on(step, step=step, loss=len(hex(step)))
 
     assert numbers(loop) == [71, 80, 90]
 
@@ -46,7 +53,7 @@ def test_further_arguments():
 def test_arguments_that_stars_hide():
     def loop(stop):
         for step in stop():
-            loss = len(str(step))
+            loss = len(hex(step))
             save_every_40(*(step, loss))
             info = {"step": step - 1, "loss": loss}
             save_every_40(**info)
@@ -62,7 +69,7 @@ def test_new_tables_and_tuples():
 
     def loop(stop):
         for step in stop(save=save):
-            save({"step": step, "loss": len(str(step))}, (step, len(str(step))))
+            save({"step": step, "loss": len(hex(step))}, (step, len(hex(step))))
 
     assert numbers(loop) == [71, 80]
 
@@ -95,7 +102,7 @@ def test_new_objects():
     def loop(stop):
         for step in stop(save=save):
             save(Context(step, "scene"), 40)
-            save(SimpleNamespace(step=step, loss=len(str(step))), 45)
+            save(SimpleNamespace(step=step, loss=len(hex(step))), 45)
             progress = Progress(step, "scene")
             save(progress, 33)
 
@@ -252,6 +259,44 @@ def test_methods_of_classes_and_methods_by_name():
             getattr(schedule, "save")(step)  # noqa: B009
 
     assert numbers(loop) == [71, 80, 81]
+
+
+def test_the_number_as_a_value_of_a_library():
+    def save(step):
+        if step % 40 == 0 or str(step).endswith("9"):
+            print("save")
+
+    def loop(stop):
+        for step in stop(save=save):
+            count = np.int64(step - 1)
+            if count % 40 == 0 or torch.tensor(step, dtype=torch.int64).item() == 71:
+                print("save")
+            save(Decimal(step - 2))
+            if f"{step:04d}".endswith("66") or math.floor(step / 2) == 49:
+                print("evaluate")
+
+    assert numbers(loop) == [51, 61, 66, 71, 81, 82, 91, 98, 99]
+
+
+def test_what_a_library_computes_from_the_number_is_not_known():
+    def save(step):
+        if step % 40 == 0:
+            print("save")
+
+    def in_loop(stop):
+        for step in stop():
+            rest = operator.mod(step, 40)
+            if rest == 0:
+                print("save")
+
+    def in_function(stop):
+        for step in stop(save=save):
+            save(operator.index(step))
+
+    with pytest.raises(SkipGSError, match=r"cannot be evaluated ahead \(operator.mod\(step, 40\) == 0\)"):
+        found(in_loop)
+    with pytest.warns(RuntimeWarning, match=r"depend on functions .* \(save.step % 40 == 0\)"):
+        assert found(in_function) == {}
 
 
 def test_a_number_that_a_module_keeps_gets_a_warning():
