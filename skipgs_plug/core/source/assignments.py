@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from skipgs_plug.core.source.inlining import PLACES
-from skipgs_plug.core.source.run_options import comprehended
+from skipgs_plug.core.source.run_options import comprehended, text_of
 
 # Methods that change lists, sets and queues, so that an object can differ from iteration to iteration.
 CHANGES = frozenset({"add", "append", "appendleft", "clear", "discard", "extend", "insert", "pop", "popleft", "remove"})
@@ -35,7 +35,7 @@ def assignments_in(body: Iterable[ast.stmt]) -> Assignments:
     parts = [node for one in body for node in ast.walk(one)]
     inner = set(map(id, comprehended(parts)))
     stored = [node for node in parts if isinstance(node, PLACES) and not isinstance(node.ctx, ast.Load)]
-    assigned = [ast.unparse(node) for node in stored if id(node) not in inner]
+    assigned = [text_of(node) for node in stored if id(node) not in inner]
     called = [node.func for node in parts if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
     changed = {ast.unparse(method.value) for method in called if method.attr in CHANGES}
     options = {ast.unparse(method.value) for method in called if method.attr in CHANGES_OPTIONS}

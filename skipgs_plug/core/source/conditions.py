@@ -39,7 +39,7 @@ def conditions_in(
 
     Args:
         body: The statements.
-        functions: Inlined functions by the id of the call, or of the attribute if it is a property.
+        functions: Inlined functions by the id of the call, or of the attribute or entry that makes it.
         guards: Conditions under which the statements run.
         function: The function that the statements are of; None for the loop.
     """
@@ -226,15 +226,15 @@ def _filters(generators: Sequence[ast.comprehension]) -> Iterator[ast.expr]:
 
 
 def _calls_of(statement: ast.stmt, guards: Guards) -> Iterator[tuple[ast.expr, Guards]]:
-    """Yield the calls and attributes in a statement, but not in the blocks inside it; see `_calls`."""
+    """Yield the calls, attributes and entries in a statement, but not in the blocks inside it; see `_calls`."""
     for part in ast.iter_child_nodes(statement):
         if not isinstance(part, (ast.stmt, ast.ExceptHandler, ast.match_case)):
             yield from _calls(part, guards)
 
 
 def _calls(node: ast.AST, guards: Guards) -> Iterator[tuple[ast.expr, Guards]]:
-    """Yield the calls and attributes in an expression, each with the conditions under which it is reached."""
-    if isinstance(node, (ast.Call, ast.Attribute)):
+    """Yield the calls, attributes and entries in an expression, each with the conditions under which it is reached."""
+    if isinstance(node, (ast.Call, ast.Attribute, ast.Subscript)):
         yield node, guards
     if isinstance(node, ast.BoolOp):
         for part in node.values:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from skipgs_plug.core.source.conditions import Guards, is_point, leaves
 from skipgs_plug.core.source.inlining import PLACES
-from skipgs_plug.core.source.run_options import RunOptions, comprehended
+from skipgs_plug.core.source.run_options import RunOptions, comprehended, text_of
 
 Truths = npt.NDArray[np.bool_]  # one truth value for each number of a range
 _NUMBERS = "numbers of the loop"  # with spaces, so that no name in a source is the same
@@ -74,7 +74,7 @@ class Evaluator:
             return False
         parts = list(ast.walk(node))
         inner = {name.id for name in comprehended(parts)}
-        read = {ast.unparse(part) for part in parts if isinstance(part, PLACES)} - inner
+        read = {text_of(part) for part in parts if isinstance(part, PLACES)} - inner
         calls = [part for part in parts if isinstance(part, ast.Call)]
         return read.isdisjoint(self._changing) and all(
             self._options.only_reads(one) or is_foreign(one) for one in calls
@@ -83,7 +83,7 @@ class Evaluator:
     def value(self, node: ast.expr) -> Any:
         """Return the value that a name, attribute or entry has in all iterations; None if it is not known."""
         parts = [part for part in ast.walk(node) if isinstance(part, ast.expr)]
-        read = {ast.unparse(part) for part in parts if isinstance(part, PLACES)}
+        read = {text_of(part) for part in parts if isinstance(part, PLACES)}
         reads = all(isinstance(part, (*PLACES, ast.Constant)) for part in parts)
         if reads and read.isdisjoint(self._changing) and not self.mentions(node):
             with contextlib.suppress(Exception):

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from types import CodeType, FunctionType, MethodType
 from typing import Any
 
-from skipgs_plug.core.source.run_options import is_plain
+from skipgs_plug.core.source.run_options import is_plain, text_of
 
 # Largest number of objects that are read one by one. Lists of callbacks are shorter, and lists of cameras longer.
 MOST_CALLBACKS = 16
@@ -31,7 +31,7 @@ def value_of(place: ast.expr, names: Mapping[str, Any], unknown: Collection[str]
         names: Names and values before the loop.
         unknown: Names and attributes that the loop assigns.
     """
-    if ast.unparse(place) in unknown:
+    if text_of(place) in unknown:
         return None
     match place:
         case ast.Name(name):
@@ -64,13 +64,6 @@ def called_function(
     found = _named(function, names, value, code)
     own = inspect.getattr_static(type(found), "__call__", None)
     return MethodType(own, found) if isinstance(own, FunctionType) else found
-
-
-def property_of(owner: Any, name: str) -> MethodType | None:
-    """Return the bound method that computes a property of an object; None if the object has no such property."""
-    found = inspect.getattr_static(type(owner), name, None)
-    getter = found.fget if isinstance(found, property) else None
-    return MethodType(getter, owner) if isinstance(getter, FunctionType) else None
 
 
 def without_partial(call: ast.Call, function: Any, named: Callable[[str, Any], ast.expr]) -> tuple[ast.Call, Any]:

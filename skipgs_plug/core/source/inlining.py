@@ -6,17 +6,17 @@ import ast
 import dis
 import inspect
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
+from skipgs_plug.core.source.accesses import access
 from skipgs_plug.core.source.bindings import arguments, assigned_values, handed_over, held_in, initialiser, spread
 from skipgs_plug.core.source.conversions import is_conversion
 from skipgs_plug.core.source.functions import (
     callbacks,
     called_function,
     closure,
-    property_of,
     read_syntax,
     undecorated,
     value_of,
@@ -24,7 +24,7 @@ from skipgs_plug.core.source.functions import (
 )
 from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.rewriting import Managed, Plain, Renamed, Repeated, Stored
-from skipgs_plug.core.source.run_options import assigned_globals, comprehended
+from skipgs_plug.core.source.run_options import assigned_globals, comprehended, text_of
 
 # Largest depth of nested calls that are read: a loop calls its trainer, which calls a logger, which opens a file.
 MAX_DEPTH = 3
@@ -72,7 +72,7 @@ class InlinedFunctions:
         pure: Names of functions that are evaluated and not read.
 
     Attributes:
-        by_call: The functions, by the id of the call in the syntax tree; for a property, of the attribute.
+        by_call: The functions, by the id, in the syntax tree, of the call, or of the attribute or entry that makes it.
         unknown: The argument, and variables of the functions whose values are not known before the loop.
         counted: Variables of the functions that begin with the number and are assigned again.
         shared: Added names that other functions may change.
@@ -95,6 +95,7 @@ class InlinedFunctions:
         stores = "STORE_GLOBAL" if code.co_flags & inspect.CO_NEWLOCALS else "STORE_NAME"
         self._globals = {one.argval for one in dis.get_instructions(code) if one.opname == stores}
         self._open = [code]  # code of the loop and of the functions that are being read, outermost first
+        self._assigned: dict[int, ast.expr] = {}  # values that are assigned, by the id of the target in the syntax tree
         self._made: dict[str, type] = {}  # classes of new objects, by the names that hold them
         Repeated(self._held).visit_all(body)
         Managed(self._new).visit_all(body)
@@ -104,8 +105,10 @@ class InlinedFunctions:
         """Iterate over the statements of all functions."""
         return (statement for function in self.by_call.values() for statement in function.body)
 
-    def _follow(self, body: list[ast.stmt], numbers: set[str]) -> None:
+    def _follow(self, body: list[ast.stmt], numbers: set[str]) -> set[str]:
         """Read the functions that statements call with the number, or that read it from the loop's variable.
+
+        The names and attributes that hold the number afterwards are returned.
 
         Args:
             body: The statements.
@@ -115,21 +118,27 @@ class InlinedFunctions:
         for node in nodes:
             for target, value in assigned_values(node):
                 if isinstance(target, PLACES):
-                    held = self.held_in(ast.unparse(target), value)
+                    self._assigned[id(target)] = value
+                    held = self.held_in(text_of(target), value)
                     numbers |= self._numbers_in(held, numbers)
                     self._note_new(held)
-        holders = {text[: end.start()] for text in numbers for end in re.finditer(r"[.[]", text)}
+        holders = _holders(numbers)
         for node in nodes:
             call, function = self._called(node, numbers, holders)
             plain = undecorated(function)
             if call is not None and plain is not None and plain.__code__ not in self._open and self._is_own(plain):
+                before = set(self.unknown)
                 read = self._read(call, function, plain, numbers)
                 if read is not None:
                     self.by_call[id(node)] = read
                     self._note_new(read.held)
                     self._open.append(plain.__code__)
-                    self._follow(read.body, numbers | self._numbers_in(read.held, numbers))
+                    kept = self._follow(read.body, numbers | self._numbers_in(read.held, numbers))
                     self._open.pop()
+                    own = self.unknown - before
+                    new = {text for text in kept - numbers if own.isdisjoint({text, *_holders([text])})}
+                    numbers, holders = numbers | new, holders | _holders(new)
+        return numbers
 
     def held_in(self, name: str, value: ast.expr) -> dict[str, ast.expr]:
         """Return the values that a name holds, as source text; see `bindings.held_in`."""
@@ -153,10 +162,8 @@ class InlinedFunctions:
                 call, found = without_partial(call, found, self._named)
                 handed = None if self._is_own(found) else handed_over(node, self._is_function)
                 return (call, found) if handed is None else (handed, self._function(handed.func))
-        if isinstance(node, ast.Attribute) and ast.unparse(node.value) in holders:
-            getter = property_of(self._value(node.value), node.attr)
-            return ast.copy_location(ast.Call(node, [], []), node), getter
-        return None, None
+        made, method = access(node, self._assigned.get(id(node)), self._value)
+        return (made, method) if made is not None and self._receives(made, numbers, holders) else (None, None)
 
     def _note_new(self, held: Mapping[str, ast.expr]) -> None:
         """Note the names that hold new objects."""
@@ -164,7 +171,7 @@ class InlinedFunctions:
 
     def _new(self, value: ast.expr) -> type | None:
         """Return the class of a new object; None for any other value."""
-        if (cls := self._made.get(ast.unparse(value))) is not None:
+        if (cls := self._made.get(text_of(value))) is not None:
             return cls
         made = self._function(value.func) if isinstance(value, ast.Call) else None
         return made if inspect.isclass(made) else None
@@ -217,18 +224,18 @@ class InlinedFunctions:
         if any(self._numbers_in(self.held_in("", value), numbers) for value in given):
             return True
         given = [one.value if isinstance(one, ast.Starred) else one for one in given]
-        return any(isinstance(one, (ast.Name, ast.Attribute)) and ast.unparse(one) in holders for one in given)
+        return any(isinstance(one, (ast.Name, ast.Attribute)) and text_of(one) in holders for one in given)
 
-    def is_foreign(self, call: ast.Call) -> bool:
-        """Whether a call is of a library's function, which is no method."""
-        function = self._function(call.func)
+    def is_foreign(self, part: ast.AST) -> bool:
+        """Whether a part of an expression calls a library's function, which is no method."""
+        function = self._function(part.func) if isinstance(part, ast.Call) else None
         return isinstance(function, (FunctionType, BuiltinFunctionType)) and not self._is_own(function)
 
     def _is_of(self, value: ast.expr, numbers: Collection[str]) -> bool:
         """Whether a value is computed from the number alone, perhaps by functions of libraries."""
-        parts = [*ast.walk(value)]
-        plain = all(self._only_reads(one) or (isinstance(one, ast.Call) and self.is_foreign(one)) for one in parts)
-        return plain and any(isinstance(one, PLACES) and ast.unparse(one) in numbers for one in parts)
+        places = (part for part in ast.walk(value) if isinstance(part, PLACES))
+        plain = all(self._only_reads(part) or self.is_foreign(part) for part in ast.walk(value))
+        return plain and any(text_of(one) in numbers for one in places)
 
     def _is_plain(self, value: ast.expr) -> bool:
         """Whether an expression only reads names, attributes and entries, so that it can stand in several places."""
@@ -342,6 +349,11 @@ class InlinedFunctions:
     def _named(self, name: str, value: Any) -> ast.expr:
         self._names[name] = value
         return ast.Name(name, ast.Load())
+
+
+def _holders(places: Iterable[str]) -> set[str]:
+    """Return the names and places whose attributes or entries these are, as source text."""
+    return {text[: end.start()] for text in places for end in re.finditer(r"[.[]", text)}
 
 
 def _bound(syntax: ast.FunctionDef) -> set[str]:

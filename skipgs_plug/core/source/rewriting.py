@@ -10,7 +10,21 @@ from types import CodeType
 from typing import Any
 
 
-class Renamed(ast.NodeTransformer):
+class _Rewrite(ast.NodeTransformer):
+    """Changes statements in place."""
+
+    def visit_all(self, body: list[ast.stmt]) -> None:
+        """Change these statements."""
+        body[:] = self.visit(ast.Module(body, [])).body
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        return node  # names and constants are most of the nodes, and have no parts to change
+
+    def visit_Constant(self, node: ast.Constant) -> ast.expr:
+        return node
+
+
+class Renamed(_Rewrite):
     """Puts expressions in place of names."""
 
     def __init__(self, meanings: Mapping[str, ast.expr]) -> None:
@@ -30,14 +44,6 @@ class Renamed(ast.NodeTransformer):
             case ast.Subscript(ast.Tuple(values) | ast.List(values), ast.Constant(int(index))) if index < len(values):
                 return ast.copy_location(values[index], node)
         return node
-
-
-class _Rewrite(ast.NodeTransformer):
-    """Changes statements in place."""
-
-    def visit_all(self, body: list[ast.stmt]) -> None:
-        """Change these statements."""
-        body[:] = self.visit(ast.Module(body, [])).body
 
 
 class Plain(_Rewrite):

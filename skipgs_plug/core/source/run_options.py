@@ -107,7 +107,7 @@ class RunOptions:
 
     def _look_up(self, node: ast.expr) -> Any:
         """Return the value of an option, or of an object that holds options; `_UNKNOWN` if it is neither."""
-        if ast.unparse(node) in self._changing:
+        if text_of(node) in self._changing:
             return _UNKNOWN
         match node:
             case ast.Name(name):
@@ -123,6 +123,16 @@ class RunOptions:
             case ast.Subscript(holder, ast.Constant(key)):
                 return _item(self._look_up(holder), key, _UNKNOWN)
         return _UNKNOWN
+
+
+def text_of(place: ast.expr) -> str:
+    """Return the source text of a place, as `ast.unparse` does, in less time for names and their attributes."""
+    match place:
+        case ast.Name(name):
+            return name
+        case ast.Attribute(ast.Name() | ast.Attribute() as holder, name):
+            return f"{text_of(holder)}.{name}"
+    return ast.unparse(place)
 
 
 def root_of(place: ast.expr) -> ast.expr:

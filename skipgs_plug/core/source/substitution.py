@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from skipgs_plug.core.source.bindings import assigned_values
 from skipgs_plug.core.source.evaluator import Evaluator
 from skipgs_plug.core.source.inlining import PLACES, InlinedFunctions
+from skipgs_plug.core.source.run_options import text_of
 
 
 class Substitution(ast.NodeTransformer):
@@ -42,7 +43,7 @@ class Substitution(ast.NodeTransformer):
                 continue
             self.visit(statement)
             for target, value in assigned_values(statement):
-                name = ast.unparse(target)
+                name = text_of(target)
                 if isinstance(target, PLACES) and self._times.get(name) == 1:
                     entry = isinstance(value, ast.Subscript)  # of a tuple that is unpacked
                     self._learn(self._functions.held_in(name, self.visit(value) if entry else value))
@@ -57,9 +58,8 @@ class Substitution(ast.NodeTransformer):
                 self._meanings[text] = value
 
     def visit_Name(self, node: ast.Name | ast.Attribute | ast.Subscript) -> ast.AST:
-        if isinstance(node.ctx, ast.Load) and (meaning := self._meanings.get(ast.unparse(node))) is not None:
-            return ast.copy_location(copy.deepcopy(meaning), node)
-        return self._result(node)
+        meaning = self._meanings.get(text_of(node)) if isinstance(node.ctx, ast.Load) else None
+        return self._result(node) if meaning is None else ast.copy_location(copy.deepcopy(meaning), node)
 
     visit_Attribute = visit_Subscript = visit_Name
 
@@ -72,6 +72,11 @@ class Substitution(ast.NodeTransformer):
         return value
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
+        match node:
+            case ast.Call(ast.Attribute(table, "get"), [ast.Constant(key), *_]):
+                meaning = self._meanings.get(f"{text_of(table)}[{key!r}]")
+                if meaning is not None:
+                    return ast.copy_location(copy.deepcopy(meaning), node)
         return self._result(node)
 
     def _result(self, node: ast.expr) -> ast.AST:
@@ -80,10 +85,8 @@ class Substitution(ast.NodeTransformer):
         function = self._functions.by_call.get(id(node))
         if function is None:
             return node
-        before = dict(self._meanings)
         self._learn({text: self.visit(copy.deepcopy(one)) for text, one in function.held.items()})
         self.apply(function.body)
-        self._meanings = before
         value = returned(function.body)
         if value is None or not (self._evaluator.mentions(value) and self._evaluator.is_known(value)):
             return node

@@ -26,3 +26,8 @@ def found(loop, pure=(), known=None):
     with pytest.raises(Stopped):
         loop(stop)
     return {re.sub(r"^line \d+: ", "", reason): sorted(numbers) for reason, numbers in caught.items() if numbers}
+
+
+def numbers(loop):
+    """Numbers that the conditions of a loop name, in order."""
+    return sorted(set().union(*found(loop).values()))

@@ -10,7 +10,7 @@ import project_helpers
 import pytest
 import torch
 from project_helpers import Saver, Trainer, is_late, log, switch, while_switched_on
-from read_milestones import found
+from read_milestones import found, numbers
 
 from skipgs_plug import SkipGate, SkipGSError
 
@@ -18,11 +18,6 @@ from skipgs_plug import SkipGate, SkipGSError
 def maybe_save(step, saves, model=None):
     if step in saves:
         print(model)
-
-
-def numbers(loop):
-    """Numbers that the conditions of a loop name, in order."""
-    return sorted(set().union(*found(loop).values()))
 
 
 def test_functions_of_the_same_file_and_of_the_project():

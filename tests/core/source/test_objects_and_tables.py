@@ -4,7 +4,7 @@ from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
-from read_milestones import found
+from read_milestones import found, numbers
 
 from skipgs_plug import SkipGSError
 
@@ -72,8 +72,76 @@ def test_properties_of_an_object_that_holds_the_number():
                 print("evaluate")
             print(state.saves_itself)
 
-    assert {number for numbers in found(loop).values() for number in numbers} == {77, 80, 90}
+    assert numbers(loop) == [77, 80, 90]
     assert found(State().train) == {"step % self.every == 0": [90]}
+
+
+class Run:
+    """Keeps the step in a property, in an entry, or by a method; and acts when it is set."""
+
+    def __init__(self):
+        self._step, self.held = 0, {}
+
+    step = property(lambda self: self._step)
+
+    @step.setter
+    def step(self, value):
+        self._step = value
+        if value == 71:
+            print("save")
+
+    def begin(self, step):
+        self._step = step
+
+    def save(self):
+        if self._step % 40 == 0:
+            print("save")
+
+    def __setitem__(self, key, value):
+        self.held[key] = value
+        if key == "step" and value == 72:
+            print("save")
+
+    def __getitem__(self, key):
+        return self.held[key]
+
+    def get(self, key, default=None):
+        return self.held.get(key, default)
+
+
+def test_properties_that_are_set():
+    def loop(stop):
+        run, other = Run(), Run()
+        for step in stop(run=run, other=other):
+            run.step = other.step = step
+            run.save()
+            if run.step == 81 or other._step == 82:
+                print("evaluate")
+
+    assert numbers(loop) == [71, 80, 81, 82]
+
+
+def test_methods_that_keep_the_number():
+    def loop(stop):
+        run = Run()
+        for step in stop(run=run):
+            run.begin(step)
+            run.save()
+            if run._step == 81:
+                print("evaluate")
+
+    assert numbers(loop) == [80, 81]
+
+
+def test_entries_of_objects():
+    def loop(stop):
+        run = Run()
+        for step in stop(run=run):
+            run["step"] = step
+            if run["step"] == 81 or run.get("step") == 82 or run.held["step"] == 83:
+                print("evaluate")
+
+    assert numbers(loop) == [72, 81, 82, 83]
 
 
 def test_a_property_that_is_no_condition_on_the_number_is_evaluated():

@@ -13,14 +13,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from read_milestones import found
+from read_milestones import found, numbers
 
 from skipgs_plug import SkipGSError
-
-
-def numbers(loop):
-    """Numbers that the conditions of a loop name, in order."""
-    return sorted(set().union(*found(loop).values()))
 
 
 def save_every_40(step, scene=None):
