@@ -145,6 +145,16 @@ def closure(function: Any) -> dict[str, Any]:
     return held
 
 
+def returns_owner(method: Any) -> bool:
+    """Whether a method returns its own object, as `__enter__` mostly does."""
+    function = undecorated(method)
+    syntax = None if function is None else syntax_of(function)
+    match syntax:
+        case ast.FunctionDef(args=ast.arguments(args=[owner, *_]), body=[*_, ast.Return(ast.Name(name))]):
+            return name == owner.arg
+    return False
+
+
 def read_syntax(function: FunctionType) -> ast.FunctionDef | None:
     """Return the syntax of a function, whose first line is line 1; None if there is no source.
 

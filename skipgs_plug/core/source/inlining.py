@@ -162,7 +162,7 @@ class InlinedFunctions:
                 call, found = without_partial(call, found, self._named)
                 handed = None if self._is_own(found) else handed_over(node, self._is_function)
                 return (call, found) if handed is None else (handed, self._function(handed.func))
-        made, method = access(node, self._assigned.get(id(node)), self._value)
+        made, method = access(node, self._assigned.get(id(node)), self._class)
         return (made, method) if made is not None and self._receives(made, numbers, holders) else (None, None)
 
     def _note_new(self, held: Mapping[str, ast.expr]) -> None:
@@ -175,6 +175,10 @@ class InlinedFunctions:
             return cls
         made = self._function(value.func) if isinstance(value, ast.Call) else None
         return made if inspect.isclass(made) else None
+
+    def _class(self, value: ast.expr) -> type:
+        """Return the class of an object; that of None if it is unknown."""
+        return self._new(value) or type(self._value(value))
 
     def _method_of_new(self, call: ast.Call, method: ast.Attribute) -> tuple[ast.Call, Any]:
         """Return a call `Saver(step).save()` with the object as first argument, and its method; None if unknown."""

@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from types import CodeType
 from typing import Any
 
+from skipgs_plug.core.source.functions import returns_owner
+
 
 class _Rewrite(ast.NodeTransformer):
     """Changes statements in place."""
@@ -85,6 +87,8 @@ class Plain(_Rewrite):
 class Managed(_Rewrite):
     """Adds the calls that `with Saver(step):` makes of the new object's methods, around the block.
 
+    The name after `as` is assigned in the block.
+
     Args:
         new: Returns the class of a new object; None for any other value.
     """
@@ -94,9 +98,20 @@ class Managed(_Rewrite):
 
     def visit_With(self, node: ast.With) -> ast.AST:
         self.generic_visit(node)
-        made = [item.context_expr for item in node.items if self._new(item.context_expr) is not None]
-        begin = [_call_of(one, "__enter__", 0) for one in made]
-        end = [_call_of(one, "__exit__", 3) for one in reversed(made)]
+        begin: list[ast.stmt] = []
+        end: list[ast.stmt] = []
+        for item in node.items:
+            cls, made = self._new(item.context_expr), item.context_expr
+            if cls is None:
+                continue
+            enter = _call_of(made, "__enter__", 0)
+            begin.append(enter)
+            end.insert(0, _call_of(made, "__exit__", 3))
+            if item.optional_vars is not None:
+                is_same = returns_owner(inspect.getattr_static(cls, "__enter__", None))
+                entered = copy.deepcopy(made if is_same else enter.value)
+                begin.append(ast.copy_location(ast.Assign([item.optional_vars], entered), made))
+                item.optional_vars = None
         node.body = [*begin, *node.body, *end]
         return node
 
@@ -164,7 +179,7 @@ class Stored(_Rewrite):
         return [node, *(ast.fix_missing_locations(ast.copy_location(one, node)) for one in added)]
 
 
-def _call_of(owner: ast.expr, method: str, arguments: int) -> ast.stmt:
+def _call_of(owner: ast.expr, method: str, arguments: int) -> ast.Expr:
     """Return a call of a method with so many times None."""
     nothing: list[ast.expr] = [ast.Constant(None) for _ in range(arguments)]
     call = ast.Call(ast.Attribute(copy.deepcopy(owner), method, ast.Load()), nothing, [])
