@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import dataclasses
 import inspect
 import itertools
@@ -11,6 +12,7 @@ from types import FunctionType, MethodType
 from typing import Any
 
 from skipgs_plug.core.source.functions import syntax_of, undecorated
+from skipgs_plug.core.source.rewriting import Renamed
 
 _VALUES = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 
@@ -144,10 +146,10 @@ def initialiser(call: ast.Call, cls: type) -> tuple[ast.Call, MethodType | Funct
 
 
 def _attributes(call: ast.Call, cls: type) -> dict[str, ast.expr]:
-    """Return the attributes of a new object that hold an argument of its class.
+    """Return the attributes of a new object that hold values of the arguments of its class.
 
-    They are those to which `__init__` assigns a parameter. Without a source of `__init__`, as for a dataclass or a
-    namespace, attributes are named like parameters.
+    They are those to which `__init__` assigns parameters, constants, or values computed from them. Without a source of
+    `__init__`, as for a dataclass or a namespace, attributes are named like parameters.
     """
     try:
         given = arguments(call, inspect.signature(cls))
@@ -160,9 +162,10 @@ def _attributes(call: ast.Call, cls: type) -> dict[str, ast.expr]:
     own = syntax.args.args[0].arg if syntax.args.args else None
     found = {}
     for target, value in (pair for statement in syntax.body for pair in assigned_values(statement)):
-        match target, value:
-            case ast.Attribute(ast.Name(holder), attribute), ast.Name(name) if holder == own and name in given:
-                found[attribute] = given[name]
+        read = {part.id for part in ast.walk(value) if isinstance(part, ast.Name)}
+        match target:
+            case ast.Attribute(ast.Name(holder), attribute) if holder == own and read <= given.keys():
+                found[attribute] = Renamed(given).visit(copy.deepcopy(value))
     return found
 
 

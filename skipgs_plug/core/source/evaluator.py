@@ -73,8 +73,7 @@ class Evaluator:
         if not self.mentions(node):
             return False
         parts = list(ast.walk(node))
-        inner = {name.id for name in comprehended(parts)}
-        read = {text_of(part) for part in parts if isinstance(part, PLACES)} - inner
+        read = places_in(node) - {name.id for name in comprehended(parts)}
         calls = [part for part in parts if isinstance(part, ast.Call)]
         return read.isdisjoint(self._changing) and all(
             self._options.only_reads(one) or is_foreign(one) for one in calls
@@ -83,9 +82,8 @@ class Evaluator:
     def value(self, node: ast.expr) -> Any:
         """Return the value that a name, attribute or entry has in all iterations; None if it is not known."""
         parts = [part for part in ast.walk(node) if isinstance(part, ast.expr)]
-        read = {text_of(part) for part in parts if isinstance(part, PLACES)}
         reads = all(isinstance(part, (*PLACES, ast.Constant)) for part in parts)
-        if reads and read.isdisjoint(self._changing) and not self.mentions(node):
+        if reads and places_in(node).isdisjoint(self._changing) and not self.mentions(node):
             with contextlib.suppress(Exception):
                 return eval(_compiled(node), dict(self.names))
         return None
@@ -160,6 +158,11 @@ class _Evaluation:
             with contextlib.suppress(Exception):
                 found[index] = bool(eval(code, names))
         return found
+
+
+def places_in(expression: ast.expr) -> set[str]:
+    """Return the names, attributes and entries that an expression reads, as source text."""
+    return {text_of(part) for part in ast.walk(expression) if isinstance(part, PLACES)}
 
 
 def _compiled(node: ast.expr) -> CodeType:

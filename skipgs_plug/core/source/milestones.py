@@ -31,9 +31,9 @@ from skipgs_plug.core.source.conditions import (
     unconditional,
 )
 from skipgs_plug.core.source.counters import counters
-from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator
+from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator, places_in
 from skipgs_plug.core.source.functions import value_of
-from skipgs_plug.core.source.inlining import PLACES, InlinedFunction, InlinedFunctions
+from skipgs_plug.core.source.inlining import InlinedFunction, InlinedFunctions
 from skipgs_plug.core.source.lines import GATED_LOOP, head_of
 from skipgs_plug.core.source.progress_bars import Moves, moves, outermost_bar_ifs
 from skipgs_plug.core.source.project import Project
@@ -93,7 +93,7 @@ class TrainingLoop:
         times = Counter([*own.assigned, *inlined.assigned])
         Substitution(functions, self._evaluator, times).apply(self._body)
         self._all = list(conditions_in(self._body, functions.by_call))
-        self._functions = [*functions.by_call.values()]
+        self._by_call = functions.by_call
         self._warned_of: set[str] = set()  # conditions that warnings have named
 
     def milestones(self, numbers: range) -> dict[str, set[int]]:
@@ -110,8 +110,8 @@ class TrainingLoop:
 
         Warns:
             RuntimeWarning: A condition depends on a counter of the loop's own, or compares the number with a limit that
-                it moves, so it holds less often if iterations are left out; or a module keeps the number; or a
-                condition cannot be evaluated ahead because of a function that the loop calls.
+                it moves, so it holds less often if iterations are left out; or a module, queue or generator receives
+                the number; or a condition cannot be evaluated ahead because of a function that the loop calls.
 
         Raises:
             SkipGSError: A condition cannot be evaluated ahead because of the loop itself.
@@ -127,8 +127,8 @@ class TrainingLoop:
             "name the iterations that must run (--always, always=).",
         )
         self._warn_of(
-            self._kept_in_modules(),
-            "keeps the iteration's number in a module, where conditions on it are not read; "
+            self._kept_for_others(),
+            "keeps the iteration's number for other code, whose conditions on it are not read; "
             "name the iterations that must run (--always, always=).",
         )
         found: dict[str, set[int]] = {}
@@ -219,7 +219,7 @@ class TrainingLoop:
                 continue
             for leaf in leaves(condition.test):
                 picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and is_point(leaf)
-                if picks and _read(leaf) & self._counters and not self._evaluator.mentions(leaf):
+                if picks and places_in(leaf) & self._counters and not self._evaluator.mentions(leaf):
                     yield condition._replace(test=leaf)
 
     def _moving_limits(self) -> Iterator[Condition]:
@@ -230,15 +230,19 @@ class TrainingLoop:
             moved = assignments_in(node.body).changed
             for leaf in leaves(node.test):
                 if isinstance(leaf, ast.Compare) and self._evaluator.mentions(leaf) and not is_point(leaf):
-                    yield from [Condition(leaf, (), function)] if _read(leaf) & moved else []
+                    yield from [Condition(leaf, (), function)] if places_in(leaf) & moved else []
 
-    def _kept_in_modules(self) -> Iterator[Condition]:
-        """Yield all places in modules that hold the number, as `os.environ["STEP"]` after `... = str(step)`."""
+    def _kept_for_others(self) -> Iterator[Condition]:
+        """Yield all places in modules that hold the number, as `os.environ["STEP"]`, and calls as `queue.put(step)`."""
         for function, node in self._nodes():
             for target, value in assigned_values(node):
                 holder = value_of(root_of(target), self._names, ())
                 if isinstance(holder, ModuleType) and self._evaluator.mentions(value):
                     yield Condition(target, (), function)
+            match node:  # methods of queues, pipes and generators
+                case ast.Call(ast.Attribute(held, "put" | "put_nowait" | "send"), [value, *_]):
+                    known = value_of(held, self._names, ()) is not None and id(node) not in self._by_call
+                    yield from [Condition(node, (), function)] if known and self._evaluator.mentions(value) else []
 
     def _lists(self) -> Iterator[ast.expr]:
         """Yield names that are passed to a function together with the number, and may be lists of iterations."""
@@ -259,7 +263,7 @@ class TrainingLoop:
 
     def _nodes(self) -> Iterator[tuple[InlinedFunction | None, ast.AST]]:
         """Yield all nodes of the loop, with None, and of each function that it calls, with the function."""
-        bodies = [(None, self._body), *((one, one.body) for one in self._functions)]
+        bodies = [(None, self._body), *((one, one.body) for one in self._by_call.values())]
         return ((one, part) for one, body in bodies for statement in body for part in ast.walk(statement))
 
     def _bar_if_of(self, condition: Condition) -> ast.If | None:
@@ -291,11 +295,6 @@ class TrainingLoop:
         found = [location for location in dict.fromkeys(locations) if location not in self._warned_of]
         self._warned_of.update(found)
         return found
-
-
-def _read(expression: ast.expr) -> set[str]:
-    """Return the names, attributes and entries that an expression reads."""
-    return {ast.unparse(part) for part in ast.walk(expression) if isinstance(part, PLACES)}
 
 
 def _rarer(evaluator: Evaluator, condition: Condition, numbers: range) -> set[int] | None:

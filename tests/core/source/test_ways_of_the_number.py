@@ -4,6 +4,7 @@ import asyncio
 import math
 import operator
 import os
+import queue
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import InitVar, dataclass
@@ -136,9 +137,23 @@ class Saving:
     def __exit__(self, *error):
         self.save()
 
+    @property
+    def late(self):
+        return self.number == 72
+
     def save(self):
         if self.number % self.every == 0:
             print("save")
+
+
+class Paused(Saving):
+    """Gives another value to the name of the block."""
+
+    def __init__(self, number):
+        self.number, self.every = number, 1000
+
+    def __enter__(self):
+        return self.number
 
 
 def test_methods_of_new_objects():
@@ -304,6 +319,32 @@ def test_a_number_that_a_module_keeps_gets_a_warning():
 
     with pytest.warns(RuntimeWarning, match=r"Line \d+ of .* \(os.environ\['STEP'\]\) keeps the iteration's number"):
         assert found(loop) == {}
+
+
+def test_a_number_that_a_queue_or_a_generator_receives_gets_a_warning():
+    def save_some():
+        while True:
+            print((yield) % 40)
+
+    def loop(stop):
+        steps, some = queue.Queue(), save_some()
+        for step in stop(steps=steps, some=some):
+            steps.put({"step": step})
+            some.send(step)
+
+    with pytest.warns(RuntimeWarning, match="keeps the iteration's number for other code") as said:
+        assert found(loop) == {}
+    assert [str(one.message).split("(")[1] for one in said] == ["steps.put", "some.send"]
+
+
+def test_objects_of_a_with_statement():
+    def loop(stop):
+        for step in stop():
+            with Saving(step, 40) as saving, Paused(step) as other:
+                if saving.number == 71 or saving.late or other == 73:
+                    print("evaluate")
+
+    assert numbers(loop) == [71, 72, 73, 80]
 
 
 current = 0
