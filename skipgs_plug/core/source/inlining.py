@@ -96,6 +96,7 @@ class InlinedFunctions:
         self._globals = {one.argval for one in dis.get_instructions(code) if one.opname == stores}
         self._open = [code]  # code of the loop and of the functions that are being read, outermost first
         self._assigned: dict[int, ast.expr] = {}  # values that are assigned, by the id of the target in the syntax tree
+        self._nodes: list[ast.AST] = []  # keeps the nodes of `by_call`, so that no new node gets the id of one
         self._made: dict[str, type] = {}  # classes of new objects, by the names that hold them
         Repeated(self._held).visit_all(body)
         Managed(self._new).visit_all(body)
@@ -131,6 +132,7 @@ class InlinedFunctions:
                 read = self._read(call, function, plain, numbers)
                 if read is not None:
                     self.by_call[id(node)] = read
+                    self._nodes.append(node)
                     self._note_new(read.held)
                     self._open.append(plain.__code__)
                     kept = self._follow(read.body, numbers | self._numbers_in(read.held, numbers))
