@@ -103,7 +103,8 @@ FACTS = (
     "epoch: 'int | None' = None, max_steps: 'int | None' = None, world_size: 'int | None' = None, "
     "gradients_read_until: 'int | None' = None, accumulates: 'bool' = False, "
     "steps_each: 'bool' = False, "
-    "densification: 'Densification | None' = None, defaults: 'Mapping[str, Any]' = <factory>) -> None"
+    "densification: 'Densification | None' = None, "
+    "photographs: 'Callable[[], Iterable[Tensor]] | None' = None, defaults: 'Mapping[str, Any]' = <factory>) -> None"
 )
 POLICY = {
     "decide": "(self, view: 'Hashable', loss: 'float', step: 'int') -> 'Decision'",
@@ -127,6 +128,7 @@ DEFAULTS = {
     "share": None,
     "grow_share": None,
     "refine_share": None,
+    "half_size": None,
     "max_gaussians": None,
     "always": None,
     "tolerance": 0.05,
@@ -178,7 +180,8 @@ def test_what_adapters_are_written_with() -> None:
         "stand_ins",
     }
     assert signatures(Hooks) == HOOKS
-    assert properties(Hooks) == {"gap", "lengthens_steps", "patched", "released", "state", "trained"}
+    asked = {"at_half_size", "gap", "lengthens_steps", "may_halve", "patched", "released", "state", "trained"}
+    assert properties(Hooks) == asked
     assert str(inspect.signature(TrainerInfo)) == FACTS
     assert str(inspect.signature(adapters.register_adapter)) == (
         "(adapter: 'type[AbstractAdapter]') -> 'type[AbstractAdapter]'"

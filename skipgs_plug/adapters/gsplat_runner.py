@@ -15,6 +15,7 @@ from skipgs_plug.adapters.gsplat_strategy import (
     strategy_events,
     survey_of,
 )
+from skipgs_plug.adapters.half_size_batches import show_half_size_batches
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode, function_names
 from skipgs_plug.core.errors import SkipGSError
@@ -123,6 +124,7 @@ class GsplatRunner(AbstractAdapter):
                 world_size=runner.world_size,
                 gradients_read_until=gradients_read_until(strategy),
                 densification=None if survey.unknown else strategy_events(strategy),
+                photographs=None if survey.unknown else show_half_size_batches(hooks, runner),
             )
         )
 

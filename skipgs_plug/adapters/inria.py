@@ -20,9 +20,10 @@ import torch
 
 from skipgs_plug.adapters import registry
 from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.half_size_cameras import HalfSizeCameras
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import last_calls
-from skipgs_plug.adapters.loop_code import LOOP, LoopCode, names_around
+from skipgs_plug.adapters.loop_code import LOOP, LoopCode, names_around, namespace_of
 from skipgs_plug.adapters.unknown_forks import BY_HAND, CALLS, Unrecognised, begin_after, left_alone, unrecognised
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
@@ -52,6 +53,7 @@ class InriaFamily(AbstractAdapter):
         arguments: Arguments of the renderer that the adapter knows, beyond those of Inria's.
         densification: How to recognise its densification events; None if all iterations of densification must run.
         pure: Functions and methods that depend on the iteration, and need no iteration besides those of `always_run`.
+        shows_half_size: Whether cameras may be shown at half their size; see `HalfSizeCameras`.
         known_names: Values of names that the loop assigns, if they are known before it. `begin` fills them.
     """
 
@@ -64,6 +66,7 @@ class InriaFamily(AbstractAdapter):
     calls: ClassVar[tuple[str, ...]] = ()
     arguments: ClassVar[tuple[str, ...]] = ()
     pure: ClassVar[tuple[str, ...]] = ()
+    shows_half_size: ClassVar[bool] = False
     # Statistics are means over visits, so some events may be left out if the others have enough visits.
     densification: ClassVar[Densification | None] = Densification(marks=("densification_interval",))
 
@@ -76,6 +79,7 @@ class InriaFamily(AbstractAdapter):
         self._model_class: type = object
         self.known_names: dict[str, Any] = {}
         self._unknown = Unrecognised(*5 * (frozenset(),))
+        self._cameras: HalfSizeCameras | None = None  # None if they cannot be shown at half their size
 
     @classmethod
     def matches(cls, trainer: Any) -> bool:
@@ -209,8 +213,11 @@ class InriaFamily(AbstractAdapter):
         def rendered(first: str, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             camera = args[0] if args else kwargs.get(first)
             # A camera without a name is the viewer's, which renders before the training view.
-            if self.is_training_render(args[1:], kwargs) and (key := self.view_key(camera)) is not None:
+            key = self.view_key(camera) if self.is_training_render(args[1:], kwargs) else None
+            if key is not None:
                 hooks.view(key)
+            if self._cameras is not None:
+                self._cameras.rendered(camera, training=key is not None)
             return original(*args, **kwargs)
 
         self._renderers(names)
@@ -233,6 +240,8 @@ class InriaFamily(AbstractAdapter):
     def _begins(self, hooks: Hooks, model: Any, caller: types.FrameType) -> None:
         """An iteration begins in the loop around this frame. The first one reads the run."""
         with hooks.guarded():
+            if self._cameras is not None:
+                self._cameras.restore()
             # Variables of the loop are read once, before they hold the graph of an iteration.
             if self._model() is not model:
                 self._refuse_fork(LoopCode.of_module(caller.f_globals))
@@ -319,6 +328,8 @@ class InriaFamily(AbstractAdapter):
             )
             self._label = "uid"
         self.begin(opt, loop)
+        known = self.shows_half_size and not self._unknown.listed and HalfSizeCameras.can_be_shown(cameras)
+        self._cameras = HalfSizeCameras(hooks, cameras) if known and hooks.may_halve else None
         hooks.ready(
             TrainerInfo(
                 self._start_after_changes(opt, loop),
@@ -328,6 +339,7 @@ class InriaFamily(AbstractAdapter):
                 gradients_read_until=self.gradients_read_until(opt, loop),
                 accumulates=self.accumulates(opt, loop),
                 steps_each=self.steps_each(opt, loop),
+                photographs=None if self._cameras is None else self._cameras.photographs,
             )
         )
 
@@ -364,6 +376,7 @@ class Inria(InriaFamily):
         "position. A fork that no adapter knows is refused if its loop changes tensors in place."
     )
     stand_ins = "inria"
+    shows_half_size = True
 
     @classmethod
     def recognises(cls, names: Container[str]) -> bool:
@@ -383,12 +396,3 @@ class Inria(InriaFamily):
     def stand_ins_for(cls, command: Sequence[str]) -> str:
         # Its train.py takes the presence of SparseGaussianAdam for the accelerated branch of the rasterizer.
         return "inria_accelerated" if "sparse_adam" in command else cls.stand_ins
-
-
-def namespace_of(trainer: Any) -> dict[str, Any] | None:
-    """Return the global names of a train module, or of the module of a training function."""
-    if isinstance(trainer, types.ModuleType):
-        return vars(trainer)
-    if isinstance(trainer, types.FunctionType):
-        return trainer.__globals__
-    return None

@@ -208,3 +208,12 @@ def _with_inner(code: types.CodeType) -> Iterator[types.CodeType]:
     for const in code.co_consts:
         if isinstance(const, types.CodeType):
             yield from _with_inner(const)
+
+
+def namespace_of(trainer: Any) -> dict[str, Any] | None:
+    """Return the global names of a train module, or of the module of a training function."""
+    if isinstance(trainer, types.ModuleType):
+        return vars(trainer)
+    if isinstance(trainer, types.FunctionType):
+        return trainer.__globals__
+    return None

@@ -33,6 +33,7 @@ class MCMC(InriaFamily):
     )
     left_alone = "The position noise is zero in skipped iterations. Its random numbers are drawn as usual."
     stand_ins = "mcmc"
+    shows_half_size = True
     mark = NOISE
     changes = (*InriaFamily.changes, "add_new_gs", "relocate_gs")
     calls = ("add_", "randn_like", "randn")

@@ -33,6 +33,9 @@ class SkipConfig:
             too few iterations before them are left out.
         refine_share: Share of the iterations from `start_iter` on that runs, or "auto". None for the paper's gate,
             unless `share` is given.
+        half_size: With `share` or `grow_share`: train on photographs of half the width and height until densification
+            ends, at most in the first half of the run. None with "auto" is True if the trainer's adapter can do it and
+            the photographs lose little by it; otherwise False.
         max_gaussians: With `share` or `grow_share`: densification stops before an event could exceed this number
             of Gaussians. None for no bound.
         always: With a share: iterations that always run. None reads them from the conditions of the loop.
@@ -69,6 +72,7 @@ class SkipConfig:
     share: float | str | None = None
     grow_share: float | str | None = None
     refine_share: float | str | None = None
+    half_size: bool | None = None
     max_gaussians: int | None = None
     always: tuple[int, ...] | None = None
     tolerance: float = 0.05
@@ -97,6 +101,8 @@ class SkipConfig:
             _check_count("max_gaussians", self.max_gaussians, "Gaussians")
             if self.growing is None and self.enabled:
                 raise SkipGSError("max_gaussians needs share or grow_share; give one of them too.")
+        if self.half_size and self.growing is None and self.enabled:
+            raise SkipGSError("half_size needs share or grow_share; give one of them too.")
         if self.always is not None:
             # Accept any collection of whole numbers and store a tuple. The class is frozen, hence object.__setattr__.
             object.__setattr__(self, "always", tuple(sorted(int(number) for number in self.always)))
@@ -121,6 +127,13 @@ class SkipConfig:
     def leaves_out(self) -> bool:
         """Whether whole iterations are left out."""
         return self.enabled and self.refining is not None
+
+    @property
+    def may_halve(self) -> bool:
+        """Whether the scene may grow on photographs of half the size; see `half_size`."""
+        if not self.enabled or self.growing is None:
+            return False
+        return self.growing == "auto" if self.half_size is None else self.half_size
 
     @property
     def compensates(self) -> bool:

@@ -123,6 +123,16 @@ class LoopHooks:
         return counted if number is None else number
 
     @property
+    def may_halve(self) -> bool:
+        """Whether the settings allow photographs of half the size, if the adapter can show them."""
+        return self._engine.config.may_halve
+
+    @property
+    def at_half_size(self) -> bool:
+        """Whether the present iteration must train on a photograph of half the width and height."""
+        return self._engine.pace.at_half_size
+
+    @property
     def gap(self) -> int:
         """Number of iterations that were left out right before the present one."""
         return self._engine.pace.gap

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, Literal
 
+from torch import Tensor
+
 
 @dataclass(frozen=True)
 class Densification:
@@ -61,6 +63,8 @@ class TrainerInfo:
             whole all the same: the trainer's own run takes nearly all of its steps there.
         densification: How to find the densification events, so that fewer iterations can run before densification
             ends; None if all of them must run.
+        photographs: Returns some training photographs [3, H, W] with values in [0, 1], if the adapter shows views at
+            half their size while `Hooks.at_half_size`; None if it cannot.
         defaults: Settings that suit this trainer. They are used where the user gave no value.
     """
 
@@ -75,4 +79,5 @@ class TrainerInfo:
     accumulates: bool = False
     steps_each: bool = False
     densification: Densification | None = None
+    photographs: Callable[[], Iterable[Tensor]] | None = None
     defaults: Mapping[str, Any] = dataclasses.field(default_factory=dict)

@@ -152,9 +152,6 @@ class TrainConfig:
     """Compensate opacities for the 2D low-pass filter (Mip-Splatting)."""
     random_bkgd: bool = False
     """Train on random background colours, so that no Gaussian imitates a background. Photographs must be opaque."""
-    half_size: bool = False
-    """Densify on photographs of half the width and height, at most in the first half of the run. It pays for
-    photographs of 640x480 or larger."""
     near_plane: Optional[float] = None
     """Near clipping plane, world units; default: a tenth of the depth of the nearest points that a view shows."""
     far_plane: float = 1e10

@@ -193,7 +193,7 @@ class Trainer:
         if not self._warm:
             self._warm_up(view)
         densifying = step < self.refine_stop_iter
-        if self.config.half_size and densifying and step < self.config.schedule / 2:  # mcmc densifies for longer
+        if self.at_half_size():
             view = half_size(view)
         self.set_learning_rate(step)
 
@@ -251,6 +251,10 @@ class Trainer:
                 f"Loss is {value.value()} at iteration {step} on view {view!r}; check that image and camera, or lower "
                 "the learning rates."
             )
+
+    def at_half_size(self) -> bool:
+        """Whether the present iteration trains on a photograph of half the width and height. A gate may replace it."""
+        return False
 
     def set_learning_rate(self, step: float) -> None:
         """Set the learning rates of positions and exposure; the others are constant.

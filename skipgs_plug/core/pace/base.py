@@ -120,6 +120,11 @@ class Pace:
         return True
 
     @property
+    def at_half_size(self) -> bool:
+        """Whether the present iteration trains on a photograph of half the width and height."""
+        return False
+
+    @property
     def leaves_out(self) -> bool:
         """Whether whole iterations may be left out; the pace then needs the training loop."""
         return False

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
+
 from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.half_size import LEAST_PSNR, half_size_psnr
 from skipgs_plug.core.pace.densification_events import DensificationEvents
 from skipgs_plug.core.pace.needs import (
     LEAST_GROWING_SHARE,
@@ -67,6 +71,8 @@ class Growing(Phase):
         self._share_now: float | None = None  # share of the present iterations; None for `share`
         self._rows_at_first = 0  # number of Gaussians at the first event
         self._measuring = True
+        self._half_until: int | None = None  # iteration before which photographs have half their size
+        self._half_psnr: float | None = None  # PSNR of these photographs, in decibels; None if it did not decide
         self._saved_events: dict[str, Any] | None = None
 
     def numbers(self, number: int, end: int) -> range:
@@ -115,7 +121,31 @@ class Growing(Phase):
         until, after = (len(self._must.intersection(part)) / max(len(part), 1) for part in parts)
         self._must_shares = until, after
         self._epoch = plan.epoch or self._epoch
+        if self._half_until is None:
+            self._half_until = min(numbers.stop, (plan.last + 1) // 2) if self._halves(plan) else 0
         return True
+
+    def _halves(self, plan: PhasePlan) -> bool:
+        """Whether the scene grows on photographs of half the size. All processes must call it together.
+
+        Raises:
+            SkipGSError: The user asked for it, and it is not possible.
+        """
+        if plan.photographs is None:
+            if self._config.half_size:
+                raise SkipGSError(
+                    "half_size is not possible here: the adapter of this trainer does not show its views at half their "
+                    "size, or they are too small; leave it out."
+                )
+            return False
+        if not self._config.may_halve or self._config.half_size:
+            return self._config.may_halve
+        own = torch.tensor([half_size_psnr(plan.photographs())])
+        (self._half_psnr,) = distributed.mean(own)
+        return self._half_psnr >= LEAST_PSNR
+
+    def at_half_size(self, number: int) -> bool:
+        return number < (self._half_until or 0)
 
     @property
     def stretch(self) -> float:
@@ -244,7 +274,8 @@ class Growing(Phase):
 
         `share`, `iterations_run`, `iterations_skipped`, `events_run`, `events_skipped`, `rate_factor`,
         `opacity_rate_factor`, `times_grown` (Gaussians at the last event, as a multiple of those at the first; None if
-        unknown), `always_run`.
+        unknown), `half_size_until` (iteration before which photographs had half their size; 0 for none),
+        `half_size_psnr` (decibels; None if it did not decide), `always_run`.
         """
         if self._first is None:
             return None
@@ -260,6 +291,8 @@ class Growing(Phase):
             "rate_factor": factor,
             "opacity_rate_factor": None if parts is None else parts.opacities,
             "times_grown": self._times_grown,
+            "half_size_until": self._half_until,
+            "half_size_psnr": self._half_psnr,
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
         }
 
@@ -280,6 +313,7 @@ class Growing(Phase):
             "share_now": self._share_now,
             "gaussians_at_first": self._rows_at_first,
             "measuring": self._measuring,
+            "half_size": [self._half_until, self._half_psnr],
             "sampling": self.sampling.state_dict(),
             "events": self._events_state,
         }
@@ -292,5 +326,6 @@ class Growing(Phase):
         self._measuring = state["measuring"]
         self._share_now, self._rows_at_first = state.get("share_now"), state.get("gaussians_at_first", 0)
         self._visible, self._visible_now = state["gaussians_shown"]
+        self._half_until, self._half_psnr = state.get("half_size", (0, None))  # an older run has no such photographs
         self.sampling.load_state_dict(state["sampling"])
         self._saved_events, self.events = state["events"], None

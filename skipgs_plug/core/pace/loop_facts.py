@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
+
+from torch import Tensor
 
 from skipgs_plug.core import distributed
 from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_known
@@ -45,6 +47,7 @@ class LoopFacts:
         self._pure: tuple[str, ...] = ()
         self._known: Known = nothing_known
         self._accumulates = self._steps_each = False
+        self._photographs: Callable[[], Iterable[Tensor]] | None = None
         self._views: list[str] | None = None
         self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
 
@@ -53,6 +56,7 @@ class LoopFacts:
         self.start, self.last, self._views = start, info.max_steps, views
         self._accumulates, self._steps_each, self._epoch = info.accumulates, info.steps_each, info.epoch
         self.densification = info.densification or self.densification
+        self._photographs = info.photographs
 
     def describe(self, always: Always, pure: Iterable[str], densification: Densification | None, known: Known) -> None:
         """Receive facts from the trainer's adapter; see `Pace.describe`."""
@@ -111,6 +115,7 @@ class LoopFacts:
             epoch,
             self.densification,
             self._accumulates,
+            self._photographs,
             self._steps_each,
         )
 

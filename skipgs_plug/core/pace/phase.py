@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
+
+from torch import Tensor
 
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.trainer_info import Densification
@@ -25,6 +27,7 @@ class PhasePlan(NamedTuple):
         epoch: Number of iterations in which every view comes up once; None if unknown.
         densification: How to recognise densification events; None if unknown.
         accumulates: Optimizers step on gradients that are accumulated over several iterations; see `TrainerInfo`.
+        photographs: Returns some training photographs, if views can be shown at half their size; see `TrainerInfo`.
         steps_each: Optimizers would do so, but step in each iteration of refinement that runs; see `TrainerInfo`.
     """
 
@@ -37,6 +40,7 @@ class PhasePlan(NamedTuple):
     epoch: int | None
     densification: Densification | None
     accumulates: bool
+    photographs: Callable[[], Iterable[Tensor]] | None = None
     steps_each: bool = False
 
     def epoch_for(self, setting: str) -> int:
@@ -89,6 +93,10 @@ class Phase:
     def runs(self, number: int) -> bool:
         """Whether iteration `number` runs; called once for each number, in order."""
         return True
+
+    def at_half_size(self, number: int) -> bool:
+        """Return whether iteration `number` trains on a photograph of half the width and height."""
+        return False
 
     def is_named(self, number: int) -> bool:
         """Return whether a condition of the loop, or the adapter, may name iteration `number`."""

@@ -110,6 +110,11 @@ class Phased(Pace):
         loop = self._finder.found
         return None if loop is None else loop.current
 
+    @property
+    def at_half_size(self) -> bool:
+        number = self.number
+        return number is not None and not self._removed and self._phase(number).at_half_size(number)
+
     def begin(self, step: int, policy: Policy | None) -> None:
         # An adapter's loop is searched for from the first iteration on, so that a refusal comes before any training.
         needed = self._attached or self._grows.leaves_out or step >= self._facts.start

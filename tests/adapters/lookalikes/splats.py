@@ -62,15 +62,17 @@ class _Noted(torch.autograd.Function):
         return gradient, None
 
 
-def make_cameras(order=0):
-    """Training cameras; `uid` is the position in a shuffled list, as in the Inria family."""
+def make_cameras(order=0, scale=1):
+    """Training cameras of `scale` times the usual size; `uid` is the position in a shuffled list, as in Inria 3DGS."""
     rng = torch.Generator().manual_seed(1)
     cameras = []
     for i, name in enumerate(NAMES):
         viewmat = torch.eye(4)
         viewmat[:3, 3] = torch.tensor([0.3 * i - 0.6, 0.1 * i, 3.0])
-        image = torch.rand(3, HEIGHT, WIDTH, generator=rng)
-        cameras.append(SimpleNamespace(image_name=name, viewmat=viewmat, original_image=image))
+        image = torch.rand(3, scale * HEIGHT, scale * WIDTH, generator=rng)
+        camera = SimpleNamespace(image_name=name, viewmat=viewmat, original_image=image, world_view_transform=viewmat.T)
+        camera.image_height, camera.image_width = image.shape[1:]
+        cameras.append(camera)
     random.Random(order).shuffle(cameras)
     for uid, camera in enumerate(cameras):
         camera.uid = uid
@@ -172,7 +174,8 @@ def draw(camera, values, training=True, scores=None):
 
     The log tells backwards of training renders from others; None keeps this one out of it.
     """
-    focal = torch.tensor([[20.0, 0, WIDTH / 2], [0, 20.0, HEIGHT / 2], [0, 0, 1]])
+    width, height = getattr(camera, "image_width", WIDTH), getattr(camera, "image_height", HEIGHT)
+    focal = torch.tensor([[20.0 * width / WIDTH, 0, width / 2], [0, 20.0 * height / HEIGHT, height / 2], [0, 0, 1]])
     colors = torch.sigmoid(values["f_dc"] + values["f_rest"])
     if scores is not None:
         colors = colors * (1 + scores)
@@ -185,8 +188,8 @@ def draw(camera, values, training=True, scores=None):
         colors,
         camera.viewmat[None],
         focal[None],
-        WIDTH,
-        HEIGHT,
+        width,
+        height,
         packed=False,
     )
     if info["means2d"].requires_grad:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from skipgs_plug import SkipGate
 from skipgs_plug.trainer import TrainConfig, Trainer
 from skipgs_plug.trainer.half_size import half_size
 from skipgs_plug.trainer.iteration import Iteration
@@ -51,13 +52,37 @@ def test_a_view_too_small_for_ssim_keeps_its_size() -> None:
 def test_the_scene_grows_on_half_size_in_the_first_half_of_the_run_at_most(strategy: str) -> None:
     scene = make_scene(n_views=10, width=48, height=36, n_points=160)
     sizes: dict[int, tuple[int, ...]] = {}
-    trainer = Trainer(TrainConfig(max_steps=40, half_size=True, strategy=strategy), scene)
+    trainer = Trainer(TrainConfig(max_steps=40, strategy=strategy), scene)
 
     def note(done: Iteration) -> None:
         assert done.image.shape == done.target.shape
         sizes[done.step] = tuple(done.image.shape)
 
     trainer.on_step = note
-    trainer.train(progress=False)
+    with SkipGate(trainer, share=1.0, half_size=True) as gate:
+        trainer.train(progress=False)
     assert sizes == {step: (18, 24, 3) if step < 20 else (36, 48, 3) for step in range(40)}
+    assert gate.report()["growing"]["half_size_until"] == 20
     assert trainer.render(scene.test[0]).shape == (36, 48, 3)
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_auto_asks_the_photographs_and_a_resumed_run_keeps_the_answer(smooth: bool) -> None:
+    scene = make_scene(n_views=10, width=48, height=36, n_points=160)
+    if smooth:
+        for view in scene.train:
+            view.image[:] = torch.linspace(0, 255, 48)[:, None]
+    trainer = Trainer(TrainConfig(max_steps=400), scene)
+    with SkipGate(trainer, share="auto") as gate:
+        trainer.train(until=30, progress=False)
+        saved = trainer.snapshot()
+        until = gate.report()["growing"]["half_size_until"]
+    assert until == (200 if smooth else 0)
+    sizes = set()
+    again = Trainer(TrainConfig(max_steps=400), scene)
+    again.on_step = lambda done: sizes.add(tuple(done.image.shape))
+    with SkipGate(again, share="auto") as gate:
+        again.restore(saved)
+        again.train(until=60, progress=False)
+        assert gate.report()["growing"]["half_size_until"] == until
+    assert sizes == {(18, 24, 3) if smooth else (36, 48, 3)}
