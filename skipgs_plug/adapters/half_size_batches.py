@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from skipgs_plug.core.half_size import can_be_halved, halved, some_of
+from skipgs_plug.core.half_size import can_be_halved, halved, in_unit_range, some_of
 from skipgs_plug.core.hooks import Hooks
 
 # Entries of a batch whose meaning at half the size is known. Points of a depth loss, for example, are in pixels.
@@ -39,7 +39,7 @@ def show_half_size_batches(hooks: Hooks, runner: Any) -> Callable[[], Iterator[T
         return _Batches(batches, hooks, runner.device) if loader.dataset is dataset else batches
 
     hooks.wrap(DataLoader, "__iter__", begun)
-    return lambda: (dataset[i]["image"].movedim(-1, 0) / 255.0 for i in some_of(len(dataset)))
+    return lambda: (in_unit_range(dataset[i]["image"]) for i in some_of(len(dataset)))
 
 
 class _Batches:

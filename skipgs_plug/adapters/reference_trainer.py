@@ -6,14 +6,13 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.gsplat_strategy import iterations_that_run, strategy_events
 from skipgs_plug.core.clock import Times
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.half_size import can_be_halved, some_of
+from skipgs_plug.core.half_size import can_be_halved, in_unit_range, some_of
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.pause import MIN_PAUSE_ITERS
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
@@ -58,7 +57,7 @@ class ReferenceTrainer(AbstractAdapter):
                 view_names=trainer.view_names,
                 max_steps=trainer.max_steps - 1,
                 densification=_densification(trainer),
-                photographs=(lambda: (_photograph(views[i]) for i in some_of(n_views))) if halves else None,
+                photographs=(lambda: (in_unit_range(views[i].image) for i in some_of(n_views))) if halves else None,
                 defaults={
                     "warmup": max(2 * n_views, round(SkipConfig.warmup * scale)),
                     "pause_iters": max(n_views, round(MIN_PAUSE_ITERS * scale)),
@@ -74,11 +73,6 @@ class ReferenceTrainer(AbstractAdapter):
     def timing(self) -> Times | None:
         wall, processor = self.trainer.clock.wall, self.trainer.clock.processor
         return Times(wall.total, wall.post, processor.total, processor.post)
-
-
-def _photograph(view: Any) -> Tensor:
-    """Return the photograph of a view as [3, H, W] with values in [0, 1]."""
-    return view.image.permute(2, 0, 1).float() / 255.0
 
 
 def _densification(trainer: Any) -> Densification | None:

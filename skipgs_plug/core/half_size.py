@@ -56,6 +56,16 @@ def half_size_psnr(photographs: Iterable[Tensor]) -> float:
     return sum(values) / len(values)
 
 
+def keep_detail(psnr: float) -> bool:
+    """Return whether photographs with this `half_size_psnr` keep enough for a scene to grow on them at half size."""
+    return psnr >= LEAST_PSNR
+
+
+def in_unit_range(pixels: Tensor) -> Tensor:
+    """Return a photograph [3, H, W] with values in [0, 1], from one [H, W, 3] with values in [0, 255]."""
+    return pixels.movedim(-1, 0) / 255.0
+
+
 def some_of(count: int) -> list[int]:
     """Return the positions of at most `JUDGED` photographs out of `count`, spread evenly."""
     judged = min(JUDGED, count)

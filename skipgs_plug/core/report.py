@@ -159,8 +159,17 @@ def _summarise_growing(growing: dict[str, Any]) -> str:
     return (
         f"SkipGS: {run:,} of {run + skipped:,} iterations run ({percent:.1f} %) until densification ends, with "
         f"{growing['events_run']:,} of {growing['events_run'] + growing['events_skipped']:,} densification "
-        f"events{longer}.{_why_more(growing)}"
+        f"events{longer}.{_why_more(growing)}{_half_size(growing)}"
     )
+
+
+def _half_size(growing: dict[str, Any]) -> str:
+    """Return a line about photographs of half the size; empty if there were none."""
+    until, psnr = growing["half_size_until"], growing["half_size_psnr"]
+    if not until:
+        return ""
+    kept = "" if psnr is None else f", because they keep {psnr:.1f} dB at that size"
+    return f"\n  photographs had half their size until iteration {until:,}{kept}"
 
 
 def _why_more(growing: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from skipgs_plug import SkipGate
 from skipgs_plug.bench.memory import memory_meter
+from skipgs_plug.core.half_size import half_size_psnr, in_unit_range, keep_detail, some_of
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.loop import Iteration
 
@@ -38,6 +39,7 @@ class Pilot:
         views: Number of training views.
         visible: Share of the Gaussians that a view shows; None if too few iterations ran to measure it.
         stop: Iteration of the pilot's schedule at which densification ends.
+        half_size: Whether `share="auto"` would grow the scene on photographs of half the size. The pilot does not.
         peak_memory: Peak memory in bytes, of the process on the CPU and of PyTorch on a GPU; None if unknown.
     """
 
@@ -46,6 +48,7 @@ class Pilot:
     views: int
     visible: float | None
     stop: int
+    half_size: bool
     peak_memory: int | None
 
 
@@ -80,8 +83,10 @@ def run_pilot(
     trainer.on_step = after
     if meter is not None:
         meter.reset()
-    with SkipGate(trainer, share="auto") as gate:
+    with SkipGate(trainer, share="auto", half_size=False) as gate:
         trainer.train(progress=progress)
         visible = gate.report()["gaussians_shown"]
     peak = None if meter is None else meter.peak()
-    return Pilot(tuple(samples), first, len(scene.train), visible, trainer.refine_stop_iter, peak)
+    photographs = [in_unit_range(scene.train[i].image) for i in some_of(len(scene.train))]
+    halves = keep_detail(half_size_psnr(photographs))
+    return Pilot(tuple(samples), first, len(scene.train), visible, trainer.refine_stop_iter, halves, peak)

@@ -16,6 +16,7 @@ ROWS = (
     "densification events run",
     "densification events left out",
     "factor on step lengths",
+    "photographs of half the size until iteration",
     "Gaussians at the end",
     "training, s",
     "training without left-out iterations, s (estimate)",
@@ -23,7 +24,7 @@ ROWS = (
 ESTIMATE = (
     "The estimate assumes that each left-out iteration would have cost the mean of the iterations of its phase that "
     "ran, densification included. It was not measured: without left-out iterations the run may end with another number "
-    "of Gaussians."
+    "of Gaussians. Iterations on photographs of half the size take less time, so the estimate is too low with them."
 )
 
 
@@ -39,6 +40,7 @@ class Phase:
         events_run: Number of densification events that ran.
         events_left_out: Number of densification events that were left out.
         rate_factor: Factor by which optimizer steps were longer.
+        half_size_until: Iteration before which photographs had half their size.
     """
 
     run: int
@@ -48,6 +50,7 @@ class Phase:
     events_run: int | None = None
     events_left_out: int | None = None
     rate_factor: float | None = None
+    half_size_until: int | None = None
 
     @property
     def iterations(self) -> int:
@@ -79,6 +82,7 @@ def phases(gate: Mapping[str, Any], curve: Mapping[str, Sequence[float]]) -> tup
         events_run=growing.get("events_run"),
         events_left_out=growing.get("events_skipped"),
         rate_factor=growing.get("rate_factor"),
+        half_size_until=growing.get("half_size_until") or None,
     )
     last = Phase(
         run=gate["iterations_run"],
@@ -120,6 +124,7 @@ def _column(phase: Phase, without: float | None) -> list[str]:
         (phase.events_run, ","),
         (phase.events_left_out, ","),
         (phase.rate_factor, ".1f"),
+        (phase.half_size_until, ","),
         (phase.gaussians, ","),
         (phase.seconds, ".1f"),
         (without, ".0f"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -28,7 +29,7 @@ def pilot_of(
     for step in range(0, round(until * STOP), 4):
         count = FIRST + ADDED * growth_shape(step // 100 * 100 / STOP, BEGIN, rate)  # events every 100 iterations
         samples.append(Sample(step, round(count), seconds(count)))
-    return Pilot(tuple(samples), FIRST, 20, 0.3, STOP, peak)
+    return Pilot(tuple(samples), FIRST, 20, 0.3, STOP, half_size=False, peak_memory=peak)
 
 
 @pytest.mark.parametrize("rate", [1.0, 2.2, 5.0])
@@ -41,7 +42,7 @@ def test_growth_is_continued(rate: float, until: float) -> None:
 
 def test_growth_that_has_ended_is_met() -> None:
     seen = pilot_of(1.0)
-    over = Pilot((*seen.samples, Sample(STOP, 26_123, 0.01)), FIRST, 20, 0.3, STOP, None)
+    over = dataclasses.replace(seen, samples=(*seen.samples, Sample(STOP, 26_123, 0.01)))
     assert fit_growth(over, TrainConfig())(1.0) == pytest.approx(26_123)
 
 
@@ -72,6 +73,14 @@ def test_a_longer_run_takes_longer_and_auto_takes_less() -> None:
         assert one.iterations_auto < one.max_steps
         assert one.seconds_auto == pytest.approx(0.01 * one.iterations_auto, rel=0.03)
     assert short.memory is not None and short.memory >= 10**9
+
+
+def test_growth_on_smaller_photographs_takes_less() -> None:
+    pilot = pilot_of(0.5)
+    plain = predict(pilot, TrainConfig(), 7000)
+    smaller = predict(dataclasses.replace(pilot, half_size=True), TrainConfig(), 7000)
+    assert smaller.seconds == plain.seconds and smaller.iterations_auto == plain.iterations_auto
+    assert 0.5 * plain.seconds_auto < smaller.seconds_auto < plain.seconds_auto
 
 
 def test_a_shorter_run_ends_where_growth_is_by_then() -> None:

@@ -63,6 +63,7 @@ def test_the_scene_grows_on_half_size_in_the_first_half_of_the_run_at_most(strat
         trainer.train(progress=False)
     assert sizes == {step: (18, 24, 3) if step < 20 else (36, 48, 3) for step in range(40)}
     assert gate.report()["growing"]["half_size_until"] == 20
+    assert "photographs had half their size until iteration 20" in gate.summary()
     assert trainer.render(scene.test[0]).shape == (36, 48, 3)
 
 

@@ -9,7 +9,7 @@ import torch
 from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.half_size import LEAST_PSNR, half_size_psnr
+from skipgs_plug.core.half_size import half_size_psnr, keep_detail
 from skipgs_plug.core.pace.densification_events import DensificationEvents
 from skipgs_plug.core.pace.needs import (
     LEAST_GROWING_SHARE,
@@ -142,7 +142,7 @@ class Growing(Phase):
             return self._config.may_halve
         own = torch.tensor([half_size_psnr(plan.photographs())])
         (self._half_psnr,) = distributed.mean(own)
-        return self._half_psnr >= LEAST_PSNR
+        return keep_detail(self._half_psnr)
 
     def at_half_size(self, number: int) -> bool:
         return number < (self._half_until or 0)
