@@ -328,8 +328,8 @@ class InriaFamily(AbstractAdapter):
             )
             self._label = "uid"
         self.begin(opt, loop)
-        known = self.shows_half_size and not self._unknown.listed and HalfSizeCameras.can_be_shown(cameras)
-        self._cameras = HalfSizeCameras(hooks, cameras) if known and hooks.may_halve else None
+        known = None if self._unknown.listed or not self.shows_half_size else self._code
+        self._cameras = HalfSizeCameras.of(hooks, cameras, known, self.renders)
         hooks.ready(
             TrainerInfo(
                 self._start_after_changes(opt, loop),

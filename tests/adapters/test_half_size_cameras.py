@@ -1,5 +1,6 @@
 """Inria 3DGS and 3DGS-MCMC grow on cameras of half the size, and all other code finds the cameras as they are."""
 
+import ast
 from types import SimpleNamespace
 
 import pytest
@@ -101,6 +102,22 @@ def test_a_released_gate_leaves_the_cameras_as_they_were(sizes, monkeypatch):
     assert all((camera.image_height, camera.image_width) == FULL for camera in cameras)
 
 
+AFTER = """
+def training(cameras):
+    for iteration in range(60):
+        camera = cameras[iteration]
+        image = render(camera, gaussians)["render"]
+        loss = (image - camera.original_image).abs().mean()
+"""
+BEFORE = AFTER.replace("image = render", "pixels = camera.image_width * camera.image_height\n        image = render")
+ELSEWHERE = AFTER.replace("for iteration", "edges = [edge(view.original_image) for view in cameras]\n    for iteration")
+
+
+def shown(camera, source=AFTER, may_halve=True):
+    hooks = SimpleNamespace(may_halve=may_halve, at_half_size=True, on_detach=lambda label, undo: None)
+    return HalfSizeCameras.of(hooks, [camera], SimpleNamespace(syntax=ast.parse(source)), ("render",))
+
+
 @pytest.mark.parametrize("odd", ["too small", "an unknown image", "no photograph"])
 def test_cameras_that_cannot_be_halved_are_left_alone(odd):
     camera = make_cameras(scale=1 if odd == "too small" else 2)[0]
@@ -108,15 +125,21 @@ def test_cameras_that_cannot_be_halved_are_left_alone(odd):
         camera.normals = torch.zeros(3, *FULL)
     if odd == "no photograph":
         del camera.original_image
-    assert not HalfSizeCameras.can_be_shown([camera])
+    assert shown(camera) is None
+
+
+def test_a_loop_that_reads_a_camera_before_its_render_is_left_alone():
+    camera = make_cameras(scale=2)[0]
+    assert shown(camera) is not None
+    assert shown(camera, BEFORE) is None and shown(camera, ELSEWHERE) is None
+    assert shown(camera, may_halve=False) is None
 
 
 def test_all_images_of_a_camera_are_halved():
     camera = make_cameras(scale=2)[0]
     camera.alpha_mask, camera.invdepthmap = torch.ones(1, *FULL), torch.rand(1, *FULL)
     camera.depth_mask = torch.zeros(1, *FULL)
-    cameras = HalfSizeCameras(SimpleNamespace(at_half_size=True, on_detach=lambda label, undo: None), [camera])
-    assert HalfSizeCameras.can_be_shown([camera])
+    cameras = shown(camera)
     cameras.rendered(camera, training=True)
     assert all(getattr(camera, name).shape[1:] == HALF for name in IMAGES)
     cameras.rendered(camera, training=False)
