@@ -104,7 +104,8 @@ FACTS = (
     "gradients_read_until: 'int | None' = None, accumulates: 'bool' = False, "
     "steps_each: 'bool' = False, "
     "densification: 'Densification | None' = None, "
-    "photographs: 'Callable[[], Iterable[Tensor]] | None' = None, defaults: 'Mapping[str, Any]' = <factory>) -> None"
+    "photographs: 'Callable[[], Iterable[Tensor]] | None' = None, "
+    "width: 'int | None' = None, defaults: 'Mapping[str, Any]' = <factory>) -> None"
 )
 POLICY = {
     "decide": "(self, view: 'Hashable', loss: 'float', step: 'int') -> 'Decision'",

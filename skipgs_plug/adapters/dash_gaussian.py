@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.adapters.inria import RESETS, InriaFamily
 from skipgs_plug.core.trainer_info import Densification
 
 
@@ -21,4 +21,4 @@ class DashGaussian(InriaFamily):
     mark = "TrainingScheduler"
     changes = (*InriaFamily.changes, "prune_and_densify")
     arguments = ("render_size",)
-    densification = Densification(marks=("densification_interval",), needs="nothing")
+    densification = Densification(marks=("densification_interval",), reset_marks=RESETS, needs="nothing")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from skipgs_plug.adapters.inria import GROWS_WHOLE, InriaFamily
+from skipgs_plug.adapters.inria import GROWS_WHOLE, RESETS, InriaFamily
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import Densification
 
@@ -43,7 +43,7 @@ class FastGS(InriaFamily):
     renders = ("render_fastgs",)
     pure = ("optimizer_step",)
     # Each event caps opacities at 0.8 and replaces their moments.
-    densification = Densification(marks=("densification_interval",), clears_moments=True)
+    densification = Densification(marks=("densification_interval",), reset_marks=RESETS, clears_moments=True)
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.adapters.inria import RESETS, InriaFamily
 from skipgs_plug.core.trainer_info import Densification
 
 
@@ -25,4 +25,4 @@ class GOF(InriaFamily):
     calls = ("compute_3D_filter", "get_apperance_embedding")
     arguments = ("kernel_size",)
     # `densification_interval` would match its pictures for inspection, too.
-    densification = Densification(marks=("iteration > opt.densify_from_iter",))
+    densification = Densification(marks=("iteration > opt.densify_from_iter",), reset_marks=RESETS)

@@ -62,6 +62,7 @@ def strategy_events(strategy: Any) -> Densification | None:
         numbers=lambda numbers: filter(acts, numbers),
         needs="nothing" if mcmc else "visits",
         resets=not mcmc,
+        reset_numbers=None if mcmc else lambda numbers: _resets(strategy, numbers),
     )
 
 
@@ -72,10 +73,16 @@ def iterations_that_run(strategy: Any, numbers: range) -> Iterable[int]:
     (`refine_scale2d_stop_iter`, nerfstudio's default). With fewer, longer steps sizes overshoot: splatfacto ended with
     172 % of its Gaussians on fern, and 0.2 dB below its own run.
     """
-    every = getattr(strategy, "reset_every", 0)
     stop = getattr(strategy, "refine_stop_iter", 0)
     by_size = getattr(strategy, "refine_scale2d_stop_iter", 0)
-    return (n for n in numbers if n < stop and (n < by_size or (every and n > 0 and n % every == 0)))
+    resets = set(_resets(strategy, numbers))
+    return (n for n in numbers if (n < stop and n < by_size) or n in resets)
+
+
+def _resets(strategy: Any, numbers: range) -> Iterable[int]:
+    """Return the iterations of a range that reset opacities."""
+    every, stop = getattr(strategy, "reset_every", 0), getattr(strategy, "refine_stop_iter", 0)
+    return (n for n in numbers if every and 0 < n < stop and n % every == 0)
 
 
 def leave_out_noise(hooks: Hooks, strategy: Any, owner: Any) -> range:

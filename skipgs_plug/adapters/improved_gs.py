@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from skipgs_plug.adapters.inria import GROWS_WHOLE, InriaFamily
+from skipgs_plug.adapters.inria import GROWS_WHOLE, RESETS, InriaFamily
 from skipgs_plug.core.trainer_info import Densification
 
 
@@ -31,7 +31,7 @@ class ImprovedGS(InriaFamily):
     changes = (*InriaFamily.changes, "densify_and_prune_Improved")
     calls: ClassVar[tuple[str, ...]] = ("add_densification_stats_abs",)
     arguments = ("pixel_weights",)
-    densification = Densification(marks=("densification_interval",), needs="nothing")
+    densification = Densification(marks=("densification_interval",), reset_marks=RESETS, needs="nothing")
     structural = (*InriaFamily.structural, "only_prune")
     accumulates_from: ClassVar[int] = 15_000  # iteration; a constant of the loop
 

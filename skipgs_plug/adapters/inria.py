@@ -34,6 +34,7 @@ from skipgs_plug.core.views import view_key
 
 # Modules of a checkout. The script imports them.
 RENDERER, MODEL = "gaussian_renderer", "scene.gaussian_model"
+RESETS = ("opacity_reset_interval",)  # option that the condition of opacity resets names
 # Effect of `share` on trainers that accumulate gradients after densification; see `Phased`.
 GROWS_WHOLE = "If steps accumulate gradients after densification, it runs whole."
 
@@ -68,7 +69,7 @@ class InriaFamily(AbstractAdapter):
     pure: ClassVar[tuple[str, ...]] = ()
     shows_half_size: ClassVar[bool] = False
     # Statistics are means over visits, so some events may be left out if the others have enough visits.
-    densification: ClassVar[Densification | None] = Densification(marks=("densification_interval",))
+    densification: ClassVar[Densification | None] = Densification(("densification_interval",), reset_marks=RESETS)
 
     def __init__(self, trainer: Any = None) -> None:
         super().__init__(trainer)
@@ -339,6 +340,7 @@ class InriaFamily(AbstractAdapter):
                 gradients_read_until=self.gradients_read_until(opt, loop),
                 accumulates=self.accumulates(opt, loop),
                 steps_each=self.steps_each(opt, loop),
+                width=max((getattr(camera, "image_width", 0) for camera in cameras), default=0) or None,
                 photographs=None if self._cameras is None else self._cameras.photographs,
             )
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.adapters.inria import RESETS, InriaFamily
 from skipgs_plug.core.trainer_info import Densification
 
 
@@ -25,4 +25,4 @@ class Taming(InriaFamily):
     changes = (*InriaFamily.changes, "densify_with_score")
     calls = ("modify_functions",)
     arguments = ("pixel_weights",)
-    densification = Densification(marks=("densification_interval",), needs="nothing")
+    densification = Densification(marks=("densification_interval",), reset_marks=RESETS, needs="nothing")

@@ -25,6 +25,8 @@ class Densification:
             suits growth by a budget or by a constant share per event.
         resets: Whether opacities are reset now and then, so that few iterations run between two resets, or it is not
             known. Without resets, longer steps are tolerated in schedules of any length (3DGS-MCMC).
+        reset_marks: Names that identify the condition of an opacity reset, as `marks` do for densification.
+        reset_numbers: Returns the iterations of a range that reset opacities, as `numbers` does for densification.
         clears_moments: Whether every event clears Adam's moments of opacities, but not its count of steps. Adam's steps
             are several times as long after that, which lets opacities recover from resets, but only with the trainer's
             beta2. Opacities keep it then.
@@ -34,6 +36,8 @@ class Densification:
     numbers: Callable[[range], Iterable[int]] | None = None
     needs: Literal["visits", "iterations", "nothing"] = "visits"
     resets: bool = True
+    reset_marks: tuple[str, ...] = ()
+    reset_numbers: Callable[[range], Iterable[int]] | None = None
     clears_moments: bool = False
 
 
@@ -65,6 +69,8 @@ class TrainerInfo:
             ends; None if all of them must run.
         photographs: Returns some training photographs [3, H, W] with values in [0, 1], if the adapter shows views at
             half their size while `Hooks.at_half_size`; None if it cannot.
+        width: Largest width of the training photographs in pixels, if the trainer may lower the learning rate of
+            positions too slowly for its schedule; None if it does not, or if it is unknown.
         defaults: Settings that suit this trainer. They are used where the user gave no value.
     """
 
@@ -80,4 +86,5 @@ class TrainerInfo:
     steps_each: bool = False
     densification: Densification | None = None
     photographs: Callable[[], Iterable[Tensor]] | None = None
+    width: int | None = None
     defaults: Mapping[str, Any] = dataclasses.field(default_factory=dict)

@@ -17,8 +17,12 @@ from skipgs_plug.core.pace.needs import (
     for_new_gaussians,
     growing_factor,
     growing_share,
+    last_part,
+    longest_positions,
     opacity_factor,
+    opacity_rate,
     positions_part,
+    refining_share,
     share_factor,
 )
 from skipgs_plug.core.pace.parts import UNCHANGED, GrowingParts
@@ -71,6 +75,9 @@ class Growing(Phase):
         self._share_now: float | None = None  # share of the present iterations; None for `share`
         self._rows_at_first = 0  # number of Gaussians at the first event
         self._measuring = True
+        self._reset: int | None = None  # iteration of the last opacity reset; None without one, or if it is unknown
+        self._whole_from: int | None = None  # iteration from which all run, because no refinement follows
+        self._end = self._steps_after = 0  # end of the phase, and number of iterations that will run in the following
         self._half_until: int | None = None  # iteration before which photographs have half their size
         self._half_psnr: float | None = None  # PSNR of these photographs, in decibels; None if it did not decide
         self._saved_events: dict[str, Any] | None = None
@@ -95,7 +102,10 @@ class Growing(Phase):
         marks = densification.marks
         events = set() if densification.numbers is None else set(densification.numbers(numbers))
         others: dict[str, set[int]] = {}
+        resets = set() if densification.reset_numbers is None else set(densification.reset_numbers(numbers))
         for reason, hits in found.items():
+            if any(mark in reason for mark in densification.reset_marks):
+                resets |= hits
             if any(mark in reason for mark in marks):
                 events |= hits
             elif hits:
@@ -114,12 +124,23 @@ class Growing(Phase):
         self._must = frozenset(named).union(*rare, *(hits - events for hits in common))
         if self._first is None:
             self._first = numbers.start
+        self._reset, self._end = max(resets, default=None), numbers.stop
+        self._rates.longest_positions = longest_positions(plan.width)
+        following = plan.last + 1 - numbers.stop
+        if following > 0:
+            asked = self._config.refining
+            share = refining_share(following, plan.epoch or 0, len(numbers)) if asked == "auto" else float(asked or 1.0)
+            self._steps_after = round(share * following)
         # Prunes and selections after the last event need no further iterations.
         self._length = min(numbers.stop, self.events.end or numbers.stop) - self._first
         end = self._first + self._length
         parts = range(self._first, end), range(end, numbers.stop)
         until, after = (len(self._must.intersection(part)) / max(len(part), 1) for part in parts)
         self._must_shares = until, after
+        if following <= 0 and self._auto:
+            last = last_part(len(numbers), None if self._reset is None else plan.last - self._reset)
+            self._whole_from = max(numbers.stop - last, self._first)
+            self._must |= set(range(self._whole_from, numbers.stop))
         self._epoch = plan.epoch or self._epoch
         if self._half_until is None:
             self._half_until = min(numbers.stop, (plan.last + 1) // 2) if self._halves(plan) else 0
@@ -151,6 +172,17 @@ class Growing(Phase):
     def stretch(self) -> float:
         """Factor on the share of the iterations for Gaussians that were added, also in refinement; at least 1."""
         return 1.0 if self._all_must else for_new_gaussians(self._times_grown)
+
+    @property
+    def opacity_rate(self) -> float:
+        nothing_left_out = self.share is None or self.share >= 1.0 or self._all_must
+        if self._reset is None or nothing_left_out or not self._config.compensates:
+            return 0.0
+        assert self.share is not None
+        if self._whole_from is not None:  # twice their rate in the last 1,000 iterations did not help on bonsai
+            return 0.0
+        grown = (self._end - self._reset) * self.share * opacity_factor(self.share)
+        return opacity_rate(grown + self._steps_after)
 
     @property
     def _all_must(self) -> bool:
@@ -193,6 +225,12 @@ class Growing(Phase):
         if event and self._visible is not None and not self._all_must:
             self._measuring = True
             self._rates.visibility.restart()
+        if self._reset is not None and number > self._reset:
+            self._rates.opacity_rate = self.opacity_rate
+        if self._whole_from is not None and number >= self._whole_from:
+            # Steps that are longer and shrink, as in refinement, end 0.7 dB lower on bonsai: opacities recover less.
+            self._rates.look()
+            return True
         factor, parts = self._factors(number)
         if parts.opacities > 1.0:
             self._rates.scale(factor, parts)
@@ -313,6 +351,7 @@ class Growing(Phase):
             "share_now": self._share_now,
             "gaussians_at_first": self._rows_at_first,
             "measuring": self._measuring,
+            "positions_rate": self._rates.positions_rate,
             "half_size": [self._half_until, self._half_psnr],
             "sampling": self.sampling.state_dict(),
             "events": self._events_state,
@@ -326,6 +365,7 @@ class Growing(Phase):
         self._measuring = state["measuring"]
         self._share_now, self._rows_at_first = state.get("share_now"), state.get("gaussians_at_first", 0)
         self._visible, self._visible_now = state["gaussians_shown"]
+        self._rates.positions_rate = state.get("positions_rate", 0.0)
         self._half_until, self._half_psnr = state.get("half_size", (0, None))  # an older run has no such photographs
         self.sampling.load_state_dict(state["sampling"])
         self._saved_events, self.events = state["events"], None

@@ -48,6 +48,7 @@ class LoopFacts:
         self._known: Known = nothing_known
         self._accumulates = self._steps_each = False
         self._photographs: Callable[[], Iterable[Tensor]] | None = None
+        self._width: int | None = None
         self._views: list[str] | None = None
         self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
 
@@ -56,7 +57,7 @@ class LoopFacts:
         self.start, self.last, self._views = start, info.max_steps, views
         self._accumulates, self._steps_each, self._epoch = info.accumulates, info.steps_each, info.epoch
         self.densification = info.densification or self.densification
-        self._photographs = info.photographs
+        self._photographs, self._width = info.photographs, info.width
 
     def describe(self, always: Always, pure: Iterable[str], densification: Densification | None, known: Known) -> None:
         """Receive facts from the trainer's adapter; see `Pace.describe`."""
@@ -116,6 +117,7 @@ class LoopFacts:
             self.densification,
             self._accumulates,
             self._photographs,
+            self._width,
             self._steps_each,
         )
 

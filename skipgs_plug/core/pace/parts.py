@@ -18,6 +18,8 @@ PART_BY_NAME = {
     **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
+# Largest factor on the rate of opacities that must recover from their last reset. They flicker with more.
+MOST_OPACITY_FACTOR = 2.0
 # Largest factor on the rate of parameters without a row for each Gaussian (exposures, poses, networks). They must not
 # follow a model that is far off for a while.
 OTHERS_AT_MOST = 0.25
@@ -33,7 +35,8 @@ def group_part(group: dict[str, Any], name: str | None = None) -> float | None:
     The image is linear in the colours. Trainers set the rate of the higher bands to a twentieth of the constant band's,
     so the higher bands tolerate the longest steps. All views agree on the constant band, so it needs shorter steps.
     Positions, whose rate has fallen to a tenth when refinement begins, and scales tolerate longer steps. Opacities are
-    not raised in refinement: their rate is large already, and longer steps make them flicker.
+    not raised in refinement, except to recover from a reset: their rate is large already, and longer steps make them
+    flicker.
 
     A group without any name is identified by its shape: [N, 1, 3] is the constant band, [N, K, 3] are higher bands,
     [N, 1] are opacities.
@@ -115,6 +118,11 @@ class GroupInfo:
             return bool(shape) and shape[0] == rows
         return all(param.shape[:1] == (rows,) for param in self._params)
 
+    @property
+    def rate(self) -> float:
+        """The trainer's learning rate; 0 for a group without one."""
+        return float(self.group.get("lr") or 0.0)
+
     def has_gradient(self) -> bool:
         """Whether a parameter has a gradient."""
         return any(param.grad is not None for param in self._params)
@@ -167,11 +175,15 @@ class Division(NamedTuple):
         growing: While the scene grows, the parts of opacities and positions. Parameters without a row for each Gaussian
             then keep their rates. None in refinement, in which opacities are never raised.
         raised: Whether the factor is larger than 1 while the scene grows. True in refinement.
+        opacity_rate: Least learning rate of opacities, if they must recover from their last reset; else 0.
+        positions_rate: Largest learning rate of positions in refinement.
     """
 
     rows: int
     growing: GrowingParts | None
     raised: bool
+    opacity_rate: float = 0.0
+    positions_rate: float = math.inf
 
 
 class OptimizerInfo:
@@ -202,6 +214,11 @@ class OptimizerInfo:
         self.division: Division | None = None
         self._only = self.groups[0] if len(self.groups) == 1 and self.groups[0].first is not None else None
 
+    @property
+    def positions_rate(self) -> float:
+        """Learning rate of the parameters whose name says that they are positions."""
+        return max((group.rate for group in self.groups if group.named_positions), default=0.0)
+
     def fits(self, optimizer: torch.optim.Optimizer) -> bool:
         """Whether these facts still hold."""
         groups, only = optimizer.param_groups, self._only
@@ -217,19 +234,29 @@ class OptimizerInfo:
 
 
 def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
-    rows, growing, raised = division
+    rows, growing, raised, opacity_rate, positions_rate = division
     if not info.of_gaussians(rows):
         return ScaledGroup(info.group, OTHERS_AT_MOST, 1.0, None) if growing is None else None
     if info.part is None:
-        times = 1.0 if growing is None else growing.opacities
+        times = (1.0 if growing is None else growing.opacities) * _recovering(info.rate, opacity_rate)
         if growing is None or times > 1.0:
             remembers = growing is not None and growing.opacities_remember
             return ScaledGroup(info.group, times, 1.0, None if remembers else info)
         return None
     if not raised:
         return None
-    part = info.part if growing is None or not info.named_positions else growing.positions
-    return ScaledGroup(info.group, part, math.inf, info)
+    if not info.named_positions:
+        return ScaledGroup(info.group, info.part, math.inf, info)
+    if growing is not None:
+        return ScaledGroup(info.group, growing.positions, math.inf, info)
+    step = info.part * info.rate
+    most = positions_rate / step if step > 0.0 else math.inf
+    return ScaledGroup(info.group, info.part, most, info)
+
+
+def _recovering(rate: float, least: float) -> float:
+    """Return the factor on the rate of opacities that must recover; see `needs.opacity_rate`."""
+    return min(max(least / rate, 1.0), MOST_OPACITY_FACTOR) if rate > 0.0 else 1.0
 
 
 def _is_about(info: GroupInfo, group: dict[str, Any]) -> bool:

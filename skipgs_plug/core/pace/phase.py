@@ -28,6 +28,7 @@ class PhasePlan(NamedTuple):
         densification: How to recognise densification events; None if unknown.
         accumulates: Optimizers step on gradients that are accumulated over several iterations; see `TrainerInfo`.
         photographs: Returns some training photographs, if views can be shown at half their size; see `TrainerInfo`.
+        width: Width of the training photographs in pixels; None if unknown.
         steps_each: Optimizers would do so, but step in each iteration of refinement that runs; see `TrainerInfo`.
     """
 
@@ -41,6 +42,7 @@ class PhasePlan(NamedTuple):
     densification: Densification | None
     accumulates: bool
     photographs: Callable[[], Iterable[Tensor]] | None = None
+    width: int | None = None
     steps_each: bool = False
 
     def epoch_for(self, setting: str) -> int:
@@ -111,6 +113,11 @@ class Phase:
     def shortened(self, end: int) -> int:
         """Return the number of iterations from the first of the phase to `end`; 0 if none of them is left out."""
         return 0
+
+    @property
+    def opacity_rate(self) -> float:
+        """Learning rate that opacities need to recover from their last reset, also in the following phase; else 0."""
+        return 0.0
 
     @property
     def stretch(self) -> float:

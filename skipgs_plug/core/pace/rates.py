@@ -71,6 +71,9 @@ class ScaledRates:
     Attributes:
         only: The argument.
         visibility: Share of the Gaussians that a view shows, measured in the steps scaled so far.
+        opacity_rate: See `Division`.
+        positions_rate: Largest learning rate of positions while the scene grew; 0 if it is not known.
+        longest_positions: Bound on their rate in refinement, as a multiple of `positions_rate`.
         on_error: Receives errors of hooks, and raises them or releases the gate. None raises them.
     """
 
@@ -79,6 +82,8 @@ class ScaledRates:
         self.visibility = Visibility()
         self.on_error: Callable[[Exception], None] | None = None
         self._factor: float | None = None
+        self.opacity_rate = self.positions_rate = 0.0
+        self.longest_positions = math.inf
         self._division = Division(0, None, True)
         self._rows = self._rows_now = 0  # number of Gaussians in the previous and in this iteration; 0 if unknown
         self._thread = get_ident()
@@ -207,14 +212,19 @@ class ScaledRates:
             self.visibility.see(info.positions)
         if info.known_positions is not None:
             self._rows = self._rows_now = info.known_positions.shape[0]
+            if self._division.growing is not None:
+                self.positions_rate = max(self.positions_rate, info.positions_rate)
         else:  # in groups without names, positions of cameras have the shape of positions of Gaussians, but fewer rows
             self._rows_now = max(self._rows_now, *(param.shape[0] for param in info.positions))
         self._divide(max(self._rows_now, self._rows), self._division.growing, self._division.raised)
 
     def _divide(self, rows: int, growing: GrowingParts | None, raised: bool) -> None:
         """Set the division; an equal one stays the same object, so that optimizers compare it fast."""
-        if (rows, growing, raised) != self._division:
-            self._division = Division(rows, growing, raised)
+        known = growing is None and self.positions_rate > 0.0
+        bound = self.longest_positions * self.positions_rate if known else math.inf
+        division = (rows, growing, raised, self.opacity_rate, bound)
+        if division != self._division:
+            self._division = Division(*division)
 
     def _not_begun(self, scaled: list[ScaledGroup]) -> list[ScaledGroup]:
         """Leave out groups of steps that are under way: an optimizer can wrap another one that has the same groups."""

@@ -139,6 +139,7 @@ class Refining(Phase):
     def runs(self, number: int) -> bool:
         if not self._entered:
             self._enter()
+            self._rates.opacity_rate = self._before.opacity_rate
         if self._expected is not None and number > self._expected:
             assert self._last is not None
             self._recover(min(RECOVERY, self._last - self._expected))

@@ -1,0 +1,112 @@
+"""Opacities recover from their last reset, positions take no giant steps, and a run without refinement ends well."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from skipgs_plug import SkipGate
+from skipgs_plug.adapters.gsplat_strategy import strategy_events
+from skipgs_plug.core.pace.needs import MOST_LAST, OPACITY_PATH, last_part, longest_positions, opacity_rate
+from skipgs_plug.core.pace.parts import MOST_OPACITY_FACTOR, UNCHANGED
+from skipgs_plug.core.pace.rates import ScaledRates
+
+VIEWS = [f"{i}.png" for i in range(4)]
+RATE = 0.1
+STRATEGY = SimpleNamespace(refine_start_iter=2, refine_stop_iter=20, refine_every=5, reset_every=8)
+
+
+@pytest.fixture
+def rates():
+    scaled = ScaledRates()
+    yield scaled
+    scaled.remove()
+
+
+def moved(name, factor, rates, rate=RATE, growing=None):
+    """Return how far a parameter moves at a gradient of 1, in units of its rate."""
+    value = torch.nn.Parameter(torch.zeros(5, 1 if name == "opacity" else 3))
+    optimizer = torch.optim.SGD([{"params": [value], "name": name}], lr=rate)
+    value.grad = torch.ones_like(value)
+    rates.scale(factor, growing)
+    optimizer.step()
+    return -value.detach()[0, 0].item() / rate
+
+
+@pytest.mark.parametrize(("least", "times"), [(0.0, 1.0), (0.5 * RATE, 1.0), (1.5 * RATE, 1.5), (9 * RATE, 2.0)])
+def test_opacities_take_the_rate_that_they_need_in_refinement(least, times, rates):
+    rates.opacity_rate = least
+    assert times <= MOST_OPACITY_FACTOR
+    assert moved("opacity", 5.0, rates) == pytest.approx(times)
+    assert moved("opacity", 0.5, rates) == pytest.approx(0.5 * times)
+
+
+def test_positions_take_at_most_three_times_their_first_rate(rates):
+    assert moved("xyz", 10.0, rates) == pytest.approx(20.0)  # their first rate is not known
+    moved("xyz", 1.0, rates, growing=UNCHANGED)
+    assert moved("xyz", 10.0, rates) == pytest.approx(20.0)  # the size of the photographs is not known
+    rates.longest_positions = longest_positions(1600)
+    assert moved("xyz", 10.0, rates) == pytest.approx(3.0)
+    # A trainer that has lowered the rate to a tenth gets the steps that it would get without the bound.
+    assert moved("xyz", 10.0, rates, rate=RATE / 10) == pytest.approx(20.0)
+    assert moved("xyz", 1.0, rates) == pytest.approx(2.0)
+
+
+def test_on_small_photographs_positions_take_longer_steps():
+    assert longest_positions(None) == math.inf
+    assert [longest_positions(width) for width in (3000, 800, 400, 100)] == [3.0, 3.5, 7.0, 28.0]
+
+
+def test_the_end_of_a_run_without_refinement():
+    assert last_part(7000, None) == last_part(7000, 300) == 700
+    assert last_part(7000, 1000) == last_part(7000, 4000) == MOST_LAST == 1000
+    assert last_part(30_000, 3000) == 3000
+    assert opacity_rate(1000) == OPACITY_PATH / 1000 == 0.05
+
+
+def test_resets_of_a_strategy_are_known():
+    resets = strategy_events(STRATEGY).reset_numbers
+    assert list(resets(range(20))) == [8, 16] and list(resets(range(100))) == [8, 16]
+
+
+class Loop:
+    """A loop that densifies every 20 iterations to its end, and resets opacities every 150."""
+
+    LAST = 400
+
+    def __init__(self):
+        self.means = torch.nn.Parameter(torch.rand(6, 3))
+        self.opacities = torch.nn.Parameter(torch.rand(6, 1))
+        groups = [{"params": [self.means], "name": "xyz"}, {"params": [self.opacities], "name": "opacity"}]
+        self.optimizer = torch.optim.SGD(groups, lr=1.0)
+        self.steps = {}
+
+    def train(self, gate):
+        for step in gate.iterations(range(self.LAST), views=VIEWS, events=range(20, self.LAST, 20)):
+            before = self.means.detach()[0, 0].item(), self.opacities.detach()[0, 0].item()
+            loss = self.means.sum() + self.opacities.sum()
+            if gate.backward(loss, view=VIEWS[step % 4], step=step):
+                self.optimizer.step()
+                self.optimizer.zero_grad(set_to_none=True)
+            after = self.means.detach()[0, 0].item(), self.opacities.detach()[0, 0].item()
+            self.steps[step] = tuple(a - b for a, b in zip(before, after, strict=True))
+        return self
+
+
+def test_all_iterations_at_the_end_run_with_the_trainers_steps():
+    with SkipGate(start_iter=1000, share="auto") as gate:
+        loop = Loop().train(gate)
+    last = range(Loop.LAST - last_part(Loop.LAST, None), Loop.LAST)
+    assert set(last) <= loop.steps.keys()
+    assert all(loop.steps[step] == (pytest.approx(1.0), pytest.approx(1.0)) for step in last)
+    assert gate.report()["growing"]["iterations_run"] == len(loop.steps)
+
+
+def test_a_given_share_and_a_run_with_refinement_have_no_such_end():
+    for settings in ({"share": 0.25, "start_iter": 1000}, {"share": "auto", "start_iter": 200}):
+        with SkipGate(**settings) as gate:
+            loop = Loop().train(gate)
+        last = range(Loop.LAST - last_part(Loop.LAST, None), Loop.LAST)
+        assert not set(last) <= loop.steps.keys()
+        assert math.isfinite(loop.steps[max(loop.steps)][0])
