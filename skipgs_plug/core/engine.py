@@ -127,7 +127,8 @@ class Engine:
         if info.view_names is not None:
             self._view_names = require_unique(info.view_names)
         if config.enabled and info.max_steps is not None and self.start > info.max_steps:
-            log.warning("The gate starts at %d, after the last iteration %d.", self.start, info.max_steps)
+            why = "The gate starts at %d, after the last iteration %d. Nothing is refined; end densification sooner."
+            log.warning(why, self.start, info.max_steps)
         self._accumulates = info.accumulates
         self.pace.configure(self.start, info, self._view_names)
         if self.policy is None:

@@ -25,6 +25,7 @@ GIVEN = {
     "share": 0.5,
     "grow_share": "auto",
     "refine_share": 0.25,
+    "half_size": False,
     "max_gaussians": 1000,
     "always": (70, 80),
     "tolerance": 0.1,
