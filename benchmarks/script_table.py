@@ -44,12 +44,12 @@ def table(runs: list[Run]) -> str:
 
 def notes(pairs: list[Pair]) -> list[str]:
     """Return the sentences below the table, as lines."""
-    differ = sum(pair["own"]["package_commit"] != pair["auto"]["package_commit"] for pair in pairs)
+    alike = sum(pair["own"]["package_commit"] == pair["auto"]["package_commit"] for pair in pairs)
     return [
         "Seconds with a star are from a core that other programs used, too, which makes them too high. The percentage",
         "compares only pairs whose runs are alike in this.",
         "",
-        f"In {differ} of {len(pairs)} pairs the own run is from another version of this package than the run with auto",
+        f"In {alike} of {len(pairs)} pairs both runs are from one version of this package",
         "(`runs.json` has the commits). Rounding differs between versions, which alone moves a run by 0.0 to 0.5 dB.",
     ]
 

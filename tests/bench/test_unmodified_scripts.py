@@ -137,5 +137,6 @@ def test_table_has_means_over_draws_of_the_points_and_each_difference():
     assert table(runs).splitlines()[4] == (
         "| Tiny | 100 | 45 | 3 | 2* | 50 | 10 |  | 31.00 (0.5500) | 31.25 (0.5000) | +0.25 (+1.00, -0.50) |"
     )
+    assert "In 2 of 2 pairs both runs are from one version" in table(runs)
     runs[-1]["package_commit"] = "2"
-    assert "In 1 of 2 pairs the own run is from another version" in table(runs)
+    assert "In 1 of 2 pairs both runs are from one version" in table(runs)
