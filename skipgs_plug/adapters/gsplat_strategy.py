@@ -76,7 +76,7 @@ def iterations_that_run(strategy: Any, numbers: range) -> Iterable[int]:
     stop = getattr(strategy, "refine_stop_iter", 0)
     by_size = getattr(strategy, "refine_scale2d_stop_iter", 0)
     resets = set(_resets(strategy, numbers))
-    return (n for n in numbers if (n < stop and n < by_size) or n in resets)
+    return (n for n in numbers if n < min(stop, by_size) or n in resets)
 
 
 def _resets(strategy: Any, numbers: range) -> Iterable[int]:

@@ -87,6 +87,6 @@ def run_pilot(
         trainer.train(progress=progress)
         visible = gate.report()["gaussians_shown"]
     peak = None if meter is None else meter.peak()
-    photographs = [in_unit_range(scene.train[i].image) for i in some_of(len(scene.train))]
+    photographs = (in_unit_range(scene.train[i].image) for i in some_of(len(scene.train)))  # one at a time in memory
     halves = keep_detail(half_size_psnr(photographs))
     return Pilot(tuple(samples), first, len(scene.train), visible, trainer.refine_stop_iter, halves, peak)

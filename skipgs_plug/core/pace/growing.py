@@ -175,11 +175,10 @@ class Growing(Phase):
 
     @property
     def opacity_rate(self) -> float:
-        nothing_left_out = self.share is None or self.share >= 1.0 or self._all_must
-        if self._reset is None or nothing_left_out or not self._config.compensates:
+        if self.share is None or self.share >= 1.0 or self._all_must or not self._config.compensates:
             return 0.0
-        assert self.share is not None
-        if self._whole_from is not None:  # twice their rate in the last 1,000 iterations did not help on bonsai
+        # Twice their rate in the last 1,000 iterations of a run without refinement did not help on bonsai.
+        if self._reset is None or self._whole_from is not None:
             return 0.0
         grown = (self._end - self._reset) * self.share * opacity_factor(self.share)
         return opacity_rate(grown + self._steps_after)

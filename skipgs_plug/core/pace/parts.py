@@ -10,7 +10,7 @@ from torch import Tensor
 
 from skipgs_plug.core.pace.visibility import POSITIONS
 
-# Multiples of the common factor that groups of parameters take, by kind. In refinement opacities are never raised.
+# Multiples of the common factor that groups of parameters take, by kind. In refinement opacities take none.
 HIGHER_BANDS, GEOMETRY, OTHERS, CONSTANT_BAND = 4.0, 2.0, 1.0, 0.5
 PART_BY_NAME = {
     **dict.fromkeys(("f_rest", "shN", "features_rest"), HIGHER_BANDS),
@@ -173,7 +173,7 @@ class Division(NamedTuple):
     Attributes:
         rows: Number of Gaussians; 0 if it is not known. Only parameters with as many rows take larger steps.
         growing: While the scene grows, the parts of opacities and positions. Parameters without a row for each Gaussian
-            then keep their rates. None in refinement, in which opacities are never raised.
+            then keep their rates. None in refinement, in which opacities are raised by `opacity_rate` alone.
         raised: Whether the factor is larger than 1 while the scene grows. True in refinement.
         opacity_rate: Least learning rate of opacities, if they must recover from their last reset; else 0.
         positions_rate: Largest learning rate of positions in refinement.
