@@ -1,4 +1,4 @@
-"""Train gsplat and FastGS from first to last iteration, without a gate and with share="auto", on this GPU.
+"""Train gsplat, Inria's 3DGS and FastGS from first to last iteration, with and without share="auto", on this GPU.
 
     python -m benchmarks.gpu.whole_run SCENE CHECKOUTS --steps 30000 --out gpu_whole.json
 
@@ -24,7 +24,12 @@ import torch
 from benchmarks.pictures import find_pictures, measure_pictures
 from skipgs_plug.files import write_aside
 
-MODES = {"auto": ["--share", "auto"], "own": ["--no-gate"]}  # the shorter run first: a failure shows early
+# The shorter runs first: a failure shows early.
+MODES = {
+    "auto": ["--share", "auto"],
+    "auto_full_size": ["--share", "auto", "--half-size", "False"],
+    "own": ["--no-gate"],
+}
 
 
 class Script(NamedTuple):
@@ -34,14 +39,15 @@ class Script(NamedTuple):
         folder: Name of its checkout in the folder of all checkouts.
         train: Command line, with placeholders {scene}, {out}, {n} (iterations) and {scale} (iterations / 30,000).
         render: Command line that writes pictures of held-out views, if training does not.
-        seconds: Pattern of the training seconds that the script prints or stores, evaluation and loading left out.
+        seconds: Pattern of the training seconds that the script prints or stores, evaluation and loading left out. If
+            the script has none, those of the gate's report count, from the first iteration to the last one.
         gaussians: Pattern of the number of Gaussians that it prints or stores.
     """
 
     folder: str
     train: str
     render: str | None
-    seconds: str
+    seconds: str | None
     gaussians: str
 
 
@@ -61,6 +67,15 @@ def gsplat(strategy: str) -> Script:
 SCRIPTS = {
     "gsplat": gsplat("default"),
     "gsplat_mcmc": gsplat("mcmc"),
+    # Inria's training script as DashGaussian keeps it, with the rasterizer and the loss kernels of that project.
+    "inria": Script(
+        "DashGaussian",
+        "train.py -s {scene} -i images -r 1 --eval -m {out} --iterations {n} --save_iterations {n} "
+        "--test_iterations -1 --disable_viewer",
+        "render.py -m {out} --skip_train",
+        None,
+        r"GS Number: (\d+)",
+    ),
     # The settings of FastGS' own train_base.sh for this scene.
     "fastgs": Script(
         "FastGS",
@@ -76,10 +91,10 @@ SCRIPTS = {
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu.whole_run", description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, help="COLMAP folder")
-    parser.add_argument("checkouts", type=Path, help="folder with the checkouts gsplat and FastGS")
+    parser.add_argument("checkouts", type=Path, help="folder with the checkouts gsplat, DashGaussian and FastGS")
     parser.add_argument("--steps", type=int, default=30_000, help="iterations of the schedule")
     parser.add_argument("--only", nargs="+", choices=SCRIPTS, default=list(SCRIPTS), help="scripts to run")
-    parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES), help="with or without a gate")
+    parser.add_argument("--modes", nargs="+", choices=MODES, default=["auto", "own"], help="with or without a gate")
     parser.add_argument("--seconds", type=float, default=3600.0, help="time limit of all runs")
     parser.add_argument("--lpips", choices=("alex", "vgg"), help="measure LPIPS too, with this backbone")
     parser.add_argument("--out", type=Path, default=Path("gpu_whole.json"), help="file to write")
@@ -141,13 +156,16 @@ def run(name: str, mode: str, folder: Path, asked: argparse.Namespace, seconds: 
         error = call(script.render.format(**filled).split(), asked.checkouts / script.folder, folder, 120.0)
     if error is not None:
         return record | {"error": error}
-    written = "\n".join(path.read_text(errors="replace") for path in [folder / "log.txt", *folder.glob("stats/train*")])
-    report = next(folder.rglob("skipgs.json"), None)
+    stored = [folder / "log.txt", *folder.glob("stats/train*"), *folder.glob("TRAIN_INFO")]
+    written = "\n".join(path.read_text(errors="replace") for path in stored)
+    found = next(folder.rglob("skipgs.json"), None)
+    report = None if found is None else json.loads(found.read_text(encoding="utf-8"))
+    seconds = re.findall(script.seconds, written)[-1] if script.seconds else report["t_total"]
     return record | {
-        "train_seconds": float(re.findall(script.seconds, written)[-1]),
+        "train_seconds": float(seconds),
         "gaussians": int(re.findall(script.gaussians, written)[-1]),
         **json.loads(peak.read_text()),
-        "report": None if report is None else json.loads(report.read_text(encoding="utf-8")),
+        "report": report,
     }
 
 
