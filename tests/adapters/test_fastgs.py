@@ -108,8 +108,9 @@ def test_steps_with_fewer_gradients_are_longer_and_shrink(monkeypatch, compensat
     assert gate.report()["gaussians_shown"] is None  # a gradient is gathered from several views
 
 
-def test_fastgs_steps_in_each_iteration_of_refinement_that_runs(monkeypatch):
+def test_refinement_of_fastgs_steps_as_densification_does(monkeypatch):
     monkeypatch.setattr(adapter, "ACCUMULATES_FROM", 20)
+    monkeypatch.setattr(adapter, "BOTH_STEP", fastgs.STEP_EVERY)
     gated, gate, factors = factors_of(CASES["fastgs"], fastgs, monkeypatch, refine_share=0.25)
     ran = [step for step in gated.backwards if 20 < step < 64 and step not in fastgs.PRUNES]
     assert set(ran) == {step for step in gated.steps if 20 < step < 64} and 8 < len(ran) < 16
@@ -117,7 +118,9 @@ def test_fastgs_steps_in_each_iteration_of_refinement_that_runs(monkeypatch):
     assert gate.report()["gaussians_shown"] > 0.5  # it is measured, since each gradient is of one view
     for step in ran:
         assert factors[step, "rotation"] > path_factor(0.25, (step - 20) / 45)  # if a third is shown
-        assert factors[step, "f_rest"] == pytest.approx(4.0 * factors[step, "rotation"])
+    step = [step for step in gated.backwards if step > 20][fastgs.STEP_EVERY - 1]
+    assert [one for one in ran if (one, "f_rest") in factors] == [step]
+    assert factors[step, "f_rest"] == pytest.approx(4.0 * factors[step, "rotation"])
 
 
 def test_fastgs_accumulates_if_steps_stay_as_they_are(monkeypatch):
