@@ -36,9 +36,7 @@ class FastGS(InriaFamily):
         "The paper's gate: `optimizer_step(iteration)` steps every 16th, 32nd or 64th iteration with the gradients "
         "gathered since, even in a skipped one."
     )
-    with_share = (
-        f"Refinement steps as densification does: in each iteration that runs, higher bands in each 16th. {GROWS_WHOLE}"
-    )
+    with_share = f"Refinement steps as densification does, higher bands in every 16th iteration. {GROWS_WHOLE}"
     stand_ins = "fastgs"
     mark = "render_fastgs"
     changes = (*InriaFamily.changes, "densify_and_prune_fastgs")

@@ -1,4 +1,4 @@
-"""Batches of the script of gsplat, shown at half their size while the scene grows."""
+"""Batches of the script of gsplat, shown at half their size while `Hooks.at_half_size`."""
 
 from __future__ import annotations
 

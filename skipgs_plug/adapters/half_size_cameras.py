@@ -1,4 +1,4 @@
-"""Cameras of Inria 3DGS and its forks, shown at half their size while the scene grows."""
+"""Cameras of Inria 3DGS and its forks, shown at half their size while `Hooks.at_half_size`."""
 
 from __future__ import annotations
 

@@ -34,8 +34,8 @@ class SkipConfig:
         refine_share: Share of the iterations from `start_iter` on that runs, or "auto". None for the paper's gate,
             unless `share` is given.
         half_size: With `share` or `grow_share`: train on photographs of half the width and height until densification
-            ends, at most in the first half of the run. None with "auto" is True if the trainer's adapter can do it and
-            the photographs lose little by it; otherwise False.
+            ends or the scene has e times as many Gaussians, at most in the first half of the run. None with "auto" is
+            True if the trainer's adapter can do it and the photographs lose little by it; otherwise False.
         max_gaussians: With `share` or `grow_share`: densification stops before an event could exceed this number
             of Gaussians. None for no bound.
         always: With a share: iterations that always run. None reads them from the conditions of the loop.

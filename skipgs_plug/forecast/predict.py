@@ -64,14 +64,17 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
     # end with about as many Gaussians.
     end = min(1.0, stop / pilot.stop)
     grown = growth(end)
-    per_growing = float(np.mean([cost(growth(x)) for x in np.linspace(0.0, end, 101)]))
+    numbers = [growth(x) for x in np.linspace(0.0, end, 101)]
+    per_growing = float(np.mean([cost(number) for number in numbers]))
     per_refining = cost(grown)
     growing = growing_share(stop, pilot.views, longer=pilot.visible is not None) * stop
     left = max_steps - stop
     refining = refining_share(left, pilot.views, grown=stop) * left if left else 0.0
     more = grown - max(sample.gaussians for sample in pilot.samples)
     memory = None if pilot.peak_memory is None else round(pilot.peak_memory + BYTES_OF_A_GAUSSIAN * max(more, 0.0))
-    per_grown = per_growing * (SECONDS_AT_HALF_SIZE if pilot.half_size else 1.0)
+    # Photographs have half their size until the scene has e times as many Gaussians as at first.
+    few = [pilot.half_size and number <= math.e * numbers[0] for number in numbers]
+    per_grown = per_growing * (1.0 - (1.0 - SECONDS_AT_HALF_SIZE) * float(np.mean(few)))
     return Forecast(
         max_steps=max_steps,
         seconds=stop * per_growing + (max_steps - stop) * per_refining,

@@ -11,6 +11,7 @@ from lookalikes.splats import draw, make_cameras, new_log, options, photo_loss
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.adapters.half_size_cameras import IMAGES, HalfSizeCameras
 from skipgs_plug.adapters.inria import Inria
+from skipgs_plug.core.pace.growing import Growing
 
 FULL, HALF = (24, 32), (12, 16)
 GROWS, LAST = 20, 60
@@ -76,6 +77,19 @@ def test_auto_asks_the_photographs(sizes, smooth):
     gate = train(inria, cameras, share="auto")
     assert bool(half_sizes(sizes)) == smooth
     assert (gate.report()["growing"]["half_size_psnr"] > 32) == smooth
+
+
+def test_a_scene_with_many_new_gaussians_grows_on_cameras_of_their_own_size(monkeypatch, sizes):
+    strongly_from = 12
+
+    def grows_strongly(phase):
+        return phase._rates.rows > 0 and max(sizes.training) >= strongly_from
+
+    monkeypatch.setattr(Growing, "_grows_strongly", property(grows_strongly))
+    gate = train(inria, make_cameras(scale=2), share=1.0, half_size=True)
+    first_event = 15  # of those that come after
+    assert half_sizes(sizes) == list(range(2, first_event))
+    assert gate.report()["growing"]["half_size_until"] == first_event
 
 
 def test_half_size_can_be_refused(sizes):

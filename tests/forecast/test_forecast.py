@@ -80,7 +80,8 @@ def test_growth_on_smaller_photographs_takes_less() -> None:
     plain = predict(pilot, TrainConfig(), 7000)
     smaller = predict(dataclasses.replace(pilot, half_size=True), TrainConfig(), 7000)
     assert smaller.seconds == plain.seconds and smaller.iterations_auto == plain.iterations_auto
-    assert 0.5 * plain.seconds_auto < smaller.seconds_auto < plain.seconds_auto
+    # The scene has e times its Gaussians after a third of densification, and photographs their own size from then on.
+    assert 0.8 * plain.seconds_auto < smaller.seconds_auto < 0.95 * plain.seconds_auto
 
 
 def test_a_shorter_run_ends_where_growth_is_by_then() -> None:
