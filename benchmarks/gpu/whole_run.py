@@ -159,7 +159,9 @@ def run(name: str, mode: str, folder: Path, asked: argparse.Namespace, seconds: 
     stored = [folder / "log.txt", *folder.glob("stats/train*"), *folder.glob("TRAIN_INFO")]
     written = "\n".join(path.read_text(errors="replace") for path in stored)
     found = next(folder.rglob("skipgs.json"), None)
-    report = None if found is None else json.loads(found.read_text(encoding="utf-8"))
+    if found is None:
+        return record | {"error": "it wrote no skipgs.json"}
+    report = json.loads(found.read_text(encoding="utf-8"))
     seconds = re.findall(script.seconds, written)[-1] if script.seconds else report["t_total"]
     return record | {
         "train_seconds": float(seconds),

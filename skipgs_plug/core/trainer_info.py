@@ -62,8 +62,8 @@ class TrainerInfo:
             of steps does not change when iterations are left out. Each step has fewer gradients then, so steps of
             refinement are longer by the root of their share only, and shrink. With `share`, densification runs whole,
             since few steps follow it.
-        steps_each: The trainer's own schedule accumulates, but the adapter makes optimizers step in each iteration of
-            refinement that runs, if iterations are left out and steps are longer. With `share`, densification runs
+        steps_each: The trainer's own schedule accumulates, but the adapter makes refinement step as densification
+            does, if iterations are left out and steps are longer. With `share`, densification runs
             whole all the same: the trainer's own run takes nearly all of its steps there.
         densification: How to find the densification events, so that fewer iterations can run before densification
             ends; None if all of them must run.

@@ -9,7 +9,7 @@ from statistics import fmean as mean
 
 import numpy as np
 
-from skipgs_plug.core.pace.needs import growing_share, refining_share
+from skipgs_plug.core.pace.needs import for_new_gaussians, growing_share, refining_share
 from skipgs_plug.forecast.pilot import Pilot
 from skipgs_plug.trainer.config import TrainConfig
 
@@ -65,16 +65,17 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
     end = min(1.0, stop / pilot.stop)
     grown = growth(end)
     numbers = [growth(x) for x in np.linspace(0.0, end, 101)]
-    per_growing = float(np.mean([cost(number) for number in numbers]))
+    costs = [cost(number) for number in numbers]
+    per_growing = mean(costs)
     per_refining = cost(grown)
     growing = growing_share(stop, pilot.views, longer=pilot.visible is not None) * stop
     left = max_steps - stop
     refining = refining_share(left, pilot.views, grown=stop) * left if left else 0.0
     more = grown - max(sample.gaussians for sample in pilot.samples)
     memory = None if pilot.peak_memory is None else round(pilot.peak_memory + BYTES_OF_A_GAUSSIAN * max(more, 0.0))
-    # Photographs have half their size until the scene has e times as many Gaussians as at first.
-    few = [pilot.half_size and number <= math.e * numbers[0] for number in numbers]
-    per_grown = per_growing * (1.0 - (1.0 - SECONDS_AT_HALF_SIZE) * float(np.mean(few)))
+    # Photographs have half their size until the scene grows strongly.
+    halved = [pilot.half_size and for_new_gaussians(number / numbers[0]) == 1.0 for number in numbers]
+    per_grown = mean(one * (SECONDS_AT_HALF_SIZE if half else 1.0) for one, half in zip(costs, halved, strict=True))
     return Forecast(
         max_steps=max_steps,
         seconds=stop * per_growing + (max_steps - stop) * per_refining,

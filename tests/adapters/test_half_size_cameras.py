@@ -80,14 +80,9 @@ def test_auto_asks_the_photographs(sizes, smooth):
 
 
 def test_a_scene_with_many_new_gaussians_grows_on_cameras_of_their_own_size(monkeypatch, sizes):
-    strongly_from = 12
-
-    def grows_strongly(phase):
-        return phase._rates.rows > 0 and max(sizes.training) >= strongly_from
-
-    monkeypatch.setattr(Growing, "_grows_strongly", property(grows_strongly))
+    monkeypatch.setattr(Growing, "_grows_strongly", property(lambda phase: max(sizes.training) >= 12))
     gate = train(inria, make_cameras(scale=2), share=1.0, half_size=True)
-    first_event = 15  # of those that come after
+    first_event = 15  # of those that come after iteration 12
     assert half_sizes(sizes) == list(range(2, first_event))
     assert gate.report()["growing"]["half_size_until"] == first_event
 

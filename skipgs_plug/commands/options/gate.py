@@ -37,7 +37,7 @@ class GateOptions:
     refine_share: Annotated[Optional[str], shown("SHARE|auto", "as --share")] = None
     """The same, but only after densification, such as 0.4, or auto."""
     half_size: Annotated[Optional[bool], shown("True|False", "with auto, if photographs lose little by it")] = None
-    """Until densification ends, train on photographs of half the width and height."""
+    """Until densification ends, or the scene has grown strongly, train on photographs of half the width and height."""
     max_gaussians: Annotated[Optional[int], shown("INT", "no bound")] = None
     """With --share: largest number of Gaussians. Densification stops before an event could exceed it."""
     always: Annotated[OptionalIntegers, shown("INT ...", "read from the loop's conditions")] = None

@@ -29,7 +29,7 @@ class PhasePlan(NamedTuple):
         accumulates: Optimizers step on gradients that are accumulated over several iterations; see `TrainerInfo`.
         photographs: Returns some training photographs, if views can be shown at half their size; see `TrainerInfo`.
         width: Width of the training photographs in pixels; None if unknown.
-        steps_each: Optimizers would do so, but step in each iteration of refinement that runs; see `TrainerInfo`.
+        steps_each: Optimizers would do so, but step in refinement as in densification; see `TrainerInfo`.
     """
 
     numbers: range
