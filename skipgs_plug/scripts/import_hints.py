@@ -21,6 +21,8 @@ REQUIREMENTS = ("*requirements*.txt", "environment*.yml", "environment*.yaml", "
 # Number of folders that are searched for requirements, from the script's folder upwards. gsplat keeps its scripts one
 # folder below its checkout.
 FOLDERS = 2
+# Parts of a requirements file that list nothing: comments, and the name of the checkout or environment itself.
+UNLISTED = re.compile(r"""#.*|\bname["']?\s*[=:]\s*["']?[\w.-]+""")
 
 
 def is_extension(module: str) -> bool:
@@ -66,6 +68,11 @@ def requirements(script: Path) -> Iterator[Path]:
 
 
 def names(listing: Path, package: str) -> bool:
-    """Return whether a requirements file names a package. Package indices treat "-" and "_" alike."""
+    """Return whether a requirements file names a package of the index. Package indices treat "-" and "_" alike.
+
+    The last part of a path or address, as in `submodules/simple-knn`, is none: the index may hold an unrelated package
+    of that name.
+    """
+    text = UNLISTED.sub("", listing.read_text(errors="replace"))
     name = re.sub("[-_]+", "[-_]", re.escape(package).replace(r"\-", "-"))
-    return re.search(rf"(?<![\w-]){name}(?![\w-])", listing.read_text(errors="replace"), re.IGNORECASE) is not None
+    return re.search(rf"(?<![\w/-]){name}(?![\w-])", text, re.IGNORECASE) is not None

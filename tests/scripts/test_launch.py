@@ -218,6 +218,12 @@ def test_missing_module_is_named(checkout, capfd):
         ("absent_module", "requirements.txt", "numpy\nAbsent-Module>=2\n", "lists; run: pip install absent_module"),
         ("absent_module", "../environment.yml", "  - absent_module=1.0\n", "environment.yml lists; run: pip install"),
         ("absent", "requirements.txt", "absent-module\n", "If absent is part of the checkout"),
+        ("absent", "environment.yml", "name: absent\n  - numpy\n", "If absent is part of the checkout"),
+        ("absent", "environment.yml", "  - submodules/absent\n", "If absent is part of the checkout"),
+        ("absent", "requirements.txt", "git+https://host/absent.git\n", "If absent is part of the checkout"),
+        ("absent", "requirements.txt", "# absent\n", "If absent is part of the checkout"),
+        ("absent", "pyproject.toml", 'name = "absent"\n', "If absent is part of the checkout"),
+        ("absent", "setup.py", "setup(name='own', install_requires=['absent'])\n", "run: pip install absent"),
         ("skimage", None, "", "run: pip install scikit-image"),
         (
             "skimage",
