@@ -6,6 +6,7 @@ placement and clocks. Everything else (streams, graphs, CUDA generators) fails a
 
 from __future__ import annotations
 
+import functools
 import importlib
 import time
 from collections.abc import Callable, Iterator
@@ -79,7 +80,7 @@ def cuda_on_cpu() -> Iterator[None]:
     # `_in_one_thread` first: it imports dynamo, which lists the functions of torch.cuda and fails if they are replaced.
     with (
         _in_one_thread(),
-        stand_ins([*_places(), (torch, "load", _load_on_cpu(torch.load))]),
+        stand_ins([*_places(), *_engine(), (torch, "load", _load_on_cpu(torch.load))]),
         also_in_threads(_in_one_thread),
         also_in_children(cuda_on_cpu),
     ):
@@ -98,6 +99,25 @@ def _places() -> list[tuple[Any, str, Any]]:
     """Return module, name and stand-in of each replaced function. Torch before 2.6 has no module `accelerator`."""
     split = ((*name.split(".")[1:], stand_in) for name, stand_in in REPLACED.items())
     return [(getattr(torch, module), name, stand_in) for module, name, stand_in in split if hasattr(torch, module)]
+
+
+def _engine() -> list[tuple[Any, str, Any]]:
+    """Return the function of torch that runs every backward pass, with a stand-in that redirects the script's own code.
+
+    `Tensor.backward` calls it with all function modes off, but it also runs `backward` of the script's
+    `autograd.Function`s, and hooks. The name is private to torch.
+    """
+    name = "_engine_run_backward"
+    if not hasattr(torch.autograd, name):
+        return []
+    run = getattr(torch.autograd, name)
+
+    @functools.wraps(run)
+    def redirected(*args: Any, **kwargs: Any) -> Any:
+        with _CpuPlacement():
+            return run(*args, **kwargs)
+
+    return [(torch.autograd, name, redirected)]
 
 
 @contextmanager

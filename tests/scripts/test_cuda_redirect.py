@@ -45,6 +45,29 @@ def test_values_dtypes_and_gradients_pass_through():
     assert leaf.grad.tolist() == [2.0, 4.0]
 
 
+class Doubled(torch.autograd.Function):
+    """A function as scripts write it: its backward asks for CUDA."""
+
+    @staticmethod
+    def forward(ctx, value):
+        return 2 * value
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return torch.full([2], 2.0, device="cuda") * gradient.cuda()
+
+
+@pytest.mark.parametrize("as_method", [True, False])
+def test_the_scripts_own_code_in_a_backward_pass_is_redirected(as_method):
+    hooked = []
+    with cuda_on_cpu():
+        leaf = torch.ones(2, device="cuda", requires_grad=True)
+        leaf.register_hook(lambda gradient: hooked.append(gradient.to("cuda")))
+        loss = Doubled.apply(leaf).sum()
+        gradient = loss.backward() if as_method else torch.autograd.grad(loss, leaf)[0]
+    assert (leaf.grad if as_method else gradient).tolist() == hooked[0].tolist() == [2.0, 2.0]
+
+
 def test_device_calls_that_only_order_work_do_nothing():
     with cuda_on_cpu():
         torch.cuda.synchronize()
