@@ -82,7 +82,8 @@ def leaves(node: ast.expr) -> Iterator[ast.expr]:
 def is_point(leaf: ast.expr) -> bool:
     """Whether a part of a condition picks single numbers: by equality, membership, a remainder or a called function."""
     if isinstance(leaf, ast.Compare):
-        return any(isinstance(operator, _PICKS) for operator in leaf.ops) or any(
+        compared = zip(leaf.ops, leaf.comparators, strict=True)
+        return any(isinstance(operator, _PICKS) and not _is_stretch(right) for operator, right in compared) or any(
             isinstance(part, ast.Mod) for part in ast.walk(leaf)
         )
     if isinstance(leaf, ast.IfExp):
@@ -90,6 +91,14 @@ def is_point(leaf: ast.expr) -> bool:
         return any(is_point(part) for part in parts if not isinstance(part, ast.Constant))
     # The training backward of a user's own loop receives the number too, but is not a milestone.
     return not (isinstance(leaf, ast.Call) and isinstance(leaf.func, ast.Attribute) and leaf.func.attr == "backward")
+
+
+def _is_stretch(values: ast.expr) -> bool:
+    """Whether these are all numbers between two, as in `step in range(30, 40)`, which says `30 <= step < 40`."""
+    match values:
+        case ast.Call(ast.Name("range"), [_] | [_, _]):
+            return True
+    return False
 
 
 def unconditional(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:

@@ -369,3 +369,18 @@ def test_calls_and_global_names_that_keep_the_number():
             save_current(40)
 
     assert numbers(loop) == [71, 72, 73, 80]
+
+
+def test_a_range_without_gaps_is_a_stretch_of_the_run():
+    def loop(stop):
+        for step in stop():
+            if step not in range(60, 90):
+                print("no pause")
+                if step % 25 == 0:
+                    print("densify")
+            if step in range(95):
+                print("a stretch of them")
+            if step in range(60, 90, 10):
+                print("save")
+
+    assert found(loop) == {"step % 25 == 0": [50], "step in range(60, 90, 10)": [60, 70, 80]}
