@@ -137,16 +137,16 @@ def find_script_adapter(script: Path) -> type[AbstractAdapter]:
         adapter = get_adapter(candidate)
         if adapter.recognises_script(code):
             return adapter
+    advice = "name the script that holds the training loop, gate that loop"
     if code.used:
-        found = "a function training(), but no GaussianModel"
+        found, advice = "a function training(), but no GaussianModel", "gate its loop"
     elif functions := sorted(name for name in code.functions if not name.startswith("_")):
         found = f"no function training(), but {', '.join(functions[:SHOWN])}{' ...' if functions[SHOWN:] else ''}"
     else:
         found = "no function at all"
     raise UnknownTrainerError(
-        f"No adapter knows {script}, which has {found}: name the script that holds the training loop, gate that loop "
-        "by hand with SkipGate(start_iter=...) and gate.backward(loss, view, step), or write an adapter "
-        "(CONTRIBUTING.md)."
+        f"No adapter knows {script}, which has {found}: {advice} by hand with SkipGate(start_iter=...) and "
+        "gate.backward(loss, view, step), or write an adapter (CONTRIBUTING.md)."
     )
 
 

@@ -64,6 +64,9 @@ def test_auto_recognises_the_script_before_it_runs(checkout, tmp_path, capfd):
     error = capfd.readouterr().err
     assert "other.py, which has no function training(), but main: name the script that holds the training loop" in error
     assert "name one of" not in error and error.count("\n") == 1
+    other.write_text("def training():\n    model = OwnModel()\n    model.loss().backward()\n")
+    assert cli.main(["run", "auto", "--", str(other)]) == cli.BAD_INPUT
+    assert "a function training(), but no GaussianModel: gate its loop by hand" in capfd.readouterr().err
 
 
 def test_wrong_adapter_is_refused_before_anything_is_imported(checkout, tmp_path, capfd):
