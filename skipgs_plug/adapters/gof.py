@@ -22,7 +22,7 @@ class GOF(InriaFamily):
         "Needs CUDA: `--cpu` has no stand-in for its rasterizer."
     )
     mark = "depth_normal_from_iter"
-    calls = ("compute_3D_filter", "get_apperance_embedding")
+    calls = ("get_apperance_embedding",)
     arguments = ("kernel_size",)
     # `densification_interval` would match its pictures for inspection, too.
     densification = Densification(marks=("iteration > opt.densify_from_iter",), reset_marks=RESETS)

@@ -32,6 +32,7 @@ class LoopCode(NamedTuple):
         used: Every global and attribute that `training` and the functions that it calls use. Empty if there is no
             function `training`.
         repeated: The subset of `used` inside the loop itself and in functions that the loop calls.
+        called: Names of the functions and methods that are called there; all of `repeated` if there is no source.
         keywords: Names by which arguments are passed.
         stored: Attributes that the loop assigns to.
         syntax: Syntax of `training`; None if there is no source.
@@ -44,6 +45,7 @@ class LoopCode(NamedTuple):
     callers: frozenset[str] = frozenset()
     used: frozenset[str] = frozenset()
     repeated: frozenset[str] = frozenset()
+    called: frozenset[str] = frozenset()
     keywords: frozenset[str] = frozenset()
     stored: frozenset[str] = frozenset()
     syntax: ast.FunctionDef | None = None
@@ -98,10 +100,11 @@ class LoopCode(NamedTuple):
         training, syntax = functions[LOOP], syntax_of(LOOP)
         callers = _callers(training)
         if not callers:  # functions that hold a loop of their own, which sets the rates, are no helpers of this one
-            called_here = _called_in_loops(syntax) & backward
-            callers = {name for name in called_here if RATES not in _called_in_loops(syntax_of(name))}
+            called_here = _called_in(*_loops(syntax)) & backward
+            callers = {name for name in called_here if RATES not in _called_in(*_loops(syntax_of(name)))}
         repeated, stored = _in_loop(training, syntax)
         called = _called(repeated, functions)
+        syntaxes = [syntax_of(code.co_name) for code in called]
         parts = [part for code in (training, *called) for part in _with_inner(code)]
         # The compiler puts the names of keywords together in one constant.
         keywords = frozenset(
@@ -121,6 +124,11 @@ class LoopCode(NamedTuple):
             frozenset(callers),
             frozenset(of_loop | of_called),
             frozenset(repeated | of_called),
+            frozenset(
+                repeated | of_called
+                if syntax is None or None in syntaxes
+                else _called_in(*_loops(syntax), *(one for one in syntaxes if one is not None))
+            ),
             keywords,
             frozenset(stored),
             syntax,
@@ -160,10 +168,14 @@ def _callers(code: types.CodeType) -> set[str]:
     return {part.co_name for part in _with_inner(code) if "backward" in part.co_names}
 
 
-def _called_in_loops(syntax: ast.FunctionDef | None) -> set[str]:
-    """Names of the functions and methods that a function calls in its loops."""
-    loops = [] if syntax is None else [node for node in ast.walk(syntax) if isinstance(node, (ast.For, ast.While))]
-    called = [node.func for loop in loops for node in ast.walk(loop) if isinstance(node, ast.Call)]
+def _loops(syntax: ast.FunctionDef | None) -> list[ast.For | ast.While]:
+    """The loops in a function and in the functions inside it."""
+    return [] if syntax is None else [node for node in ast.walk(syntax) if isinstance(node, (ast.For, ast.While))]
+
+
+def _called_in(*parts: ast.AST) -> set[str]:
+    """Names of the functions and methods that these parts of a source call."""
+    called = [node.func for part in parts for node in ast.walk(part) if isinstance(node, ast.Call)]
     return {
         function.id if isinstance(function, ast.Name) else function.attr
         for function in called

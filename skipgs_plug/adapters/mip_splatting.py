@@ -21,5 +21,4 @@ class MipSplatting(InriaFamily):
     )
     stand_ins = "mip_splatting"
     mark = "create_offset_gt"
-    calls = ("compute_3D_filter",)
     arguments = ("kernel_size", "subpixel_offset")

@@ -20,11 +20,13 @@ from skipgs_plug.core.source.functions import undecorated
 NOISE = frozenset({"randn", "randn_like", "normal"})
 # Methods of a tensor whose names end in "_" but that change no values.
 HARMLESS = frozenset({"requires_grad_", "share_memory_", "detach_", "rename_"})
-# Methods of the model that Inria's loops (classic and current) call.
+# Methods of the model that Inria's loops (classic and current) call, and `compute_3D_filter` of Mip-Splatting, which
+# many forks call until the end. It depends on positions and cameras only, so it changes only if the model moves.
 CALLS = frozenset(
     {
         "add_densification_stats",
         "capture",
+        "compute_3D_filter",
         "densify_and_prune",
         "get_opacity",
         "get_rotation",
@@ -116,7 +118,7 @@ def unrecognised(
     return Unrecognised(
         frozenset(code.repeated & _methods(model) - known),
         frozenset(code.keywords & parameters - ARGUMENTS - set(arguments)),
-        frozenset(code.repeated & NOISE - known),
+        frozenset(code.called & NOISE - known),  # `camera.normal` is the name of no noise
         frozenset(writes - known),
         code.used & known,
     )

@@ -49,6 +49,9 @@ class GaussianModel(SplatModel):
     def count(self):
         self.counted = True
 
+    def compute_3D_filter(self):
+        self.filter = self.values["xyz"].detach().abs()
+
     def thin(self):
         for one in self.optimizer.param_groups:
             one["params"][0] = self.values[one["name"]] = torch.nn.Parameter(one["params"][0].detach()[:-1])
@@ -175,6 +178,21 @@ def test_noise_for_a_network_is_listed_and_not_refused():
     with gate:
         train(gate.adapter.trainer)
     assert gate.report()["backwards_skipped"] == 21
+
+
+def test_an_attribute_with_the_name_of_a_noise_is_none(from_file, recwarn):
+    SkipGate(from_file(extra="viewpoint_cam.normal = normal = None; viewpoint_cam.normal")).detach()
+    assert not recwarn.list
+    helper = "\ndef shaken(camera):\n    return torch.normal(0.0, 1.0, (3,))\n"
+    with pytest.warns(RuntimeWarning, match=r"still executed in skipped iterations: normal\(\)"):
+        SkipGate(from_file(extra="viewpoint_cam.normal; shaken(viewpoint_cam)", helper=helper)).detach()
+
+
+def test_a_filter_of_positions_puts_no_start_off(from_file, recwarn):
+    fork = from_file(extra="if iteration < opt.prune_until_iter: gaussians.compute_3D_filter()")
+    with SkipGate(fork, policy=SkipAlways()) as gate:
+        train(fork)
+    assert gate.config.start_iter == 20 and gate.released is None and not recwarn.list
 
 
 @pytest.mark.parametrize(
