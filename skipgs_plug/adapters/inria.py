@@ -23,8 +23,16 @@ from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.half_size_cameras import HalfSizeCameras
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import last_calls
-from skipgs_plug.adapters.loop_code import LOOP, LoopCode, names_around, namespace_of
-from skipgs_plug.adapters.unknown_forks import BY_HAND, CALLS, Unrecognised, begin_after, left_alone, unrecognised
+from skipgs_plug.adapters.loop_code import LOOP, OPTIONS, LoopCode, names_around, namespace_of
+from skipgs_plug.adapters.unknown_forks import (
+    BY_HAND,
+    CALLS,
+    Unrecognised,
+    begin_after,
+    left_alone,
+    refuse_loop_elsewhere,
+    unrecognised,
+)
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
@@ -165,7 +173,7 @@ class InriaFamily(AbstractAdapter):
             raise self.mismatch(f"a train module with {LOOP}() and GaussianModel, or its {LOOP} function")
         code = LoopCode.of_module(names)
         self._refuse_fork(code)
-        self._refuse_loop_elsewhere(code)
+        refuse_loop_elsewhere(code, self.difference(code))
         self.examine(code, self._renderers(names), names["GaussianModel"])
         self._attach_to_renderer(hooks, names)
         self._attach_to_model(hooks, names)
@@ -179,7 +187,7 @@ class InriaFamily(AbstractAdapter):
                 f"it was checked with {self.checked}."
             )
         self._refuse_fork(code)
-        self._refuse_loop_elsewhere(code)
+        refuse_loop_elsewhere(code, self.difference(code))
         # The script binds names of these modules when it imports them, so they are replaced right before.
         loaded: dict[str, dict[str, Any]] = {}
 
@@ -270,8 +278,8 @@ class InriaFamily(AbstractAdapter):
 
     def _known(self, names: Mapping[str, Any]) -> Mapping[str, Any]:
         """Read the run before its conditions: the loop of a resumed run needs them before its first iteration."""
-        if "opt" in names:
-            self.begin(names["opt"], names)
+        if OPTIONS in names:
+            self.begin(names[OPTIONS], names)
         return self.known_names
 
     def always_run(self, numbers: range) -> Iterable[int]:
@@ -300,25 +308,15 @@ class InriaFamily(AbstractAdapter):
                 f"looks like the training script of {right.name!r}."
             )
 
-    def _refuse_loop_elsewhere(self, code: LoopCode) -> None:
-        """Refuse a script whose `training` calls no backward; in 4DGaussians, another function has the loop."""
-        if not code.callers:
-            callers = ", ".join(f"{name}()" for name in sorted(code.backward & code.used))
-            calls = f"{callers} calls backward in its place" if callers else "nor does another function in this file"
-            raise AdapterMismatchError(
-                f"{self.difference(code)}: {LOOP}() does not call loss.backward(), {calls}, and such a loop is not "
-                f"supported. {BY_HAND}"
-            )
-
     def _read_run(self, hooks: Hooks, loop: Mapping[str, Any]) -> None:
         """Read options, views and first iteration from the loop's variables."""
         scene = next((loop[name] for name in self.scenes if name in loop), None)
         number = "iteration" if self._code is None else self._code.number
-        missing = [name for name in ("opt", number) if name not in loop]
+        missing = [name for name in (OPTIONS, number) if name not in loop]
         if scene is None or missing:
             wanted = ", ".join(missing or self.scenes)
             raise self.mismatch(f"{wanted} among the variables of {LOOP}()")
-        opt, self._step = loop["opt"], int(loop[number])
+        opt, self._step = loop[OPTIONS], int(loop[number])
         self.output_folder = getattr(scene, "model_path", None)
         cameras = scene.getTrainCameras()
         names = [camera.image_name for camera in cameras]

@@ -16,6 +16,7 @@ from skipgs_plug.adapters.loop_bounds import function_of
 from skipgs_plug.core.errors import AdapterMismatchError
 
 LOOP = "training"  # name of the function that holds the loop, in the whole Inria family
+OPTIONS = "opt"  # its variable that holds the options of optimization
 RATES = "update_learning_rate"  # method of the model that each iteration calls with its number
 
 
@@ -35,6 +36,7 @@ class LoopCode(NamedTuple):
         called: Names of the functions and methods that are called there; all of `repeated` if there is no source.
         keywords: Names by which arguments are passed.
         stored: Attributes that the loop assigns to.
+        variables: Variables of `training`, of functions inside it, and of functions of the script that its loop calls.
         syntax: Syntax of `training`; None if there is no source.
     """
 
@@ -48,6 +50,7 @@ class LoopCode(NamedTuple):
     called: frozenset[str] = frozenset()
     keywords: frozenset[str] = frozenset()
     stored: frozenset[str] = frozenset()
+    variables: frozenset[str] = frozenset()
     syntax: ast.FunctionDef | None = None
 
     @property
@@ -131,6 +134,7 @@ class LoopCode(NamedTuple):
             ),
             keywords,
             frozenset(stored),
+            frozenset(name for part in parts for name in (*part.co_varnames, *part.co_cellvars)),
             syntax,
         )
 

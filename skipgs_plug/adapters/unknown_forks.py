@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 
 from skipgs_plug.adapters.loop_bounds import ASSIGNED, CallReader
-from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.adapters.loop_code import LOOP, OPTIONS, LoopCode
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Adapter
@@ -122,6 +122,30 @@ def unrecognised(
         frozenset(writes - known),
         code.used & known,
     )
+
+
+def refuse_loop_elsewhere(code: LoopCode, who: str) -> None:
+    """Raise an error if `training` is not the loop of the Inria family, before the script imports anything.
+
+    Args:
+        code: The training script.
+        who: Start of the message.
+
+    Raises:
+        AdapterMismatchError: `training` calls no backward (in 4DGaussians, another function has the loop), or has no
+            variable with the options (in Self-Organizing Gaussians, they are parts of one `cfg`).
+    """
+    if not code.callers:
+        callers = ", ".join(f"{name}()" for name in sorted(code.backward & code.used))
+        calls = f"{callers} calls backward in its place" if callers else "nor does another function in this file"
+        raise AdapterMismatchError(
+            f"{who}: {LOOP}() does not call loss.backward(), {calls}, and such a loop is not supported. {BY_HAND}"
+        )
+    if OPTIONS not in code.variables | code.names:
+        raise AdapterMismatchError(
+            f"{who}: {LOOP}() has no variable {OPTIONS!r}, whose densify_until_iter and iterations the gate needs. "
+            f"{BY_HAND}"
+        )
 
 
 class Survey:

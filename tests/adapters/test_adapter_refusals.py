@@ -147,12 +147,14 @@ def test_script_shorter_than_ten_iterations_is_judged_at_its_end():
         gate.verify()
 
 
-@pytest.mark.parametrize("name", ["opt", "scene"])
-def test_renamed_variable_of_the_loop_is_named(name):
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [("opt", r"training\(\) has no variable 'opt'"), ("scene", r"expects scene among the variables of training\(\)")],
+)
+def test_renamed_variable_of_the_loop_is_named(name, sentence):
     module = train_module("loss.backward()")
     exec(TRAIN.format(backward="loss.backward()").replace(name, "renamed"), vars(module))
     opt = types.SimpleNamespace(iterations=40, densify_until_iter=20)
-    sentence = rf"expects {name} among the variables of training\(\)"
     with pytest.raises(AdapterMismatchError, match=sentence), SkipGate(module):
         module.training(dataset(), opt, None)
 

@@ -1,5 +1,6 @@
 """Forks that no adapter knows are refused, warned about, or run without a gate, as their loop requires."""
 
+import re
 import types
 
 import pytest
@@ -220,6 +221,17 @@ def test_loop_in_a_function_that_training_calls_is_refused():
         match=r"training\(\) does not call loss.backward\(\), reconstruct\(\) calls backward in its place, .* not",
     ):
         SkipGate(fork)
+
+
+def test_a_loop_without_a_variable_of_options_is_refused_before_it_begins(monkeypatch):
+    monkeypatch.setattr("test_unknown_forks.TRAIN", re.sub(r"\bopt\b", "cfg", TRAIN))
+    with pytest.raises(AdapterMismatchError, match=r"training\(\) has no variable 'opt', whose .* by hand"):
+        SkipGate(unknown_fork())
+    options = "opt = types.SimpleNamespace(iterations=40, densify_until_iter=20)\n"
+    monkeypatch.setattr("test_unknown_forks.TRAIN", f"import types\n{options}" + TRAIN.replace("opt, pipe", "pipe, _"))
+    with SkipGate(unknown_fork(), policy=SkipAlways()) as gate:
+        train(gate.adapter.trainer)
+    assert gate.report()["backwards_skipped"] == 21
 
 
 def test_functions_that_the_loop_calls_are_read_too():
