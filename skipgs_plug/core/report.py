@@ -122,6 +122,9 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
         f"SkipGS: {run:,} of {run + skipped:,} iterations run ({percent:.1f} %) since iteration "
         f"{config.start_iter or 0:,}, {skipped:,} left out whole."
     ]
+    if counted["non_finite"]:
+        backward = "ran all the same" if config.on_nonfinite == "pass" else "was skipped"
+        lines.append(f"  in {counted['non_finite']:,} of them the loss was not finite, and the backward {backward}")
     if counted["gaussians_shown"] is not None:
         lines.append(
             f"  each view shows {100 * counted['gaussians_shown']:.0f} % of the Gaussians; this share sets the "

@@ -74,3 +74,15 @@ def test_before_start_it_is_the_trainers_own_affair() -> None:
     gate = SkipGate(start_iter=10)
     assert gate.backward(poison(), view="a", step=0)
     assert gate.stats()["non_finite"] == 0
+
+
+@pytest.mark.parametrize(("mode", "backward"), [("skip", "was skipped"), ("pass", "ran all the same")])
+def test_the_summary_of_a_gate_that_leaves_out_iterations_counts_them(mode: str, backward: str) -> None:
+    gate = SkipGate(start_iter=0, refine_share=0.5, on_nonfinite=mode)
+    with pytest.warns(RuntimeWarning, match="Loss is nan"):
+        for step in gate.iterations(range(40)):
+            loss = torch.tensor(math.nan if step % 4 == 0 else 1.0, requires_grad=True)
+            gate.backward(loss, view=step % 4, step=step)
+    count = gate.report()["non_finite"]
+    assert 0 < count < 20
+    assert f"in {count} of them the loss was not finite, and the backward {backward}" in gate.summary()
