@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from .runtime.buffers import floats, ints, zeros
 from .runtime.constants import blocks
+from .runtime.function_modes import without_function_modes
 from .runtime.optimizations import OPTIMIZATIONS, active_optimizations
 from .stages.compose import compose, compose_adjoint
 from .stages.project import Limits, Projected, ProjectFlags, project_adjoint, project_forward
@@ -105,6 +106,7 @@ class Project(torch.autograd.Function):
         return means2d, depths, conics, compensations, radii, sigmas, visible, block_start
 
     @staticmethod
+    @without_function_modes
     @once_differentiable
     def backward(  # type: ignore[override]
         ctx: Any,
@@ -188,6 +190,7 @@ class SphericalHarmonics(torch.autograd.Function):
         return colors
 
     @staticmethod
+    @without_function_modes
     @once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> Any:  # type: ignore[override]
         means, sh0, shN, position, colors, visible, block_start = check_shapes(ctx.saved_tensors, **ctx.shapes)
@@ -220,6 +223,7 @@ class Pack(torch.autograd.Function):
         return take_rows(tensor, visible)
 
     @staticmethod
+    @without_function_modes
     @once_differentiable
     def backward(ctx: Any, v_packed: Tensor) -> Any:  # type: ignore[override]
         visible, block_start = ctx.saved_tensors
@@ -267,6 +271,7 @@ class Blend(torch.autograd.Function):
         return image, alpha, tiles_per_gauss
 
     @staticmethod
+    @without_function_modes
     @once_differentiable
     def backward(  # type: ignore[override]
         ctx: Any, v_image: Tensor | None, v_alpha: Tensor | None, _: Any

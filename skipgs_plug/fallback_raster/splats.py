@@ -16,6 +16,7 @@ from .autograd import check_shapes
 from .runtime.arguments import as_kernels_read, camera_centre, check_tensors, planes
 from .runtime.buffers import floats, ints, zeros
 from .runtime.constants import FACTOR_FLOATS, TILE, blocks, tiles
+from .runtime.function_modes import without_function_modes
 from .runtime.optimizations import active_optimizations
 from .stages.compose import compose, pair_sums
 from .stages.project import Limits, Projected, ProjectFlags, project_forward
@@ -201,6 +202,7 @@ class _Render(torch.autograd.Function):
         return image, transmittance
 
     @staticmethod
+    @without_function_modes
     @once_differentiable
     def backward(  # type: ignore[override]
         ctx: Any, v_image: Tensor | None, v_transmittance: Tensor | None

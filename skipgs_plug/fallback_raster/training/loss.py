@@ -28,6 +28,7 @@ from torch.autograd.function import once_differentiable
 from ..runtime.arguments import as_kernels_read
 from ..runtime.buffers import floats
 from ..runtime.constants import LOSS_TILE_ROWS, LOSS_TILE_VECTORS, MAX_LOSS_CHANNELS, SSIM_WINDOW, TILE_LOSS_FLOATS
+from ..runtime.function_modes import without_function_modes
 from ..runtime.launch import Worker, worker
 from ..runtime.parameters import ArrayKind, ByteArray, FloatArray, FloatOutput
 
@@ -110,6 +111,7 @@ class _L1Ssim(torch.autograd.Function):
         return torch.tensor(weights.l1 * l1 + weights.ssim * unlike, dtype=torch.float32, device="cpu")
 
     @staticmethod
+    @without_function_modes
     @once_differentiable
     def backward(ctx: Any, v_loss: Tensor) -> Any:  # type: ignore[override]
         (gradient,) = ctx.saved_tensors
