@@ -160,7 +160,7 @@ def _summarise_growing(growing: dict[str, Any]) -> str:
     factor = growing["rate_factor"]
     longer = "" if factor is None or factor == 1.0 else f", steps {factor:.1f} times as long"
     return (
-        f"SkipGS: {run:,} of {run + skipped:,} iterations run ({percent:.1f} %) until densification ends, with "
+        f"SkipGS: {run:,} of {run + skipped:,} iterations run ({percent:.1f} %) while the scene grows, with "
         f"{growing['events_run']:,} of {growing['events_run'] + growing['events_skipped']:,} densification "
         f"events{longer}.{_why_more(growing)}{_half_size(growing)}"
     )
