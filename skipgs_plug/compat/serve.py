@@ -7,11 +7,12 @@ import importlib
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 from .child_processes import also_in_children
 from .nvidia_smi import one_free_gpu
-from .packages import usable
+from .packages import reported_missing, usable
 
 _CLASSES = ("GaussianRasterizationSettings", "GaussianRasterizer")
 _ACCELERATED = (*_CLASSES, "SparseGaussianAdam")
@@ -75,16 +76,18 @@ def serve(family: str) -> Iterator[None]:
     if family not in FAMILIES:
         raise ValueError(f"No stand-ins for {family!r}; there are some for: {', '.join(sorted(FAMILIES))}.")
     served = {name: _module(name, *source) for name, source in FAMILIES[family].items()}
+    in_part: dict[str, ModuleType] = {}
     # gsplat's script has no use for torchvision.
     if family != "gsplat" and not usable("torchvision"):
-        served |= importlib.import_module(".vision", __package__).modules()
+        in_part = importlib.import_module(".vision", __package__).modules()
         served |= {name: _module(name, *source) for name, source in _WITHOUT_TORCHVISION.items()}
+        served |= in_part
     before = {name: sys.modules.get(name) for name in served}
     try:
         # `_extras` first: it imports torchmetrics, which must not find the served part of torchvision.
         with _extras(family):
             sys.modules.update(served)
-            with also_in_children(functools.partial(serve, family)):
+            with reported_missing(in_part), also_in_children(functools.partial(serve, family)):
                 yield
     finally:
         for name, module in before.items():
@@ -109,6 +112,7 @@ class StandIn(ModuleType):
 
 def _module(name: str, source: str, offered: tuple[str, ...]) -> ModuleType:
     module = StandIn(name, f"CPU stand-in for {name}, served by skipgs_plug.")
+    module.__spec__ = ModuleSpec(name, None)  # scripts ask `importlib.util.find_spec` whether an extension is there
     ours = importlib.import_module(source, __package__)
     for attribute in offered:
         setattr(module, attribute, getattr(ours, attribute))

@@ -214,6 +214,7 @@ def test_modules_are_served_and_taken_away(family):
         with serve(family):
             for name, (_, offered) in FAMILIES[family].items():
                 assert all(hasattr(importlib.import_module(name), attribute) for attribute in offered)
+                assert importlib.util.find_spec(name) is not None  # how a script asks whether an extension is there
         assert sys.modules[names[0]] is other_module
     finally:
         del sys.modules[names[0]]
@@ -234,6 +235,8 @@ def test_missing_torchvision_is_stood_in_for(tmp_path):
         import torchvision
         import torchvision.transforms as transforms
 
+        find_spec = importlib.util.find_spec
+        assert find_spec("torchvision") is None  # else torchmetrics imports models of it, or fails on import
         picture = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(0))
         torchvision.utils.save_image(picture, tmp_path / "a.png")
         back = transforms.functional.to_tensor(Image.open(tmp_path / "a.png"))
@@ -246,6 +249,7 @@ def test_missing_torchvision_is_stood_in_for(tmp_path):
 
         with pytest.warns(UserWarning, match="LPIPS needs torchvision"):  # an evaluation must not end the run
             assert lpips(picture, picture, net_type="vgg").isnan()
+    assert find_spec is not importlib.util.find_spec and find_spec("json") == importlib.util.find_spec("json")
 
 
 def test_mip_splatting_filters_conserve_opacity_and_sum_absolute_gradients():
