@@ -18,8 +18,8 @@ class AbsentLpips(torch.nn.Module):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__()
 
-    def forward(self, image: Tensor, target: Tensor) -> Tensor:
-        """Warn, and return NaN. Shapes are not checked."""
+    def forward(self, *args: Any, **kwargs: Any) -> Tensor:
+        """Warn, and return NaN. Trainers and the package pass different arguments besides the two images."""
         warnings.warn("LPIPS needs torchvision, which cannot be imported: reporting nan.", stacklevel=2)
         return torch.tensor(torch.nan)
 
@@ -27,6 +27,6 @@ class AbsentLpips(torch.nn.Module):
 LPIPS = AbsentLpips  # the class's name in the package `lpips`
 
 
-def lpips(x: Tensor, y: Tensor, net_type: str = "alex", version: str = "0.1") -> Tensor:
-    """Warn, and return NaN, in place of the function of `lpipsPyTorch`. Shapes are not checked."""
-    return AbsentLpips()(x, y)  # type: ignore[no-any-return]
+def lpips(*args: Any, **kwargs: Any) -> Tensor:
+    """Warn, and return NaN, in place of the function of `lpipsPyTorch`. Some forks give it a mask, too."""
+    return AbsentLpips()(*args, **kwargs)  # type: ignore[no-any-return]

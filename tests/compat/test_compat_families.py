@@ -249,6 +249,7 @@ def test_missing_torchvision_is_stood_in_for(tmp_path):
 
         with pytest.warns(UserWarning, match="LPIPS needs torchvision"):  # an evaluation must not end the run
             assert lpips(picture, picture, net_type="vgg").isnan()
+            assert lpips(picture, picture, None, net_type="vgg").isnan()  # FSGS passes a mask
     assert find_spec is not importlib.util.find_spec and find_spec("json") == importlib.util.find_spec("json")
 
 
