@@ -95,6 +95,7 @@ class NewerRefiningState(TypedDict, total=False):
 
     changed: int | None
     expected: int | None
+    late_change: tuple[int, int]
     ran_for: dict[str, int]
 
 

@@ -1,4 +1,4 @@
-"""Prunes when refinement has ended: a share of the iterations after each prune runs, and all after the last."""
+"""Prunes when refinement has ended, or nearly: a share of the iterations after each runs, and all after the last."""
 
 import json
 
@@ -55,6 +55,22 @@ def test_where_no_other_comes_as_expected_the_model_recovers_then():
     assert [step for step in ran if step > 700] == [*range(701, 721), *range(801, 1301), 2000]
 
 
+def test_a_prune_in_the_second_half_of_the_steps_is_recovered_from_when_they_have_run():
+    gate, ran = train(2000, [350])
+    assert ran == [*range(401), *range(401, 851), 2000]  # 50 steps were left, and 500 are wanted
+    assert gate.stats()["ran_for"] == {"share": 401, "conditions": 1, "changes": 450}
+    _, ran = train(2000, [150])
+    assert ran == [*range(401), 2000]
+    _, ran = train(2000, [350], pause_iters=30)  # 50 steps are enough
+    assert ran == [*range(401), 2000]
+
+
+def test_prunes_that_repeat_before_and_after_the_end_get_their_share_each():
+    _, ran = train(2000, range(100, 2000, 100))
+    assert ran[: ran.index(420) + 1] == list(range(421))  # 20 after the prune in iteration 400, the last step
+    assert [step for step in ran if 420 < step <= 520] == list(range(500, 521))
+
+
 def test_pause_iters_is_taken_as_it_is():
     _, ran = train(1000, [600, 800], pause_iters=7)
     assert [step for step in ran if step > 600] == [*range(601, 608), 800, *range(801, 808), 1000]
@@ -71,17 +87,17 @@ def test_the_summary_and_skipgs_json_say_why_more_than_the_share_ran(tmp_path):
     assert "6 changes in all" in line
 
 
-@pytest.mark.parametrize("stop", [560, 720])
-def test_a_resumed_run_counts_on(stop):
+@pytest.mark.parametrize(("stop", "prunes"), [(560, (500, 700, 900)), (720, (500, 700, 900)), (190, (170, 600))])
+def test_a_resumed_run_counts_on(stop, prunes):
     weight = torch.nn.Parameter(torch.zeros(1))
     optimizer = torch.optim.SGD([weight], lr=0.01)
 
     def part(gate, first, end):
-        for step in gate.iterations(range(first, 1001), always=[500, 700, 900]):
+        for step in gate.iterations(range(first, 1001), always=prunes):
             gate.backward((weight - 1).square().mean(), view=step % 4, step=step)
             gate.step(optimizer)
             ran.append(step)
-            if step in (500, 700, 900):
+            if step in prunes:
                 gate.notify_event("prune", step)
             if step == end:
                 return json.loads(json.dumps(gate.state_dict()))
