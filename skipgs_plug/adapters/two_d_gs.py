@@ -17,4 +17,4 @@ class TwoDGS(InriaFamily):
     project = "[2D Gaussian Splatting](https://github.com/hbb1/2d-gaussian-splatting)"
     gated = "From `densify_until_iter` on; decided on the whole loss, with normal consistency and depth distortion."
     left_alone = "Needs CUDA: `--cpu` has no stand-in for its surfel rasterizer."
-    mark = "render_net_image"
+    mark = "lambda_dist"  # `render_net_image` is none: other forks have its viewer

@@ -35,7 +35,7 @@ def install_hint(module: str, script: Path, stand_ins: Container[str] = ()) -> s
 
     The sentence names a package only if the requirements of the checkout list it or if `PACKAGES` holds the module.
     Any other module may be a file that the checkout lacks, and the package index may hold an unrelated package of
-    that name.
+    that name. So may it for an entry with a folder or an address, such as `submodules/simple-knn`.
 
     Args:
         module: Name of the missing module.
@@ -50,7 +50,13 @@ def install_hint(module: str, script: Path, stand_ins: Container[str] = ()) -> s
         return f"{top} is a CUDA extension of the trainer: build it as the trainer's README says{cpu}."
     package = PACKAGES.get(top, top)
     for listing in requirements(script):
-        if names(listing, package):
+        entry = entry_of(listing, package)
+        if entry is not None and "/" in entry:
+            return (
+                f"{script.name} needs the module {top}, which {listing.name} takes from {entry}: install it from "
+                "there, as the trainer's README says."
+            )
+        if entry is not None:
             return f"{script.name} needs the package {package}, which {listing.name} lists; run: pip install {package}"
     if top in PACKAGES:
         return f"{script.name} needs the module {top}; run: pip install {package}"
@@ -67,12 +73,12 @@ def requirements(script: Path) -> Iterator[Path]:
             yield from sorted(path for path in folder.glob(pattern) if path.is_file())
 
 
-def names(listing: Path, package: str) -> bool:
-    """Return whether a requirements file names a package of the index. Package indices treat "-" and "_" alike.
+def entry_of(listing: Path, package: str) -> str | None:
+    """Return the entry of a requirements file that names a package; None without one.
 
-    The last part of a path or address, as in `submodules/simple-knn`, is none: the index may hold an unrelated package
-    of that name.
+    Package indices treat "-" and "_" alike. A plain name is preferred to a folder or an address.
     """
-    text = UNLISTED.sub("", listing.read_text(errors="replace"))
     name = re.sub("[-_]+", "[-_]", re.escape(package).replace(r"\-", "-"))
-    return re.search(rf"(?<![\w/-]){name}(?![\w-])", text, re.IGNORECASE) is not None
+    pattern = rf"[^\s\"']*(?<![\w-]){name}(?![\w-])(?:[ \t]*@[ \t]*)?[^\s\"',]*"
+    found = re.findall(pattern, UNLISTED.sub("", listing.read_text(errors="replace")), re.IGNORECASE)
+    return min(found, key=lambda entry: "/" in entry, default=None)

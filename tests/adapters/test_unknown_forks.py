@@ -10,6 +10,7 @@ from lookalikes.splats import Scene, SplatModel, dataset, draw, log, new_log, ph
 
 from skipgs_plug import AdapterMismatchError, SkipGate
 from skipgs_plug.adapters.inria import Inria
+from skipgs_plug.adapters.registry import find_script_adapter
 
 TRAIN = """
 def training(dataset, opt, pipe):
@@ -335,3 +336,12 @@ def test_a_loop_that_does_the_same_in_other_words_is_gated(way, tmp_path, monkey
     with SkipGate(fork, policy=SkipAlways()) as gate:
         train(fork)
     assert gate.released is None and gate.report()["backwards_skipped"] == 21
+
+
+@pytest.mark.parametrize(("name", "extra"), [("inria", "pass"), ("2dgs", "lambda_dist = opt.lambda_dist")])
+def test_the_viewer_that_2dgs_shares_with_other_forks_does_not_make_a_script_its_own(name, extra, tmp_path):
+    shows = "render_net_image(None, dataset.render_items, None, None)"
+    text = TRAIN.format(before="pass", argument="", until="densify_until_iter", extra=extra, after=shows)
+    script = tmp_path / "train.py"
+    script.write_text(f"from scene import GaussianModel\nfrom utils.image_utils import render_net_image\n{text}")
+    assert find_script_adapter(script).name == name
