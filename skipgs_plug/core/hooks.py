@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, ClassVar, Protocol
@@ -83,6 +84,7 @@ class Hooks(LoopHooks):
         self._iterations = 0
         self._backwards = 0
         self._odd_iterations = 0  # iterations with a number of backward passes other than one, so far
+        self._awaited: list[str] = []  # modules of the script that the adapter attaches to when they are imported
 
     # Facts, at attach or when training begins.
 
@@ -196,6 +198,9 @@ class Hooks(LoopHooks):
         """Whether this backward is the first of an iteration."""
         self._backwards += 1
         if self._iterations == 0:
+            absent = [name for name in self._awaited if name not in sys.modules]
+            if self._engine.config.enabled and absent and self._backwards == 1:
+                raise self._mismatch(f"it trains without a module {' or '.join(absent)}")
             if self._engine.config.enabled and self._backwards >= CHECKED_ITERATIONS:
                 raise self._mismatch(f"{self._backwards} training backwards ran in no iteration")
             return False
@@ -282,6 +287,10 @@ class Hooks(LoopHooks):
         """
         intercept_tensor_backward(self._patches, callers, self.backward)
         guard_scalers(self._patches, self._iteration)
+
+    def await_import(self, name: str) -> None:
+        """Refuse the run if its first training backward comes outside of any iteration and without this module."""
+        self._awaited.append(name)
 
     def check_drift(self, optimizers: Optimizers) -> None:
         """Check that no code of a fork changes the parameters of these optimizers unseen.

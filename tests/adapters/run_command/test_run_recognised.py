@@ -119,6 +119,24 @@ def test_script_in_a_subfolder_may_extend_its_path_first(checkout, tmp_path, cap
     assert not any("_Finder" in repr(finder) for finder in sys.meta_path)
 
 
+@pytest.mark.parametrize("gate", [[], ["--share", "0.5"], ["--no-gate"]])
+def test_modules_of_other_names_are_refused_before_an_iteration_has_trained(
+    gate, checkout, tmp_path, capfd, monkeypatch
+):
+    script = Path(checkout)
+    for name in ("own_gaussian_renderer", "own_scene", "own_scene.gaussian_model"):  # those of other cases
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    for name in ("gaussian_renderer", "scene"):
+        (script.parent / name).rename(script.parent / f"own_{name}")
+    script.write_text(
+        script.read_text().replace("from gaussian_", "from own_gaussian_").replace("from sc", "from own_sc")
+    )
+    code = cli.main(["run", "auto", "--cpu", *gate, "--", checkout, str(tmp_path)])
+    assert code == (0 if gate == ["--no-gate"] else cli.BAD_INPUT) and (tmp_path / "model.pth").exists() == (code == 0)
+    why = "it trains without a module scene.gaussian_model or gaussian_renderer"
+    assert (why in capfd.readouterr().err) == (code != 0)
+
+
 def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(SpeedySplat, "stand_ins", "inria")  # the look-alike has Inria's rasterizer
     options = ["--always", "5", "--share", "7", "--resume-gate", "absent"]  # a run without a gate does not read them
