@@ -43,6 +43,7 @@ from skipgs_plug.core.source.substitution import Substitution
 
 # Functions that take all numbers from a range at once, before any iteration has run.
 GATHERING = frozenset({"list", "set", "sorted", "tuple"})
+BY_ALWAYS = "name all iterations that must run (--always, always=), since no condition is read then"
 
 
 class TrainingLoop:
@@ -123,13 +124,11 @@ class TrainingLoop:
         )
         self._warn_of(
             self._moving_limits(),
-            "moves its own limit, so it can hold later and less often if iterations are left out; "
-            "name the iterations that must run (--always, always=).",
+            f"moves its own limit, so it can hold later and less often if iterations are left out; {BY_ALWAYS}.",
         )
         self._warn_of(
             self._kept_for_others(),
-            "keeps the iteration's number for other code, whose conditions on it are not read; "
-            "name the iterations that must run (--always, always=).",
+            f"keeps the iteration's number for other code, whose conditions on it are not read; {BY_ALWAYS}.",
         )
         found: dict[str, set[int]] = {}
         uncertain: list[str] = []
@@ -149,8 +148,7 @@ class TrainingLoop:
         if uncertain:
             caution(
                 "Conditions on the iteration's number depend on functions that the loop calls and cannot be evaluated "
-                f"ahead, so iterations that they need could be left out: {', '.join(uncertain)}; name the iterations "
-                "that must run (--always, always=)."
+                f"ahead, so iterations that they need could be left out: {', '.join(uncertain)}; {BY_ALWAYS}."
             )
         for node in self._lists():
             try:
@@ -193,7 +191,7 @@ class TrainingLoop:
             raise SkipGSError(
                 f"Line {line} of {self._code.co_filename} has a condition on the iteration's number that cannot be "
                 f"evaluated ahead ({text}), so an iteration that it needs could be left out; use the gate without a "
-                "share, or name the iterations that must run (--always, always=)."
+                f"share, or {BY_ALWAYS}."
             )
         return hits, False
 
