@@ -29,7 +29,7 @@ def when_imported(hooks: Hooks, name: str, call: Callable[[ModuleType], None]) -
         with hooks.guarded():
             call(module)
 
-    hooks.await_import(name)
+    hooks.awaited.append(name)
     finder = _Finder(name, guarded)
     sys.meta_path.insert(0, finder)
     hooks.on_detach(f"sys.meta_path ({name})", lambda: sys.meta_path.remove(finder))

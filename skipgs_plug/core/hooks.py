@@ -55,6 +55,10 @@ class Hooks(LoopHooks):
     """Reports the iterations, views, backward passes and structural changes of a trainer to a gate.
 
     The first training backward pass of an iteration is gated. Any further one runs and counts as a mismatch.
+
+    Attributes:
+        awaited: Modules that the adapter attaches to when the script imports them. A run whose first training backward
+            pass comes outside of any iteration, and without one of them, is refused.
     """
 
     def __init__(self, engine: Engine, adapter: Adapter, given: frozenset[str], in_script: bool = False) -> None:
@@ -84,7 +88,7 @@ class Hooks(LoopHooks):
         self._iterations = 0
         self._backwards = 0
         self._odd_iterations = 0  # iterations with a number of backward passes other than one, so far
-        self._awaited: list[str] = []  # modules of the script that the adapter attaches to when they are imported
+        self.awaited: list[str] = []
 
     # Facts, at attach or when training begins.
 
@@ -198,7 +202,7 @@ class Hooks(LoopHooks):
         """Whether this backward is the first of an iteration."""
         self._backwards += 1
         if self._iterations == 0:
-            absent = [name for name in self._awaited if name not in sys.modules]
+            absent = [name for name in self.awaited if name not in sys.modules]
             if self._engine.config.enabled and absent and self._backwards == 1:
                 raise self._mismatch(f"it trains without a module {' or '.join(absent)}")
             if self._engine.config.enabled and self._backwards >= CHECKED_ITERATIONS:
@@ -287,10 +291,6 @@ class Hooks(LoopHooks):
         """
         intercept_tensor_backward(self._patches, callers, self.backward)
         guard_scalers(self._patches, self._iteration)
-
-    def await_import(self, name: str) -> None:
-        """Refuse the run if its first training backward comes outside of any iteration and without this module."""
-        self._awaited.append(name)
 
     def check_drift(self, optimizers: Optimizers) -> None:
         """Check that no code of a fork changes the parameters of these optimizers unseen.
