@@ -55,10 +55,12 @@ def test_where_no_other_comes_as_expected_the_model_recovers_then():
     assert [step for step in ran if step > 700] == [*range(701, 721), *range(801, 1301), 2000]
 
 
-def test_a_prune_in_the_second_half_of_the_steps_is_recovered_from_when_they_have_run():
+def test_a_prune_in_the_second_half_of_the_steps_is_recovered_from_at_the_end():
     gate, ran = train(2000, [350])
-    assert ran == [*range(401), *range(401, 851), 2000]  # 50 steps were left, and 500 are wanted
-    assert gate.stats()["ran_for"] == {"share": 401, "conditions": 1, "changes": 450}
+    assert ran == [*range(401), *range(1551, 2001)]  # 50 steps were left, and 500 are wanted
+    assert gate.stats()["ran_for"] == {"share": 401, "conditions": 0, "changes": 450}
+    _, ran = train(2000, [350, 1400])  # the iterations after the second prune are enough for both
+    assert ran == [*range(401), *range(1400, 1901), 2000]
     _, ran = train(2000, [150])
     assert ran == [*range(401), 2000]
     _, ran = train(2000, [350], pause_iters=30)  # 50 steps are enough
