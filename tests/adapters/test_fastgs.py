@@ -74,7 +74,7 @@ def test_densification_runs_whole_before_steps_with_accumulated_gradients(monkey
     assert grown == list(range(1, 20)) if "share" in settings else len(grown) < 16  # grow_share is the user's wish
     if "share" in settings:
         assert len([step for step in gated.backwards if step >= 20]) < 45
-        assert "18 of 18 iterations run (100.0 %) until densification ends" in gate.summary()
+        assert "18 of 18 iterations run (100.0 %) while the scene grows" in gate.summary()
 
 
 def factors_of(case, lookalike, monkeypatch, **settings):

@@ -12,6 +12,7 @@ from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.half_size import half_size_psnr, keep_detail
 from skipgs_plug.core.pace.densification_events import DensificationEvents
 from skipgs_plug.core.pace.needs import (
+    LAST_FACTOR,
     LEAST_GROWING_SHARE,
     MOST_RAISED_SHARE,
     for_new_gaussians,
@@ -175,13 +176,18 @@ class Growing(Phase):
 
     @property
     def opacity_rate(self) -> float:
-        if self.share is None or self.share >= 1.0 or self._all_must or not self._config.compensates:
+        if not self._has_longer_steps:
             return 0.0
         # Twice their rate in the last 1,000 iterations of a run without refinement did not help on bonsai.
         if self._reset is None or self._whole_from is not None:
             return 0.0
         grown = (self._end - self._reset) * self.share * opacity_factor(self.share)
         return opacity_rate(grown + self._steps_after)
+
+    @property
+    def _has_longer_steps(self) -> bool:
+        """Whether iterations are left out until the last event, and longer steps may replace them."""
+        return self.share is not None and self.share < 1.0 and not self._all_must and self._config.compensates
 
     @property
     def _all_must(self) -> bool:
@@ -228,7 +234,10 @@ class Growing(Phase):
             self._rates.opacity_rate = self.opacity_rate
         if self._whole_from is not None and number >= self._whole_from:
             # Steps that are longer and shrink, as in refinement, end 0.7 dB lower on bonsai: opacities recover less.
-            self._rates.look()
+            if self._has_longer_steps:
+                self._rates.scale(LAST_FACTOR, UNCHANGED._replace(only_higher_bands=True))
+            else:
+                self._rates.look()
             return True
         factor, parts = self._factors(number)
         if parts.opacities > 1.0:

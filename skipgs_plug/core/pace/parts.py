@@ -157,11 +157,13 @@ class GrowingParts(NamedTuple):
         opacities: Multiple of their rate that opacities take, at least 1.
         positions: Multiple of the common factor that positions take.
         opacities_remember: Whether opacities keep the trainer's beta2.
+        only_higher_bands: Whether no steps are longer but those of the colours' higher bands.
     """
 
     opacities: float
     positions: float
     opacities_remember: bool = False
+    only_higher_bands: bool = False
 
 
 UNCHANGED = GrowingParts(1.0, 1.0)  # with a factor of 1, the trainer's own steps
@@ -243,7 +245,7 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
             remembers = growing is not None and growing.opacities_remember
             return ScaledGroup(info.group, times, 1.0, None if remembers else info)
         return None
-    if not raised:
+    if not raised or (growing is not None and growing.only_higher_bands and info.part != HIGHER_BANDS):
         return None
     if not info.named_positions:
         return ScaledGroup(info.group, info.part, math.inf, info)

@@ -73,38 +73,43 @@ def test_resets_of_a_strategy_are_known():
 class Loop:
     """A loop that densifies every 20 iterations to its end, and resets opacities every 150."""
 
-    LAST = 400
+    LAST = 2000
 
     def __init__(self):
         self.means = torch.nn.Parameter(torch.rand(6, 3))
         self.opacities = torch.nn.Parameter(torch.rand(6, 1))
-        groups = [{"params": [self.means], "name": "xyz"}, {"params": [self.opacities], "name": "opacity"}]
-        self.optimizer = torch.optim.SGD(groups, lr=1.0)
+        self.bands = torch.nn.Parameter(torch.rand(6, 15, 3))
+        values = {"xyz": self.means, "opacity": self.opacities, "f_rest": self.bands}
+        self.optimizer = torch.optim.SGD([{"params": [value], "name": name} for name, value in values.items()], lr=1.0)
         self.steps = {}
 
     def train(self, gate):
         for step in gate.iterations(range(self.LAST), views=VIEWS, events=range(20, self.LAST, 20)):
-            before = self.means.detach()[0, 0].item(), self.opacities.detach()[0, 0].item()
-            loss = self.means.sum() + self.opacities.sum()
+            before = self.now
+            loss = self.means.sum() + self.opacities.sum() + self.bands.sum()
             if gate.backward(loss, view=VIEWS[step % 4], step=step):
                 self.optimizer.step()
                 self.optimizer.zero_grad(set_to_none=True)
-            after = self.means.detach()[0, 0].item(), self.opacities.detach()[0, 0].item()
-            self.steps[step] = tuple(a - b for a, b in zip(before, after, strict=True))
+            self.steps[step] = tuple(a - b for a, b in zip(before, self.now, strict=True))
         return self
 
+    @property
+    def now(self):
+        return tuple(value.detach().flatten()[0].item() for value in (self.means, self.opacities, self.bands))
 
-def test_all_iterations_at_the_end_run_with_the_trainers_steps():
-    with SkipGate(start_iter=1000, share="auto") as gate:
+
+@pytest.mark.parametrize(("compensate", "bands"), [(None, 8.0), (False, 1.0)])
+def test_all_iterations_at_the_end_run_and_only_higher_bands_take_longer_steps(compensate, bands):
+    with SkipGate(start_iter=5 * Loop.LAST, share="auto", compensate=compensate) as gate:
         loop = Loop().train(gate)
     last = range(Loop.LAST - last_part(Loop.LAST, None), Loop.LAST)
     assert set(last) <= loop.steps.keys()
-    assert all(loop.steps[step] == (pytest.approx(1.0), pytest.approx(1.0)) for step in last)
+    assert all(loop.steps[step] == pytest.approx((1.0, 1.0, bands), rel=1e-4) for step in last)
     assert gate.report()["growing"]["iterations_run"] == len(loop.steps)
 
 
 def test_a_given_share_and_a_run_with_refinement_have_no_such_end():
-    for settings in ({"share": 0.25, "start_iter": 1000}, {"share": "auto", "start_iter": 200}):
+    for settings in ({"share": 0.25, "start_iter": 5 * Loop.LAST}, {"share": "auto", "start_iter": 200}):
         with SkipGate(**settings) as gate:
             loop = Loop().train(gate)
         last = range(Loop.LAST - last_part(Loop.LAST, None), Loop.LAST)
