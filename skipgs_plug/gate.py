@@ -128,8 +128,8 @@ class SkipGate:
         Args:
             numbers: All iterations of the run, or all remaining ones, as a range with step 1. A run may have several
                 parts, one after the other; the part in which refinement begins then goes on to the last iteration.
-            always: Iterations that always run. They replace the iterations that the conditions of the loop name, and
-                the iterations that an adapter names are added.
+            always: Iterations that always run besides those. Conditions that the gate cannot evaluate in advance are no
+                error then.
             views: Keys of all training views. `share="auto"` and `refine_share="auto"` need them.
             events: Iterations in which your loop densifies, such as `range(600, 15_000, 100)`. `share` leaves out
                 some of them.
@@ -137,7 +137,7 @@ class SkipGate:
         Raises:
             SkipGSError: `numbers` is not a range with step 1. Before training has begun, the gate also raises it if
                 `numbers` goes beyond the plan of an earlier call, or if a condition of the loop cannot be evaluated
-                in advance. During training, these two problems release the gate.
+                in advance and `always` is not given. During training, these two problems release the gate.
 
         Examples:
             Four of ten iterations run after densification, which ends here at iteration 10. The last one always runs.
@@ -147,11 +147,9 @@ class SkipGate:
             >>> list(gate.iterations(range(20), always=[15]))
             [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 15, 19]
         """
-        source = None
-        if always is None:
-            frame = sys._getframe(1)
-            source = (frame.f_code, {**frame.f_globals, **frame.f_locals})
-        return self._loop.iterations(numbers, source, always or (), views, events)
+        frame = sys._getframe(1)
+        source = (frame.f_code, {**frame.f_globals, **frame.f_locals})
+        return self._loop.iterations(numbers, source, always, views, events)
 
     def backward(self, loss: Any, view: Any, step: int, *, signal: Any = None) -> bool:
         """Run `loss.backward()`, or skip it; return True when gradients were computed.

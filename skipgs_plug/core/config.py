@@ -38,7 +38,8 @@ class SkipConfig:
             True if the trainer's adapter can do it and the photographs lose little by it; otherwise False.
         max_gaussians: With `share` or `grow_share`: densification stops before an event could exceed this number
             of Gaussians. None for no bound.
-        always: With a share: iterations that always run. None reads them from the conditions of the loop.
+        always: With a share: iterations that always run besides those that the loop's conditions name. Conditions that
+            cannot be evaluated in advance are no error then.
         tolerance: With "auto": refinement ends when the remaining iterations would gain less than this, in decibels.
         compensate: Take larger, shrinking steps to make up for iterations that are left out. None is True with a share
             and False with the paper's gate.

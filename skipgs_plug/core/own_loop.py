@@ -45,7 +45,7 @@ class OwnLoop:
         self,
         numbers: range,
         source: Source | None,
-        always: Iterable[int],
+        always: Iterable[int] | None,
         views: Iterable[Any] | None,
         events: Iterable[int] | None,
     ) -> LoopRange:
@@ -54,7 +54,7 @@ class OwnLoop:
         Args:
             numbers: Iterations of the loop.
             source: Code in which the loop's conditions are read; None to read no conditions.
-            always: Iterations that must run.
+            always: Iterations that must run; see `Pace.follow`.
             views: Keys of all training views; None if they are unknown.
             events: Iterations that densify; None if they are unknown.
 

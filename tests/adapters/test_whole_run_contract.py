@@ -145,8 +145,8 @@ def test_a_loop_that_cannot_be_shortened_is_refused_before_anything_runs(case, s
     assert begun == []
 
 
-def test_numbers_given_as_always_leave_densification_whole_and_the_warning_says_so():
+def test_numbers_given_as_always_run_besides_those_of_conditions():
     case = next(case for case in LOOPS if case.name == "inria")
-    with pytest.warns(RuntimeWarning, match="The numbers given as always replace the loop's conditions, also those"):
-        gated = run(case, share=SHARE, always=[30], pause_iters=0)[0]
-    assert set(range(1, 20)) <= set(gated.values)
+    (plain, _), (given, _) = (run(case, share=SHARE, always=always, pause_iters=0)[:2] for always in (None, [13, 37]))
+    assert {13, 37} <= set(given.values) and not {13, 37} <= set(plain.values)
+    assert given.structure == plain.structure

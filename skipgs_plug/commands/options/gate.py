@@ -40,8 +40,8 @@ class GateOptions:
     """Until densification ends, or the scene has grown strongly, train on photographs of half the width and height."""
     max_gaussians: Annotated[Optional[int], shown("INT", "no bound")] = None
     """With --share: largest number of Gaussians. Densification stops before an event could exceed it."""
-    always: Annotated[OptionalIntegers, shown("INT ...", "read from the loop's conditions")] = None
-    """Iterations that always run. Replaces the numbers that are read from the loop's conditions."""
+    always: Annotated[OptionalIntegers, shown("INT ...", "none")] = None
+    """Iterations that always run besides those that the loop's conditions name, for conditions that cannot be read."""
     tolerance: Annotated[Optional[float], shown("FLOAT", "0.05")] = None
     """With auto: refinement ends when the rest of it is worth less than this, in decibels."""
     compensate: Annotated[Optional[bool], shown("True|False", "True with --share or --refine-share")] = None

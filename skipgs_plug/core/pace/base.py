@@ -64,7 +64,7 @@ class Pace:
         self,
         numbers: range,
         source: Source | None,
-        always: Iterable[int] = (),
+        always: Iterable[int] | None = None,
         views: list[str] | None = None,
         events: Iterable[int] | None = None,
     ) -> LoopRange:
@@ -73,7 +73,8 @@ class Pace:
         Args:
             numbers: All iterations of the run, or all that are left.
             source: Code in which the loop's conditions are read; None to read no conditions.
-            always: Iterations that must run.
+            always: Iterations that must run besides those that conditions name. Conditions that cannot be read are no
+                error then. None if the user named none.
             views: Keys of all training views; None if the trainer's adapter passes them.
             events: Iterations that densify; None if they are unknown, or if the trainer's adapter knows them.
 

@@ -37,7 +37,7 @@ class Compensated(Pace):
         self,
         numbers: range,
         source: Source | None,
-        always: Iterable[int] = (),
+        always: Iterable[int] | None = None,
         views: list[str] | None = None,
         events: Iterable[int] | None = None,
     ) -> LoopRange:

@@ -176,12 +176,11 @@ class Growing(Phase):
 
     @property
     def opacity_rate(self) -> float:
-        if not self._has_longer_steps:
-            return 0.0
+        share = self.share
         # Twice their rate in the last 1,000 iterations of a run without refinement did not help on bonsai.
-        if self._reset is None or self._whole_from is not None:
+        if share is None or not self._has_longer_steps or self._reset is None or self._whole_from is not None:
             return 0.0
-        grown = (self._end - self._reset) * self.share * opacity_factor(self.share)
+        grown = (self._end - self._reset) * share * opacity_factor(share)
         return opacity_rate(grown + self._steps_after)
 
     @property

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from types import CodeType
 from typing import Any
 
 from torch import Tensor
 
 from skipgs_plug.core import distributed
+from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_known
 from skipgs_plug.core.pace.loop_range import LoopRange
 from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.source.lines import line_of
-from skipgs_plug.core.source.milestones import read_loop
+from skipgs_plug.core.source.milestones import TrainingLoop, read_loop
 from skipgs_plug.core.source.progress_bars import Bars
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
@@ -21,7 +23,7 @@ class LoopFacts:
     """Collects the facts that the phases of a run need to plan their iterations.
 
     Args:
-        always: Iterations that must run in place of those that the loop's conditions name; None to read the conditions.
+        always: Iterations that must run besides those that the loop's conditions name; None if the user named none.
 
     Attributes:
         start: First iteration of refinement.
@@ -41,7 +43,7 @@ class LoopFacts:
         self.grown: dict[str, set[int]] = {}
         self.refined: dict[str, set[int]] = {}
         self.bars = Bars([])
-        self._reads = always is None  # whether the loop's conditions are read
+        self._names_all = always is not None  # whether the user names the iterations that conditions do not tell
         self._given = self._chosen = frozenset(always or ())  # iterations that must run: by the settings, and in all
         self._always: Always = nothing_always
         self._pure: tuple[str, ...] = ()
@@ -63,12 +65,13 @@ class LoopFacts:
         """Receive facts from the trainer's adapter; see `Pace.describe`."""
         self._always, self._pure, self.densification, self._known = always, tuple(pure), densification, known
 
-    def choose(self, always: Iterable[int], views: list[str] | None, events: Iterable[int] | None) -> None:
+    def choose(self, always: Iterable[int] | None, views: list[str] | None, events: Iterable[int] | None) -> None:
         """Receive facts about a loop of the user's own; see `Pace.follow`."""
         if events is not None:
             known = frozenset(int(number) for number in events)
             self.densification = Densification(numbers=lambda part: known.intersection(part))
-        self._chosen = self._given.union(always)
+        self._chosen = self._given.union(always or ())
+        self._names_all = self._names_all or always is not None
         if views is not None:
             self._views = views
 
@@ -81,16 +84,24 @@ class LoopFacts:
             refined: Iterations of the refining phase.
 
         Raises:
-            SkipGSError: A condition cannot be evaluated ahead because of the loop itself.
+            SkipGSError: The loop cannot be read, or a condition cannot be evaluated ahead because of the loop itself,
+                and the user has not named the iterations that must run.
         """
-        if loop.source is not None and self._reads:
-            code, names = loop.source
-            source = read_loop(code, line_of(code), names, self._pure, self._known(names))
-            self.grown, self.refined = (source.milestones(part) if part else {} for part in (grown, refined))
+        self.grown, self.refined, self.bars = {}, {}, Bars([])
+        source = None if loop.source is None else self._read(*loop.source)
+        if source is not None:
+            parts = (grown, refined)
+            self.grown, self.refined = (source.milestones(part, self._names_all) if part else {} for part in parts)
             self.bars = Bars(source.bar_moves(loop.numbers))
-        else:
-            self.grown, self.refined, self.bars = {}, {}, Bars([])
         loop.source = None
+
+    def _read(self, code: CodeType, names: Mapping[str, Any]) -> TrainingLoop | None:
+        try:
+            return read_loop(code, line_of(code), names, self._pure, self._known(names))
+        except SkipGSError:
+            if self._names_all:
+                return None
+            raise
 
     def plan(self, numbers: range, conditions: dict[str, set[int]], last: int, before: Phase) -> PhasePlan:
         """Return the plan of a phase. All processes must call it together.

@@ -86,7 +86,7 @@ class Phased(Pace):
         self,
         numbers: range,
         source: Source | None,
-        always: Iterable[int] = (),
+        always: Iterable[int] | None = None,
         views: list[str] | None = None,
         events: Iterable[int] | None = None,
     ) -> LoopRange:
@@ -262,9 +262,7 @@ class Phased(Pace):
         if self._facts.densification is None:
             return "" if self._release.in_script else " In a loop of your own give events= to gate.iterations()."
         marks = ", ".join(self._facts.densification.marks)
-        if self._config.always is None:
-            return f" No condition of the loop that names {marks} holds before iteration {self._facts.start}."
-        return f" The numbers given as always replace the loop's conditions, also those that name {marks}."
+        return f" No condition of the loop that names {marks} holds before iteration {self._facts.start}."
 
     # State and report.
 

@@ -43,7 +43,7 @@ from skipgs_plug.core.source.substitution import Substitution
 
 # Functions that take all numbers from a range at once, before any iteration has run.
 GATHERING = frozenset({"list", "set", "sorted", "tuple"})
-BY_ALWAYS = "name all iterations that must run (--always, always=), since no condition is read then"
+BY_ALWAYS = "name the iterations that must run (--always, always=)"
 
 
 class TrainingLoop:
@@ -97,11 +97,13 @@ class TrainingLoop:
         self._by_call = functions.by_call
         self._warned_of: set[str] = set()  # conditions that warnings have named
 
-    def milestones(self, numbers: range) -> dict[str, set[int]]:
+    def milestones(self, numbers: range, others_named: bool = False) -> dict[str, set[int]]:
         """Return the iterations that must run, by the condition that names them.
 
         Args:
             numbers: Iterations that may be left out.
+            others_named: Whether the user has named the iterations of conditions that cannot be evaluated ahead. No
+                error or warning is about such a condition then.
 
         Returns:
             Sets of iterations by "line N: condition", or by "line N: list" for a list of iterations that the loop
@@ -122,20 +124,21 @@ class TrainingLoop:
             "counts the iterations that run, so it holds less often if others are left out. "
             f"Decide by {self._target} if that matters.",
         )
-        self._warn_of(
-            self._moving_limits(),
-            f"moves its own limit, so it can hold later and less often if iterations are left out; {BY_ALWAYS}.",
-        )
-        self._warn_of(
-            self._kept_for_others(),
-            f"keeps the iteration's number for other code, whose conditions on it are not read; {BY_ALWAYS}.",
-        )
+        if not others_named:
+            self._warn_of(
+                self._moving_limits(),
+                f"moves its own limit, so it can hold later and less often if iterations are left out; {BY_ALWAYS}.",
+            )
+            self._warn_of(
+                self._kept_for_others(),
+                f"keeps the iteration's number for other code, whose conditions on it are not read; {BY_ALWAYS}.",
+            )
         found: dict[str, set[int]] = {}
         uncertain: list[str] = []
         for condition in self._conditions():
             if self._bar_if_of(condition) is not None:
                 continue
-            text, (hits, certain) = ast.unparse(condition.test), self._needed(condition, numbers)
+            text, (hits, certain) = ast.unparse(condition.test), self._needed(condition, numbers, others_named)
             if hits is not None:
                 found.setdefault(f"{self._where(condition)}: {text}", set()).update(hits)
             if not certain:
@@ -144,7 +147,7 @@ class TrainingLoop:
             hits = _rarer(self._evaluator, lookup, numbers)
             if hits:
                 found[f"{self._where(lookup)}: {ast.unparse(lookup.test)}"] = hits
-        uncertain = self._without_warning(uncertain)
+        uncertain = [] if others_named else self._without_warning(uncertain)
         if uncertain:
             caution(
                 "Conditions on the iteration's number depend on functions that the loop calls and cannot be evaluated "
@@ -172,13 +175,13 @@ class TrainingLoop:
                     found += [Moves(bar, by, frozenset(hits)) for bar, by in moves(bar_if.body, self._names)]
         return found
 
-    def _needed(self, condition: Condition, numbers: range) -> tuple[set[int] | None, bool]:
+    def _needed(self, condition: Condition, numbers: range, others_named: bool) -> tuple[set[int] | None, bool]:
         """Return the iterations that a condition names, and whether called functions leave no doubt about them.
 
         The iterations are None if they are not known.
 
         Raises:
-            SkipGSError: The loop itself changes a value in its condition.
+            SkipGSError: The loop itself changes a value in its condition, and the user has not named its iterations.
         """
         hits = _rarer(self._evaluator, condition, numbers)
         if hits is not None:
@@ -186,7 +189,7 @@ class TrainingLoop:
         if condition.function is not None:
             return None, False
         hits = _rarer(self._evaluator_of_loop, condition, numbers)
-        if hits is None:
+        if hits is None and not others_named:
             text, line = ast.unparse(condition.test), _line(condition.test, self._code)
             raise SkipGSError(
                 f"Line {line} of {self._code.co_filename} has a condition on the iteration's number that cannot be "

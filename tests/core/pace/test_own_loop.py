@@ -47,6 +47,19 @@ def test_without_larger_steps_they_are_spread_evenly():
     assert gate.report()["reasons"] == {"full": 16}
 
 
+@pytest.mark.filterwarnings("error")
+def test_numbers_given_as_always_are_for_conditions_that_cannot_be_read():
+    gate, upcoming, ran, saved = SkipGate(start_iter=10, refine_share=0.2), 60, [], []
+    for step in gate.iterations(range(100), always=[60]):
+        gate.backward(torch.ones((), requires_grad=True) * 1.0, "a", step)
+        ran.append(step)
+        if step == upcoming:
+            upcoming += 30
+        if step % 45 == 44:
+            saved.append(step)
+    assert saved == [44, 89] and 60 in ran and 90 not in ran
+
+
 def test_a_change_after_the_end_is_followed_by_iterations_that_train():
     ran = []
     with SkipGate(start_iter=40, refine_share=0.25, pause_iters=6) as gate:

@@ -205,8 +205,7 @@ def test_condition_that_cannot_be_evaluated_is_one_warning_with_its_place():
 
     sentence = (
         r"line \d+ of \S*project_helpers.py \(step - saver.last == 20\), line \d+ of \S*test_called_functions.py "
-        r"\(step in maybe_save.saves\); name all iterations that must run \(--always, always=\), "
-        "since no condition is read then."
+        r"\(step in maybe_save.saves\); name the iterations that must run \(--always, always=\)\."
     )
     with pytest.warns(RuntimeWarning, match=sentence) as said:
         assert found(loop) == {}

@@ -230,7 +230,7 @@ def test_a_condition_on_what_changes_in_the_loop_is_refused():
             if step == upcoming:
                 upcoming += 10
 
-    with pytest.raises(SkipGSError, match=r"cannot be evaluated ahead \(step == upcoming\).*name all iterations"):
+    with pytest.raises(SkipGSError, match=r"cannot be evaluated ahead \(step == upcoming\).*name the iterations"):
         found(loop)
 
 
