@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, NamedTuple, Union
 
 from skipgs_plug.garbage import keep_everything, uncollected
-from skipgs_plug.messages import say
+from skipgs_plug.messages import plain_warnings, say
 from skipgs_plug.terminate import UNREAD, Terminated, terminable
 
 
@@ -43,6 +43,7 @@ DESCRIPTION = "skipgs-plug COMMAND --help describes its options; --debug shows t
 BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143
 # Classes of errors whose message is all that a user needs. They are known by name, so that torch need not be loaded.
 OURS = ("SkipGSError", "InputError", "WriteError")
+WARNINGS = "GateWarning"  # class of the gate's warnings, likewise
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -69,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     whole_program = argv is None and arguments[:1] != ["run"]
     try:
         # A script of another project gets signals as without this package.
-        with contextlib.nullcontext() if arguments[:1] == ["run"] else terminable():
+        with contextlib.nullcontext() if arguments[:1] == ["run"] else terminable(), plain_warnings(WARNINGS):
             return run(arguments, whole_program)
     except KeyboardInterrupt as error:
         return interrupted([error])

@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -16,8 +17,10 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
-from skipgs_plug.cli import COMMANDS, main
+from skipgs_plug.cli import COMMANDS, WARNINGS, main
 from skipgs_plug.commands.demo import LEAST
+from skipgs_plug.core.caution import GateWarning
+from skipgs_plug.messages import plain_warnings
 from skipgs_plug.trainer import Trainer, save_packed
 from skipgs_plug.trainer.synthetic import make_scene
 
@@ -266,3 +269,13 @@ def test_names_that_the_locale_cannot_print(tmp_path: Path, packed: str) -> None
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, env=narrow)
     assert ended.returncode == 0, ended.stderr
     assert b"l\\xe4uft" in ended.stdout
+
+
+def test_warnings_of_the_gate_are_printed_as_sentences_and_others_as_ever() -> None:
+    before = warnings.formatwarning
+    with plain_warnings(WARNINGS):
+        assert warnings.formatwarning(GateWarning("One."), GateWarning, "a.py", 3) == "skipgs-plug: One.\n"
+        assert warnings.formatwarning(UserWarning("Two."), UserWarning, "a.py", 3, "x") == before(
+            UserWarning("Two."), UserWarning, "a.py", 3, "x"
+        )
+    assert warnings.formatwarning is before

@@ -7,8 +7,12 @@ import warnings
 from skipgs_plug.messages import say
 
 
+class GateWarning(RuntimeWarning):
+    """A warning of the gate. The command line prints its sentence alone, without file, line and source."""
+
+
 def caution(sentence: str, stacklevel: int = 2) -> None:
-    """Issue a RuntimeWarning. If warnings are errors (`python -W error`), print the sentence instead.
+    """Issue a GateWarning. If warnings are errors (`python -W error`), print the sentence instead.
 
     A warning that is raised as an error would end the training, or release the gate.
 
@@ -17,6 +21,6 @@ def caution(sentence: str, stacklevel: int = 2) -> None:
         stacklevel: Stack level of `warnings.warn`, counted from the caller of this function.
     """
     try:
-        warnings.warn(sentence, RuntimeWarning, stacklevel=stacklevel + 1)
-    except RuntimeWarning:
+        warnings.warn(sentence, GateWarning, stacklevel=stacklevel + 1)
+    except GateWarning:
         say(sentence)

@@ -116,11 +116,14 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
 
 def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
     run, skipped = counted["iterations_run"], counted["iterations_skipped"]
-    percent = 100 * run / (run + skipped) if run + skipped else 0.0
+    start = config.start_iter or 0
     lines = [] if counted["growing"] is None else [_summarise_growing(counted["growing"])]
+    if not run + skipped:
+        return "\n".join([*lines, f"SkipGS: no iteration of refinement, which begins at iteration {start:,}."])
+    percent = 100 * run / (run + skipped)
     lines += [
-        f"SkipGS: {run:,} of {run + skipped:,} iterations run ({percent:.1f} %) since iteration "
-        f"{config.start_iter or 0:,}, {skipped:,} left out whole."
+        f"SkipGS: {run:,} of {run + skipped:,} iterations run ({percent:.1f} %) since iteration {start:,}, "
+        f"{skipped:,} left out whole."
     ]
     if counted["non_finite"]:
         backward = "ran all the same" if config.on_nonfinite == "pass" else "was skipped"

@@ -13,6 +13,7 @@ from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError, UnknownTrai
 from skipgs_plug.adapters import register_adapter, registry
 from skipgs_plug.adapters.inria import InriaFamily
 from skipgs_plug.adapters.registry import adapter_names
+from skipgs_plug.core.caution import GateWarning
 
 
 def test_unknown_trainer_gets_the_list_and_the_manual_form():
@@ -135,7 +136,7 @@ def test_not_one_backward_per_iteration_releases_the_gate_after_ten_and_loses_no
             module.training(dataset(), opt, None)
         assert not gate.patched
     assert module.done == list(range(1, 41))
-    warning = next(one.message for one in seen if one.category is RuntimeWarning)
+    warning = next(one.message for one in seen if one.category is GateWarning)
     assert "8a70a8cd" in str(warning) and "8a70a8cd" in gate.released
 
 

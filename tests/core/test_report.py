@@ -91,3 +91,8 @@ def test_a_gate_that_is_off_says_so() -> None:
     gate = SkipGate(enabled=False)
     gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
     assert gate.summary() == "SkipGS: off, 1 backwards seen."
+
+
+def test_a_run_that_ends_before_refinement_says_so() -> None:
+    gate = SkipGate(start_iter=1000, refine_share=0.4)
+    assert gate.summary() == "SkipGS: no iteration of refinement, which begins at iteration 1,000."
