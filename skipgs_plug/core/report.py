@@ -134,7 +134,7 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
             "length of the steps"
         )
     wanted, ran_for = counted["refine_share"], counted["ran_for"]
-    if wanted is not None and run > wanted * (run + skipped) + 1:
+    if wanted is not None and run > wanted * (run + skipped) + 2:  # a part of an iteration, and the last one
         lines.append(
             f"  this is more than the share of {wanted:.2f}: {ran_for['share']:,} ran for the share, "
             f"{ran_for['conditions']:,} for conditions of the loop, "
