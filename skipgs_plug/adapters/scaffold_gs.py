@@ -18,7 +18,7 @@ class ScaffoldGS(InriaFamily):
     gated = "From `update_until` on: anchors are no longer grown or pruned."
     left_alone = "Networks and anchors have one optimizer, which is left alone."
     stand_ins = "scaffold_gs"
-    mark = "prefilter_voxel"
+    mark = "training_statis"  # `prefilter_voxel` is none: Spec-Gaussian culls plain Gaussians with it
     changes = ("adjust_anchor",)
     calls = ("eval", "get_anchor", "train", "training_statis")
     arguments = ("retain_grad", "visible_mask")

@@ -18,8 +18,9 @@ from skipgs_plug.core.source.functions import undecorated
 
 # Functions that draw random numbers.
 NOISE = frozenset({"randn", "randn_like", "normal"})
-# Methods of a tensor whose names end in "_" but that change no values.
-HARMLESS = frozenset({"requires_grad_", "share_memory_", "detach_", "rename_"})
+# Methods of a tensor whose names end in "_" but that change no values, or none that they have changed already: in a
+# skipped iteration nothing moves a value that was clamped.
+HARMLESS = frozenset({"requires_grad_", "share_memory_", "detach_", "rename_", "clamp_", "clamp_min_", "clamp_max_"})
 # Methods of the model that Inria's loops (classic and current) call, and `compute_3D_filter` of Mip-Splatting, which
 # many forks call until the end. It depends on positions and cameras only, so it changes only if the model moves.
 CALLS = frozenset(
@@ -264,7 +265,7 @@ def _callables(owner: Any) -> set[str]:
 
 
 def writes_in_place(name: str) -> bool:
-    """Return whether a tensor method of this name changes the values of the tensor in place."""
+    """Return whether a tensor method of this name changes the values of the tensor in place, each time it is called."""
     private = name.startswith("_") or not name.endswith("_")
     return not private and name not in HARMLESS and callable(getattr(torch.Tensor, name, None))
 

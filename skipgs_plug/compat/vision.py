@@ -31,8 +31,9 @@ def to_pil_image(picture: Tensor) -> Image.Image:
 
 
 def save_image(tensor: Tensor, fp: str | Path) -> None:
-    """Write a tensor [3, H, W] in [0, 1] to a file. Rounds as torchvision does."""
-    pixels = tensor.detach().mul(255).add(0.5).clamp(0, 255).permute(1, 2, 0).to(torch.uint8)
+    """Write a tensor [3, H, W], [1, H, W] or [H, W] in [0, 1] to a file, in color. Rounds as torchvision does."""
+    color = tensor.detach().expand(3, *tensor.shape[-2:])
+    pixels = color.mul(255).add(0.5).clamp(0, 255).permute(1, 2, 0).to(torch.uint8)
     Image.fromarray(pixels.numpy()).save(fp)
 
 

@@ -98,6 +98,20 @@ def test_inrias_own_loop_is_not_an_unknown_fork():
     assert gate.report()["backwards_skipped"] == 21
 
 
+def test_fork_that_culls_as_scaffold_gs_does_but_has_no_anchors_is_inrias():
+    module = unknown_fork()
+    module.prefilter_voxel = module.render  # Spec-Gaussian
+    with SkipGate(module) as gate:
+        assert gate.adapter.name == "inria"
+
+
+def test_loop_that_clamps_values_is_gated():
+    """A clamp changes nothing in a skipped iteration, in which nothing moves: GaussianShader clamps its light."""
+    with SkipGate(unknown_fork(extra="gaussians.values['opacity'].clamp_(max=1.0)"), policy=SkipAlways()) as gate:
+        train(gate.adapter.trainer)
+    assert gate.report()["backwards_skipped"] == 21
+
+
 @pytest.mark.parametrize(
     ("extra", "sentence"),
     [

@@ -241,6 +241,9 @@ def test_missing_torchvision_is_stood_in_for(tmp_path):
         torchvision.utils.save_image(picture, tmp_path / "a.png")
         back = transforms.functional.to_tensor(Image.open(tmp_path / "a.png"))
         assert (back - picture).abs().max() <= 0.5 / 255 + 1e-6
+        for depth in (picture[:1], picture[0]):  # Spec-Gaussian saves its depths
+            torchvision.utils.save_image(depth, tmp_path / "depth.png")
+            assert (transforms.functional.to_tensor(Image.open(tmp_path / "depth.png")) == back[:1]).all()
         gray = transforms.ToTensor()(transforms.ToPILImage()(picture).convert("L"))
         assert gray.shape == (1, 5, 7)
         with pytest.raises(RuntimeError, match="vgg16 needs torchvision"):
