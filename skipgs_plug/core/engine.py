@@ -171,7 +171,6 @@ class Engine:
             distributed.require_gates()
         if self.iteration.step is None:
             self._go_on_from_saved(step)
-            self._saved_state = None
         if self.iteration.step is not None and step < self.iteration.step:
             raise GateOrderError(
                 f"Iterations went back from {self.iteration.step} to {step}: load the gate state that belongs to "
@@ -351,9 +350,9 @@ class Engine:
 
     def _go_on_from_saved(self, step: int) -> None:
         """Load the state of the checkpoint from which training continues with iteration `step`, if there is one."""
-        state = None if self._saved_state is None else self._saved_state(step)
+        ask, self._saved_state = self._saved_state, None
+        state = None if ask is None else ask(step)
         if state is not None:
-            self._saved_state = None
             self.load_state_dict(state)
 
     def _load_pace(self, whole: dict[str, Any]) -> None:

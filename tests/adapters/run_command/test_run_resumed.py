@@ -128,5 +128,7 @@ def test_gate_states_go_with_their_checkpoints(train):
 def test_a_resumed_run_without_a_state_says_so(train, capfd):
     _, off = train("off", "--save", gate=["--no-gate"])
     code, _ = train("on", "--start", str(off / "chkpnt40.pth"))
-    state = off / "chkpnt40.pth.skipgs.json"
-    assert code == 0 and f"The gate starts afresh in iteration 41: {state} does not exist." in capfd.readouterr().err
+    sentence = f"The gate starts afresh in iteration 41: {off / 'chkpnt40.pth.skipgs.json'} does not exist."
+    assert code == 0 and sentence in capfd.readouterr().err
+    code, _ = train("share", "--start", str(off / "chkpnt40.pth"), gate=["--share", "0.5"])
+    assert code == 0 and capfd.readouterr().err.count(sentence) == 1  # the loop's range asks, and its first iteration
