@@ -15,6 +15,7 @@ PACKAGES = ("skipgs_plug.compat", "skipgs_plug.fallback_raster")  # packages of 
 FOLDERS = tuple(Path(__file__).parents[1] / package.rpartition(".")[2] for package in PACKAGES)
 # Beginning of the message of a `TypeError`, if a call has other arguments than the function.
 SIGNATURE = re.compile(r"([\w.]+)\(\) (got|takes|missing) ")
+SHAPE = " must have shape "  # in the message of the stand-ins' rasterizer for a tensor that does not fit the others
 
 
 def stand_in_hint(error: BaseException) -> str | None:
@@ -45,6 +46,11 @@ def stand_in_hint(error: BaseException) -> str | None:
         lacks = inside or call[1].partition(".")[0] in callables()
     elif isinstance(error, IndexError):
         lacks = is_stand_in(error)
+    elif isinstance(error, ValueError) and inside and SHAPE in text:  # extensions of forks return other shapes
+        return (
+            f"The script gives the stand-ins of --cpu a tensor of another shape than they take ({text.rstrip('.')}): "
+            "if it trains with CUDA, its own CUDA extensions return or take other shapes; run it without --cpu."
+        )
     elif isinstance(error, ValueError) and "to unpack" in text:
         lacks = "gaussian_renderer" in last[0].filename
         text += " where the renderer unpacks the outputs"

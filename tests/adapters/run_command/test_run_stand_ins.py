@@ -68,6 +68,12 @@ def test_an_option_that_a_stand_in_refuses_is_one_sentence(error_of):
     assert "skipgs-plug: The CPU stand-in needs scales and rotations" in error and "Traceback" not in error
 
 
+def test_a_tensor_of_another_shape_is_one_sentence(error_of):
+    """As after `distCUDA2(points)[0]`: the extension of FSGS returns a pair, and the stand-in one tensor."""
+    error = error_of(lambda text: text.replace("torch.full((len(model.xyz), 3), 0.2)", "torch.full((1, 3), 0.2)"))
+    assert "a tensor of another shape than they take (scales must have shape" in error and "Traceback" not in error
+
+
 @pytest.mark.parametrize("line", ["(1, 2)[2]", "len(1, 2)", "None.integrate", "import simple_knx"])
 def test_an_error_of_the_scripts_own_keeps_its_traceback(error_of, line):
     error = error_of(lambda text: f"{line}\n{text}")
