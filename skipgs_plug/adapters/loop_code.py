@@ -86,7 +86,8 @@ class LoopCode(NamedTuple):
             raise AdapterMismatchError(
                 f"{path} is not a script for Python {platform.python_version()}: {error}."
             ) from error
-        functions = {const.co_name: const for const in script.co_consts if isinstance(const, types.CodeType)}
+        parts = [const for const in script.co_consts if isinstance(const, types.CodeType)]
+        functions = {part.co_name: part for part in parts if part.co_name.isidentifier()}  # "<lambda>" is none
         return cls._made(str(path), {*script.co_names, *functions}, functions, lambda name: function_of(path, name))
 
     @classmethod
@@ -169,7 +170,12 @@ def _called(used: set[str], functions: Mapping[str, types.CodeType]) -> list[typ
 
 def _callers(code: types.CodeType) -> set[str]:
     """Names of a function, and of the functions inside it, that call `backward`."""
-    return {part.co_name for part in _with_inner(code) if "backward" in part.co_names}
+    # A class that defines a method of that name stores it and calls nothing.
+    return {
+        part.co_name
+        for part in _with_inner(code)
+        if any(step.argval == "backward" and step.opname != "STORE_NAME" for step in dis.get_instructions(part))
+    }
 
 
 def _loops(syntax: ast.FunctionDef | None) -> list[ast.For | ast.While]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -137,17 +137,27 @@ def find_script_adapter(script: Path) -> type[AbstractAdapter]:
         adapter = get_adapter(candidate)
         if adapter.recognises_script(code):
             return adapter
-    advice = "name the script that holds the training loop, gate that loop"
+    advice = "gate that loop"
     if code.used:
         found, advice = "a function training(), but no GaussianModel", "gate its loop"
-    elif functions := sorted(name for name in code.functions if not name.startswith("_")):
-        found = f"no function training(), but {', '.join(functions[:SHOWN])}{' ...' if functions[SHOWN:] else ''}"
+    elif code.backward:
+        found = f"no function training(), but calls backward in {_listed(code.backward)}"
+    elif "backward" in code.names - code.functions:
+        found = "no function training(), but calls backward itself"
     else:
-        found = "no function at all"
+        functions = [name for name in code.functions if not name.startswith("_")]
+        found = f"no function training(), but {_listed(functions)}" if functions else "no function at all"
+        advice = "name the script that holds the training loop, gate that loop"
     raise UnknownTrainerError(
         f"No adapter knows {script}, which has {found}: {advice} by hand with SkipGate(start_iter=...) and "
-        "gate.backward(loss, view, step), or write an adapter (CONTRIBUTING.md)."
+        "gate.backward(loss, view, step), as in docs/gate.md, or write an adapter (CONTRIBUTING.md)."
     )
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Return the first of the names, in one line."""
+    first, more = sorted(names)[:SHOWN], sorted(names)[SHOWN:]
+    return f"{', '.join(first)}{' ...' if more else ''}"
 
 
 def _load(path: str) -> type[AbstractAdapter]:

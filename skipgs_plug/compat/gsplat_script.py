@@ -10,6 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
+from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.fallback_raster import rasterization
 from skipgs_plug.fallback_raster.runtime.function_modes import without_function_modes
 
@@ -30,9 +31,17 @@ def gsplat_on_cpu() -> Iterator[None]:
 
     Raises:
         ImportError: gsplat is not installed.
+        SkipGSError: It is installed, or in the checkout of a fork, and cannot be imported.
     """
-    with _no_cuda_toolkit():
-        import gsplat.rendering
+    try:
+        with _no_cuda_toolkit():
+            import gsplat.rendering
+    except ImportError as error:
+        if error.name == "gsplat":
+            raise
+        raise SkipGSError(
+            f"The trainer's gsplat cannot be imported ({error}): install what it needs, as its README says."
+        ) from error
     import torchmetrics.image.lpip
 
     replaced: list[tuple[Any, str, Any]] = []

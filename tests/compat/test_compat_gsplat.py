@@ -2,6 +2,7 @@
 
 import importlib
 import math
+import sys
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ pytest.importorskip("gsplat")
 from skipgs_plug.compat import serve
 from skipgs_plug.compat.relocation import compute_relocation
 from skipgs_plug.compat.strategy_operations import quat_scale_to_covar_preci
+from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.fallback_raster import rasterization
 
 
@@ -64,6 +66,15 @@ def test_gsplat_is_replaced_for_the_block_only():
         assert gsplat.rendering.rasterization.__wrapped__ is rasterization
         assert gsplat.strategy.ops.compute_relocation is compute_relocation
     assert (gsplat.rendering.rasterization, gsplat.strategy.ops.compute_relocation) == before
+
+
+def test_a_forks_own_gsplat_that_lacks_a_package_is_no_missing_extra(monkeypatch):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "gsplat"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "torch.nn.functional", None)  # gsplat imports it
+    with pytest.raises(SkipGSError, match=r"gsplat cannot be imported \(.*functional.*install what it needs"):
+        with serve("gsplat"):
+            pass
 
 
 def test_nerfstudio_gets_what_its_pinned_gsplat_returned(monkeypatch):

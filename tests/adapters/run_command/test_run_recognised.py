@@ -69,6 +69,28 @@ def test_auto_recognises_the_script_before_it_runs(checkout, tmp_path, capfd):
     assert "a function training(), but no GaussianModel: gate its loop by hand" in capfd.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("def load():\n    pass\nclass Runner:\n    def step(self):\n        self.loss.backward()\n", "in Runner"),
+        ("def load():\n    pass\ndef loss():\n    pass\nwhile True:\n    loss().backward()\n", "itself"),
+    ],
+    ids=["in a class", "in no function"],
+)
+def test_a_loop_of_ones_own_is_named(source, found, tmp_path, capfd):
+    script = tmp_path / "own.py"
+    script.write_text(source)
+    assert cli.main(["run", "auto", "--", str(script)]) == cli.BAD_INPUT
+    assert f"no function training(), but calls backward {found}: gate that loop by hand" in capfd.readouterr().err
+
+
+def test_only_calls_of_backward_and_named_functions_are_named(tmp_path, capfd):
+    script = tmp_path / "own.py"
+    script.write_text("class Render:\n    def backward(context, gradient):\n        return gradient\nten = lambda: 10\n")
+    assert cli.main(["run", "auto", "--", str(script)]) == cli.BAD_INPUT
+    assert "no function training(), but Render: name the script" in capfd.readouterr().err
+
+
 def test_wrong_adapter_is_refused_before_anything_is_imported(checkout, tmp_path, capfd):
     assert cli.main(["run", "mcmc", "--cpu", "--", checkout, str(tmp_path)]) == cli.BAD_INPUT
     assert "looks like the training script of 'inria'" in capfd.readouterr().err
