@@ -86,7 +86,7 @@ def test_a_loop_of_ones_own_is_named(source, found, tmp_path, capfd):
 
 def test_only_calls_of_backward_and_named_functions_are_named(tmp_path, capfd):
     script = tmp_path / "own.py"
-    script.write_text("class Render:\n    def backward(context, gradient):\n        return gradient\nten = lambda: 10\n")
+    script.write_text("class Render:\n    def backward(context, gradient):\n        return gradient\nf = lambda: 10\n")
     assert cli.main(["run", "auto", "--", str(script)]) == cli.BAD_INPUT
     assert "no function training(), but Render: name the script" in capfd.readouterr().err
 
