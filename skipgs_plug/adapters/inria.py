@@ -338,7 +338,7 @@ class InriaFamily(AbstractAdapter):
                 gradients_read_until=self.gradients_read_until(opt, loop),
                 accumulates=self.accumulates(opt, loop),
                 steps_each=self.steps_each(opt, loop),
-                width=max((getattr(camera, "image_width", 0) for camera in cameras), default=0) or None,
+                slow_positions=True,  # they reach their last rate in `position_lr_max_steps`, by default 30,000
                 photographs=None if self._cameras is None else self._cameras.photographs,
             )
         )

@@ -69,8 +69,7 @@ class TrainerInfo:
             ends; None if all of them must run.
         photographs: Returns some training photographs [3, H, W] with values in [0, 1], if the adapter shows views at
             half their size while `Hooks.at_half_size`; None if it cannot.
-        width: Largest width of the training photographs in pixels, if the trainer may lower the learning rate of
-            positions too slowly for its schedule; None if it does not, or if it is unknown.
+        slow_positions: Whether the trainer may lower the learning rate of positions too slowly for its schedule.
         defaults: Settings that suit this trainer. They are used where the user gave no value.
     """
 
@@ -86,5 +85,5 @@ class TrainerInfo:
     steps_each: bool = False
     densification: Densification | None = None
     photographs: Callable[[], Iterable[Tensor]] | None = None
-    width: int | None = None
+    slow_positions: bool = False
     defaults: Mapping[str, Any] = dataclasses.field(default_factory=dict)

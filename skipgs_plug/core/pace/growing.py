@@ -19,7 +19,6 @@ from skipgs_plug.core.pace.needs import (
     growing_factor,
     growing_share,
     last_part,
-    longest_positions,
     opacity_factor,
     opacity_rate,
     positions_part,
@@ -126,7 +125,7 @@ class Growing(Phase):
         if self._first is None:
             self._first = numbers.start
         self._reset, self._end = max(resets, default=None), numbers.stop
-        self._rates.longest_positions = longest_positions(plan.width)
+        self._rates.bounds_positions = plan.slow_positions
         following = plan.last + 1 - numbers.stop
         if following > 0:
             asked = self._config.refining

@@ -50,7 +50,7 @@ class LoopFacts:
         self._known: Known = nothing_known
         self._accumulates = self._steps_each = False
         self._photographs: Callable[[], Iterable[Tensor]] | None = None
-        self._width: int | None = None
+        self._slow_positions = False
         self._views: list[str] | None = None
         self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
 
@@ -59,7 +59,7 @@ class LoopFacts:
         self.start, self.last, self._views = start, info.max_steps, views
         self._accumulates, self._steps_each, self._epoch = info.accumulates, info.steps_each, info.epoch
         self.densification = info.densification or self.densification
-        self._photographs, self._width = info.photographs, info.width
+        self._photographs, self._slow_positions = info.photographs, info.slow_positions
 
     def describe(self, always: Always, pure: Iterable[str], densification: Densification | None, known: Known) -> None:
         """Receive facts from the trainer's adapter; see `Pace.describe`."""
@@ -128,7 +128,7 @@ class LoopFacts:
             self.densification,
             self._accumulates,
             self._photographs,
-            self._width,
+            self._slow_positions,
             self._steps_each,
         )
 

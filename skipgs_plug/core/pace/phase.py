@@ -28,7 +28,7 @@ class PhasePlan(NamedTuple):
         densification: How to recognise densification events; None if unknown.
         accumulates: Optimizers step on gradients that are accumulated over several iterations; see `TrainerInfo`.
         photographs: Returns some training photographs, if views can be shown at half their size; see `TrainerInfo`.
-        width: Width of the training photographs in pixels; None if unknown.
+        slow_positions: Whether the learning rate of positions may fall too slowly; see `TrainerInfo`.
         steps_each: Optimizers would do so, but step in refinement as in densification; see `TrainerInfo`.
     """
 
@@ -42,7 +42,7 @@ class PhasePlan(NamedTuple):
     densification: Densification | None
     accumulates: bool
     photographs: Callable[[], Iterable[Tensor]] | None = None
-    width: int | None = None
+    slow_positions: bool = False
     steps_each: bool = False
 
     def epoch_for(self, setting: str) -> int:

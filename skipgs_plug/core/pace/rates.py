@@ -15,6 +15,7 @@ from torch.utils.hooks import RemovableHandle
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.optimizers import Optimizers, with_names
+from skipgs_plug.core.pace.needs import longest_positions
 from skipgs_plug.core.pace.optimizer_steps import OptimizerSteps
 from skipgs_plug.core.pace.parts import UNCHANGED, Division, GrowingParts, OptimizerInfo, ScaledGroup
 from skipgs_plug.core.pace.visibility import VISIBLE, Visibility
@@ -73,7 +74,7 @@ class ScaledRates:
         visibility: Share of the Gaussians that a view shows, measured in the steps scaled so far.
         opacity_rate: See `Division`.
         positions_rate: Largest learning rate of positions while the scene grew; 0 if it is not known.
-        longest_positions: Bound on their rate in refinement, as a multiple of `positions_rate`.
+        bounds_positions: Whether their rate is bounded in refinement; see `longest_positions`.
         on_error: Receives errors of hooks, and raises them or releases the gate. None raises them.
     """
 
@@ -83,7 +84,7 @@ class ScaledRates:
         self.on_error: Callable[[Exception], None] | None = None
         self._factor: float | None = None
         self.opacity_rate = self.positions_rate = 0.0
-        self.longest_positions = math.inf
+        self.bounds_positions = False
         self._division = Division(0, None, True)
         self._rows = self._rows_now = 0  # number of Gaussians in the previous and in this iteration; 0 if unknown
         self._thread = get_ident()
@@ -220,8 +221,8 @@ class ScaledRates:
 
     def _divide(self, rows: int, growing: GrowingParts | None, raised: bool) -> None:
         """Set the division; an equal one stays the same object, so that optimizers compare it fast."""
-        known = growing is None and self.positions_rate > 0.0
-        bound = self.longest_positions * self.positions_rate if known else math.inf
+        bounds = growing is None and self.bounds_positions and self.positions_rate > 0.0
+        bound = longest_positions(self.visibility.visible) * self.positions_rate if bounds else math.inf
         division = (rows, growing, raised, self.opacity_rate, bound)
         if division != self._division:
             self._division = Division(*division)

@@ -8,7 +8,14 @@ import torch
 
 from skipgs_plug import SkipGate
 from skipgs_plug.adapters.gsplat_strategy import strategy_events
-from skipgs_plug.core.pace.needs import MOST_LAST, OPACITY_PATH, last_part, longest_positions, opacity_rate
+from skipgs_plug.core.pace.needs import (
+    LONGEST_POSITIONS,
+    MOST_LAST,
+    OPACITY_PATH,
+    last_part,
+    longest_positions,
+    opacity_rate,
+)
 from skipgs_plug.core.pace.parts import MOST_OPACITY_FACTOR, UNCHANGED
 from skipgs_plug.core.pace.rates import ScaledRates
 
@@ -24,11 +31,12 @@ def rates():
     scaled.remove()
 
 
-def moved(name, factor, rates, rate=RATE, growing=None):
-    """Return how far a parameter moves at a gradient of 1, in units of its rate."""
+def moved(name, factor, rates, rate=RATE, growing=None, shown=5):
+    """Return how far a parameter moves at a gradient of 1, in units of its rate; a view shows `shown` of 5 Gaussians."""
     value = torch.nn.Parameter(torch.zeros(5, 1 if name == "opacity" else 3))
     optimizer = torch.optim.SGD([{"params": [value], "name": name}], lr=rate)
     value.grad = torch.ones_like(value)
+    value.grad[shown:] = 0
     rates.scale(factor, growing)
     optimizer.step()
     return -value.detach()[0, 0].item() / rate
@@ -42,20 +50,22 @@ def test_opacities_take_the_rate_that_they_need_in_refinement(least, times, rate
     assert moved("opacity", 0.5, rates) == pytest.approx(0.5 * times)
 
 
-def test_positions_take_at_most_three_times_their_first_rate(rates):
+def test_a_rate_of_positions_that_falls_too_slowly_is_bounded_by_the_first_one(rates):
+    rates.bounds_positions = True
     assert moved("xyz", 10.0, rates) == pytest.approx(20.0)  # their first rate is not known
     moved("xyz", 1.0, rates, growing=UNCHANGED)
-    assert moved("xyz", 10.0, rates) == pytest.approx(20.0)  # the size of the photographs is not known
-    rates.longest_positions = longest_positions(1600)
-    assert moved("xyz", 10.0, rates) == pytest.approx(3.0)
+    rates.visibility.restart()
+    assert moved("xyz", 10.0, rates, shown=2) == pytest.approx(longest_positions(2 / 5))
     # A trainer that has lowered the rate to a tenth gets the steps that it would get without the bound.
     assert moved("xyz", 10.0, rates, rate=RATE / 10) == pytest.approx(20.0)
     assert moved("xyz", 1.0, rates) == pytest.approx(2.0)
+    rates.bounds_positions = False
+    assert moved("xyz", 10.0, rates) == pytest.approx(20.0)
 
 
-def test_on_small_photographs_positions_take_longer_steps():
-    assert longest_positions(None) == math.inf
-    assert [longest_positions(width) for width in (3000, 800, 400, 100)] == [3.0, 3.5, 7.0, 28.0]
+def test_where_a_view_shows_more_positions_take_longer_steps():
+    assert longest_positions(None) == longest_positions(1 / 3) == LONGEST_POSITIONS
+    assert longest_positions(2 / 3) == pytest.approx(4 * LONGEST_POSITIONS)
 
 
 def test_the_end_of_a_run_without_refinement():
