@@ -32,7 +32,7 @@ def rates():
 
 
 def moved(name, factor, rates, rate=RATE, growing=None, shown=5):
-    """Return how far a parameter moves at a gradient of 1, in units of its rate; a view shows `shown` of 5 Gaussians."""
+    """Return how far a parameter moves at a gradient of 1, in units of its rate. A view shows `shown` of 5 rows."""
     value = torch.nn.Parameter(torch.zeros(5, 1 if name == "opacity" else 3))
     optimizer = torch.optim.SGD([{"params": [value], "name": name}], lr=rate)
     value.grad = torch.ones_like(value)
