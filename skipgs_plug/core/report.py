@@ -134,7 +134,9 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
             "length of the steps"
         )
     wanted, ran_for = counted["refine_share"], counted["ran_for"]
-    if wanted is not None and run > wanted * (run + skipped) + 2:  # a part of an iteration, and the last one
+    others = ran_for["conditions"] + ran_for["changes"]
+    # The last iteration is one of the others, and the iterations of the share come first, also in a run that was ended.
+    if wanted is not None and others > 1 and run > wanted * (run + skipped) + 2:
         lines.append(
             f"  this is more than the share of {wanted:.2f}: {ran_for['share']:,} ran for the share, "
             f"{ran_for['conditions']:,} for conditions of the loop, "

@@ -96,3 +96,12 @@ def test_a_gate_that_is_off_says_so() -> None:
 def test_a_run_that_ends_before_refinement_says_so() -> None:
     gate = SkipGate(start_iter=1000, refine_share=0.4)
     assert gate.summary() == "SkipGS: no iteration of refinement, which begins at iteration 1,000."
+
+
+def test_a_run_that_was_ended_early_did_not_run_more_than_its_share() -> None:
+    gate = SkipGate(start_iter=10, refine_share=0.4)
+    for step in gate.iterations(range(100)):
+        gate.backward(torch.ones((), requires_grad=True) * 2.0, view=step % 4, step=step)
+        if step == 30:
+            break
+    assert gate.summary().startswith("SkipGS: 21 of 21 iterations run") and "more than" not in gate.summary()
