@@ -25,7 +25,7 @@ from skipgs_plug.core.pace.needs import (
     refining_share,
     share_factor,
 )
-from skipgs_plug.core.pace.parts import UNCHANGED, GrowingParts
+from skipgs_plug.core.pace.parts import ONLY_HIGHER_BANDS, UNCHANGED, GrowingParts
 from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.sampling import Sampling
@@ -233,7 +233,7 @@ class Growing(Phase):
         if self._whole_from is not None and number >= self._whole_from:
             # Steps that are longer and shrink, as in refinement, end 0.7 dB lower on bonsai: opacities recover less.
             if self._has_longer_steps:
-                self._rates.scale(LAST_FACTOR, UNCHANGED._replace(only_higher_bands=True))
+                self._rates.scale(LAST_FACTOR, ONLY_HIGHER_BANDS)
             else:
                 self._rates.look()
             return True

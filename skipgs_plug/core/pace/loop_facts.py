@@ -43,7 +43,7 @@ class LoopFacts:
         self.grown: dict[str, set[int]] = {}
         self.refined: dict[str, set[int]] = {}
         self.bars = Bars([])
-        self._names_all = always is not None  # whether the user names the iterations that conditions do not tell
+        self._others_named = always is not None  # whether the user named those that conditions do not tell
         self._given = self._chosen = frozenset(always or ())  # iterations that must run: by the settings, and in all
         self._always: Always = nothing_always
         self._pure: tuple[str, ...] = ()
@@ -71,7 +71,7 @@ class LoopFacts:
             known = frozenset(int(number) for number in events)
             self.densification = Densification(numbers=lambda part: known.intersection(part))
         self._chosen = self._given.union(always or ())
-        self._names_all = self._names_all or always is not None
+        self._others_named = self._others_named or always is not None
         if views is not None:
             self._views = views
 
@@ -91,7 +91,7 @@ class LoopFacts:
         source = None if loop.source is None else self._read(*loop.source)
         if source is not None:
             parts = (grown, refined)
-            self.grown, self.refined = (source.milestones(part, self._names_all) if part else {} for part in parts)
+            self.grown, self.refined = (source.milestones(part, self._others_named) if part else {} for part in parts)
             self.bars = Bars(source.bar_moves(loop.numbers))
         loop.source = None
 
@@ -99,7 +99,7 @@ class LoopFacts:
         try:
             return read_loop(code, line_of(code), names, self._pure, self._known(names))
         except SkipGSError:
-            if self._names_all:
+            if self._others_named:
                 return None
             raise
 

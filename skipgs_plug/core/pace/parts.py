@@ -167,6 +167,7 @@ class GrowingParts(NamedTuple):
 
 
 UNCHANGED = GrowingParts(1.0, 1.0)  # with a factor of 1, the trainer's own steps
+ONLY_HIGHER_BANDS = GrowingParts(1.0, 1.0, only_higher_bands=True)
 
 
 class Division(NamedTuple):
