@@ -45,6 +45,7 @@ class EDGS(AbstractAdapter):
 
     def attach_script(self, hooks: Hooks) -> None:
         gate_backwards_only(hooks, self)
+        hooks.gate_tensor_backward(STEP)
         when_imported(hooks, MODULE, lambda module: self.attach_on_call(hooks, module.EDGSTrainer, "train"))
 
     def attach(self, hooks: Hooks) -> None:

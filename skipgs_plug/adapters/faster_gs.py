@@ -66,6 +66,7 @@ class FasterGS(AbstractAdapter):
 
     def attach_script(self, hooks: Hooks) -> None:
         gate_backwards_only(hooks, self)
+        hooks.gate_tensor_backward(LOOP)
         when_imported(hooks, MODULE, lambda module: self.attach_on_call(hooks, module.FasterGSTrainer, "run"))
 
     def attach(self, hooks: Hooks) -> None:

@@ -77,6 +77,7 @@ class FVDB(AbstractAdapter):
 
     def attach_script(self, hooks: Hooks) -> None:
         gate_backwards_only(hooks, self)
+        hooks.gate_tensor_backward(OLD.loop, FRGS.loop)
         for runner in (OLD, FRGS):
             when_imported(hooks, runner.module, functools.partial(self._attach_to_class, hooks, runner))
 

@@ -23,7 +23,7 @@ from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.host_copy import HostCopy
 
-MODULE = "gsplat.distributed"
+MODULE, LOOP = "gsplat.distributed", "train"
 EXPECTED = ("cfg", "parser", "trainset", "rasterize_splats", "world_size")
 BATCH = "batch"  # one key for the joint loss of random batches: a batch never comes up twice
 
@@ -67,17 +67,20 @@ class GsplatRunner(AbstractAdapter):
         def started(
             original: Callable[..., Any], rank: int, size: int, fn: Callable[..., Any], *args: Any, **kwargs: Any
         ) -> Any:
-            self.attach_on_call(hooks, fn.__globals__["Runner"], "train")
+            self.attach_on_call(hooks, fn.__globals__["Runner"], LOOP)
             return original(rank, size, fn, *args, **kwargs)
 
         # Only the launcher attaches in each spawned process.
         if not getattr(torch.multiprocessing.spawn, GATES_SPAWNED, False):
             refuse_other_processes(hooks)
+        hooks.gate_tensor_backward(LOOP)
         when_imported(hooks, MODULE, lambda module: hooks.wrap(module, "_distributed_worker", started))
 
     def attach(self, hooks: Hooks) -> None:
         runner = self.trainer
         missing = [name for name in EXPECTED if not hasattr(runner, name)]
+        if not hasattr(getattr(runner, "cfg", None), "strategy"):  # gsplat before 1.3
+            missing.append("cfg.strategy")
         if missing:
             raise self.mismatch(f"a Runner with {', '.join(missing)}")
         strategy = runner.cfg.strategy
@@ -107,9 +110,9 @@ class GsplatRunner(AbstractAdapter):
         stage = getattr(runner, "stage", None)
         hooks.before(*((runner, "rasterize_splats") if stage is None else (stage, "render")), remember)
         hooks.before(type(strategy), "step_pre_backward", forwarded)
-        hooks.gate_tensor_backward("train")
+        hooks.gate_tensor_backward(LOOP)
         hooks.loop(
-            function_names(type(runner).train), "train", always=lambda numbers: iterations_that_run(strategy, numbers)
+            function_names(type(runner).train), LOOP, always=lambda numbers: iterations_that_run(strategy, numbers)
         )
         hooks.check_drift(lambda: runner.optimizers)
         self._relocations = leave_out_noise(hooks, strategy, type(strategy))

@@ -58,6 +58,7 @@ class LiteGS(AbstractAdapter):
         return "litegs" in code.names
 
     def attach_script(self, hooks: Hooks) -> None:
+        hooks.gate_tensor_backward(LOOP)
         when_imported(hooks, MODULE, lambda module: self._attach_to(hooks, vars(module)))
         gate_backwards_only(hooks, self)
 

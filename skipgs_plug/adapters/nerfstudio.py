@@ -59,6 +59,7 @@ class Nerfstudio(AbstractAdapter):
 
     def attach_script(self, hooks: Hooks) -> None:
         refuse_other_processes(hooks)
+        hooks.gate_tensor_backward(LOOP)
         when_imported(hooks, MODULE, lambda module: self.attach_on_call(hooks, module.Trainer, "train"))
 
     def attach(self, hooks: Hooks) -> None:

@@ -16,7 +16,7 @@ from skipgs_plug.core.caution import caution
 from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
-MODULE = "gaussian_splatting.prepare"
+MODULE, STEP = "gaussian_splatting.prepare", "step"
 
 # Attributes of the outermost trainer that `step` or this adapter uses.
 EXPECTED = ("step", "curr_step", "optimizer", "update_learning_rate", "preprocess", "before_optim_hook", "optim_step")
@@ -80,6 +80,7 @@ class StepTrainer(AbstractAdapter):
             self.attach(hooks)
             return self.trainer
 
+        hooks.gate_tensor_backward(STEP)
         # `python -m gaussian_splatting.train` binds this name after the import.
         when_imported(hooks, MODULE, lambda module: hooks.wrap(module, "prepare_trainer", prepared))
         hooks.loop(hooks.script_globals, "training")
@@ -130,7 +131,7 @@ class StepTrainer(AbstractAdapter):
         hooks.before(trainer, "preprocess", lambda camera: hooks.view(camera.ground_truth_image_path))
         hooks.wrap(trainer, "before_optim_hook", hooked)
         hooks.wrap(trainer, "optim_step", watched)
-        hooks.gate_tensor_backward("step")
+        hooks.gate_tensor_backward(STEP)
         hooks.check_drift(lambda: [trainer.optimizer])
         known = end is not None and not unknown and not unread
         hooks.ready(

@@ -80,6 +80,7 @@ class ThreeDGRUT(AbstractAdapter):
 
     def attach_script(self, hooks: Hooks) -> None:
         gate_backwards_only(hooks, self)
+        hooks.gate_tensor_backward(STEP)
         when_imported(hooks, MODULE, lambda module: self.attach_on_call(hooks, module.Trainer3DGRUT, "run_training"))
 
     def attach(self, hooks: Hooks) -> None:

@@ -88,6 +88,7 @@ class Hooks(LoopHooks):
         self._iterations = 0
         self._backwards = 0
         self._odd_iterations = 0  # iterations with a number of backward passes other than one, so far
+        self._callers: set[str] = set()  # functions whose backward passes are gated
         self.awaited: list[str] = []
 
     # Facts, at attach or when training begins.
@@ -287,10 +288,13 @@ class Hooks(LoopHooks):
         """Gate the scalar `Tensor.backward` that certain functions call themselves, with or without a loss scaler.
 
         Args:
-            *callers: Names of these functions.
+            *callers: Names of these functions, besides those of earlier calls. A script in which one of them trains
+                while a module is still awaited is refused.
         """
-        intercept_tensor_backward(self._patches, callers, self.backward)
-        guard_scalers(self._patches, self._iteration)
+        if not self._callers:
+            intercept_tensor_backward(self._patches, self._callers, self.backward)
+            guard_scalers(self._patches, self._iteration)
+        self._callers.update(callers)
 
     def check_drift(self, optimizers: Optimizers) -> None:
         """Check that no code of a fork changes the parameters of these optimizers unseen.

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import Any
 
 import torch
@@ -149,7 +149,7 @@ def _is_bound(function: Any, owner: Any) -> bool:
 
 
 def intercept_tensor_backward(
-    patches: Patches, callers: tuple[str, ...], gated: Callable[[torch.Tensor, Callable[[], Any]], Any]
+    patches: Patches, callers: Container[str], gated: Callable[[torch.Tensor, Callable[[], Any]], Any]
 ) -> None:
     """Pass scalar backward calls of functions with these names to `gated`.
 

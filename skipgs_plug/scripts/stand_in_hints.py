@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ PACKAGES = ("skipgs_plug.compat", "skipgs_plug.fallback_raster")  # packages of 
 FOLDERS = tuple(Path(__file__).parents[1] / package.rpartition(".")[2] for package in PACKAGES)
 # Beginning of the message of a `TypeError`, if a call has other arguments than the function.
 SIGNATURE = re.compile(r"([\w.]+)\(\) (got|takes|missing) ")
+CUDA_WRAPPERS = ("gsplat", "cuda")  # folder whose functions need the extension, with or without a toolkit to compile it
 SHAPE = " must have shape "  # in the message of the stand-ins' rasterizer for a tensor that does not fit the others
 
 
@@ -26,7 +27,12 @@ def stand_in_hint(error: BaseException) -> str | None:
     Returns:
         The sentence; None for any other error.
     """
-    text, last = str(error), traceback.extract_tb(error.__traceback__)[-1:]
+    frames = traceback.extract_tb(error.__traceback__)
+    if name := called_with_cuda(frames):
+        return (
+            f"The script calls gsplat's {name}(), for which --cpu has no stand-in: it needs CUDA; run it without --cpu."
+        )
+    text, last = str(error), frames[-1:]
     inside = bool(last) and any(folder in Path(last[0].filename).parents for folder in FOLDERS)
     lacks = False
     if isinstance(error, NotImplementedError) and inside:
@@ -57,6 +63,14 @@ def stand_in_hint(error: BaseException) -> str | None:
     if not lacks:
         return None
     return f"The script uses a feature that the stand-ins of --cpu lack ({text}): it needs CUDA; run it without --cpu."
+
+
+def called_with_cuda(frames: Sequence[traceback.FrameSummary]) -> str:
+    """Return the function of gsplat that the script called, if its CUDA code failed; else an empty string."""
+    package = next(
+        (path.parents[1] for frame in frames if (path := Path(frame.filename)).parts[-3:-1] == CUDA_WRAPPERS), None
+    )
+    return next((frame.name for frame in frames if package in Path(frame.filename).parents), "")
 
 
 def is_stand_in(thing: Any) -> bool:

@@ -68,6 +68,13 @@ def test_renamed_attribute_names_what_was_expected_and_where():
         SkipGate(runner, adapter="gsplat")
 
 
+def test_a_strategy_elsewhere_than_in_the_configuration_is_a_mismatch():
+    runner = Runner(DefaultStrategy())
+    del runner.cfg.strategy  # before gsplat 1.3, the Runner itself had one
+    with pytest.raises(AdapterMismatchError, match=r"Runner with cfg\.strategy, as in"):
+        SkipGate(runner, adapter="gsplat")
+
+
 @pytest.fixture
 def gsplat_module(monkeypatch):
     """`gsplat.distributed` with upstream's `cli`: several devices mean several processes."""
@@ -112,6 +119,21 @@ def test_script_is_reached_through_its_launcher(gsplat_module):
     assert not hasattr(names["Runner"].train, "__skipgs_plug__") and not hasattr(
         gsplat_module._distributed_worker, "__skipgs_plug__"
     )
+
+
+def test_a_script_that_trains_without_the_launcher_is_refused_with_its_first_backward(monkeypatch):
+    """As gsplat's own scripts before 1.2 and simple_trainer_2dgs.py do, if a user names the adapter for them."""
+    monkeypatch.delitem(sys.modules, "gsplat.distributed", raising=False)
+    weight = torch.ones(1, requires_grad=True)
+    names = {"weight": weight}
+    exec("def train():\n    (2 * weight).sum().backward()\n", names)
+    sentence = r"trains without a module gsplat\.distributed"
+    with pytest.raises(AdapterMismatchError, match=sentence), SkipGate(adapter="gsplat"):
+        names["train"]()
+    assert weight.grad is None
+    with SkipGate(adapter="gsplat", enabled=False):
+        names["train"]()
+    assert weight.grad is not None
 
 
 def test_script_that_spawns_processes_is_refused(gsplat_module):
