@@ -23,7 +23,7 @@ from skipgs_plug.core.hooks import Hooks
 from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.host_copy import HostCopy
 
-MODULE, LOOP = "gsplat.distributed", "train"
+MODULE, RUNNER, LOOP = "gsplat.distributed", "Runner", "train"
 EXPECTED = ("cfg", "parser", "trainset", "rasterize_splats", "world_size")
 BATCH = "batch"  # one key for the joint loss of random batches: a batch never comes up twice
 
@@ -61,13 +61,16 @@ class GsplatRunner(AbstractAdapter):
 
     @classmethod
     def recognises_script(cls, code: LoopCode) -> bool:
-        return {"Runner", MODULE} <= code.names  # simple_trainer_2dgs.py has no gsplat.distributed
+        return {RUNNER, MODULE} <= code.names  # simple_trainer_2dgs.py has no gsplat.distributed
 
     def attach_script(self, hooks: Hooks) -> None:
         def started(
             original: Callable[..., Any], rank: int, size: int, fn: Callable[..., Any], *args: Any, **kwargs: Any
         ) -> Any:
-            self.attach_on_call(hooks, fn.__globals__["Runner"], LOOP)
+            names = getattr(fn, "__globals__", {})  # a functools.partial has none
+            if RUNNER not in names:
+                raise self.mismatch(f"a class {RUNNER} among the names of the function that the script passes to cli()")
+            self.attach_on_call(hooks, names[RUNNER], LOOP)
             return original(rank, size, fn, *args, **kwargs)
 
         # Only the launcher attaches in each spawned process.

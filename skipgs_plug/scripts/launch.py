@@ -107,7 +107,7 @@ def _resolve(command: Sequence[str]) -> _Program:
     if name == "-m":
         name, *arguments = arguments
         with _first_on_path(Path.cwd()):
-            source = _source_of(name)
+            source = _source_of(f"{name}.__main__") or _source_of(name)  # of a package, Python runs `__main__`
         if source is None:
             raise SkipGSError(f"There is no module {name}: install it, or name a training script after '--'.")
         run = functools.partial(_run_module, name)

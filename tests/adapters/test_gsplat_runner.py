@@ -136,6 +136,11 @@ def test_a_script_that_trains_without_the_launcher_is_refused_with_its_first_bac
     assert weight.grad is not None
 
 
+def test_a_runner_under_another_name_is_a_mismatch(gsplat_module):
+    with pytest.raises(AdapterMismatchError, match="a class Runner among the names of the"), SkipGate(adapter="gsplat"):
+        gsplat_module.cli(print, None)
+
+
 def test_script_that_spawns_processes_is_refused(gsplat_module):
     gsplat_module.devices = 4
     sentence = "starts 4 processes, which the gate cannot reach"

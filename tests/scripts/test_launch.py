@@ -186,6 +186,8 @@ def test_the_source_of_a_module_is_found_without_importing_its_packages(checkout
     (package / "train.py").write_text("pass\n")
     monkeypatch.syspath_prepend(checkout)
     assert source_of(["-m", "package_of_script.inner.train"]) == (package / "train.py").resolve()
+    (package.parent / "__main__.py").write_text("pass\n")  # Python runs it for a package
+    assert source_of(["-m", "package_of_script"]) == (package.parent / "__main__.py").resolve()
 
 
 def test_missing_script_is_named(tmp_path):
