@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any, NamedTuple
 
 import torch
@@ -15,7 +16,7 @@ HIGHER_BANDS, GEOMETRY, OTHERS, CONSTANT_BAND = 4.0, 2.0, 1.0, 0.5
 PART_BY_NAME = {
     **dict.fromkeys(("f_rest", "shN", "features_rest"), HIGHER_BANDS),
     **dict.fromkeys(("f_dc", "sh0", "features_dc"), CONSTANT_BAND),
-    **dict.fromkeys(("xyz", "means", "scaling", "scales"), GEOMETRY),
+    **dict.fromkeys((*POSITIONS, "scaling", "scales"), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
 # Largest factor on the rate of opacities that must recover from their last reset. They flicker with more.
@@ -27,6 +28,11 @@ OTHERS_AT_MOST = 0.25
 # the root of 1 - beta2: 32 times the rate at the usual 0.999, which is too far with larger rates, 7 times at 0.98.
 SQUARES_KEPT = 0.98
 GAUSSIAN_SHAPES = ((), (1,), (2,), (3,), (4,))  # shapes of one Gaussian's parameters, except colours [K, 3]
+
+
+def known_name(name: str | None) -> str | None:
+    """Return the name of a group without its prefix: `point_cloud.position`, `Background#xyz` and `_xyz` have one."""
+    return None if name is None else re.split(r"[.#/]", str(name))[-1].lstrip("_")
 
 
 def group_part(group: dict[str, Any], name: str | None = None) -> float | None:
@@ -45,7 +51,7 @@ def group_part(group: dict[str, Any], name: str | None = None) -> float | None:
         group: One of an optimizer's `param_groups`, which may have a name.
         name: Name of the optimizer, which stands for that of a group without one; None if unknown.
     """
-    name = group.get("name", name)
+    name = known_name(group.get("name", name))
     if name is not None:
         return None if name in OPACITIES else PART_BY_NAME.get(name, OTHERS)
     shapes = [tuple(param.shape[1:]) for param in group["params"]]
@@ -93,7 +99,7 @@ class GroupInfo:
         self.part = group_part(group, name)
         self._params: list[Tensor] = list(group["params"])
         self.first = self._params[0] if len(self._params) == 1 else None
-        known = group.get("name", name)
+        known = known_name(group.get("name", name))
         self._known = known is not None
         shapes = [tuple(param.shape[1:]) for param in self._params]
         # Inria's exposures step before the positions, so their rows cannot be compared. Groups with names belong to the

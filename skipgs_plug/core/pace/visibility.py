@@ -10,7 +10,7 @@ from torch import Tensor
 from skipgs_plug.core import distributed
 
 # Names of the positions. Regularisers fill the gradients of opacities and scales in some trainers, but not theirs.
-POSITIONS = ("xyz", "means")
+POSITIONS = ("xyz", "means", "means3d", "means3D", "position", "positions")
 # Share of the Gaussians that a view shows while it is not measured. A third is typical of a room photographed from
 # within.
 VISIBLE = 1 / 3

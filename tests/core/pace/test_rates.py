@@ -135,6 +135,11 @@ def test_the_path_is_conserved():
         ({"name": "features_dc"}, (5, 3), 0.5),
         ({"name": "offset"}, (5, 10, 3), 1.0),  # Scaffold-GS: positions of the Gaussians of an anchor
         ({"name": "xyz"}, (5, 3), 2.0),
+        ({"name": "means3D"}, (5, 3), 2.0),
+        ({"name": "point_cloud.position"}, (5, 3), 2.0),
+        ({"name": "Background#f_rest"}, (5, 15, 3), 4.0),
+        ({"name": "_opacity"}, (5, 1), None),
+        ({"name": "mlp_opacity"}, (5, 1), 1.0),  # a network of Scaffold-GS
         ({"name": "scaling"}, (5, 3), 2.0),
         ({"name": "rotation"}, (5, 4), 1.0),
         ({"name": "opacity"}, (5, 1), None),
