@@ -29,9 +29,7 @@ def stand_in_hint(error: BaseException) -> str | None:
     """
     frames = traceback.extract_tb(error.__traceback__)
     if name := called_with_cuda(frames):
-        return (
-            f"The script calls gsplat's {name}(), for which --cpu has no stand-in: it needs CUDA; run it without --cpu."
-        )
+        return f"The script calls {name}(), for which --cpu has no stand-in: it needs CUDA; run it without --cpu."
     text, last = str(error), frames[-1:]
     inside = bool(last) and any(folder in Path(last[0].filename).parents for folder in FOLDERS)
     lacks = False
@@ -66,11 +64,16 @@ def stand_in_hint(error: BaseException) -> str | None:
 
 
 def called_with_cuda(frames: Sequence[traceback.FrameSummary]) -> str:
-    """Return the function of gsplat that the script called, if its CUDA code failed; else an empty string."""
-    package = next(
-        (path.parents[1] for frame in frames if (path := Path(frame.filename)).parts[-3:-1] == CUDA_WRAPPERS), None
-    )
-    return next((frame.name for frame in frames if package in Path(frame.filename).parents), "")
+    """Return the full name of the function of gsplat that the script called, if CUDA code of it failed; else ""."""
+    files = [Path(frame.filename) for frame in frames]
+    first = next((index for index, file in enumerate(files) if file.parts[-3:-1] == CUDA_WRAPPERS), None)
+    if first is None:
+        return ""
+    package = files[first].parents[1]
+    while first and package in files[first - 1].parents:  # the script itself may run in a function of gsplat, `cli`
+        first -= 1
+    module = files[first].relative_to(package.parent).with_suffix("").parts
+    return ".".join((*module, frames[first].name))
 
 
 def is_stand_in(thing: Any) -> bool:

@@ -14,11 +14,10 @@ def test_a_function_of_gsplat_without_a_stand_in_is_named(tmp_path):
 
     define(package / "cuda" / "_wrapper.py", "def project():\n    raise ImportError('gsplat_cuda.so: cannot open')\n")
     define(package / "rendering.py", "def rasterization_2dgs():\n    project()\n")
-    define(package.parent / "examples" / "simple_trainer_2dgs.py", "def train():\n    rasterization_2dgs()\n")
+    define(package.parent / "examples" / "simple_trainer_2dgs.py", "def main():\n    rasterization_2dgs()\n")
+    define(package / "distributed.py", "def cli(function):\n    function()\n")
     try:
-        here["train"]()
+        here["cli"](here["main"])
     except ImportError as error:
         hint = stand_in_hint(error)
-    assert hint is not None and hint.startswith(
-        "The script calls gsplat's rasterization_2dgs(), for which --cpu has no"
-    )
+    assert hint is not None and hint.startswith("The script calls gsplat.rendering.rasterization_2dgs(), for which")
