@@ -141,6 +141,19 @@ def test_a_runner_under_another_name_is_a_mismatch(gsplat_module):
         gsplat_module.cli(print, None)
 
 
+def test_a_loop_that_goes_on_after_the_configured_end_is_refused_with_a_share():
+    """As in a fork that sparsifies after `max_steps`: its steps would have shrunk to zero by then."""
+    runner = Runner(DefaultStrategy())
+    new_log()
+    sentence = "Iterations up to 69 come after a plan that ends with 59"
+    with pytest.raises(SkipGSError, match=sentence), SkipGate(runner, refine_share=0.4):
+        runner.train(last=69)
+    new_log()
+    with SkipGate(runner, **RULE) as gate:  # the paper's gate has no plan
+        runner.train(last=69)
+    assert gate.report()["iterations"] == 70
+
+
 def test_script_that_spawns_processes_is_refused(gsplat_module):
     gsplat_module.devices = 4
     sentence = "starts 4 processes, which the gate cannot reach"

@@ -100,11 +100,12 @@ class LoopRange:
 
 
 def require_planned(numbers: range, last: int) -> None:
-    """Raise SkipGSError if a loop continues after the iteration at which steps have shrunk to zero."""
+    """Raise SkipGSError if a loop continues after the last iteration that is known, at which steps shrink to zero."""
     if numbers and numbers[-1] > last:
         sentence = f"Iterations up to {numbers[-1]} come after a plan that ends with {last}"
         raise SkipGSError(
-            f"{sentence}; give gate.iterations() all iterations of the run at once.", in_script=f"{sentence}."
+            f"{sentence}; give gate.iterations() all iterations of the run at once.",
+            in_script=f"{sentence}; use the gate without share and refine_share.",
         )
 
 

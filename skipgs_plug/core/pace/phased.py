@@ -241,7 +241,7 @@ class Phased(Pace):
         self._planned = loop
 
     def _require_planned(self, numbers: range) -> None:
-        if self.refining.begun and self._facts.last is not None:
+        if self._facts.last is not None:  # told by the adapter, or by the first loop of refinement
             require_planned(numbers, self._facts.last)
 
     def _require_events(self) -> None:
