@@ -22,7 +22,7 @@ from skipgs_plug.adapters import registry
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.half_size_cameras import HalfSizeCameras
 from skipgs_plug.adapters.import_hook import when_imported
-from skipgs_plug.adapters.loop_bounds import last_calls
+from skipgs_plug.adapters.loop_bounds import read_loops
 from skipgs_plug.adapters.loop_code import LOOP, OPTIONS, LoopCode, names_around, namespace_of
 from skipgs_plug.adapters.unknown_forks import (
     BY_HAND,
@@ -40,8 +40,8 @@ from skipgs_plug.core.source.functions import undecorated
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 from skipgs_plug.core.views import view_key
 
-# Modules of a checkout. The script imports them.
-RENDERER, MODEL = "gaussian_renderer", "scene.gaussian_model"
+RENDERER, MODEL = "gaussian_renderer", "scene.gaussian_model"  # modules of a checkout, which the script imports
+UNTIL, FIRST = "densify_until_iter", 1  # option that ends densification, and number of the first iteration
 RESETS = ("opacity_reset_interval",)  # option that the condition of opacity resets names
 # Effect of `share` on trainers that accumulate gradients after densification; see `Phased`.
 GROWS_WHOLE = "If steps accumulate gradients after densification, it runs whole."
@@ -88,6 +88,7 @@ class InriaFamily(AbstractAdapter):
         self._model_class: type = object
         self.known_names: dict[str, Any] = {}
         self._unknown = Unrecognised(*5 * (frozenset(),))
+        self._densifies = True  # False if options keep the loop from densification, as LangSplat's
         self._cameras: HalfSizeCameras | None = None  # None if they cannot be shown at half their size
 
     @classmethod
@@ -149,7 +150,7 @@ class InriaFamily(AbstractAdapter):
             opt: The run's optimization options.
             loop: All names of `training` when its first iteration begins. Do not keep it.
         """
-        return int(opt.densify_until_iter)
+        return int(getattr(opt, UNTIL)) if self._densifies else FIRST
 
     def settled_iter(self, opt: Any, loop: Mapping[str, Any]) -> int | None:
         """Return the first iteration after the last known prune; None without one. Arguments as for `start_iter`."""
@@ -157,7 +158,7 @@ class InriaFamily(AbstractAdapter):
 
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
         """Return the first iteration whose gradients only the optimizers read. Arguments as for `start_iter`."""
-        return int(opt.densify_until_iter)
+        return int(getattr(opt, UNTIL)) if self._densifies else FIRST
 
     def steps_each(self, opt: Any, loop: Mapping[str, Any]) -> bool:
         """Whether optimizers would accumulate, but step in each iteration that runs; see `TrainerInfo.steps_each`."""
@@ -327,11 +328,12 @@ class InriaFamily(AbstractAdapter):
             )
             self._label = "uid"
         self.begin(opt, loop)
+        ends = self._ends_of_calls(loop)
         known = None if self._unknown.listed or not self.shows_half_size else self._code
         self._cameras = HalfSizeCameras.of(hooks, cameras, known, self.renders)
         hooks.ready(
             TrainerInfo(
-                self._start_after_changes(opt, loop),
+                begin_after(self.start_iter(opt, loop), opt.iterations, ends),
                 settled_iter=self.settled_iter(opt, loop),
                 view_names=[view_key(key) for key in self.view_keys(cameras)],
                 max_steps=opt.iterations,
@@ -343,15 +345,17 @@ class InriaFamily(AbstractAdapter):
             )
         )
 
-    def _start_after_changes(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        """Return `start_iter`, or the end of the calls that this adapter does not know, if that is later."""
-        start = self.start_iter(opt, loop)
+    def _ends_of_calls(self, loop: Mapping[str, Any]) -> dict[str, int]:
+        """Return the first iterations after calls that change the model, and learn whether the loop densifies."""
         if self._code is None or self._code.syntax is None:
-            return start
-        awaited = self._unknown.calls.union(self.structural, self.changes).difference(self.pausing)
-        parts = [part for part in (self._model_class, undecorated(loop.get(LOOP))) if part is not None]
-        ends = last_calls(self._code.syntax, self._code.number, awaited, loop, parts, stops=self._known_calls())
-        return begin_after(start, opt.iterations, ends)
+            return {}
+        parts = (self._model_class, undecorated(loop.get(LOOP)))
+        awaited = self._unknown.calls.union(self.structural, self.changes)
+        found = read_loops(self._code.syntax, self._code.number, loop, parts, awaited | self._known_calls())
+        adds = self._unknown.calls.union(self.changes) & found.ends.keys()
+        self._densifies = UNTIL in found.asked or UNTIL not in found.passed_over or bool(adds)
+        awaited -= set(self.pausing)
+        return {name: end for name, end in found.ends.items() if end is not None and name in awaited}
 
     def _known_calls(self) -> frozenset[str]:
         """Return the names of calls that the adapter knows."""
@@ -386,10 +390,8 @@ class Inria(InriaFamily):
         return f"{code.source} is a fork of Inria 3DGS that no adapter knows"
 
     def examine(self, code: LoopCode, renderers: Sequence[Callable[..., Any]], model: type) -> None:
-        if "densify_until_iter" not in code.used:
-            raise AdapterMismatchError(
-                f"{self.difference(code)}: its loop never asks for densify_until_iter. {BY_HAND}"
-            )
+        if UNTIL not in code.used:
+            raise AdapterMismatchError(f"{self.difference(code)}: its loop never asks for {UNTIL}. {BY_HAND}")
         super().examine(code, renderers, model)
 
     @classmethod
