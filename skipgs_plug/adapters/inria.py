@@ -29,6 +29,7 @@ from skipgs_plug.adapters.unknown_forks import (
     CALLS,
     Unrecognised,
     begin_after,
+    changing,
     left_alone,
     refuse_loop_elsewhere,
     unrecognised,
@@ -43,8 +44,7 @@ from skipgs_plug.core.views import view_key
 RENDERER, MODEL = "gaussian_renderer", "scene.gaussian_model"  # modules of a checkout, which the script imports
 UNTIL, FIRST = "densify_until_iter", 1  # option that ends densification, and number of the first iteration
 RESETS = ("opacity_reset_interval",)  # option that the condition of opacity resets names
-# Effect of `share` on trainers that accumulate gradients after densification; see `Phased`.
-GROWS_WHOLE = "If steps accumulate gradients after densification, it runs whole."
+GROWS_WHOLE = "If steps accumulate gradients after densification, it runs whole."  # with `share`; see `Phased`
 
 
 class InriaFamily(AbstractAdapter):
@@ -352,7 +352,7 @@ class InriaFamily(AbstractAdapter):
         parts = (self._model_class, undecorated(loop.get(LOOP)))
         awaited = self._unknown.calls.union(self.structural, self.changes)
         found = read_loops(self._code.syntax, self._code.number, loop, parts, awaited | self._known_calls())
-        adds = self._unknown.calls.union(self.changes) & found.ends.keys()
+        adds = changing(self._unknown.calls).union(self.changes) & found.ends.keys()
         self._densifies = UNTIL in found.asked or UNTIL not in found.passed_over or bool(adds)
         awaited -= set(self.pausing)
         return {name: end for name, end in found.ends.items() if end is not None and name in awaited}
