@@ -72,7 +72,7 @@ class TrainingLoop:
         self._target = target = statement.target.id
         Plain(code).visit_all(statement.body)
         Stored(lambda place: value_of(place, self._names, ())).visit_all(statement.body)
-        own = assignments_in(statement.body)
+        own = assignments_in(statement.body).possible(self._names)
         self._counters = {*counters(statement.body, self._names, own.assigned, Project(code, self._names))}
         functions = InlinedFunctions(
             statement.body,
@@ -83,7 +83,7 @@ class TrainingLoop:
             set(own.assigned).difference(known),
             pure | PURE,
         )
-        inlined = assignments_in(functions)
+        inlined = assignments_in(functions).possible(self._names)
         by_loop = own.changed.difference(known)
         changing = by_loop.union(functions.unknown, inlined.changed).difference(known)
         no_options = changing.union({target}, own.options, inlined.options)
