@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import torch
 
 from skipgs_plug.adapters import registry
-from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.half_size_cameras import HalfSizeCameras
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import read_loops
@@ -267,6 +267,8 @@ class InriaFamily(AbstractAdapter):
 
     def _attach_to_loop(self, hooks: Hooks, script: dict[str, Any], code: LoopCode) -> None:
         """Attach to the loop's backward and to its range."""
+        if not code.counts_with_range:
+            gate_backwards_only(hooks, self)
         hooks.gate_tensor_backward(*code.callers)
         hooks.loop(
             script,
@@ -315,13 +317,11 @@ class InriaFamily(AbstractAdapter):
         number = "iteration" if self._code is None else self._code.number
         missing = [name for name in (OPTIONS, number) if name not in loop]
         if scene is None or missing:
-            wanted = ", ".join(missing or self.scenes)
-            raise self.mismatch(f"{wanted} among the variables of {LOOP}()")
+            raise self.mismatch(f"{', '.join(missing or self.scenes)} among the variables of {LOOP}()")
         opt, self._step = loop[OPTIONS], int(loop[number])
         self.output_folder = getattr(scene, "model_path", None)
         cameras = scene.getTrainCameras()
-        names = [camera.image_name for camera in cameras]
-        if len(set(names)) < len(names):
+        if len({camera.image_name for camera in cameras}) < len(cameras):
             caution(
                 "Several training images have the same name; the gate tells views apart by their position, "
                 "which stays the same in a resumed run only with the same seed."
