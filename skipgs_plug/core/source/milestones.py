@@ -73,7 +73,7 @@ class TrainingLoop:
         Plain(code).visit_all(statement.body)
         Stored(lambda place: value_of(place, self._names, ())).visit_all(statement.body)
         own = assignments_in(statement.body).possible(self._names)
-        self._counters = {*counters(statement.body, self._names, own.assigned, Project(code, self._names))}
+        self._counters, self._set_back = counters(statement.body, self._names, own.assigned, Project(code, self._names))
         functions = InlinedFunctions(
             statement.body,
             code,
@@ -158,10 +158,8 @@ class TrainingLoop:
                 value = eval(compile(ast.Expression(node), "<list>", "eval"), dict(self._names))
             except Exception:
                 continue
-            if _is_list(value):
-                hits = {int(entry) for entry in value if entry in numbers}
-                if hits:
-                    found[f"line {_line(node, self._code)}: {ast.unparse(node)}"] = hits
+            if _is_list(value) and (hits := {int(entry) for entry in value if entry in numbers}):
+                found[f"line {_line(node, self._code)}: {ast.unparse(node)}"] = hits
         return found
 
     def bar_moves(self, numbers: range) -> list[Moves]:
@@ -216,7 +214,8 @@ class TrainingLoop:
     def _counted_by_itself(self) -> Iterator[Condition]:
         """Yield all conditions on a counter of the loop's own, which does not count left-out iterations."""
         for condition in self._all:
-            if any(self._evaluator.is_off(guard) for guard in condition.guards):
+            sets_back = condition.function is None and position(condition.test) in self._set_back
+            if sets_back or any(self._evaluator.is_off(guard) for guard in condition.guards):
                 continue
             for leaf in leaves(condition.test):
                 picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and is_point(leaf)
