@@ -372,12 +372,12 @@ class Inria(InriaFamily):
     name = "inria"
     checked = "graphdeco-inria/gaussian-splatting 8a70a8cd and 54c035f (their scripts, run on the CPU)"
     project = "[Inria 3DGS](https://github.com/graphdeco-inria/gaussian-splatting)"
-    gated = "From `densify_until_iter` on: that iteration does not densify any more."
+    gated = "From `densify_until_iter` on, or from the beginning if options keep the loop from densification."
     left_alone = (
         "The optimizers of Gaussians (sparse Adam too) and exposure have no gradients in skipped iterations. "
-        "Renders of the viewer and of evaluations do not count as training. If two images have the same name in "
-        "different folders (older versions keep the name only), the gate warns and tells views apart by their "
-        "position. A fork that no adapter knows is refused if its loop changes tensors in place."
+        "If two images have the same name in different folders (older versions keep the name only), the gate warns and "
+        "tells views apart by their position. A fork that no adapter knows is refused if its loop changes tensors in "
+        "place, and `share` if the loop counts without `range`."
     )
     stand_ins = "inria"
     shows_half_size = True
