@@ -1,5 +1,6 @@
 """`skipgs-plug run --cpu`: errors of the stand-ins for CUDA modules, and errors of the script's own."""
 
+import importlib.util
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,28 @@ def test_a_feature_that_the_stand_ins_lack_is_one_sentence(error_of, old, new, f
     error = error_of(lambda text: text.replace(old, new))
     assert "The script uses a feature that the stand-ins of --cpu lack (" in error and found in error
     assert "it needs CUDA; run it without --cpu." in error and "Traceback" not in error
+
+
+@pytest.mark.skipif(importlib.util.find_spec("torchvision") is not None, reason="torchvision is installed")
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from torchvision.transforms import GaussianBlur",
+        "from torchvision.models import resnet18",
+        "import torchvision; torchvision.utils.make_grid",
+        "import torchvision.datasets",
+        "from lpips.pretrained_networks import alexnet",
+    ],
+)
+def test_a_part_of_torchvision_that_is_not_served_is_one_sentence(error_of, line):
+    error = error_of(lambda text: f"{line}\n{text}")
+    assert "it needs torchvision; install the version" in error and "Traceback" not in error and "CUDA" not in error
+
+
+def test_a_script_that_compiles_an_extension_is_one_sentence(error_of):
+    """As `torch.utils.cpp_extension.load` does in RAIN-GS and Relightable3DGaussian, where there is no CUDA compiler."""
+    error = error_of(lambda text: f"raise OSError('CUDA_HOME environment variable is not set.')\n{text}")
+    assert "The script compiles a CUDA extension of its own" in error and "Traceback" not in error
 
 
 def test_an_option_that_a_stand_in_refuses_is_one_sentence(error_of):
