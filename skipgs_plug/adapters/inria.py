@@ -244,6 +244,8 @@ class InriaFamily(AbstractAdapter):
             self._begins(hooks, args[0], sys._getframe(2))  # frame 2 is the caller's
             return original(*args, **kwargs)
 
+        hooks.awaited.add("GaussianModel")  # a fork may import it and train a class of its own, as GES does
+        hooks.before(model, "__init__", lambda *args, **kwargs: hooks.awaited.discard("GaussianModel"))
         hooks.wrap(model, "update_learning_rate", rate_updated)
         hooks.events(model, *(name for name in self.structural if hasattr(model, name)))
 

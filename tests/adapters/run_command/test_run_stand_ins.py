@@ -81,7 +81,7 @@ def test_a_part_of_torchvision_that_is_not_served_is_one_sentence(error_of, line
 
 
 def test_a_script_that_compiles_an_extension_is_one_sentence(error_of):
-    """As `torch.utils.cpp_extension.load` does in RAIN-GS and Relightable3DGaussian, where there is no CUDA compiler."""
+    """As after `torch.utils.cpp_extension.load`, which RAIN-GS calls, where there is no CUDA compiler."""
     error = error_of(lambda text: f"raise OSError('CUDA_HOME environment variable is not set.')\n{text}")
     assert "The script compiles a CUDA extension of its own" in error and "Traceback" not in error
 
