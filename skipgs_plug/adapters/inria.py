@@ -22,7 +22,7 @@ from skipgs_plug.adapters import registry
 from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.half_size_cameras import HalfSizeCameras
 from skipgs_plug.adapters.import_hook import when_imported
-from skipgs_plug.adapters.loop_bounds import read_loops
+from skipgs_plug.adapters.loop_bounds import READS_GRADIENT, SETS_END, read_loops
 from skipgs_plug.adapters.loop_code import LOOP, OPTIONS, LoopCode, names_around, namespace_of
 from skipgs_plug.adapters.unknown_forks import (
     BY_HAND,
@@ -30,8 +30,8 @@ from skipgs_plug.adapters.unknown_forks import (
     Unrecognised,
     begin_after,
     changing,
-    left_alone,
     refuse_loop_elsewhere,
+    refuse_loop_without_end,
     unrecognised,
 )
 from skipgs_plug.core.caution import caution
@@ -57,6 +57,7 @@ class InriaFamily(AbstractAdapter):
         scenes: Possible names of the loop's variable for its Scene.
         changes: Further methods that change the model. The gate begins after the last call of these and `structural`.
         pausing: Methods in `changes` that the trainer also calls after the gate has begun. Each call pauses the gate.
+        uses: Uses of attributes that put the gate's start off or refuse it; see `loop_bounds`.
         calls: Further names that the adapter knows beyond those of Inria's loop: methods of the model, functions that
             draw noise, methods that change a tensor in place.
         arguments: Arguments of the renderer that the adapter knows, beyond those of Inria's.
@@ -72,6 +73,7 @@ class InriaFamily(AbstractAdapter):
     scenes: ClassVar[tuple[str, ...]] = ("scene",)
     changes: ClassVar[tuple[str, ...]] = ("densify_and_prune",)
     pausing: ClassVar[tuple[str, ...]] = ()
+    uses: ClassVar[tuple[str, ...]] = ()
     calls: ClassVar[tuple[str, ...]] = ()
     arguments: ClassVar[tuple[str, ...]] = ()
     pure: ClassVar[tuple[str, ...]] = ()
@@ -127,11 +129,7 @@ class InriaFamily(AbstractAdapter):
         self._code, self._model_class = code, model
         self._unknown = unrecognised(code, renderers, model, self._known_calls(), self.arguments)
         self._unknown.refuse(self.difference(code))
-        if self._unknown.listed:
-            caution(
-                f"{self.difference(code)}. Recognised: {', '.join(self.renders[:1])}, backward, "
-                f"{', '.join(sorted(self._unknown.known))}. {left_alone(self._unknown.listed)}"
-            )
+        self._unknown.tell(self.difference(code), self.renders[0])
 
     def difference(self, code: LoopCode) -> str:
         """Return the beginning of a sentence about a script that does more than this adapter knows."""
@@ -352,12 +350,12 @@ class InriaFamily(AbstractAdapter):
         if self._code is None or self._code.syntax is None:
             return {}
         parts = (self._model_class, undecorated(loop.get(LOOP)))
-        awaited = self._unknown.calls.union(self.structural, self.changes)
+        awaited = self._unknown.calls.union(self.structural, self.changes, self.uses)
         found = read_loops(self._code.syntax, self._code.number, loop, parts, awaited | self._known_calls())
         adds = changing(self._unknown.calls).union(self.changes) & found.ends.keys()
         self._densifies = UNTIL in found.asked or UNTIL not in found.passed_over or bool(adds)
-        awaited -= set(self.pausing)
-        return {name: end for name, end in found.ends.items() if end is not None and name in awaited}
+        refuse_loop_without_end(found.ends if self.uses else {}, loop[OPTIONS].iterations, self.difference(self._code))
+        return {name: end for name, end in found.ends.items() if end is not None and name in awaited - {*self.pausing}}
 
     def _known_calls(self) -> frozenset[str]:
         """Return the names of calls that the adapter knows."""
@@ -367,8 +365,7 @@ class InriaFamily(AbstractAdapter):
 class Inria(InriaFamily):
     """graphdeco-inria/gaussian-splatting: densification ends before `densify_until_iter`.
 
-    It is tried last, so it also takes unknown forks. A fork whose loop writes into tensors is refused. A fork that uses
-    more methods of its model, or more arguments of its renderer, is gated with a warning.
+    It is tried last, so it also takes unknown forks. What it does not know in them is refused, or warned of.
     """
 
     name = "inria"
@@ -383,6 +380,7 @@ class Inria(InriaFamily):
     )
     stand_ins = "inria"
     shows_half_size = True
+    uses = (READS_GRADIENT, SETS_END)
 
     @classmethod
     def recognises(cls, names: Container[str]) -> bool:

@@ -40,7 +40,14 @@ from skipgs_plug.core.source.functions import (
 )
 from skipgs_plug.core.source.substitution import returned
 
-ASSIGNED = "data ="  # represents an assignment to a tensor's `data` among the names of calls
+# They represent uses of attributes among the names of calls: assignments to a tensor's `data` and to the option that
+# ends densification, and reads of a tensor's gradient by code that does not expect that there may be none.
+ASSIGNED, SETS_END, READS_GRADIENT = "data =", "densify_until_iter =", ".grad"
+_USES = {
+    ("data", ast.Store): ASSIGNED,
+    ("densify_until_iter", ast.Store): SETS_END,
+    ("grad", ast.Load): READS_GRADIENT,
+}
 # Largest depth of nested calls that are read. A trainer's loop reaches its strategy in three; deeper calls reach
 # libraries.
 MAX_DEPTH = 5
@@ -84,6 +91,7 @@ class CallReader:
         self.trainer = TrainerCode()
         self._stops, self._windows = frozenset(stops), frozenset(windows)
         self._open: list[CodeType] = []  # code of the functions that are being read, outermost first
+        self._expects_none = False  # whether a function that is being read compares a gradient with None
 
     def read(self, function: Any, numbers: Collection[str], values: Mapping[str, Any], end: int | None = None) -> None:
         """Read a function or a bound method.
@@ -99,9 +107,12 @@ class CallReader:
         syntax = None if plain is None else syntax_of(plain)
         if plain is None or syntax is None or plain.__code__ in self._open or len(self._open) == MAX_DEPTH:
             return
+        outer = self._expects_none
+        self._expects_none = outer or _expects_none(syntax)
         self._open.append(plain.__code__)
         self._body(syntax.body, self._scope(function, plain, syntax, numbers, values), end)
         self._open.pop()
+        self._expects_none = outer
 
     @staticmethod
     def _scope(
@@ -116,7 +127,7 @@ class CallReader:
 
     def read_loops(self, function: ast.FunctionDef, scope: Scope) -> None:
         """Read the loops of a function, or all of it if it has none."""
-        scope = scope_inside(function, scope)
+        scope, self._expects_none = scope_inside(function, scope), _expects_none(function)
         for body in [loop.body for loop in outermost_loops(function)] or [function.body]:
             self._body(body, scope, None)
 
@@ -169,8 +180,9 @@ class CallReader:
             self._calls(part.body, scope, _sooner(end, self._end(part.test, scope)))
             self._calls(part.orelse, scope, _sooner(end, self._end(part.test, scope, holds=False)))
             return
-        if isinstance(part, ast.Attribute) and part.attr == "data" and isinstance(part.ctx, ast.Store):
-            self.note(ASSIGNED, end)
+        if isinstance(part, ast.Attribute) and (use := _USES.get((part.attr, type(part.ctx)))) is not None:
+            if use != READS_GRADIENT or not self._expects_none:
+                self.note(use, end)
         elif isinstance(part, ast.Call):
             name = getattr(part.func, "attr", getattr(part.func, "id", None))
             if name is not None:
@@ -318,6 +330,16 @@ def _ask(part: ast.AST, into: set[str], but: Collection[int] = ()) -> None:
         match node:
             case ast.Attribute(attr=str(name)) | ast.Constant(str(name)) if id(node) not in but:
                 into.add(name)
+
+
+def _expects_none(function: ast.FunctionDef) -> bool:
+    """Whether a function asks somewhere whether there is a gradient."""
+    compared = [[node.left, *node.comparators] for node in ast.walk(function) if isinstance(node, ast.Compare)]
+    return any(
+        any(isinstance(side, ast.Attribute) and side.attr == "grad" for side in sides)
+        and any(isinstance(side, ast.Constant) and side.value is None for side in sides)
+        for sides in compared
+    )
 
 
 def _sooner(one: int | None, other: int | None) -> int | None:

@@ -321,6 +321,45 @@ def test_gate_begins_after_the_last_call_that_is_not_recognised(extra, start, fr
     assert gate.config.start_iter == start and gate.report()["backwards_skipped"] == 41 - start
 
 
+REPORT = """
+def report(model):
+    log.norm = model.values["xyz"].grad.data.norm()
+"""
+
+
+@pytest.mark.parametrize("settings", [{}, {"share": 0.5}])
+@pytest.mark.parametrize(
+    "extra", ["report(gaussians)", "if opt.logs and iteration % 2: log.last = gaussians.values['xyz'].grad.norm()"]
+)
+def test_a_loop_that_reads_gradients_until_its_end_is_refused(extra, settings, from_file):
+    """GES logs norms of gradients. A skipped iteration would end its run, such as the last one, before it saves."""
+    module = from_file(extra=extra, helper=REPORT)
+    with (
+        pytest.raises(AdapterMismatchError, match=r"its loop reads gradients \(grad\) until its end"),
+        SkipGate(module, **settings),
+    ):
+        train(module, logs=True)
+    assert not log.backwards
+
+
+@pytest.mark.parametrize(
+    ("extra", "start"),
+    [
+        ("if opt.logs: report(gaussians)", 20),
+        ("if gaussians.values['xyz'].grad is not None: report(gaussians)", 20),
+        ("if iteration < opt.prune_until_iter: log.last = gaussians.values['xyz'].grad", 30),
+    ],
+)
+def test_a_loop_that_reads_no_gradient_of_a_skipped_iteration_is_gated(extra, start, from_file):
+    with SkipGate(from_file(extra=extra, helper=REPORT), policy=SkipAlways()) as gate:
+        if start > 20:
+            with pytest.warns(RuntimeWarning, match="the loop calls for the grad of a tensor until iteration 29"):
+                train(gate.adapter.trainer, logs=False)
+        else:
+            train(gate.adapter.trainer, logs=False)
+    assert gate.config.start_iter == start and gate.report()["backwards_skipped"] == 41 - start
+
+
 def test_later_prunes_of_a_fork_put_the_start_off_too(from_file):
     extra = "if iteration <= opt.prune_until_iter: gaussians.prune_points(torch.zeros(30, dtype=torch.bool))"
     sentence = r"the loop calls prune_points\(\) until iteration 30"
