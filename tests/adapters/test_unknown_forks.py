@@ -342,6 +342,20 @@ def test_a_loop_that_reads_gradients_until_its_end_is_refused(extra, settings, f
     assert not log.backwards
 
 
+@pytest.mark.parametrize("settings", [{}, {"refine_share": 0.5}])
+def test_a_loop_that_puts_the_end_of_densification_off_is_refused(settings, from_file):
+    """Binocular3DGS densifies until the end if its opacities decay."""
+    module = from_file(extra="if opt.logs and iteration > 10: opt.densify_until_iter = opt.iterations")
+    with (
+        pytest.raises(AdapterMismatchError, match="its loop itself sets densify_until_iter"),
+        SkipGate(module, **settings),
+    ):
+        train(module, logs=True)
+    assert not log.backwards
+    with SkipGate(module, **settings):
+        train(module, logs=False)
+
+
 @pytest.mark.parametrize(
     ("extra", "start"),
     [
