@@ -20,6 +20,7 @@ from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.messages import say
 from skipgs_plug.scripts.import_hints import install_hint
 from skipgs_plug.scripts.stand_in_hints import stand_in_hint
+from skipgs_plug.scripts.wrappers import wrapper_hint
 
 Attach = Callable[[], dict[str, Any]]  # see `run_script`
 
@@ -112,6 +113,8 @@ def _resolve(command: Sequence[str]) -> _Program:
             raise SkipGSError(f"There is no module {name}: install it, or name a training script after '--'.")
         run = functools.partial(_run_module, name)
         return _Program([str(source), *arguments], Path.cwd(), source, run)
+    if (instead := wrapper_hint(name)) is not None:
+        raise SkipGSError(instead)
     script = Path(name).resolve()
     if script.is_file():
         _refuse_shadowed_modules(script.parent)

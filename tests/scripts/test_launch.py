@@ -171,6 +171,11 @@ def test_an_installed_command_fails_as_itself(installed, capfd):
         ([], "no script to run"),
         (["-m"], "no script to run"),
         (["-m", "absent_module.train"], "no module absent_module"),
+        (["python", "train.py"], "Leave out python: write after '--' what follows it"),
+        (["/usr/bin/python3.11", "-u", "train.py"], "Leave out /usr/bin/python3.11: write"),
+        (["bash", "run.sh"], "bash is not Python: write skipgs-plug run ADAPTER -- in place of python"),
+        (["scripts/run.sh"], "scripts/run.sh is not Python"),
+        (["torchrun", "--nproc_per_node", "2", "train.py"], "torchrun ... -m skipgs_plug run ADAPTER -- train.py"),
     ],
 )
 def test_nothing_to_run_is_said(command, message):
