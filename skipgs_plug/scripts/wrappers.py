@@ -17,7 +17,7 @@ def wrapper_hint(name: str) -> str | None:
         return f"Leave out {name}: write after '--' what follows it, for example -- train.py -s data."
     if word.name in SHELLS or word.suffix == ".sh":
         return (
-            f"{name} is not Python: write skipgs-plug run ADAPTER -- in place of python before train.py, inside the shell "
+            f"{name} is not Python: write skipgs-plug run ADAPTER -- in place of python before train.py, in the shell "
             "script."
         )
     if word.name in LAUNCHERS:
