@@ -103,6 +103,12 @@ def test_an_error_of_the_scripts_own_keeps_its_traceback(error_of, line):
     assert "Traceback" in error and "stand-ins of --cpu" not in error
 
 
+def test_a_traceback_shows_the_scripts_functions_and_not_what_the_gate_wraps_around_them(error_of):
+    error = error_of(lambda text: text.replace("return {", "raise KeyError('inv_covar'); return {"))
+    assert "in training" in error and "in render" in error and "KeyError: 'inv_covar'" in error
+    assert "skipgs_plug/" not in error
+
+
 def test_no_advice_to_give_an_option_that_is_given(error_of):
     error = error_of(lambda text: f"import diff_plane_rasterization\n{text}")
     assert "diff_plane_rasterization is a CUDA extension for which this adapter has no CPU stand-in" in error
