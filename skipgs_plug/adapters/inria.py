@@ -376,7 +376,7 @@ class Inria(InriaFamily):
         "The optimizers of Gaussians (sparse Adam too) and exposure have no gradients in skipped iterations. "
         "If two images have the same name in different folders (older versions keep the name only), the gate warns and "
         "tells views apart by their position. A fork that no adapter knows is refused if its loop changes tensors in "
-        "place or reads gradients, and `share` if the loop counts without `range`."
+        "place, and `share` if the loop counts without `range`."
     )
     stand_ins = "inria"
     shows_half_size = True
