@@ -6,7 +6,7 @@ import ast
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from skipgs_plug.core.source.inlining import PLACES
+from skipgs_plug.core.source.names import PLACES
 from skipgs_plug.core.source.run_options import comprehended, text_of
 
 # Methods that change lists, sets and queues, so that an object can differ from iteration to iteration.

@@ -5,8 +5,7 @@ from __future__ import annotations
 import ast
 import dis
 import inspect
-import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
@@ -22,22 +21,19 @@ from skipgs_plug.core.source.functions import (
     value_of,
     without_partial,
 )
+from skipgs_plug.core.source.names import PLACES, bound_in, holders_of, reached_in
 from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.rewriting import Managed, Plain, Renamed, Repeated, Stored
 from skipgs_plug.core.source.run_options import assigned_globals, comprehended, text_of
 
 # Largest depth of nested calls that are read: a loop calls its trainer, which calls a logger, which opens a file.
 MAX_DEPTH = 3
-PLACES = (ast.Name, ast.Attribute, ast.Subscript)  # syntax that holds a value, and that an assignment may have
 # Syntax that changes nothing and may be evaluated several times.
 _READS = (
     *(*PLACES, ast.BinOp, ast.BoolOp, ast.Compare, ast.Constant, ast.List, ast.Tuple, ast.UnaryOp),
     *(ast.FormattedValue, ast.JoinedStr, ast.keyword),
     *(ast.boolop, ast.cmpop, ast.expr_context, ast.operator, ast.unaryop),
 )
-_DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
-# Further syntax that gives a name to a value; names that are assigned are `ast.Name`.
-_BINDS_NAME = (*_DEFINITIONS, ast.ExceptHandler, ast.MatchAs, ast.MatchStar)
 _ABSENT = object()
 
 
@@ -115,7 +111,7 @@ class InlinedFunctions:
             body: The statements.
             numbers: Names and attributes that hold the number, or a value that is computed from it.
         """
-        nodes = [node for statement in body for node in _reached(statement)]
+        nodes = [node for statement in body for node in reached_in(statement)]
         for node in nodes:
             for target, value in assigned_values(node):
                 if isinstance(target, PLACES):
@@ -123,7 +119,7 @@ class InlinedFunctions:
                     held = self.held_in(text_of(target), value)
                     numbers |= self._numbers_in(held, numbers)
                     self._note_new(held)
-        holders = _holders(numbers)
+        holders = holders_of(numbers)
         for node in nodes:
             call, function = self._called(node, numbers, holders)
             plain = undecorated(function)
@@ -138,8 +134,8 @@ class InlinedFunctions:
                     kept = self._follow(read.body, numbers | self._numbers_in(read.held, numbers))
                     self._open.pop()
                     own = self.unknown - before
-                    new = {text for text in kept - numbers if own.isdisjoint({text, *_holders([text])})}
-                    numbers, holders = numbers | new, holders | _holders(new)
+                    new = {text for text in kept - numbers if own.isdisjoint({text, *holders_of([text])})}
+                    numbers, holders = numbers | new, holders | holders_of(new)
         return numbers
 
     def held_in(self, name: str, value: ast.expr) -> dict[str, ast.expr]:
@@ -291,7 +287,7 @@ class InlinedFunctions:
         times = sum(one.code.co_name == syntax.name for one in self.by_call.values())
         prefix = f"{syntax.name}{times + 1}" if times else syntax.name  # each call has local variables of its own
         given, defaults = self._given(call, function, plain, prefix)
-        bound = _bound(syntax)
+        bound = bound_in(syntax)
         own = bound.union(inspect.signature(plain).parameters)
         inner = {node.id for node in comprehended(ast.walk(syntax))}
         found: dict[str, ast.expr] = {}
@@ -355,34 +351,3 @@ class InlinedFunctions:
     def _named(self, name: str, value: Any) -> ast.expr:
         self._names[name] = value
         return ast.Name(name, ast.Load())
-
-
-def _holders(places: Iterable[str]) -> set[str]:
-    """Return the names and places whose attributes or entries these are, as source text."""
-    return {text[: end.start()] for text in places for end in re.finditer(r"[.[]", text)}
-
-
-def _bound(syntax: ast.FunctionDef) -> set[str]:
-    """Return the names that a function gives to values of its own."""
-    found: set[str | None] = set()
-    shared: set[str] = set()
-    inner = set(map(id, comprehended(ast.walk(syntax))))
-    for node in ast.walk(syntax):
-        if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load) and id(node) not in inner:
-            found.add(node.id)
-        elif isinstance(node, _BINDS_NAME) and node is not syntax:
-            found.add(node.name)
-        elif isinstance(node, (ast.Import, ast.ImportFrom)):
-            found |= {one.asname or one.name.partition(".")[0] for one in node.names}
-        elif isinstance(node, (ast.Global, ast.Nonlocal)):
-            shared |= set(node.names)
-    return {name for name in found if name is not None} - shared
-
-
-def _reached(node: ast.AST) -> Iterator[ast.AST]:
-    """Iterate over a statement, without the functions and classes that it defines."""
-    if isinstance(node, _DEFINITIONS):
-        return
-    yield node
-    for child in ast.iter_child_nodes(node):
-        yield from _reached(child)

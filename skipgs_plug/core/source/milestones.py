@@ -8,8 +8,6 @@ the number, and evaluates them ahead of time. It does not change the source.
 from __future__ import annotations
 
 import ast
-import inspect
-import textwrap
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from numbers import Integral
@@ -34,15 +32,13 @@ from skipgs_plug.core.source.counters import counters
 from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator, places_in
 from skipgs_plug.core.source.functions import value_of
 from skipgs_plug.core.source.inlining import InlinedFunction, InlinedFunctions
-from skipgs_plug.core.source.lines import GATED_LOOP, head_of
+from skipgs_plug.core.source.lines import line_in_file
 from skipgs_plug.core.source.progress_bars import Moves, moves, outermost_bar_ifs
 from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.rewriting import Plain, Stored
 from skipgs_plug.core.source.run_options import PURE, RunOptions, root_of
 from skipgs_plug.core.source.substitution import Substitution
 
-# Functions that take all numbers from a range at once, before any iteration has run.
-GATHERING = frozenset({"list", "set", "sorted", "tuple"})
 BY_ALWAYS = "name the iterations that must run (--always, always=)"
 
 
@@ -161,7 +157,7 @@ class TrainingLoop:
             if _is_list(value):
                 hits = {int(entry) for entry in value if entry in numbers}
                 if hits:
-                    found[f"line {_line(node, self._code)}: {ast.unparse(node)}"] = hits
+                    found[f"line {line_in_file(node, self._code)}: {ast.unparse(node)}"] = hits
         return found
 
     def bar_moves(self, numbers: range) -> list[Moves]:
@@ -190,7 +186,7 @@ class TrainingLoop:
             return None, False
         hits = _rarer(self._evaluator_of_loop, condition, numbers)
         if hits is None and not others_named:
-            text, line = ast.unparse(condition.test), _line(condition.test, self._code)
+            text, line = ast.unparse(condition.test), line_in_file(condition.test, self._code)
             raise SkipGSError(
                 f"Line {line} of {self._code.co_filename} has a condition on the iteration's number that cannot be "
                 f"evaluated ahead ({text}), so an iteration that it needs could be left out; use the gate without a "
@@ -275,7 +271,7 @@ class TrainingLoop:
     def _where(self, condition: Condition) -> str:
         """Return the line of a condition, and its file if that is not the file of the loop."""
         code = self._code_of(condition)
-        line, file = _line(condition.test, code), code.co_filename
+        line, file = line_in_file(condition.test, code), code.co_filename
         return f"line {line}" if file == self._code.co_filename else f"line {line} of {Path(file).name}"
 
     def _code_of(self, condition: Condition) -> CodeType:
@@ -284,7 +280,7 @@ class TrainingLoop:
     def _location(self, condition: Condition) -> str:
         """Return the number of the line, the file and the text of a condition, as warnings show them."""
         code = self._code_of(condition)
-        return f"{_line(condition.test, code)} of {code.co_filename} ({ast.unparse(condition.test)})"
+        return f"{line_in_file(condition.test, code)} of {code.co_filename} ({ast.unparse(condition.test)})"
 
     def _warn_of(self, conditions: Iterable[Condition], sentence: str) -> None:
         """Warn of each condition that no warning has named. The sentence follows "Line ..."."""
@@ -310,87 +306,6 @@ def _rarer(evaluator: Evaluator, condition: Condition, numbers: range) -> set[in
     except DependsOnLoop:
         return None
     return found
-
-
-def _line(node: ast.expr, code: CodeType) -> int:
-    """Return the line of the file in which a part of this code begins."""
-    return node.lineno + (code.co_firstlineno - 1 if code.co_flags & inspect.CO_NEWLOCALS else 0)
-
-
-def read_loop(
-    code: CodeType,
-    line: int,
-    names: Mapping[str, Any],
-    pure: Iterable[str] = (),
-    known: Mapping[str, Any] | None = None,
-) -> TrainingLoop:
-    """Return the loop that asks for its numbers.
-
-    Args:
-        code: Code of the function that holds the loop.
-        line: Present line of the function when the loop asks for a number, which is in the head of its `for`.
-        names: Names and values that the function had before the loop.
-        pure: Names of functions that only read numbers, and may occur in conditions.
-        known: Values of names that the loop assigns, if they are known before the loop.
-
-    Raises:
-        SkipGSError: The source cannot be read, or has no loop.
-    """
-    known = known or {}
-    function = code.co_flags & inspect.CO_NEWLOCALS
-    try:
-        # For the code of a module, getsource returns only the part before its first function.
-        source = inspect.getsource(code) if function else "".join(inspect.findsource(code)[0])
-        tree = ast.parse(textwrap.dedent(source))
-    except (OSError, TypeError, SyntaxError) as error:
-        raise SkipGSError(
-            f"The source of {code.co_name}() in {code.co_filename} cannot be read ({error}), so the gate cannot know "
-            "which iterations must run; gate without share and refine_share, or name them (--always, always=)."
-        ) from error
-    line_in_source = line - (code.co_firstlineno - 1 if function else 0)
-    # The head of a loop inside or around it lies on other lines.
-    heads = (node for node in ast.walk(tree) if isinstance(node, ast.For))
-    loop = next((one for one in heads if one.lineno <= line_in_source <= (one.iter.end_lineno or one.lineno)), None)
-    gathered = loop is not None and _gathers(loop.iter)
-    if loop is not None and isinstance(loop.target, ast.Name) and not gathered:
-        _refuse_to_yield(loop, code)
-        return TrainingLoop(loop, tree, code, {**names, **known}, known, frozenset(pure))
-    fault = "takes all numbers before the first iteration" if gathered else "is not in a loop over one number"
-    found = f"Line {line} of {code.co_filename} {fault}"
-    if loop is not None:
-        found = f"{found} ({head_of(loop)})"
-    elif not line:
-        found = f"{code.co_name}() of {code.co_filename} has ended, and the loop over its iterations is elsewhere"
-    raise SkipGSError(
-        f"{found}; write the loop as: {GATED_LOOP}.",
-        in_script=f"{found}; write the loop as one over range(...) alone, or name the iterations that must run "
-        "(--always).",
-    )
-
-
-def _gathers(numbers: ast.expr) -> bool:
-    """Whether the head of a loop takes all numbers before the first iteration, as `list(gate.iterations(...))` does."""
-    while isinstance(numbers, ast.Call) and isinstance(numbers.func, ast.Name) and numbers.args:
-        if numbers.func.id in GATHERING:
-            return True
-        numbers = numbers.args[0]
-    return False
-
-
-def _refuse_to_yield(loop: ast.For, code: CodeType) -> None:
-    """Raise SkipGSError if a loop yields its number: conditions of the code that receives it are not in the loop."""
-    assert isinstance(loop.target, ast.Name)
-    for node in (part for statement in loop.body for part in ast.walk(statement)):
-        if isinstance(node, ast.Yield) and any(
-            isinstance(part, ast.Name) and part.id == loop.target.id for part in ast.walk(node)
-        ):
-            found = f"Line {_line(node, code)} of {code.co_filename} yields the iteration's number to other code"
-            unread = "whose conditions on it cannot be read"
-            raise SkipGSError(
-                f"{found}, {unread}; loop over gate.iterations(range(...)) there, or name the iterations that must run "
-                "(always=).",
-                in_script=f"{found}, {unread}; name the iterations that must run (--always).",
-            )
 
 
 def _is_list(value: Any) -> bool:
