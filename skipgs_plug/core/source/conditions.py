@@ -44,7 +44,7 @@ def conditions_in(
         function: The function that the statements are of; None for the loop.
     """
     for statement in body:
-        if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+        if isinstance(statement, ast.ClassDef):
             continue
         for call, reached in _calls_of(statement, guards):
             if (inside := functions.get(id(call))) is not None:

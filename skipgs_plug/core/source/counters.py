@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MethodType
 from typing import Any
 
 from skipgs_plug.core.source.assignments import assignments_in
 from skipgs_plug.core.source.conditions import unconditional
+from skipgs_plug.core.source.evaluator import places_in
 from skipgs_plug.core.source.functions import called_function, syntax_of, undecorated, value_of
+from skipgs_plug.core.source.names import counted_by
 from skipgs_plug.core.source.project import Project
 
 
 def counters(
     body: Sequence[ast.stmt], names: Mapping[str, Any], assigned: Collection[str], project: Project
 ) -> Iterator[str]:
-    """Yield the names and attributes to which a loop adds a constant in every iteration, and that it never sets back.
+    """Yield what a loop changes by a constant in every iteration, and never sets back: names, attributes and lengths.
 
     They are those of the loop, and those of objects that the loop calls in every iteration, as in `saver.count()`, or
     in `is_due()` for an object that can be called.
@@ -27,26 +30,54 @@ def counters(
         assigned: Names and attributes that the loop assigns.
         project: The user's project. Methods of libraries are not read.
     """
-    yield from _counted(body)
+    yield from (text for text in _counted(body) if not _is_limited(text, names))
     for called in (part.func for one in unconditional(body) for part in _always_reached(one)):
         found = called_function(called, names, lambda place: value_of(place, names, assigned))
         if isinstance(found, MethodType):
             function = undecorated(found)
             syntax = None if function is None or function not in project else syntax_of(function)
             if syntax is not None and syntax.args.args:
-                own = f"{syntax.args.args[0].arg}."
+                own = rf"(len\()?{syntax.args.args[0].arg}\."
                 owner = ast.unparse(called).removesuffix(f".{syntax.name}")  # an object that is called has no suffix
-                counted = (text for text in _counted(syntax.body) if text.startswith(own))
-                yield from (f"{owner}.{text.removeprefix(own)}" for text in counted)
+                parts = ((re.match(own, text), text) for text in _counted(syntax.body))
+                yield from (f"{found[1] or ''}{owner}.{text[found.end() :]}" for found, text in parts if found)
+
+
+def counts_in(expression: ast.expr) -> set[str]:
+    """Return the names, attributes, entries and lengths that an expression reads, as source text."""
+    parts = (part for part in ast.walk(expression) if isinstance(part, ast.Call))
+    return places_in(expression).union(text for text in map(ast.unparse, parts) if text.startswith("len("))
 
 
 def _counted(body: Sequence[ast.stmt]) -> Iterator[str]:
-    assigned = assignments_in(body).assigned
-    for node in unconditional(body):
-        if isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add) and isinstance(node.value, ast.Constant):
-            text = ast.unparse(node.target)
-            if assigned.count(text) == 1:
-                yield text
+    found, own = assignments_in(body), [*unconditional(body)]
+    for node in own:
+        match node:
+            case ast.AugAssign(target, ast.Add() | ast.Sub(), ast.Constant()):
+                text = ast.unparse(target)
+            case ast.Assign([target], ast.BinOp(before, ast.Add() | ast.Sub(), ast.Constant())):
+                text = ast.unparse(target) if ast.unparse(target) == ast.unparse(before) else ""
+            case _:
+                continue
+        if found.assigned.count(text) == 1:
+            yield text
+    for held in map(_growing, own):
+        if held is not None and held not in found.shrunk.union(found.assigned):
+            yield f"len({held})"
+
+
+def _is_limited(counter: str, names: Mapping[str, Any]) -> bool:
+    """Whether this is the length of a queue that drops its first entry when it is full."""
+    place = ast.parse(counted_by(counter), mode="eval").body
+    return getattr(value_of(place, names, ()), "maxlen", None) is not None
+
+
+def _growing(statement: ast.stmt) -> str | None:
+    """Return the list, queue or set to which a statement adds one entry, as source text; None for any other one."""
+    match statement:
+        case ast.Expr(ast.Call(ast.Attribute(held, "add" | "append" | "appendleft" | "insert"))):
+            return ast.unparse(held)
+    return None
 
 
 def _always_reached(statement: ast.stmt) -> Iterator[ast.Call]:

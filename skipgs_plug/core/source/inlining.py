@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import builtins
 import dis
 import inspect
 from collections.abc import Collection, Iterator, Mapping
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 from skipgs_plug.core.source.accesses import access
 from skipgs_plug.core.source.bindings import arguments, assigned_values, handed_over, held_in, initialiser, spread
 from skipgs_plug.core.source.conversions import is_conversion
+from skipgs_plug.core.source.dispatch import chooses_decision
 from skipgs_plug.core.source.functions import (
     callbacks,
     called_function,
@@ -21,8 +23,9 @@ from skipgs_plug.core.source.functions import (
     value_of,
     without_partial,
 )
-from skipgs_plug.core.source.names import PLACES, bound_in, holders_of, reached_in
+from skipgs_plug.core.source.names import PLACES, bound_in, counted_by, holders_of, reached_in
 from skipgs_plug.core.source.project import Project
+from skipgs_plug.core.source.reach import carries, reached_by, results
 from skipgs_plug.core.source.rewriting import Managed, Plain, Renamed, Repeated, Stored
 from skipgs_plug.core.source.run_options import assigned_globals, comprehended, text_of
 
@@ -63,7 +66,8 @@ class InlinedFunctions:
         code: Code of the function that holds the loop.
         names: Names and values before the loop. Names of the functions are added.
         target: Name of the loop's number.
-        counters: Names and attributes with which the loop counts by itself. Functions that receive them are read too.
+        counters: Names, attributes and lengths with which the loop counts by itself. Functions that receive them are
+            read too.
         unknown: Names and attributes that the loop assigns.
         pure: Names of functions that are evaluated and not read.
 
@@ -72,6 +76,8 @@ class InlinedFunctions:
         unknown: The argument, and variables of the functions whose values are not known before the loop.
         counted: Variables of the functions that begin with the number and are assigned again.
         shared: Added names that other functions may change.
+        reached: Places that may hold the number, or a value that depends on it; see `reach`.
+        unread: Calls with the number, by id in the syntax tree, of functions that are not known before the loop.
     """
 
     def __init__(
@@ -86,6 +92,9 @@ class InlinedFunctions:
     ) -> None:
         self.by_call: dict[int, InlinedFunction] = {}
         self.unknown, self.counted, self.shared = set(unknown), set[str](), set[str]()
+        self.reached, self.unread = {target, *counters}, set[int]()
+        self._looped = set[str]()  # names that loops over known values give to these
+        self._returning: set[int] = set()  # calls whose functions return what they receive or compute from it, by id
         self._names, self._target, self._pure = names, target, pure
         self._project = Project(code, names)
         stores = "STORE_GLOBAL" if code.co_flags & inspect.CO_NEWLOCALS else "STORE_NAME"
@@ -96,7 +105,7 @@ class InlinedFunctions:
         self._made: dict[str, type] = {}  # classes of new objects, by the names that hold them
         Repeated(self._held).visit_all(body)
         Managed(self._new).visit_all(body)
-        self._follow(body, {target, *counters})
+        self._follow(body, {target, *map(counted_by, counters)})
 
     def __iter__(self) -> Iterator[ast.stmt]:
         """Iterate over the statements of all functions."""
@@ -119,10 +128,18 @@ class InlinedFunctions:
                     held = self.held_in(text_of(target), value)
                     numbers |= self._numbers_in(held, numbers)
                     self._note_new(held)
+                    self.reached |= {text for text, one in held.items() if self._carries(one)}
+            match node:
+                case ast.For(ast.Name(name), values) if self._value(values) is not None:
+                    self._looped.add(name)
+        self.reached = reached_by(nodes, self.reached, self._returning)
         holders = holders_of(numbers)
         for node in nodes:
             call, function = self._called(node, numbers, holders)
             plain = undecorated(function)
+            if function is None and self._is_unread(node, numbers, holders):
+                self.unread.add(id(node))
+                self._nodes.append(node)
             if call is not None and plain is not None and plain.__code__ not in self._open and self._is_own(plain):
                 before = set(self.unknown)
                 read = self._read(call, function, plain, numbers)
@@ -131,8 +148,12 @@ class InlinedFunctions:
                     self._nodes.append(node)
                     self._note_new(read.held)
                     self._open.append(plain.__code__)
+                    self.reached |= {text for text, one in read.held.items() if self._carries(one)}
                     kept = self._follow(read.body, numbers | self._numbers_in(read.held, numbers))
                     self._open.pop()
+                    if any(map(self._carries, results(read.body))):
+                        self._returning.add(id(node))
+                        self.reached = reached_by(nodes, self.reached, self._returning)
                     own = self.unknown - before
                     new = {text for text in kept - numbers if own.isdisjoint({text, *holders_of([text])})}
                     numbers, holders = numbers | new, holders | holders_of(new)
@@ -226,7 +247,29 @@ class InlinedFunctions:
         if any(self._numbers_in(self.held_in("", value), numbers) for value in given):
             return True
         given = [one.value if isinstance(one, ast.Starred) else one for one in given]
-        return any(isinstance(one, (ast.Name, ast.Attribute)) and text_of(one) in holders for one in given)
+        return any(
+            (isinstance(one, (ast.Name, ast.Attribute)) and text_of(one) in holders) or self._carries(one)
+            for one in given
+        )
+
+    def _is_unread(self, node: ast.AST, numbers: Collection[str], holders: Collection[str]) -> bool:
+        """Whether this calls a function with the number that is not known before the loop, and may decide by it."""
+        if not (isinstance(node, ast.Call) and self._receives(node, numbers, holders)):
+            return False
+        if not any(map(self._carries, [*node.args, *(one.value for one in node.keywords)])):
+            return False
+        match node.func:
+            case ast.Name(name):
+                is_new = name in self.unknown or not hasattr(builtins, name)
+                return is_new and not {name} & {*self._pure, *self._names, *self._looped, *self._made}
+            case ast.Call(made) if inspect.isclass(self._function(made)):
+                return False
+        return chooses_decision(node.func, self._value, self._project, self._open)
+
+    def _carries(self, value: ast.expr) -> bool:
+        """Whether a value may be the number, or hold it, or be computed from it in a way that is not followed."""
+        held = self.held_in("", value).values()
+        return any(carries(one, self.reached, self._returning) for one in (value, *held))
 
     def is_foreign(self, part: ast.AST) -> bool:
         """Whether a part of an expression calls a library's function, which is no method."""
@@ -303,6 +346,8 @@ class InlinedFunctions:
             else:
                 found[name] = ast.Name(f"{prefix}.{name}", ast.Load())
                 self.unknown.add(f"{prefix}.{name}")
+                if name in given and self._carries(given[name]):
+                    self.reached.add(f"{prefix}.{name}")
                 if name in given and self._is_of(given[name], numbers):
                     self.counted.add(f"{prefix}.{name}")
                 elif name in given and name not in bound:

@@ -28,13 +28,14 @@ from skipgs_plug.core.source.conditions import (
     position,
     unconditional,
 )
-from skipgs_plug.core.source.counters import counters
+from skipgs_plug.core.source.counters import counters, counts_in
 from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator, places_in
 from skipgs_plug.core.source.functions import value_of
 from skipgs_plug.core.source.inlining import InlinedFunction, InlinedFunctions
 from skipgs_plug.core.source.lines import line_in_file
 from skipgs_plug.core.source.progress_bars import Moves, moves, outermost_bar_ifs
 from skipgs_plug.core.source.project import Project
+from skipgs_plug.core.source.reach import carries, compared, inner_values, is_kept_in, remainders
 from skipgs_plug.core.source.rewriting import Plain, Stored
 from skipgs_plug.core.source.run_options import PURE, RunOptions, root_of
 from skipgs_plug.core.source.substitution import Substitution
@@ -86,11 +87,12 @@ class TrainingLoop:
         options = RunOptions(code, around, self._names, no_options, functions.shared, pure | PURE)
         self._evaluator = Evaluator(target, functions.counted, self._names, changing, options)
         self._evaluator_of_loop = Evaluator(target, (), self._names, by_loop, options)
+        self._inner = set(inner_values(statement.body))
         self._bar_ifs = outermost_bar_ifs(statement.body, names, around)
         times = Counter([*own.assigned, *inlined.assigned])
         Substitution(functions, self._evaluator, times).apply(self._body)
         self._all = list(conditions_in(self._body, functions.by_call))
-        self._by_call = functions.by_call
+        self._by_call, self._reached, self._unread_calls = functions.by_call, functions.reached, functions.unread
         self._warned_of: set[str] = set()  # conditions that warnings have named
 
     def milestones(self, numbers: range, others_named: bool = False) -> dict[str, set[int]]:
@@ -124,6 +126,16 @@ class TrainingLoop:
             self._warn_of(
                 self._moving_limits(),
                 f"moves its own limit, so it can hold later and less often if iterations are left out; {BY_ALWAYS}.",
+            )
+            self._warn_of(
+                self._lost(),
+                "can depend on the iteration's number, or on how many iterations have run, in a way that is not read, "
+                f"so iterations that it needs could be left out; {BY_ALWAYS}.",
+            )
+            self._warn_of(
+                self._unread(),
+                "hands the iteration's number to a function that is not known before the loop, so its conditions are "
+                f"not read; {BY_ALWAYS}.",
             )
             self._warn_of(
                 self._kept_for_others(),
@@ -216,7 +228,7 @@ class TrainingLoop:
                 continue
             for leaf in leaves(condition.test):
                 picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and is_point(leaf)
-                if picks and places_in(leaf) & self._counters and not self._evaluator.mentions(leaf):
+                if picks and counts_in(leaf) & self._counters and not self._evaluator.mentions(leaf):
                     yield condition._replace(test=leaf)
 
     def _moving_limits(self) -> Iterator[Condition]:
@@ -240,6 +252,32 @@ class TrainingLoop:
                 case ast.Call(ast.Attribute(held, "put" | "put_nowait" | "send"), [value, *_]):
                     known = value_of(held, self._names, ()) is not None and id(node) not in self._by_call
                     yield from [Condition(node, (), function)] if known and self._evaluator.mentions(value) else []
+
+    def _lost(self) -> Iterator[Condition]:
+        """Yield all conditions on values that may depend on the number, in a way that was not followed."""
+        for condition in self._all:
+            if self._bar_if_of(condition) is None and not any(map(self._evaluator.is_off, condition.guards)):
+                for leaf in leaves(condition.test):
+                    if not self._evaluator.mentions(leaf) and not counts_in(leaf) & self._counters:
+                        lost = self._may_decide(leaf, condition.function)
+                        yield from [condition._replace(test=leaf)] if lost else []
+
+    def _may_decide(self, leaf: ast.expr, function: InlinedFunction | None) -> bool:
+        """Whether a condition is one on a remainder or a single value of what may depend on the number.
+
+        In the loop itself, that is every remainder of a value that it changes.
+        """
+        for number in remainders(leaf):
+            new = function is None and not self._evaluator.is_known(number) and not places_in(number) & self._inner
+            if new or carries(number, self._reached):
+                return True
+        return any(is_kept_in(value, self._reached) for value in compared(leaf))
+
+    def _unread(self) -> Iterator[Condition]:
+        """Yield all calls with the number of functions that are not known before the loop."""
+        for function, node in self._nodes():
+            if isinstance(node, ast.Call) and id(node) in self._unread_calls:
+                yield Condition(node, (), function)
 
     def _lists(self) -> Iterator[ast.expr]:
         """Yield names that are passed to a function together with the number, and may be lists of iterations."""

@@ -14,6 +14,11 @@ _DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 _BINDS_NAME = (*_DEFINITIONS, ast.ExceptHandler, ast.MatchAs, ast.MatchStar)
 
 
+def counted_by(counter: str) -> str:
+    """Return the place whose value, or whose length as in `len(losses)`, is a counter, as source text."""
+    return counter[4:-1] if counter.startswith("len(") else counter
+
+
 def holders_of(places: Iterable[str]) -> set[str]:
     """Return the names and places whose attributes or entries these are, as source text."""
     return {text[: end.start()] for text in places for end in re.finditer(r"[.[]", text)}
@@ -37,8 +42,8 @@ def bound_in(syntax: ast.FunctionDef) -> set[str]:
 
 
 def reached_in(node: ast.AST) -> Iterator[ast.AST]:
-    """Iterate over a statement, without the functions and classes that it defines."""
-    if isinstance(node, _DEFINITIONS):
+    """Iterate over a statement, and the functions but not the classes that it defines."""
+    if isinstance(node, ast.ClassDef):
         return
     yield node
     for child in ast.iter_child_nodes(node):

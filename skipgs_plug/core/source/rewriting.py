@@ -27,7 +27,7 @@ class _Rewrite(ast.NodeTransformer):
 
 
 class Renamed(_Rewrite):
-    """Puts expressions in place of names."""
+    """Puts expressions in place of names. Texts that are put together of constants then are one constant."""
 
     def __init__(self, meanings: Mapping[str, ast.expr]) -> None:
         self._meanings = meanings
@@ -46,6 +46,17 @@ class Renamed(_Rewrite):
             case ast.Subscript(ast.Tuple(values) | ast.List(values), ast.Constant(int(index))) if index < len(values):
                 return ast.copy_location(values[index], node)
         return node
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.expr:
+        self.generic_visit(node)
+        parts = [one.value if isinstance(one, ast.FormattedValue) else one for one in node.values]
+        if any(isinstance(one, ast.FormattedValue) and one.format_spec is not None for one in node.values):
+            return node
+        return _text(node, parts)
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
+        self.generic_visit(node)
+        return _text(node, [node.left, node.right]) if isinstance(node.op, ast.Add) else node
 
 
 class Plain(_Rewrite):
@@ -177,6 +188,12 @@ class Stored(_Rewrite):
                 stores = [(ast.Attribute(held, name, ast.Store()), value)]
         added = [ast.Assign([target], copy.deepcopy(value)) for target, value in stores]
         return [node, *(ast.fix_missing_locations(ast.copy_location(one, node)) for one in added)]
+
+
+def _text(node: ast.expr, parts: list[ast.expr]) -> ast.expr:
+    """Return the text that these parts have together; the node itself if they are not all texts."""
+    texts = [one.value for one in parts if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+    return ast.copy_location(ast.Constant("".join(texts)), node) if len(texts) == len(parts) else node
 
 
 def _call_of(owner: ast.expr, method: str, arguments: int) -> ast.Expr:
