@@ -80,17 +80,25 @@ def leaves(node: ast.expr) -> Iterator[ast.expr]:
 
 
 def is_point(leaf: ast.expr) -> bool:
-    """Whether a part of a condition picks single numbers: by equality, membership, a remainder or a called function."""
+    """Whether a part of a condition picks single numbers: by equality, membership, a remainder or a called function.
+
+    So does the comparison of two numbers' stages, as in `step // 100 > (step - 1) // 100`.
+    """
     if isinstance(leaf, ast.Compare):
         compared = zip(leaf.ops, leaf.comparators, strict=True)
-        return any(isinstance(operator, _PICKS) and not _is_stretch(right) for operator, right in compared) or any(
-            isinstance(part, ast.Mod) for part in ast.walk(leaf)
-        )
+        if any(isinstance(operator, _PICKS) and not _is_stretch(right) for operator, right in compared):
+            return True
+        stages = all(_has(one, ast.FloorDiv) for one in (leaf.left, *leaf.comparators))
+        return stages or _has(leaf, ast.Mod)
     if isinstance(leaf, ast.IfExp):
         parts = [part for value in (leaf.test, leaf.body, leaf.orelse) for part in leaves(value)]
         return any(is_point(part) for part in parts if not isinstance(part, ast.Constant))
     # The training backward of a user's own loop receives the number too, but is not a milestone.
     return not (isinstance(leaf, ast.Call) and isinstance(leaf.func, ast.Attribute) and leaf.func.attr == "backward")
+
+
+def _has(node: ast.expr, operator: type[ast.operator]) -> bool:
+    return any(isinstance(part, operator) for part in ast.walk(node))
 
 
 def _is_stretch(values: ast.expr) -> bool:
@@ -189,6 +197,12 @@ def _matched(pattern: ast.pattern, subject: ast.expr) -> Iterator[tuple[ast.patt
     match pattern, subject:
         case ast.MatchSequence(), ast.Tuple(shown) if len(shown) == len(inner):
             parts = shown
+        case ast.MatchSequence(), _:
+            parts = [ast.Subscript(subject, ast.Constant(index), ast.Load()) for index in range(len(inner))]
+        case ast.MatchMapping(keys), _:
+            parts = [ast.Subscript(subject, key, ast.Load()) for key in keys]
+        case ast.MatchClass(_, places, names), _ if not places:
+            parts = [ast.Attribute(subject, name, ast.Load()) for name in names]
     for one, part in zip(inner, parts, strict=True):
         yield from _matched(one, part)
 

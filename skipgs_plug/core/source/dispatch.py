@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Callable, Collection, Iterable
-from types import CodeType
+from types import CodeType, FunctionType, MethodType
 from typing import Any
 
 from skipgs_plug.core.source.functions import syntax_of, undecorated
@@ -29,6 +29,20 @@ def chooses_decision(
         return not isinstance(function, ast.Lambda)
     plain = (one for one in map(undecorated, choice) if one is not None)
     return any(_decides(syntax_of(one)) for one in plain if one in project and one.__code__ not in known)
+
+
+def is_hidden(function: Any, plain: FunctionType, is_read: bool, project: Project) -> bool:
+    """Whether a function of the user's, or its decorator, has such conditions and is not read.
+
+    Args:
+        function: The function that is called.
+        plain: The function under its decorators.
+        is_read: Whether that one is read.
+        project: The user's project.
+    """
+    outer = function.__func__ if isinstance(function, MethodType) else function
+    around = isinstance(outer, FunctionType) and outer is not plain and outer in project
+    return (around and _decides(syntax_of(outer))) or (not is_read and _decides(syntax_of(plain)))
 
 
 def _choice(function: ast.expr, value: Callable[[ast.expr], Any], project: Project) -> Iterable[Any] | None:

@@ -7,36 +7,26 @@ import builtins
 import dis
 import inspect
 from collections.abc import Collection, Iterator, Mapping
-from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
+from types import CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
 from skipgs_plug.core.source.accesses import access
-from skipgs_plug.core.source.bindings import arguments, assigned_values, handed_over, held_in, initialiser, spread
-from skipgs_plug.core.source.conversions import is_conversion
-from skipgs_plug.core.source.dispatch import chooses_decision
+from skipgs_plug.core.source.bindings import arguments, assigned_values, handed_over, initialiser, spread
+from skipgs_plug.core.source.dispatch import chooses_decision, is_hidden
 from skipgs_plug.core.source.functions import (
-    callbacks,
-    called_function,
     closure,
     read_syntax,
     undecorated,
-    value_of,
     without_partial,
 )
+from skipgs_plug.core.source.known_values import KnownValues
 from skipgs_plug.core.source.names import PLACES, bound_in, counted_by, holders_of, reached_in
-from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.reach import carries, reached_by, results
 from skipgs_plug.core.source.rewriting import Managed, Plain, Renamed, Repeated, Stored
 from skipgs_plug.core.source.run_options import assigned_globals, comprehended, text_of
 
 # Largest depth of nested calls that are read: a loop calls its trainer, which calls a logger, which opens a file.
-MAX_DEPTH = 3
-# Syntax that changes nothing and may be evaluated several times.
-_READS = (
-    *(*PLACES, ast.BinOp, ast.BoolOp, ast.Compare, ast.Constant, ast.List, ast.Tuple, ast.UnaryOp),
-    *(ast.FormattedValue, ast.JoinedStr, ast.keyword),
-    *(ast.boolop, ast.cmpop, ast.expr_context, ast.operator, ast.unaryop),
-)
+MAX_DEPTH = 5
 _ABSENT = object()
 
 
@@ -55,7 +45,7 @@ class InlinedFunction(NamedTuple):
     held: dict[str, ast.expr]
 
 
-class InlinedFunctions:
+class InlinedFunctions(KnownValues):
     """The functions that a loop calls with its number, or that read its number, and the functions that they call.
 
     Only functions of the user's own project are read, and methods of objects that exist before the loop or are made in
@@ -77,7 +67,7 @@ class InlinedFunctions:
         counted: Variables of the functions that begin with the number and are assigned again.
         shared: Added names that other functions may change.
         reached: Places that may hold the number, or a value that depends on it; see `reach`.
-        unread: Calls with the number, by id in the syntax tree, of functions that are not known before the loop.
+        unread: Calls with the number, by id in the syntax tree, of functions that are not known, or cannot be read.
     """
 
     def __init__(
@@ -90,19 +80,17 @@ class InlinedFunctions:
         unknown: Collection[str],
         pure: Collection[str],
     ) -> None:
+        super().__init__(code, names, unknown, pure)
         self.by_call: dict[int, InlinedFunction] = {}
-        self.unknown, self.counted, self.shared = set(unknown), set[str](), set[str]()
+        self.counted, self.shared = set[str](), set[str]()
         self.reached, self.unread = {target, *counters}, set[int]()
         self._looped = set[str]()  # names that loops over known values give to these
         self._returning: set[int] = set()  # calls whose functions return what they receive or compute from it, by id
-        self._names, self._target, self._pure = names, target, pure
-        self._project = Project(code, names)
+        self._target = target
         stores = "STORE_GLOBAL" if code.co_flags & inspect.CO_NEWLOCALS else "STORE_NAME"
         self._globals = {one.argval for one in dis.get_instructions(code) if one.opname == stores}
-        self._open = [code]  # code of the loop and of the functions that are being read, outermost first
         self._assigned: dict[int, ast.expr] = {}  # values that are assigned, by the id of the target in the syntax tree
         self._nodes: list[ast.AST] = []  # keeps the nodes of `by_call`, so that no new node gets the id of one
-        self._made: dict[str, type] = {}  # classes of new objects, by the names that hold them
         Repeated(self._held).visit_all(body)
         Managed(self._new).visit_all(body)
         self._follow(body, {target, *map(counted_by, counters)})
@@ -138,11 +126,12 @@ class InlinedFunctions:
             call, function = self._called(node, numbers, holders)
             plain = undecorated(function)
             if function is None and self._is_unread(node, numbers, holders):
-                self.unread.add(id(node))
-                self._nodes.append(node)
+                self._note_unread(node)
             if call is not None and plain is not None and plain.__code__ not in self._open and self._is_own(plain):
                 before = set(self.unknown)
                 read = self._read(call, function, plain, numbers)
+                if is_hidden(function, plain, read is not None, self._project) and self._gets(call):
+                    self._note_unread(node)
                 if read is not None:
                     self.by_call[id(node)] = read
                     self._nodes.append(node)
@@ -159,16 +148,9 @@ class InlinedFunctions:
                     numbers, holders = numbers | new, holders | holders_of(new)
         return numbers
 
-    def held_in(self, name: str, value: ast.expr) -> dict[str, ast.expr]:
-        """Return the values that a name holds, as source text; see `bindings.held_in`."""
-        return held_in(name, value, lambda call: self._function(call.func))
-
     def _numbers_in(self, held: Mapping[str, ast.expr], numbers: Collection[str]) -> set[str]:
         """Return the texts whose values are computed from the number."""
         return {text for text, value in held.items() if self._is_of(value, numbers)}
-
-    def _function(self, named: ast.expr) -> Any:
-        return called_function(named, self._names, self._value, self._open[-1])
 
     def _called(self, node: ast.AST, numbers: Collection[str], holders: Collection[str]) -> tuple[ast.Call | None, Any]:
         """Return the call and the function if a node calls a function with the number, or reads such a property."""
@@ -184,42 +166,12 @@ class InlinedFunctions:
         made, method = access(node, self._assigned.get(id(node)), self._class)
         return (made, method) if made is not None and self._receives(made, numbers, holders) else (None, None)
 
-    def _note_new(self, held: Mapping[str, ast.expr]) -> None:
-        """Note the names that hold new objects."""
-        self._made |= {text: cls for text, value in held.items() if (cls := self._new(value)) is not None}
-
-    def _new(self, value: ast.expr) -> type | None:
-        """Return the class of a new object; None for any other value."""
-        if (cls := self._made.get(text_of(value))) is not None:
-            return cls
-        made = self._function(value.func) if isinstance(value, ast.Call) else None
-        return made if inspect.isclass(made) else None
-
-    def _class(self, value: ast.expr) -> type:
-        """Return the class of an object; that of None if it is unknown."""
-        return self._new(value) or type(self._value(value))
-
     def _method_of_new(self, call: ast.Call, method: ast.Attribute) -> tuple[ast.Call, Any]:
         """Return a call `Saver(step).save()` with the object as first argument, and its method; None if unknown."""
         found = inspect.getattr_static(self._new(method.value), method.attr, None)
         if not isinstance(found, FunctionType):
             return call, None
         return ast.copy_location(ast.Call(call.func, [method.value, *call.args], call.keywords), call), found
-
-    def _is_own(self, function: Any) -> bool:
-        """Whether this is a function of the project."""
-        plain = undecorated(function)
-        return plain is not None and plain in self._project
-
-    def _is_function(self, argument: ast.expr) -> bool:
-        """Whether an argument is a function of the project. An object that can be called, as a model, is none."""
-        function = self._function(argument)
-        return self._is_own(function) and function.__name__ != "__call__"
-
-    def _held(self, loop: ast.For | ast.comprehension) -> list[ast.expr]:
-        """Return names for the functions or objects that a loop runs over, such as callbacks; empty if unknown."""
-        held, place = callbacks(self._value(loop.iter)), ast.unparse(loop.iter)
-        return [self._named(f"{place}[{index}]", one) for index, one in enumerate(held)]
 
     def _is_read(self, call: ast.Call) -> bool:
         """Whether a call has a function that is known before the loop, and is not evaluated instead."""
@@ -256,7 +208,7 @@ class InlinedFunctions:
         """Whether this calls a function with the number that is not known before the loop, and may decide by it."""
         if not (isinstance(node, ast.Call) and self._receives(node, numbers, holders)):
             return False
-        if not any(map(self._carries, [*node.args, *(one.value for one in node.keywords)])):
+        if not self._gets(node):
             return False
         match node.func:
             case ast.Name(name):
@@ -266,37 +218,24 @@ class InlinedFunctions:
                 return False
         return chooses_decision(node.func, self._value, self._project, self._open)
 
+    def _note_unread(self, node: ast.AST) -> None:
+        self.unread.add(id(node))
+        self._nodes.append(node)
+
+    def _gets(self, call: ast.Call) -> bool:
+        """Whether an argument may be the number, or hold it, or be computed from it."""
+        return any(map(self._carries, [*call.args, *(one.value for one in call.keywords)]))
+
     def _carries(self, value: ast.expr) -> bool:
         """Whether a value may be the number, or hold it, or be computed from it in a way that is not followed."""
         held = self.held_in("", value).values()
         return any(carries(one, self.reached, self._returning) for one in (value, *held))
-
-    def is_foreign(self, part: ast.AST) -> bool:
-        """Whether a part of an expression calls a library's function, which is no method."""
-        function = self._function(part.func) if isinstance(part, ast.Call) else None
-        return isinstance(function, (FunctionType, BuiltinFunctionType)) and not self._is_own(function)
 
     def _is_of(self, value: ast.expr, numbers: Collection[str]) -> bool:
         """Whether a value is computed from the number alone, perhaps by functions of libraries."""
         places = (part for part in ast.walk(value) if isinstance(part, PLACES))
         plain = all(self._only_reads(part) or self.is_foreign(part) for part in ast.walk(value))
         return plain and any(text_of(one) in numbers for one in places)
-
-    def _is_plain(self, value: ast.expr) -> bool:
-        """Whether an expression only reads names, attributes and entries, so that it can stand in several places."""
-        return all(map(self._only_reads, ast.walk(value)))
-
-    def _only_reads(self, part: ast.AST) -> bool:
-        """Whether a part of an expression, apart from the parts inside it, changes nothing."""
-        match part:
-            case ast.Call(ast.Name(name), _, keywords) if name in self._pure:
-                return not keywords
-            case ast.Call():
-                return is_conversion(part, self._function)
-        return isinstance(part, _READS)
-
-    def _value(self, place: ast.expr) -> Any:
-        return value_of(place, self._names, self.unknown)
 
     def _read(
         self, call: ast.Call, function: Any, plain: FunctionType, numbers: Collection[str]
@@ -392,7 +331,3 @@ class InlinedFunctions:
             return given, {}
         absent = (one for name, one in signature.parameters.items() if name not in given)
         return given, {one.name: one.default for one in absent if one.default is not one.empty}
-
-    def _named(self, name: str, value: Any) -> ast.expr:
-        self._names[name] = value
-        return ast.Name(name, ast.Load())

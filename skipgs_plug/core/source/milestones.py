@@ -134,8 +134,8 @@ class TrainingLoop:
             )
             self._warn_of(
                 self._unread(),
-                "hands the iteration's number to a function that is not known before the loop, so its conditions are "
-                f"not read; {BY_ALWAYS}.",
+                "hands the iteration's number to a function that is not known before the loop or lies too deep, so its "
+                f"conditions are not read; {BY_ALWAYS}.",
             )
             self._warn_of(
                 self._kept_for_others(),
@@ -274,7 +274,7 @@ class TrainingLoop:
         return any(is_kept_in(value, self._reached) for value in compared(leaf))
 
     def _unread(self) -> Iterator[Condition]:
-        """Yield all calls with the number of functions that are not known before the loop."""
+        """Yield all calls with the number of functions that are not known before the loop, or cannot be read."""
         for function, node in self._nodes():
             if isinstance(node, ast.Call) and id(node) in self._unread_calls:
                 yield Condition(node, (), function)

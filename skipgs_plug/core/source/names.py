@@ -42,9 +42,9 @@ def bound_in(syntax: ast.FunctionDef) -> set[str]:
 
 
 def reached_in(node: ast.AST) -> Iterator[ast.AST]:
-    """Iterate over a statement, and the functions but not the classes that it defines."""
+    """Iterate over a statement, and the functions but not the classes that it defines; over parts before the whole."""
     if isinstance(node, ast.ClassDef):
         return
-    yield node
     for child in ast.iter_child_nodes(node):
         yield from reached_in(child)
+    yield node

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
+from skipgs_plug.core.source.assignments import assignments_in
 from skipgs_plug.core.source.bindings import assigned_values
 from skipgs_plug.core.source.names import PLACES
 from skipgs_plug.core.source.run_options import text_of
@@ -124,10 +125,12 @@ def is_kept_in(value: ast.expr, places: Collection[str]) -> bool:
 
 
 def inner_values(body: Iterable[ast.stmt]) -> Iterator[str]:
-    """Yield the names of the values over which loops and comprehensions inside these statements run."""
+    """Yield the names that change inside a single iteration: those of loops and comprehensions in these statements."""
     for node in (part for statement in body for part in ast.walk(statement)):
         if isinstance(node, (ast.For, ast.comprehension)):
             yield from (part.id for part in ast.walk(node.target) if isinstance(part, ast.Name))
+        elif isinstance(node, ast.While):
+            yield from assignments_in(node.body).assigned
 
 
 def results(body: Iterable[ast.stmt]) -> Iterator[ast.expr]:
