@@ -22,7 +22,7 @@ from skipgs_plug.core.source.functions import (
 from skipgs_plug.core.source.known_values import KnownValues
 from skipgs_plug.core.source.names import PLACES, bound_in, counted_by, holders_of, reached_in
 from skipgs_plug.core.source.reach import carries, reached_by, results
-from skipgs_plug.core.source.rewriting import Managed, Plain, Renamed, Repeated, Stored
+from skipgs_plug.core.source.rewriting import Managed, OneName, Plain, Renamed, Repeated, Stored
 from skipgs_plug.core.source.run_options import assigned_globals, comprehended, text_of
 
 # Largest depth of nested calls that are read: a loop calls its trainer, which calls a logger, which opens a file.
@@ -92,8 +92,12 @@ class InlinedFunctions(KnownValues):
         self._assigned: dict[int, ast.expr] = {}  # values that are assigned, by the id of the target in the syntax tree
         self._nodes: list[ast.AST] = []  # keeps the nodes of `by_call`, so that no new node gets the id of one
         Repeated(self._held).visit_all(body)
-        Managed(self._new).visit_all(body)
-        self._follow(body, {target, *map(counted_by, counters)})
+        Managed(self._entered).visit_all(body)
+        numbers = {target, *map(counted_by, counters)}
+        kept = reached_by([node for statement in body for node in reached_in(statement)], numbers, ())
+        self._note_shared(holders_of(kept))
+        OneName(self._shared_name).visit_all(body)
+        self._follow(body, numbers)
 
     def __iter__(self) -> Iterator[ast.stmt]:
         """Iterate over the statements of all functions."""
@@ -122,6 +126,7 @@ class InlinedFunctions(KnownValues):
                     self._looped.add(name)
         self.reached = reached_by(nodes, self.reached, self._returning)
         holders = holders_of(numbers)
+        self._note_shared(holders)
         for node in nodes:
             call, function = self._called(node, numbers, holders)
             plain = undecorated(function)
@@ -156,7 +161,8 @@ class InlinedFunctions(KnownValues):
         """Return the call and the function if a node calls a function with the number, or reads such a property."""
         if isinstance(node, ast.Call) and self._is_read(node):
             found = self._function(node.func)
-            if self._receives(node, numbers, holders) or self._shares_number(undecorated(found), numbers):
+            shares = self._shares_number(undecorated(found), numbers) or self._refers_to_shared(found)
+            if shares or self._receives(node, numbers, holders):
                 call, found = initialiser(node, found) if inspect.isclass(found) else (node, found)
                 if found is None and isinstance(call.func, ast.Attribute):
                     call, found = self._method_of_new(call, call.func)
@@ -248,9 +254,10 @@ class InlinedFunctions(KnownValues):
         held: dict[str, ast.expr] = {}
         renamed = Renamed(self._meanings(call, function, plain, syntax, numbers, held))
         body = [renamed.visit(statement) for statement in syntax.body]
+        OneName(self._shared_name).visit_all(body)
         Stored(self._value).visit_all(body)
         Repeated(self._held).visit_all(body)
-        Managed(self._new).visit_all(body)
+        Managed(self._entered).visit_all(body)
         return InlinedFunction(body, plain.__code__, held)
 
     def _meanings(

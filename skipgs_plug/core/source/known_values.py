@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import ast
 import inspect
-from collections.abc import Collection, Mapping
-from types import BuiltinFunctionType, CodeType, FunctionType
+from collections.abc import Collection, Iterable, Mapping
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 from skipgs_plug.core.source.bindings import held_in
 from skipgs_plug.core.source.conversions import is_conversion
-from skipgs_plug.core.source.functions import callbacks, called_function, undecorated, value_of
+from skipgs_plug.core.source.functions import callbacks, called_function, closure, undecorated, value_of
 from skipgs_plug.core.source.names import PLACES
 from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.run_options import text_of
@@ -42,6 +42,7 @@ class KnownValues:
         self._project = Project(code, names)
         self._open = [code]  # code of the loop and of the functions that are being read, outermost first
         self._made: dict[str, type] = {}  # classes of new objects, by the names that hold them
+        self._shared_objects: dict[int, str] = {}  # names of known objects that hold the number, by id
 
     def _function(self, named: ast.expr) -> Any:
         return called_function(named, self._names, self._value, self._open[-1])
@@ -56,6 +57,11 @@ class KnownValues:
             return cls
         made = self._function(value.func) if isinstance(value, ast.Call) else None
         return made if inspect.isclass(made) else None
+
+    def _entered(self, value: ast.expr) -> type | None:
+        """Return the class of an object that a `with` statement enters; None if it is unknown, or one of a library."""
+        known = type(self._value(value))
+        return self._new(value) or (known if self._is_own(inspect.getattr_static(known, "__enter__", None)) else None)
 
     def _class(self, value: ast.expr) -> type:
         """Return the class of an object; that of None if it is unknown."""
@@ -104,3 +110,24 @@ class KnownValues:
     def held_in(self, name: str, value: ast.expr) -> dict[str, ast.expr]:
         """Return the values that a name holds, as source text; see `bindings.held_in`."""
         return held_in(name, value, lambda call: self._function(call.func))
+
+    def _note_shared(self, holders: Iterable[str]) -> None:
+        """Note the known objects whose attributes hold the number, so that they have one name wherever they occur."""
+        for text in sorted(holders):
+            found = self._value(ast.parse(text, mode="eval").body)
+            if hasattr(found, "__dict__") and not isinstance(found, (ModuleType, FunctionType)):
+                self._shared_objects.setdefault(id(found), text)
+
+    def _shared_name(self, place: ast.expr) -> str | None:
+        """Return the one name of an object that holds the number; None for any other value."""
+        return self._shared_objects.get(id(self._value(place))) if self._shared_objects else None
+
+    def _refers_to_shared(self, function: Any) -> bool:
+        """Whether a function reads an object that holds the number: as a global name, or by its own object."""
+        plain = undecorated(function)
+        if plain is None or not self._shared_objects:
+            return False
+        owner = function.__self__ if isinstance(function, MethodType) else None
+        read = [*closure(plain).values(), *map(plain.__globals__.get, plain.__code__.co_names)]
+        inside = vars(owner).values() if hasattr(owner, "__dict__") else ()
+        return any(id(one) in self._shared_objects for one in (owner, *read, *inside))

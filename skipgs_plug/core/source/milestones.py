@@ -33,6 +33,7 @@ from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator, places_i
 from skipgs_plug.core.source.functions import value_of
 from skipgs_plug.core.source.inlining import InlinedFunction, InlinedFunctions
 from skipgs_plug.core.source.lines import line_in_file
+from skipgs_plug.core.source.own_counts import decisions_by_count
 from skipgs_plug.core.source.progress_bars import Moves, moves, outermost_bar_ifs
 from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.reach import carries, compared, inner_values, is_kept_in, remainders
@@ -85,6 +86,8 @@ class TrainingLoop:
         changing = by_loop.union(functions.unknown, inlined.changed).difference(known)
         no_options = changing.union({target}, own.options, inlined.options)
         options = RunOptions(code, around, self._names, no_options, functions.shared, pure | PURE)
+        counted = decisions_by_count(self._body, self._names, Project(code, self._names))
+        self._decisions_by_count = [Condition(test, (), InlinedFunction([], one, {})) for test, one in counted]
         self._evaluator = Evaluator(target, functions.counted, self._names, changing, options)
         self._evaluator_of_loop = Evaluator(target, (), self._names, by_loop, options)
         self._inner = set(inner_values(statement.body))
@@ -222,14 +225,17 @@ class TrainingLoop:
                 yield condition
 
     def _counted_by_itself(self) -> Iterator[Condition]:
-        """Yield all conditions on a counter of the loop's own, which does not count left-out iterations."""
+        """Yield all conditions on a counter of the loop's own, or of a function, which misses left-out iterations."""
+        lines: set[str] = set()
         for condition in self._all:
             if any(self._evaluator.is_off(guard) for guard in condition.guards):
                 continue
             for leaf in leaves(condition.test):
                 picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and is_point(leaf)
                 if picks and counts_in(leaf) & self._counters and not self._evaluator.mentions(leaf):
+                    lines.add(self._where(condition))
                     yield condition._replace(test=leaf)
+        yield from (one for one in self._decisions_by_count if self._where(one) not in lines)
 
     def _moving_limits(self) -> Iterator[Condition]:
         """Yield all comparisons as in `if step >= next_save: next_save += 100`."""

@@ -183,4 +183,4 @@ def _shared(one: str, other: str, places: Iterable[str]) -> set[str]:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return isinstance(value, int) and not isinstance(value, bool)

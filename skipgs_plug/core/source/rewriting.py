@@ -59,6 +59,28 @@ class Renamed(_Rewrite):
         return _text(node, [node.left, node.right]) if isinstance(node.op, ast.Add) else node
 
 
+class OneName(_Rewrite):
+    """Puts one name of an object in place of the others, as `run` for `self.saver.run`.
+
+    Args:
+        name: Returns the name for a name, attribute or entry; None if it stays.
+    """
+
+    def __init__(self, name: Callable[[ast.expr], str | None]) -> None:
+        self._name = name
+
+    def visit_Attribute(self, node: ast.Name | ast.Attribute) -> ast.expr:
+        name = self._name(node) if isinstance(node.ctx, ast.Load) else None
+        if name is None:
+            return self.generic_visit(node)  # type: ignore[return-value]
+        made = ast.parse(name, mode="eval").body
+        for part in ast.walk(made):
+            ast.copy_location(part, node)
+        return made
+
+    visit_Name = visit_Attribute
+
+
 class Plain(_Rewrite):
     """Writes `locals()` and `vars()` as the dictionary that they return, and `await call` as the call.
 
@@ -96,23 +118,23 @@ class Plain(_Rewrite):
 
 
 class Managed(_Rewrite):
-    """Adds the calls that `with Saver(step):` makes of the new object's methods, around the block.
+    """Adds the calls that `with Saver(step):` makes of the object's methods, around the block.
 
     The name after `as` is assigned in the block.
 
     Args:
-        new: Returns the class of a new object; None for any other value.
+        entered: Returns the class of the object that a `with` statement enters; None if it is unknown.
     """
 
-    def __init__(self, new: Callable[[ast.expr], type | None]) -> None:
-        self._new = new
+    def __init__(self, entered: Callable[[ast.expr], type | None]) -> None:
+        self._entered = entered
 
     def visit_With(self, node: ast.With) -> ast.AST:
         self.generic_visit(node)
         begin: list[ast.stmt] = []
         end: list[ast.stmt] = []
         for item in node.items:
-            cls, made = self._new(item.context_expr), item.context_expr
+            cls, made = self._entered(item.context_expr), item.context_expr
             if cls is None:
                 continue
             enter = _call_of(made, "__enter__", 0)
