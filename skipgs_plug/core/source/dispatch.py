@@ -42,7 +42,8 @@ def is_hidden(function: Any, plain: FunctionType, is_read: bool, project: Projec
     """
     outer = function.__func__ if isinstance(function, MethodType) else function
     around = isinstance(outer, FunctionType) and outer is not plain and outer in project
-    return (around and _decides(syntax_of(outer))) or (not is_read and _decides(syntax_of(plain)))
+    syntax = syntax_of(plain)
+    return (around and _decides(syntax_of(outer))) or (not is_read and (syntax is None or _decides(syntax)))
 
 
 def _choice(function: ast.expr, value: Callable[[ast.expr], Any], project: Project) -> Iterable[Any] | None:

@@ -175,6 +175,8 @@ class InlinedFunctions(KnownValues):
     def _method_of_new(self, call: ast.Call, method: ast.Attribute) -> tuple[ast.Call, Any]:
         """Return a call `Saver(step).save()` with the object as first argument, and its method; None if unknown."""
         found = inspect.getattr_static(self._new(method.value), method.attr, None)
+        if isinstance(found, staticmethod):
+            return call, found.__func__
         if not isinstance(found, FunctionType):
             return call, None
         return ast.copy_location(ast.Call(call.func, [method.value, *call.args], call.keywords), call), found

@@ -38,7 +38,7 @@ from skipgs_plug.core.source.progress_bars import Moves, moves, outermost_bar_if
 from skipgs_plug.core.source.project import Project
 from skipgs_plug.core.source.reach import carries, compared, inner_values, is_kept_in, remainders
 from skipgs_plug.core.source.rewriting import Plain, Stored
-from skipgs_plug.core.source.run_options import PURE, RunOptions, root_of
+from skipgs_plug.core.source.run_options import PURE, RunOptions, is_plain, root_of
 from skipgs_plug.core.source.substitution import Substitution
 
 BY_ALWAYS = "name the iterations that must run (--always, always=)"
@@ -300,6 +300,12 @@ class TrainingLoop:
                 case ast.Subscript(table, key, ast.Load()) | ast.Call(ast.Attribute(table, "get"), [key, *_]):
                     if self._evaluator.mentions(key) and isinstance(self._evaluator.value(table), dict):
                         test = ast.copy_location(ast.Compare(key, [ast.In()], [table]), node)
+                        yield Condition(test, (), function)
+                case ast.Assign(value=ast.Call(ast.Attribute(table, "pop"), [key, *_])):
+                    held = value_of(table, self._names, ())  # before the loop takes anything out
+                    if self._evaluator.mentions(key) and isinstance(held, dict) and is_plain([*held]):
+                        keys = ast.Tuple([ast.Constant(one) for one in held], ast.Load())
+                        test = ast.copy_location(ast.Compare(key, [ast.In()], [keys]), table)
                         yield Condition(test, (), function)
 
     def _nodes(self) -> Iterator[tuple[InlinedFunction | None, ast.AST]]:
