@@ -21,6 +21,7 @@ MOST_CALLBACKS = 16
 
 def callbacks(held: Any) -> Sequence[Any]:
     """Return the entries of a short list of functions or objects; nothing for any other value."""
+    held = [*held] if isinstance(held, torch.nn.ModuleList) else held
     return held if isinstance(held, (list, tuple)) and len(held) <= MOST_CALLBACKS and not is_plain(held) else ()
 
 

@@ -87,8 +87,7 @@ class InlinedFunctions(KnownValues):
         self._looped = set[str]()  # names that loops over known values give to these
         self._returning: set[int] = set()  # calls whose functions return what they receive or compute from it, by id
         self._target = target
-        stores = "STORE_GLOBAL" if code.co_flags & inspect.CO_NEWLOCALS else "STORE_NAME"
-        self._globals = {one.argval for one in dis.get_instructions(code) if one.opname == stores}
+        self._globals = _stored_globals(code)  # those of the loop's module that the loop or its functions assign
         self._assigned: dict[int, ast.expr] = {}  # values that are assigned, by the id of the target in the syntax tree
         self._nodes: list[ast.AST] = []  # keeps the nodes of `by_call`, so that no new node gets the id of one
         Repeated(self._held).visit_all(body)
@@ -252,6 +251,8 @@ class InlinedFunctions(KnownValues):
         syntax = read_syntax(plain) if len(self._open) <= MAX_DEPTH else None
         if syntax is None:
             return None
+        if plain.__module__ == self._names.get("__name__"):
+            self._globals |= _stored_globals(plain.__code__)
         Plain(plain.__code__).visit_all(syntax.body)
         held: dict[str, ast.expr] = {}
         renamed = Renamed(self._meanings(call, function, plain, syntax, numbers, held))
@@ -340,3 +341,9 @@ class InlinedFunctions(KnownValues):
             return given, {}
         absent = (one for name, one in signature.parameters.items() if name not in given)
         return given, {one.name: one.default for one in absent if one.default is not one.empty}
+
+
+def _stored_globals(code: CodeType) -> set[str]:
+    """Return the global names that a function, or the code of a module, assigns."""
+    stores = "STORE_GLOBAL" if code.co_flags & inspect.CO_NEWLOCALS else "STORE_NAME"
+    return {one.argval for one in dis.get_instructions(code) if one.opname == stores}

@@ -112,10 +112,11 @@ class KnownValues:
         return held_in(name, value, lambda call: self._function(call.func))
 
     def _note_shared(self, holders: Iterable[str]) -> None:
-        """Note the known objects whose attributes hold the number, so that they have one name wherever they occur."""
+        """Note the known objects and tables that hold the number, so that they have one name wherever they occur."""
         for text in sorted(holders):
             found = self._value(ast.parse(text, mode="eval").body)
-            if hasattr(found, "__dict__") and not isinstance(found, (ModuleType, FunctionType)):
+            held = isinstance(found, (dict, list)) or hasattr(found, "__dict__")
+            if held and not isinstance(found, (ModuleType, FunctionType)):
                 self._shared_objects.setdefault(id(found), text)
 
     def _shared_name(self, place: ast.expr) -> str | None:

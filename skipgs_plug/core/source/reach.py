@@ -83,7 +83,7 @@ def carries(value: ast.AST | None, places: Collection[str], returning: Collectio
             return any_of([element])
         case ast.DictComp(_, element):
             return any_of([element])
-        case ast.Lambda():
+        case ast.Lambda() | ast.Compare():  # a comparison is a condition itself
             return False
         case ast.expr():
             return any_of(ast.iter_child_nodes(value))
@@ -125,12 +125,14 @@ def is_kept_in(value: ast.expr, places: Collection[str]) -> bool:
 
 
 def inner_values(body: Iterable[ast.stmt]) -> Iterator[str]:
-    """Yield the names that change inside a single iteration: those of loops and comprehensions in these statements."""
+    """Yield the names that change inside a single iteration: those of loops, and parameters."""
     for node in (part for statement in body for part in ast.walk(statement)):
         if isinstance(node, (ast.For, ast.comprehension)):
             yield from (part.id for part in ast.walk(node.target) if isinstance(part, ast.Name))
         elif isinstance(node, ast.While):
             yield from assignments_in(node.body).assigned
+        elif isinstance(node, ast.arg):
+            yield node.arg
 
 
 def results(body: Iterable[ast.stmt]) -> Iterator[ast.expr]:
