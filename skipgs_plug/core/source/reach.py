@@ -22,6 +22,8 @@ _NUMBERED = frozenset({"enumerate", "range"})  # what they count begins anew in 
 # Functions that return an argument, or a value that is computed from it.
 _PASSES = frozenset({"abs", "dict", "divmod", "float", "int", "iter", "list", "max", "min", "next", "reversed"})
 _PASSES |= frozenset({"round", "set", "sorted", "str", "sum", "tuple", "zip"})
+# Largest number of times that statements are gone through. With `node = node.next`, the places have no end.
+_ROUNDS = 5
 
 
 def reached_by(nodes: Sequence[ast.AST], places: Collection[str], returning: Collection[int]) -> set[str]:
@@ -33,8 +35,7 @@ def reached_by(nodes: Sequence[ast.AST], places: Collection[str], returning: Col
         returning: Calls of functions that return it, by id in the syntax tree.
     """
     found = set(places)
-    before = -1
-    while before != len(found):
+    for _ in range(_ROUNDS):
         before = len(found)
         for node in nodes:
             for target, value in _handed_on(node):
@@ -42,6 +43,8 @@ def reached_by(nodes: Sequence[ast.AST], places: Collection[str], returning: Col
                     found |= {text_of(one) for one in _places(target)}
                 elif isinstance(target, PLACES) and isinstance(value, PLACES):
                     found |= _shared(text_of(target), text_of(value), found)
+        if before == len(found):
+            break
     return found
 
 

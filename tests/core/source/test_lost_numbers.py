@@ -3,6 +3,7 @@
 import contextlib
 import functools
 from collections import deque
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -143,6 +144,18 @@ def before_it_is_assigned(stop):
         before = step
 
 
+def under_further_names(stop):
+    node = SimpleNamespace(step=0)
+    node.next = node
+    for step in stop():
+        node = SimpleNamespace(next=node)
+        node.step = step
+        node = node.next
+        same = node
+        if same.step == 80:
+            print("save")
+
+
 def counted_by_a_library(stop):
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))])
     schedule = torch.optim.lr_scheduler.StepLR(optimizer, 10)
@@ -165,7 +178,7 @@ def made_in_the_loop(stop):
 LOST = [
     *(entered_object, entered_again, entered_generator, entered_library, last_of_a_queue, taken_from_a_queue),
     *(any_of_a_queue, kept_in_a_tensor, local_names_one_by_one, local_names_in_a_condition, assigned_twice),
-    *(returned_by_a_long_function, before_it_is_assigned, counted_by_a_library),
+    *(returned_by_a_long_function, before_it_is_assigned, counted_by_a_library, under_further_names),
 ]
 
 
