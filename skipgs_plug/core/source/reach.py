@@ -11,7 +11,7 @@ import ast
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from skipgs_plug.core.source.assignments import assignments_in
-from skipgs_plug.core.source.bindings import assigned_values
+from skipgs_plug.core.source.bindings import assigned_values, held_in
 from skipgs_plug.core.source.names import PLACES
 from skipgs_plug.core.source.run_options import text_of
 
@@ -39,7 +39,10 @@ def reached_by(nodes: Sequence[ast.AST], places: Collection[str], returning: Col
         before = len(found)
         for node in nodes:
             for target, value in _handed_on(node):
-                if carries(value, found, returning):
+                held = held_in(text_of(target), value, lambda call: None)
+                if text_of(target) not in held:  # a new dictionary
+                    found |= {text for text, one in held.items() if carries(one, found, returning)}
+                elif carries(value, found, returning):
                     found |= {text_of(one) for one in _places(target)}
                 elif isinstance(target, PLACES) and isinstance(value, PLACES):
                     found |= _shared(text_of(target), text_of(value), found)
@@ -65,6 +68,8 @@ def carries(value: ast.AST | None, places: Collection[str], returning: Collectio
     match value:
         case ast.Name(name):
             return name in places
+        case ast.Subscript(held, key) if not isinstance(key, ast.Constant):
+            return any_of([held]) or _has_entry(held, places)
         case ast.Attribute(held) | ast.Subscript(held):
             return text_of(value) in places or any_of([held])
         case ast.Call(function, values, keywords):
@@ -78,7 +83,7 @@ def carries(value: ast.AST | None, places: Collection[str], returning: Collectio
                     made = values[0] if function.attr == "enter_context" and values else function.value
                     return any_of([made, *made.args] if isinstance(made, ast.Call) else [made])
                 case ast.Attribute(held):  # a method, as in `steps.popleft()`
-                    return any_of([held])
+                    return any_of([held]) or _has_entry(held, places)
             return False
         case ast.IfExp(_, holds, fails):
             return any_of([holds, fails])
@@ -86,7 +91,7 @@ def carries(value: ast.AST | None, places: Collection[str], returning: Collectio
             return any_of([element])
         case ast.DictComp(_, element):
             return any_of([element])
-        case ast.Lambda() | ast.Compare():  # a comparison is a condition itself
+        case ast.Lambda() | ast.Compare() | ast.JoinedStr():  # a comparison is a condition itself
             return False
         case ast.expr():
             return any_of(ast.iter_child_nodes(value))
@@ -163,6 +168,11 @@ def _handed_on(node: ast.AST) -> Iterator[tuple[ast.expr, ast.expr]]:
             yield from ((ast.Name(one.name, ast.Store()), subject) for one in names if one.name is not None)
         case ast.Call(ast.Attribute(held, method), values, keywords) if method in _KEEPS:
             yield from ((held, value) for value in (*values, *(keyword.value for keyword in keywords)))
+
+
+def _has_entry(held: ast.expr, places: Iterable[str]) -> bool:
+    """Whether an entry of a table is one of these places."""
+    return any(text.startswith(f"{text_of(held)}[") for text in places)
 
 
 def _places(target: ast.expr) -> Iterator[ast.expr]:

@@ -203,6 +203,9 @@ class Stored(_Rewrite):
             case ast.Call(ast.Attribute(held, "update"), [], entries) if isinstance(self._value(held), dict):
                 named = ((entry.arg, entry.value) for entry in entries if entry.arg is not None)
                 stores = [(ast.Subscript(held, ast.Constant(name), ast.Store()), value) for name, value in named]
+            case ast.Call(ast.Attribute(held, "update"), [ast.Dict(keys, values)], []):
+                pairs = [pair for pair in zip(keys, values, strict=True) if isinstance(pair[0], ast.Constant)]
+                stores = [(ast.Subscript(held, key, ast.Store()), value) for key, value in pairs if key is not None]
             case ast.Call(ast.Attribute(held, "append"), [value], []) if isinstance(self._value(held), list):
                 last = ast.UnaryOp(ast.USub(), ast.Constant(1))
                 stores = [(ast.Subscript(held, last, ast.Store()), value)]

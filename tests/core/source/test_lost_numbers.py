@@ -261,3 +261,17 @@ def test_functions_without_conditions_are_nothing_to_warn_of():
             getattr(actions, f"{'do'}_log")(step)
 
     assert found(loop) == {}
+
+
+def test_an_entry_of_a_table_is_not_all_of_it():
+    def loop(stop):
+        views = [{"height": 60}]
+        for step in stop(views=views):
+            data = views[0]
+            height = data["height"]
+            if height == 60:
+                print("a view")
+            data = {"step": step, "loss": 0.5}
+            torch.save(data, f"{step}.pt")
+
+    assert found(loop) == {}
