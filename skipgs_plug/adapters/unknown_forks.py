@@ -206,7 +206,7 @@ class Survey:
     def unknown(self) -> list[str]:
         """The calls that the adapter does not know, except getters."""
         called = self._reader.ends.keys() & self._methods - self._known
-        return sorted(name for name in called if not name.startswith("get_"))
+        return sorted(changing(called))
 
     def start_after_changes(self, start: int, last: float = math.inf, unit: int = 1) -> int:
         """Return the later of `start` and the end of the last change of the model, known or unknown.
@@ -228,6 +228,11 @@ class Survey:
         names = self._changes.union(self.unknown)
         ends = {name: end * unit for name, end in self._reader.ends.items() if end is not None and name in names}
         return begin_after(start, last, ends)
+
+
+def changing(names: Iterable[str]) -> set[str]:
+    """Return the names of functions that may change the model: all but those of getters."""
+    return {name for name in names if not name.startswith("get_")}
 
 
 def left_alone(names: Iterable[str]) -> str:

@@ -71,6 +71,11 @@ def test_inria_classic_returns_two_and_current_three():
     assert radii.dtype == torch.int32
 
 
+def test_inrias_first_settings_have_no_debug():
+    fields = {name: value for name, value in camera().items() if name != "debug"}  # as GaussianShader passes them
+    assert inria.GaussianRasterizationSettings(**fields)[-2:] == (False, None)
+
+
 def test_mark_visible_is_the_near_plane():
     view = camera()["viewmatrix"]
     points = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])

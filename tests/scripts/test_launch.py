@@ -216,7 +216,14 @@ def test_missing_module_is_named(checkout, capfd):
     ("module", "listing", "text", "advice"),
     [
         ("absent_module", "requirements.txt", "numpy\nAbsent-Module>=2\n", "lists; run: pip install absent_module"),
-        ("absent_module", "../environment.yml", "  - absent_module=1.0\n", "environment.yml lists; run: pip install"),
+        ("absent_module", "../environment.yml", "  - pip:\n    - absent_module\n", "environment.yml lists; run: pip"),
+        (
+            "absent_module",
+            "environment.yml",
+            "  - absent_module=1.0\n  - pip:\n    - numpy\n",
+            "lists for conda: install",
+        ),
+        ("plyfile", "environment.yml", "  - plyfile=0.8.1\n", "environment.yml lists; run: pip install plyfile"),
         ("absent", "requirements.txt", "absent-module\n", "If absent is part of the checkout"),
         ("absent", "environment.yml", "name: absent\n  - numpy\n", "If absent is part of the checkout"),
         ("absent", "requirements.txt", "git+https://host/absent.git\n", "takes from git+https://host/absent.git:"),

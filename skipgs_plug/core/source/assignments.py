@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 from skipgs_plug.core.source.names import PLACES
 from skipgs_plug.core.source.run_options import comprehended, text_of
@@ -31,6 +31,15 @@ class Assignments(NamedTuple):
     changed: set[str]
     options: set[str]
     shrunk: set[str]
+
+    def possible(self, names: Mapping[str, Any]) -> Assignments:
+        """Return these without calls of methods of what is None, as in `if writer is not None: writer.add(...)`.
+
+        Args:
+            names: Names and values before the loop.
+        """
+        none = {name for name, value in names.items() if value is None}.difference(self.assigned)
+        return self._replace(changed=self.changed - none, options=self.options - none)
 
 
 def assignments_in(body: Iterable[ast.stmt]) -> Assignments:

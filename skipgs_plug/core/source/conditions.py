@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from skipgs_plug.core.source.inlining import InlinedFunction
@@ -34,30 +34,34 @@ def conditions_in(
     functions: Mapping[int, InlinedFunction],
     guards: Guards = (),
     function: InlinedFunction | None = None,
+    unread: Container[int] = (),
 ) -> Iterator[Condition]:
-    """Yield all conditions in statements, and in the functions that they call.
+    """Yield all conditions in statements, and in the functions that they call; and all calls that are not read.
 
     Args:
         body: The statements.
         functions: Inlined functions by the id of the call, or of the attribute or entry that makes it.
         guards: Conditions under which the statements run.
         function: The function that the statements are of; None for the loop.
+        unread: Calls that stand for conditions, because their functions are not read, by id.
     """
     for statement in body:
         if isinstance(statement, ast.ClassDef):
             continue
         for call, reached in _calls_of(statement, guards):
+            if id(call) in unread:
+                yield Condition(call, reached, function)
             if (inside := functions.get(id(call))) is not None:
-                yield from conditions_in(inside.body, functions, reached, inside)
+                yield from conditions_in(inside.body, functions, reached, inside, unread)
         if isinstance(statement, (ast.If, ast.While)):
             yield Condition(statement.test, guards, function)
-            yield from conditions_in(statement.body, functions, (*guards, statement.test), function)
-            yield from conditions_in(statement.orelse, functions, (*guards, _not(statement.test)), function)
+            yield from conditions_in(statement.body, functions, (*guards, statement.test), function, unread)
+            yield from conditions_in(statement.orelse, functions, (*guards, _not(statement.test)), function, unread)
         else:
             if isinstance(statement, ast.Match):
                 yield from (Condition(equal, guards, function) for equal in _cases(statement))
             for block in _blocks(statement):
-                yield from conditions_in(block, functions, guards, function)
+                yield from conditions_in(block, functions, guards, function, unread)
             for part in ast.iter_child_nodes(statement):
                 if isinstance(statement, ast.Expr) and isinstance(part, ast.BoolOp):
                     yield Condition(_deciding(part), guards, function)

@@ -70,8 +70,8 @@ class TrainingLoop:
         self._target = target = statement.target.id
         Plain(code).visit_all(statement.body)
         Stored(lambda place: value_of(place, self._names, ())).visit_all(statement.body)
-        own = assignments_in(statement.body)
-        self._counters = {*counters(statement.body, self._names, own.assigned, Project(code, self._names))}
+        own = assignments_in(statement.body).possible(self._names)
+        self._counters, self._set_back = counters(statement.body, self._names, own.assigned, Project(code, self._names))
         functions = InlinedFunctions(
             statement.body,
             code,
@@ -81,7 +81,7 @@ class TrainingLoop:
             set(own.assigned).difference(known),
             pure | PURE,
         )
-        inlined = assignments_in(functions)
+        inlined = assignments_in(functions).possible(self._names)
         by_loop = own.changed.difference(known)
         changing = by_loop.union(functions.unknown, inlined.changed).difference(known)
         no_options = changing.union({target}, own.options, inlined.options)
@@ -94,8 +94,10 @@ class TrainingLoop:
         self._bar_ifs = outermost_bar_ifs(statement.body, names, around)
         times = Counter([*own.assigned, *inlined.assigned])
         Substitution(functions, self._evaluator, times).apply(self._body)
-        self._all = list(conditions_in(self._body, functions.by_call))
-        self._by_call, self._reached, self._unread_calls = functions.by_call, functions.reached, functions.unread
+        found = list(conditions_in(self._body, functions.by_call, unread=functions.unread))
+        self._all = [one for one in found if id(one.test) not in functions.unread]
+        self._unread_calls = [one for one in found if id(one.test) in functions.unread]
+        self._by_call, self._reached = functions.by_call, functions.reached
         self._warned_of: set[str] = set()  # conditions that warnings have named
 
     def milestones(self, numbers: range, others_named: bool = False) -> dict[str, set[int]]:
@@ -125,6 +127,16 @@ class TrainingLoop:
             "counts the iterations that run, so it holds less often if others are left out. "
             f"Decide by {self._target} if that matters.",
         )
+        found: dict[str, set[int]] = {}
+        uncertain: list[str] = []
+        for condition in self._conditions():
+            if self._bar_if_of(condition) is not None:
+                continue
+            text, (hits, certain) = ast.unparse(condition.test), self._needed(condition, numbers, others_named)
+            if hits is not None:
+                found.setdefault(f"{self._where(condition)}: {text}", set()).update(hits)
+            if not certain:
+                uncertain.append(f"line {self._location(condition)}")
         if not others_named:
             self._warn_of(
                 self._moving_limits(),
@@ -144,16 +156,6 @@ class TrainingLoop:
                 self._kept_for_others(),
                 f"keeps the iteration's number for other code, whose conditions on it are not read; {BY_ALWAYS}.",
             )
-        found: dict[str, set[int]] = {}
-        uncertain: list[str] = []
-        for condition in self._conditions():
-            if self._bar_if_of(condition) is not None:
-                continue
-            text, (hits, certain) = ast.unparse(condition.test), self._needed(condition, numbers, others_named)
-            if hits is not None:
-                found.setdefault(f"{self._where(condition)}: {text}", set()).update(hits)
-            if not certain:
-                uncertain.append(f"line {self._location(condition)}")
         for lookup in self._lookups():
             hits = _rarer(self._evaluator, lookup, numbers)
             if hits:
@@ -169,10 +171,8 @@ class TrainingLoop:
                 value = eval(compile(ast.Expression(node), "<list>", "eval"), dict(self._names))
             except Exception:
                 continue
-            if _is_list(value):
-                hits = {int(entry) for entry in value if entry in numbers}
-                if hits:
-                    found[f"line {line_in_file(node, self._code)}: {ast.unparse(node)}"] = hits
+            if _is_list(value) and (hits := {int(entry) for entry in value if entry in numbers}):
+                found[f"line {line_in_file(node, self._code)}: {ast.unparse(node)}"] = hits
         return found
 
     def bar_moves(self, numbers: range) -> list[Moves]:
@@ -228,7 +228,8 @@ class TrainingLoop:
         """Yield all conditions on a counter of the loop's own, or of a function, which misses left-out iterations."""
         lines: set[str] = set()
         for condition in self._all:
-            if any(self._evaluator.is_off(guard) for guard in condition.guards):
+            sets_back = condition.function is None and position(condition.test) in self._set_back
+            if sets_back or any(self._evaluator.is_off(guard) for guard in condition.guards):
                 continue
             for leaf in leaves(condition.test):
                 picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and is_point(leaf)
@@ -281,9 +282,9 @@ class TrainingLoop:
 
     def _unread(self) -> Iterator[Condition]:
         """Yield all calls with the number of functions that are not known before the loop, or cannot be read."""
-        for function, node in self._nodes():
-            if isinstance(node, ast.Call) and id(node) in self._unread_calls:
-                yield Condition(node, (), function)
+        for call in self._unread_calls:
+            if not any(map(self._evaluator.is_off, call.guards)):
+                yield call
 
     def _lists(self) -> Iterator[ast.expr]:
         """Yield names that are passed to a function together with the number, and may be lists of iterations."""
