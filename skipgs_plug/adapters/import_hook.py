@@ -26,10 +26,11 @@ def when_imported(hooks: Hooks, name: str, call: Callable[[ModuleType], None]) -
         return
 
     def guarded(module: ModuleType) -> None:
+        hooks.awaited.discard(f"module {name}")
         with hooks.guarded():
             call(module)
 
-    hooks.awaited.append(name)
+    hooks.awaited.add(f"module {name}")
     finder = _Finder(name, guarded)
     sys.meta_path.insert(0, finder)
     hooks.on_detach(f"sys.meta_path ({name})", lambda: sys.meta_path.remove(finder))

@@ -19,18 +19,19 @@ from typing import Any, ClassVar
 import torch
 
 from skipgs_plug.adapters import registry
-from skipgs_plug.adapters.base import AbstractAdapter
+from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.half_size_cameras import HalfSizeCameras
 from skipgs_plug.adapters.import_hook import when_imported
-from skipgs_plug.adapters.loop_bounds import last_calls
+from skipgs_plug.adapters.loop_bounds import READS_GRADIENT, SETS_END, read_loops
 from skipgs_plug.adapters.loop_code import LOOP, OPTIONS, LoopCode, names_around, namespace_of
 from skipgs_plug.adapters.unknown_forks import (
     BY_HAND,
     CALLS,
     Unrecognised,
     begin_after,
-    left_alone,
+    changing,
     refuse_loop_elsewhere,
+    refuse_loop_without_end,
     unrecognised,
 )
 from skipgs_plug.core.caution import caution
@@ -40,11 +41,10 @@ from skipgs_plug.core.source.functions import undecorated
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 from skipgs_plug.core.views import view_key
 
-# Modules of a checkout. The script imports them.
-RENDERER, MODEL = "gaussian_renderer", "scene.gaussian_model"
+RENDERER, MODEL = "gaussian_renderer", "scene.gaussian_model"  # modules of a checkout, which the script imports
+UNTIL, FIRST = "densify_until_iter", 1  # option that ends densification, and number of the first iteration
 RESETS = ("opacity_reset_interval",)  # option that the condition of opacity resets names
-# Effect of `share` on trainers that accumulate gradients after densification; see `Phased`.
-GROWS_WHOLE = "If steps accumulate gradients after densification, it runs whole."
+GROWS_WHOLE = "If steps accumulate gradients after densification, it runs whole."  # with `share`; see `Phased`
 
 
 class InriaFamily(AbstractAdapter):
@@ -57,6 +57,7 @@ class InriaFamily(AbstractAdapter):
         scenes: Possible names of the loop's variable for its Scene.
         changes: Further methods that change the model. The gate begins after the last call of these and `structural`.
         pausing: Methods in `changes` that the trainer also calls after the gate has begun. Each call pauses the gate.
+        uses: Uses of attributes that put the gate's start off or refuse it; see `loop_bounds`.
         calls: Further names that the adapter knows beyond those of Inria's loop: methods of the model, functions that
             draw noise, methods that change a tensor in place.
         arguments: Arguments of the renderer that the adapter knows, beyond those of Inria's.
@@ -72,6 +73,7 @@ class InriaFamily(AbstractAdapter):
     scenes: ClassVar[tuple[str, ...]] = ("scene",)
     changes: ClassVar[tuple[str, ...]] = ("densify_and_prune",)
     pausing: ClassVar[tuple[str, ...]] = ()
+    uses: ClassVar[tuple[str, ...]] = ()
     calls: ClassVar[tuple[str, ...]] = ()
     arguments: ClassVar[tuple[str, ...]] = ()
     pure: ClassVar[tuple[str, ...]] = ()
@@ -88,6 +90,7 @@ class InriaFamily(AbstractAdapter):
         self._model_class: type = object
         self.known_names: dict[str, Any] = {}
         self._unknown = Unrecognised(*5 * (frozenset(),))
+        self._densifies = True  # False if options keep the loop from densification, as LangSplat's
         self._cameras: HalfSizeCameras | None = None  # None if they cannot be shown at half their size
 
     @classmethod
@@ -126,11 +129,7 @@ class InriaFamily(AbstractAdapter):
         self._code, self._model_class = code, model
         self._unknown = unrecognised(code, renderers, model, self._known_calls(), self.arguments)
         self._unknown.refuse(self.difference(code))
-        if self._unknown.listed:
-            caution(
-                f"{self.difference(code)}. Recognised: {', '.join(self.renders[:1])}, backward, "
-                f"{', '.join(sorted(self._unknown.known))}. {left_alone(self._unknown.listed)}"
-            )
+        self._unknown.tell(self.difference(code), self.renders[0])
 
     def difference(self, code: LoopCode) -> str:
         """Return the beginning of a sentence about a script that does more than this adapter knows."""
@@ -149,7 +148,7 @@ class InriaFamily(AbstractAdapter):
             opt: The run's optimization options.
             loop: All names of `training` when its first iteration begins. Do not keep it.
         """
-        return int(opt.densify_until_iter)
+        return int(getattr(opt, UNTIL)) if self._densifies else FIRST
 
     def settled_iter(self, opt: Any, loop: Mapping[str, Any]) -> int | None:
         """Return the first iteration after the last known prune; None without one. Arguments as for `start_iter`."""
@@ -157,7 +156,7 @@ class InriaFamily(AbstractAdapter):
 
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
         """Return the first iteration whose gradients only the optimizers read. Arguments as for `start_iter`."""
-        return int(opt.densify_until_iter)
+        return int(getattr(opt, UNTIL)) if self._densifies else FIRST
 
     def steps_each(self, opt: Any, loop: Mapping[str, Any]) -> bool:
         """Whether optimizers would accumulate, but step in each iteration that runs; see `TrainerInfo.steps_each`."""
@@ -243,6 +242,8 @@ class InriaFamily(AbstractAdapter):
             self._begins(hooks, args[0], sys._getframe(2))  # frame 2 is the caller's
             return original(*args, **kwargs)
 
+        hooks.awaited.add("GaussianModel")  # a fork may import it and train a class of its own, as GES does
+        hooks.before(model, "__init__", lambda *args, **kwargs: hooks.awaited.discard("GaussianModel"))
         hooks.wrap(model, "update_learning_rate", rate_updated)
         hooks.events(model, *(name for name in self.structural if hasattr(model, name)))
 
@@ -266,6 +267,8 @@ class InriaFamily(AbstractAdapter):
 
     def _attach_to_loop(self, hooks: Hooks, script: dict[str, Any], code: LoopCode) -> None:
         """Attach to the loop's backward and to its range."""
+        if not code.counts_with_range:
+            gate_backwards_only(hooks, self)
         hooks.gate_tensor_backward(*code.callers)
         hooks.loop(
             script,
@@ -314,24 +317,23 @@ class InriaFamily(AbstractAdapter):
         number = "iteration" if self._code is None else self._code.number
         missing = [name for name in (OPTIONS, number) if name not in loop]
         if scene is None or missing:
-            wanted = ", ".join(missing or self.scenes)
-            raise self.mismatch(f"{wanted} among the variables of {LOOP}()")
+            raise self.mismatch(f"{', '.join(missing or self.scenes)} among the variables of {LOOP}()")
         opt, self._step = loop[OPTIONS], int(loop[number])
         self.output_folder = getattr(scene, "model_path", None)
         cameras = scene.getTrainCameras()
-        names = [camera.image_name for camera in cameras]
-        if len(set(names)) < len(names):
+        if len({camera.image_name for camera in cameras}) < len(cameras):
             caution(
                 "Several training images have the same name; the gate tells views apart by their position, "
                 "which stays the same in a resumed run only with the same seed."
             )
             self._label = "uid"
         self.begin(opt, loop)
+        ends = self._ends_of_calls(loop)
         known = None if self._unknown.listed or not self.shows_half_size else self._code
         self._cameras = HalfSizeCameras.of(hooks, cameras, known, self.renders)
         hooks.ready(
             TrainerInfo(
-                self._start_after_changes(opt, loop),
+                begin_after(self.start_iter(opt, loop), opt.iterations, ends),
                 settled_iter=self.settled_iter(opt, loop),
                 view_names=[view_key(key) for key in self.view_keys(cameras)],
                 max_steps=opt.iterations,
@@ -343,15 +345,17 @@ class InriaFamily(AbstractAdapter):
             )
         )
 
-    def _start_after_changes(self, opt: Any, loop: Mapping[str, Any]) -> int:
-        """Return `start_iter`, or the end of the calls that this adapter does not know, if that is later."""
-        start = self.start_iter(opt, loop)
+    def _ends_of_calls(self, loop: Mapping[str, Any]) -> dict[str, int]:
+        """Return the first iterations after calls that change the model, and learn whether the loop densifies."""
         if self._code is None or self._code.syntax is None:
-            return start
-        awaited = self._unknown.calls.union(self.structural, self.changes).difference(self.pausing)
-        parts = [part for part in (self._model_class, undecorated(loop.get(LOOP))) if part is not None]
-        ends = last_calls(self._code.syntax, self._code.number, awaited, loop, parts, stops=self._known_calls())
-        return begin_after(start, opt.iterations, ends)
+            return {}
+        parts = (self._model_class, undecorated(loop.get(LOOP)))
+        awaited = self._unknown.calls.union(self.structural, self.changes, self.uses)
+        found = read_loops(self._code.syntax, self._code.number, loop, parts, awaited | self._known_calls())
+        adds = changing(self._unknown.calls).union(self.changes) & found.ends.keys()
+        self._densifies = UNTIL in found.asked or UNTIL not in found.passed_over or bool(adds)
+        refuse_loop_without_end(found.ends if self.uses else {}, loop[OPTIONS].iterations, self.difference(self._code))
+        return {name: end for name, end in found.ends.items() if end is not None and name in awaited - {*self.pausing}}
 
     def _known_calls(self) -> frozenset[str]:
         """Return the names of calls that the adapter knows."""
@@ -361,22 +365,22 @@ class InriaFamily(AbstractAdapter):
 class Inria(InriaFamily):
     """graphdeco-inria/gaussian-splatting: densification ends before `densify_until_iter`.
 
-    It is tried last, so it also takes unknown forks. A fork whose loop writes into tensors is refused. A fork that uses
-    more methods of its model, or more arguments of its renderer, is gated with a warning.
+    It is tried last, so it also takes unknown forks. What it does not know in them is refused, or warned of.
     """
 
     name = "inria"
     checked = "graphdeco-inria/gaussian-splatting 8a70a8cd and 54c035f (their scripts, run on the CPU)"
     project = "[Inria 3DGS](https://github.com/graphdeco-inria/gaussian-splatting)"
-    gated = "From `densify_until_iter` on: that iteration does not densify any more."
+    gated = "From `densify_until_iter` on, or from the beginning if options keep the loop from densification."
     left_alone = (
         "The optimizers of Gaussians (sparse Adam too) and exposure have no gradients in skipped iterations. "
-        "Renders of the viewer and of evaluations do not count as training. If two images have the same name in "
-        "different folders (older versions keep the name only), the gate warns and tells views apart by their "
-        "position. A fork that no adapter knows is refused if its loop changes tensors in place."
+        "If two images have the same name in different folders (older versions keep the name only), the gate warns and "
+        "tells views apart by their position. A fork that no adapter knows is refused if its loop changes tensors in "
+        "place, and `share` if the loop counts without `range`."
     )
     stand_ins = "inria"
     shows_half_size = True
+    uses = (READS_GRADIENT, SETS_END)
 
     @classmethod
     def recognises(cls, names: Container[str]) -> bool:
@@ -386,10 +390,8 @@ class Inria(InriaFamily):
         return f"{code.source} is a fork of Inria 3DGS that no adapter knows"
 
     def examine(self, code: LoopCode, renderers: Sequence[Callable[..., Any]], model: type) -> None:
-        if "densify_until_iter" not in code.used:
-            raise AdapterMismatchError(
-                f"{self.difference(code)}: its loop never asks for densify_until_iter. {BY_HAND}"
-            )
+        if UNTIL not in code.used:
+            raise AdapterMismatchError(f"{self.difference(code)}: its loop never asks for {UNTIL}. {BY_HAND}")
         super().examine(code, renderers, model)
 
     @classmethod

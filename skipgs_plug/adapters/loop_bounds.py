@@ -40,7 +40,14 @@ from skipgs_plug.core.source.functions import (
 )
 from skipgs_plug.core.source.substitution import returned
 
-ASSIGNED = "data ="  # represents an assignment to a tensor's `data` among the names of calls
+# They represent uses of attributes among the names of calls: assignments to a tensor's `data` and to the option that
+# ends densification, and reads of a tensor's gradient by code that does not expect that there may be none.
+ASSIGNED, SETS_END, READS_GRADIENT = "data =", "densify_until_iter =", ".grad"
+_USES = {
+    ("data", ast.Store): ASSIGNED,
+    ("densify_until_iter", ast.Store): SETS_END,
+    ("grad", ast.Load): READS_GRADIENT,
+}
 # Largest depth of nested calls that are read. A trainer's loop reaches its strategy in three; deeper calls reach
 # libraries.
 MAX_DEPTH = 5
@@ -72,14 +79,19 @@ class CallReader:
     Attributes:
         ends: By the name of each call, the first iteration in which the loop no longer makes the call. If a name is
             called in several places, the latest end counts; None if one of the places has no end.
+        asked: Attributes that the loop may read, and texts, which can name attributes.
+        passed_over: The same for parts that the loop never reaches, and for the conditions that keep it from them.
         trainer: Functions of this code are read if a function calls them. Callers add to it.
     """
 
     def __init__(self, stops: Iterable[str] = (), windows: Iterable[str] = ()) -> None:
         self.ends: dict[str, int | None] = {}
+        self.asked: set[str] = set()
+        self.passed_over: set[str] = set()
         self.trainer = TrainerCode()
         self._stops, self._windows = frozenset(stops), frozenset(windows)
         self._open: list[CodeType] = []  # code of the functions that are being read, outermost first
+        self._expects_none = False  # whether a function that is being read compares a gradient with None
 
     def read(self, function: Any, numbers: Collection[str], values: Mapping[str, Any], end: int | None = None) -> None:
         """Read a function or a bound method.
@@ -95,9 +107,12 @@ class CallReader:
         syntax = None if plain is None else syntax_of(plain)
         if plain is None or syntax is None or plain.__code__ in self._open or len(self._open) == MAX_DEPTH:
             return
+        outer = self._expects_none
+        self._expects_none = outer or _expects_none(syntax)
         self._open.append(plain.__code__)
         self._body(syntax.body, self._scope(function, plain, syntax, numbers, values), end)
         self._open.pop()
+        self._expects_none = outer
 
     @staticmethod
     def _scope(
@@ -112,17 +127,21 @@ class CallReader:
 
     def read_loops(self, function: ast.FunctionDef, scope: Scope) -> None:
         """Read the loops of a function, or all of it if it has none."""
-        scope = scope_inside(function, scope)
+        scope, self._expects_none = scope_inside(function, scope), _expects_none(function)
         for body in [loop.body for loop in outermost_loops(function)] or [function.body]:
             self._body(body, scope, None)
 
     def _body(self, body: list[ast.stmt], scope: Scope, end: int | None) -> None:
         if end == 0:  # the body is never reached
+            for statement in body:
+                _ask(statement, self.passed_over)
             return
         for statement in body:
             if isinstance(statement, (ast.If, ast.While)):
                 self._calls(statement.test, scope, end)
                 inside = _sooner(end, self._end(statement.test, scope))
+                decides = inside != 0 or statement.orelse
+                _ask(statement.test, self.asked if decides else self.passed_over)
                 after = _sooner(end, self._end(statement.test, scope, holds=False))
                 self._body(statement.body, scope, inside)
                 self._body(statement.orelse, scope, after)
@@ -130,9 +149,11 @@ class CallReader:
                     end = after
                 continue
             if isinstance(statement, ast.Match):
+                _ask(statement.subject, self.asked)
                 self._calls(statement.subject, scope, end)
                 for case in statement.cases:
                     test = case_test(statement.subject, case)
+                    _ask(test, self.asked)
                     self._body(case.body, scope, _sooner(end, self._end(test, scope)))
                 continue
             if isinstance(statement, ast.For) and self._each(statement, scope, end):
@@ -140,7 +161,9 @@ class CallReader:
             blocks = [block for field in ("body", "orelse", "finalbody") for block in getattr(statement, field, [])]
             blocks += [inner for handler in getattr(statement, "handlers", []) for inner in handler.body]
             learn_names(statement, scope)
-            self._calls(statement, scope, end, {id(node) for block in blocks for node in ast.walk(block)})
+            inner = {id(node) for block in blocks for node in ast.walk(block)}
+            _ask(statement, self.asked, inner)
+            self._calls(statement, scope, end, inner)
             self._body(blocks, scope, end)
 
     def _calls(self, part: ast.AST, scope: Scope, end: int | None, but: Collection[int] = ()) -> None:
@@ -157,8 +180,9 @@ class CallReader:
             self._calls(part.body, scope, _sooner(end, self._end(part.test, scope)))
             self._calls(part.orelse, scope, _sooner(end, self._end(part.test, scope, holds=False)))
             return
-        if isinstance(part, ast.Attribute) and part.attr == "data" and isinstance(part.ctx, ast.Store):
-            self.note(ASSIGNED, end)
+        if isinstance(part, ast.Attribute) and (use := _USES.get((part.attr, type(part.ctx)))) is not None:
+            if use != READS_GRADIENT or not self._expects_none:
+                self.note(use, end)
         elif isinstance(part, ast.Call):
             name = getattr(part.func, "attr", getattr(part.func, "id", None))
             if name is not None:
@@ -266,29 +290,28 @@ class CallReader:
         return end
 
 
-def last_calls(
+def read_loops(
     function: ast.FunctionDef,
     number: str,
-    names: Collection[str],
     values: Mapping[str, Any],
-    trainer: Iterable[Part],
+    trainer: Iterable[Part | None],
     stops: Iterable[str],
-) -> dict[str, int]:
-    """Return the first iteration in which the loop no longer makes each of these calls, for calls that have an end.
+) -> CallReader:
+    """Read the loops of a function, and return what was found in them.
 
     Args:
         function: The function that holds the loop.
         number: Variable of the loop that holds the iteration's number.
-        names: Names of the methods.
         values: Values of the loop's names when it begins.
-        trainer: Functions and classes of the trainer. Its other functions are read if the loop calls them.
-        stops: Names of further methods that are not read.
+        trainer: Functions and classes of the trainer, if known. Its other functions are read if the loop calls them.
+        stops: Names of functions that are not read.
     """
-    reader = CallReader(frozenset(names).union(stops))
+    reader = CallReader(stops)
     for part in trainer:
-        reader.trainer.add(part)
+        if part is not None:
+            reader.trainer.add(part)
     reader.read_loops(function, Scope(frozenset({number}), values))
-    return {name: end for name, end in reader.ends.items() if name in names and end is not None}
+    return reader
 
 
 def function_of(source: Path | Any, name: str) -> ast.FunctionDef | None:
@@ -299,6 +322,24 @@ def function_of(source: Path | Any, name: str) -> ast.FunctionDef | None:
     except (OSError, TypeError, ValueError, SyntaxError):
         return None
     return next((node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name), None)
+
+
+def _ask(part: ast.AST, into: set[str], but: Collection[int] = ()) -> None:
+    """Record the attributes and texts in a statement or expression, except the nodes `but`."""
+    for node in ast.walk(part):
+        match node:
+            case ast.Attribute(attr=str(name)) | ast.Constant(str(name)) if id(node) not in but:
+                into.add(name)
+
+
+def _expects_none(function: ast.FunctionDef) -> bool:
+    """Whether a function asks somewhere whether there is a gradient."""
+    compared = [[node.left, *node.comparators] for node in ast.walk(function) if isinstance(node, ast.Compare)]
+    return any(
+        any(isinstance(side, ast.Attribute) and side.attr == "grad" for side in sides)
+        and any(isinstance(side, ast.Constant) and side.value is None for side in sides)
+        for sides in compared
+    )
 
 
 def _sooner(one: int | None, other: int | None) -> int | None:

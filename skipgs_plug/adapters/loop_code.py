@@ -62,6 +62,20 @@ class LoopCode(NamedTuple):
                     return name
         return "iteration"
 
+    @property
+    def counts_with_range(self) -> bool:
+        """Whether a loop over a range may set the rates; False for `while` and for loops over a data loader alone."""
+        if self.syntax is None:
+            return True
+        around = [loop for loop in _loops(self.syntax) if RATES in _called_in(loop)]
+        heads = [loop.iter for loop in around if isinstance(loop, ast.For)]
+        made, grown = {"range"}, 0
+        assigned = [node for node in ast.walk(self.syntax) if isinstance(node, (ast.Assign, ast.AnnAssign))]
+        while grown != len(made):
+            grown = len(made)
+            made = made.union(*(_names_in(node, ast.Store) for node in assigned if _names_in(node, ast.Load) & made))
+        return not around or any(_names_in(head, ast.Load) & made for head in heads)
+
     @classmethod
     def of_module(cls, namespace: Mapping[str, Any]) -> LoopCode:
         """Read an imported module."""
@@ -191,6 +205,11 @@ def _called_in(*parts: ast.AST) -> set[str]:
         for function in called
         if isinstance(function, (ast.Name, ast.Attribute))
     }
+
+
+def _names_in(part: ast.AST, use: type[ast.expr_context]) -> set[str]:
+    """Return the names that a part of a source reads (`ast.Load`) or assigns (`ast.Store`)."""
+    return {node.id for node in ast.walk(part) if isinstance(node, ast.Name) and isinstance(node.ctx, use)}
 
 
 def _in_loop(code: types.CodeType, syntax: ast.FunctionDef | None) -> tuple[set[str], set[str]]:

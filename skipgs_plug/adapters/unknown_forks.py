@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from skipgs_plug.adapters.loop_bounds import ASSIGNED, CallReader
+from skipgs_plug.adapters.loop_bounds import ASSIGNED, READS_GRADIENT, SETS_END, CallReader
 from skipgs_plug.adapters.loop_code import LOOP, OPTIONS, LoopCode
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
@@ -35,6 +35,7 @@ CALLS = frozenset(
         "get_xyz",
         "oneupSHdegree",
         "restore",
+        "save_ply",
         "training_setup",
         "update_learning_rate",
     }
@@ -86,6 +87,18 @@ class Unrecognised(NamedTuple):
             raise AdapterMismatchError(
                 f"{who}: its loop itself changes values ({names}), and would still do so in skipped iterations. "
                 f"{BY_HAND}"
+            )
+
+    def tell(self, who: str, render: str) -> None:
+        """Warn about the unrecognised parts, if there are any.
+
+        Args:
+            who: Start of the message.
+            render: Name of the renderer.
+        """
+        if self.listed:
+            caution(
+                f"{who}. Recognised: {render}, backward, {', '.join(sorted(self.known))}. {left_alone(self.listed)}"
             )
 
     @property
@@ -149,6 +162,30 @@ def refuse_loop_elsewhere(code: LoopCode, who: str) -> None:
         )
 
 
+def refuse_loop_without_end(ends: Mapping[str, int | None], last: int, who: str) -> None:
+    """Raise an error if a loop reads gradients until its end, or sets the end of densification itself.
+
+    Args:
+        ends: See `CallReader`.
+        last: Last iteration of the run.
+        who: Start of the message.
+
+    Raises:
+        AdapterMismatchError: It does. GES logs norms of gradients, also in the last iteration, before it saves.
+            Binocular3DGS puts the end off when its opacities begin to decay.
+    """
+    until = ends.get(READS_GRADIENT, 0)
+    if until is None or until > last:
+        raise AdapterMismatchError(
+            f"{who}: its loop reads gradients (grad) until its end, for example to log them, and a skipped iteration "
+            f"has none. Switch that off if the script has an option for it, such as one for the log. {BY_HAND}"
+        )
+    if SETS_END in ends:
+        raise AdapterMismatchError(
+            f"{who}: its loop itself sets densify_until_iter, so it is not known when densification ends. {BY_HAND}"
+        )
+
+
 class Survey:
     """Finds calls of a fork that its parent's adapter does not know, and delays the start of the gate until they end.
 
@@ -206,7 +243,7 @@ class Survey:
     def unknown(self) -> list[str]:
         """The calls that the adapter does not know, except getters."""
         called = self._reader.ends.keys() & self._methods - self._known
-        return sorted(name for name in called if not name.startswith("get_"))
+        return sorted(changing(called))
 
     def start_after_changes(self, start: int, last: float = math.inf, unit: int = 1) -> int:
         """Return the later of `start` and the end of the last change of the model, known or unknown.
@@ -230,6 +267,11 @@ class Survey:
         return begin_after(start, last, ends)
 
 
+def changing(names: Iterable[str]) -> set[str]:
+    """Return the names of functions that may change the model: all but those of getters."""
+    return {name for name in names if not name.startswith("get_")}
+
+
 def left_alone(names: Iterable[str]) -> str:
     """Return a sentence about calls that were not recognised."""
     return f"Not recognised, and still executed in skipped iterations: {', '.join(names)}."
@@ -237,7 +279,7 @@ def left_alone(names: Iterable[str]) -> str:
 
 def spelled(name: str) -> str:
     """Return the name of a call as messages show it."""
-    return "an assignment to data" if name == ASSIGNED else f"{name}()"
+    return {ASSIGNED: "an assignment to data", READS_GRADIENT: "for the grad of a tensor"}.get(name, f"{name}()")
 
 
 def begin_after(start: int, last: float, ends: Mapping[str, int]) -> int:

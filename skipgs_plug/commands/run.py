@@ -14,6 +14,7 @@ from typing import Any
 from skipgs_plug import SkipGate, SkipGSError, UnknownTrainerError
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
+from skipgs_plug.commands.options.gate import GateOptions
 from skipgs_plug.commands.options.run import Args
 from skipgs_plug.compat import FAMILIES, serve
 from skipgs_plug.core.errors import AdapterMismatchError, BrokenTrainingError
@@ -27,6 +28,8 @@ from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED
 from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu, exclusive_cores
 from skipgs_plug.scripts.exits import before_os_exit
 from skipgs_plug.scripts.launch import Attach, run_script, source_of
+
+ARGPARSE_ERROR = 2  # exit code of a script whose arguments argparse does not know
 
 
 def run(args: Args) -> int:
@@ -51,10 +54,18 @@ def run(args: Args) -> int:
         rank = int(os.environ.get("RANK") or 0)  # torchrun sets it
         code, gate = run_gated(args, command, execute, rank)
     verify(code, gate)
+    if code == ARGPARSE_ERROR and not (gate is not None and gate.trained) and (misplaced := own_options(command)):
+        say(f"If {misplaced} was meant for skipgs-plug, write it before '--'.")
     seen = args.no_gate if gate is None else gate.trained or gate.released
     if code == 0 and not processes and not seen:
         say(f"{script_name(command)} ended without a training iteration; nothing was gated.")
     return code
+
+
+def own_options(command: Sequence[str]) -> str:
+    """Return the arguments of the script that are options of skipgs-plug too, as one text."""
+    own = {f"--{field.name.replace('_', '-')}" for kind in (Args, GateOptions) for field in dataclasses.fields(kind)}
+    return ", ".join(word for word in command if word.partition("=")[0] in own)
 
 
 def find_adapter(args: Args, command: list[str]) -> str | None:

@@ -14,8 +14,8 @@ from torch import Tensor
 from .compose import NEAR_PLANE, render, splats
 from .settings import settings_class
 
-# The classic version has no `antialiasing`: there it is None.
-GaussianRasterizationSettings = settings_class({"debug": ("antialiasing",)}, defaults=(None,))
+# The classic version has no `antialiasing`: there it is None. The first one, which GaussianShader uses, has no `debug`.
+GaussianRasterizationSettings = settings_class({"debug": ("antialiasing",)}, defaults=(False, None))
 
 
 class MissingOutputError(IndexError):

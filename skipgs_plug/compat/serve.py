@@ -57,7 +57,11 @@ FAMILIES: dict[str, _Source] = {
     "nerfstudio": {},  # gsplat contains all CUDA code that splatfacto needs
 }
 # Modules that are also served if torchvision cannot be imported: LPIPS of pip, and the copy that most trainers bring.
-_WITHOUT_TORCHVISION: _Source = {"lpips": (".lpips", ("LPIPS",)), "lpipsPyTorch": (".lpips", ("LPIPS", "lpips"))}
+_WITHOUT_TORCHVISION: _Source = {
+    "lpips": (".lpips", ("LPIPS",)),
+    "lpips.lpips": (".lpips", ("LPIPS",)),
+    "lpipsPyTorch": (".lpips", ("LPIPS", "lpips")),
+}
 
 
 @contextmanager

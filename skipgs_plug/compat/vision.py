@@ -1,14 +1,13 @@
 """The few functions of torchvision that trainers of the Inria family call.
 
-They are served only if torchvision is not installed. Its pretrained models are needed only for LPIPS and cannot be
-replaced. A request for one raises an error that says so.
+They are served only if torchvision cannot be imported. Its pretrained models are needed only for LPIPS and cannot be
+replaced.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import torch
@@ -51,18 +50,15 @@ class ToPILImage:
         return to_pil_image(picture)
 
 
-class _Models(ModuleType):
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        raise RuntimeError(f"torchvision.models.{name} needs torchvision: install it, or leave LPIPS out.")
+class Part(ModuleType):
+    """A module with a few functions of torchvision's. Its class tells errors of its users from others."""
 
 
 def modules() -> dict[str, ModuleType]:
     """Return the module objects by import name."""
-    top = ModuleType("torchvision", "The part of torchvision that skipgs_plug serves where it is missing.")
-    utils, transforms = ModuleType("torchvision.utils"), ModuleType("torchvision.transforms")
-    functional, models = ModuleType("torchvision.transforms.functional"), _Models("torchvision.models")
+    top = Part("torchvision", "The part of torchvision that skipgs_plug serves where it is missing.")
+    utils, transforms = Part("torchvision.utils"), Part("torchvision.transforms")
+    functional, models = Part("torchvision.transforms.functional"), Part("torchvision.models")
     vars(utils).update(save_image=save_image)
     vars(functional).update(to_tensor=to_tensor, to_pil_image=to_pil_image)
     vars(transforms).update(ToTensor=ToTensor, ToPILImage=ToPILImage, functional=functional)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, ClassVar, Protocol
@@ -57,8 +56,9 @@ class Hooks(LoopHooks):
     The first training backward pass of an iteration is gated. Any further one runs and counts as a mismatch.
 
     Attributes:
-        awaited: Modules that the adapter attaches to when the script imports them. A run whose first training backward
-            pass comes outside of any iteration, and without one of them, is refused.
+        awaited: Names of what the adapter expects of the trainer and has not seen yet, such as modules that the script
+            imports. A run whose first training backward pass comes outside of any iteration, and before all of them
+            were seen, is refused.
     """
 
     def __init__(self, engine: Engine, adapter: Adapter, given: frozenset[str], in_script: bool = False) -> None:
@@ -89,7 +89,7 @@ class Hooks(LoopHooks):
         self._backwards = 0
         self._odd_iterations = 0  # iterations with a number of backward passes other than one, so far
         self._callers: set[str] = set()  # functions whose backward passes are gated
-        self.awaited: list[str] = []
+        self.awaited: set[str] = set()
 
     # Facts, at attach or when training begins.
 
@@ -203,9 +203,8 @@ class Hooks(LoopHooks):
         """Whether this backward is the first of an iteration."""
         self._backwards += 1
         if self._iterations == 0:
-            absent = [name for name in self.awaited if name not in sys.modules]
-            if self._engine.config.enabled and absent and self._backwards == 1:
-                raise self._mismatch(f"it trains without a module {' or '.join(absent)}")
+            if self._engine.config.enabled and self.awaited and self._backwards == 1:
+                raise self._mismatch(f"it trains without a {' or '.join(sorted(self.awaited))}")
             if self._engine.config.enabled and self._backwards >= CHECKED_ITERATIONS:
                 raise self._mismatch(f"{self._backwards} training backwards ran in no iteration")
             return False

@@ -9,12 +9,15 @@ from pathlib import Path
 # Modules that every checkout of the Inria family contains.
 OF_CHECKOUTS = frozenset({"arguments", "gaussian_renderer", "scene", "utils"})
 EXTENSIONS = ("diff_", "simple_knn", "fused_ssim")
-# Packages by the name of their module, where the two differ.
+# Packages of the package index by the name of their module: where the two differ, and those that Inria's checkout lists
+# for conda.
 PACKAGES = {
     "cv2": "opencv-python",
     "PIL": "pillow",
+    "plyfile": "plyfile",
     "skimage": "scikit-image",
     "sklearn": "scikit-learn",
+    "tqdm": "tqdm",
     "yaml": "pyyaml",
 }
 REQUIREMENTS = ("*requirements*.txt", "environment*.yml", "environment*.yaml", "pyproject.toml", "setup.*")
@@ -35,7 +38,8 @@ def install_hint(module: str, script: Path, stand_ins: Container[str] = ()) -> s
 
     The sentence names a package only if the requirements of the checkout list it or if `PACKAGES` holds the module.
     Any other module may be a file that the checkout lacks, and the package index may hold an unrelated package of
-    that name. So may it for an entry with a folder or an address, such as `submodules/simple-knn`.
+    that name. So may it for an entry with a folder or an address, such as `submodules/simple-knn`, and for a package of
+    conda.
 
     Args:
         module: Name of the missing module.
@@ -50,11 +54,16 @@ def install_hint(module: str, script: Path, stand_ins: Container[str] = ()) -> s
         return f"{top} is a CUDA extension of the trainer: build it as the trainer's README says{cpu}."
     package = PACKAGES.get(top, top)
     for listing in requirements(script):
-        entry = entry_of(listing, package)
+        entry = entry_of(listing.read_text(errors="replace"), package)
         if entry is not None and "/" in entry:
             return (
                 f"{script.name} needs the module {top}, which {listing.name} takes from {entry}: install it from "
                 "there, as the trainer's README says."
+            )
+        if entry is not None and top not in PACKAGES and is_for_conda(listing, package):
+            return (
+                f"{script.name} needs the package {package}, which {listing.name} lists for conda: install it from "
+                "there, or with pip under the name that its own page gives."
             )
         if entry is not None:
             return f"{script.name} needs the package {package}, which {listing.name} lists; run: pip install {package}"
@@ -73,12 +82,18 @@ def requirements(script: Path) -> Iterator[Path]:
             yield from sorted(path for path in folder.glob(pattern) if path.is_file())
 
 
-def entry_of(listing: Path, package: str) -> str | None:
-    """Return the entry of a requirements file that names a package; None without one.
+def is_for_conda(listing: Path, package: str) -> bool:
+    """Return whether an environment lists a package for conda, not for pip, whose index may not know that name."""
+    of_pip = listing.read_text(errors="replace").partition("pip:")[2]
+    return listing.suffix in (".yml", ".yaml") and entry_of(of_pip, package) is None
+
+
+def entry_of(listing: str, package: str) -> str | None:
+    """Return the entry of a list of requirements that names a package; None without one.
 
     Package indices treat "-" and "_" alike. A plain name is preferred to a folder or an address.
     """
     name = re.sub("[-_]+", "[-_]", re.escape(package).replace(r"\-", "-"))
     pattern = rf"[^\s\"']*(?<![\w-]){name}(?![\w-])(?:[ \t]*@[ \t]*)?[^\s\"',]*"
-    found = re.findall(pattern, UNLISTED.sub("", listing.read_text(errors="replace")), re.IGNORECASE)
+    found = re.findall(pattern, UNLISTED.sub("", listing), re.IGNORECASE)
     return min(found, key=lambda entry: "/" in entry, default=None)

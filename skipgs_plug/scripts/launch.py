@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib.metadata
 import importlib.util
+import itertools
 import runpy
 import sys
 import types
@@ -20,7 +21,9 @@ from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.messages import say
 from skipgs_plug.scripts.import_hints import install_hint
 from skipgs_plug.scripts.stand_in_hints import stand_in_hint
+from skipgs_plug.scripts.wrappers import wrapper_hint
 
+PACKAGE = Path(__file__).parents[1]
 Attach = Callable[[], dict[str, Any]]  # see `run_script`
 
 
@@ -112,6 +115,8 @@ def _resolve(command: Sequence[str]) -> _Program:
             raise SkipGSError(f"There is no module {name}: install it, or name a training script after '--'.")
         run = functools.partial(_run_module, name)
         return _Program([str(source), *arguments], Path.cwd(), source, run)
+    if (instead := wrapper_hint(name)) is not None:
+        raise SkipGSError(instead)
     script = Path(name).resolve()
     if script.is_file():
         _refuse_shadowed_modules(script.parent)
@@ -160,7 +165,7 @@ def _exit_code(code: Any) -> int:
 
 
 def _print_traceback(error: BaseException, program: _Program) -> None:
-    """Print the traceback from the first frame of the script or its checkout on."""
+    """Print the traceback from the first frame of the script or its checkout on, without wrappers of its functions."""
 
     def is_ours(trace: types.TracebackType) -> bool:
         file = trace.tb_frame.f_code.co_filename
@@ -169,8 +174,22 @@ def _print_traceback(error: BaseException, program: _Program) -> None:
     trace = error.__traceback__
     while trace is not None and is_ours(trace):
         trace = trace.tb_next
-    shown = error.with_traceback(trace or error.__traceback__)
+    shown = error.with_traceback(_without_wrappers(trace or error.__traceback__))
     sys.excepthook(type(shown), shown, shown.__traceback__)  # the script may have set its own
+
+
+def _without_wrappers(trace: types.TracebackType | None) -> types.TracebackType | None:
+    """Leave out the frames of this package that call other code. If the error is its own, the last frames show it."""
+    frames = []
+    while trace is not None:
+        frames.append(trace)
+        trace = trace.tb_next
+    own = [PACKAGE in Path(one.tb_frame.f_code.co_filename).parents for one in frames]
+    last = max((place for place, is_own in enumerate(own) if not is_own), default=-1)
+    kept = [one for place, one in enumerate(frames) if not own[place] or place > last]
+    for one, following in itertools.pairwise(kept):
+        one.tb_next = following
+    return kept[0] if kept else None
 
 
 def _refuse_shadowed_modules(checkout: Path) -> None:

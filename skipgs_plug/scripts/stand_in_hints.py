@@ -16,6 +16,8 @@ FOLDERS = tuple(Path(__file__).parents[1] / package.rpartition(".")[2] for packa
 # Beginning of the message of a `TypeError`, if a call has other arguments than the function.
 SIGNATURE = re.compile(r"([\w.]+)\(\) (got|takes|missing) ")
 CUDA_WRAPPERS = ("gsplat", "cuda")  # folder whose functions need the extension, with or without a toolkit to compile it
+# Modules that stand-ins replace only where torchvision cannot be imported, as messages name them.
+WITH_TORCHVISION = ("torchvision", "lpips")
 SHAPE = " must have shape "  # in the message of the stand-ins' rasterizer for a tensor that does not fit the others
 
 
@@ -35,6 +37,11 @@ def stand_in_hint(error: BaseException) -> str | None:
     lacks = False
     if isinstance(error, NotImplementedError) and inside:
         return text
+    if isinstance(error, OSError) and "CUDA_HOME" in text:  # of `torch.utils.cpp_extension`
+        return (
+            "The script compiles a CUDA extension of its own, for which this adapter has no CPU stand-in: run it on a "
+            "GPU, without --cpu."
+        )
     if isinstance(error, AttributeError):
         lacks = is_stand_in(error.obj)
     elif isinstance(error, ImportError) and error.name:  # a stand-in lacks a name or a module
@@ -60,7 +67,11 @@ def stand_in_hint(error: BaseException) -> str | None:
         text += " where the renderer unpacks the outputs"
     if not lacks:
         return None
-    return f"The script uses a feature that the stand-ins of --cpu lack ({text}): it needs CUDA; run it without --cpu."
+    if any(name in text for name in WITH_TORCHVISION):
+        need = "it needs torchvision; install the version of torchvision that belongs to this PyTorch."
+    else:
+        need = "it needs CUDA; run it without --cpu."
+    return f"The script uses a feature that the stand-ins of --cpu lack ({text}): {need}"
 
 
 def called_with_cuda(frames: Sequence[traceback.FrameSummary]) -> str:

@@ -1,12 +1,12 @@
 """A training function with several loops, one after the other: each is read when it begins."""
 
 import pytest
-from cases import note_begun
+from cases import SkipAlways, note_begun
 from lookalikes import gsplat_runner, inria
 from lookalikes.splats import log, new_log
 from test_unknown_changes import forked
 
-from skipgs_plug import SkipGate
+from skipgs_plug import SkipGate, SkipGSError
 
 LOOP = "    for iteration in range(first_iter, opt.last + 1):\n"
 WARM_UP = """    for iteration in range(1, 11):
@@ -92,6 +92,28 @@ def test_a_later_loop_that_cannot_be_planned_runs_whole_with_one_warning(head, s
     assert [str(one.message) for one in said] == [gate.released]
     assert [n for n in begun if n < 31] != WHOLE[:30] and gate.patched == []
     assert sorted(n for n in log.backwards if n > 30) == list(range(31, max(log.backwards) + 1))
+
+
+LOADER = """    iteration, views, batches = first_iter - 1, scene.getTrainCameras(), []
+    while iteration < opt.last:
+      for batch in views:
+        if iteration == opt.last:
+            break
+        iteration += 1
+"""
+
+
+@pytest.mark.parametrize("settings", [{"share": 0.4}, {"refine_share": "auto"}], ids=["share", "refine_share"])
+def test_a_loop_over_a_data_loader_refuses_a_share_before_anything_runs(settings, begun, tmp_path):
+    """So do hierarchical-3d-gaussians, whose bar alone counts with a range."""
+    with pytest.raises(SkipGSError, match=r"does not count with range\(\); give neither share nor refine_share"):
+        SkipGate(forked(inria, [(LOOP, LOADER)], tmp_path), **settings)
+    assert begun == []
+
+
+def test_the_papers_gate_follows_a_loop_over_a_data_loader(begun, tmp_path):
+    gate = train(forked(inria, [(LOOP, LOADER)], tmp_path), policy=SkipAlways())
+    assert begun == WHOLE and gate.report()["backwards_skipped"] > 30
 
 
 EPOCHS = """        step = -1

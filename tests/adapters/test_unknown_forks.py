@@ -25,8 +25,7 @@ def training(dataset, opt, pipe):
         loss = photo_loss(render(viewpoint_cam, gaussians{argument})["render"], viewpoint_cam)
         loss.backward()
         with torch.no_grad():
-            if iteration < opt.{until}:
-                pass  # densification
+            if iteration < opt.densify_until_iter: pass
             gaussians.optimizer.step()
             gaussians.optimizer.zero_grad(set_to_none=True)
             {extra}
@@ -51,6 +50,9 @@ class GaussianModel(SplatModel):
     def count(self):
         self.counted = True
 
+    def get_features(self):
+        return self.values["f_dc"]
+
     def compute_3D_filter(self):
         self.filter = self.values["xyz"].detach().abs()
 
@@ -73,11 +75,13 @@ def from_file(tmp_path):
     return make
 
 
-def unknown_fork(argument="", extra="pass", until="densify_until_iter", before="pass", after="", file=None, helper=""):
+def unknown_fork(argument="", extra="pass", densification=None, before="pass", after="", file=None, helper=""):
     module = types.ModuleType("train")
     own = {"GaussianModel": type("GaussianModel", (GaussianModel,), {}), "render": render, "Scene": Scene}
     module.__dict__.update(own, log=log, pick=pick, photo_loss=photo_loss, torch=torch)
-    source = TRAIN.format(argument=argument, extra=extra, until=until, before=before, after=after) + helper
+    source = TRAIN.format(argument=argument, extra=extra, before=before, after=after) + helper
+    if densification is not None:
+        source = source.replace("if iteration < opt.densify_until_iter: pass", densification)
     if file is not None:
         file.write_text(source)
     exec(compile(source, str(file or "train"), "exec"), vars(module))
@@ -129,7 +133,42 @@ def test_loop_that_changes_values_itself_is_refused(extra, sentence):
 
 def test_loop_without_an_end_of_densification_is_refused():
     with pytest.raises(AdapterMismatchError, match="its loop never asks for densify_until_iter"):
-        SkipGate(unknown_fork(until="iterations"))
+        SkipGate(unknown_fork(densification="pass"))
+
+
+NESTED = """if not opt.features:
+                if iteration < opt.densify_until_iter:
+                    gaussians.densify_and_prune(0.05)"""
+JOINED = "if iteration < opt.densify_until_iter and not opt.features: gaussians.densify_and_prune(0.05)"
+ELSEWHERE = """if iteration < opt.densify_until_iter:
+                if opt.features: list(gaussians.values)
+                else: gaussians.densify_and_prune(0.05)"""
+PRUNED = f"{NESTED}\n            if iteration == 6: gaussians.prune_points(torch.zeros(30, dtype=torch.bool))"
+READ, THINNED = (f"{NESTED}\n            {call}" for call in ("gaussians.get_features()", "gaussians.thin()"))
+
+
+@pytest.mark.filterwarnings("ignore:The (gate|densification)", "ignore:.*Not recognised")
+@pytest.mark.parametrize(
+    ("densification", "start"),
+    [(NESTED, 1), (JOINED, 1), (ELSEWHERE, 20), (PRUNED, 7), (READ, 1), (THINNED, 20)],
+)
+@pytest.mark.parametrize("settings", [{}, {"share": 0.4}, {"refine_share": 0.4}], ids=["paper", "share", "refined"])
+def test_a_loop_that_never_densifies_is_refined_from_its_beginning(densification, start, settings, from_file):
+    """LangSplat fits features to finished Gaussians."""
+    with SkipGate(from_file(densification=densification), **settings, pause_iters=0) as gate:
+        train(gate.adapter.trainer, features=True)
+    report = gate.report()
+    assert gate.config.start_iter == start
+    if settings and start < 20:
+        assert report["growing"] is None
+        assert report["iterations_run"] + report["iterations_skipped"] == 41 - max(start, 1)
+        assert report["iterations_skipped"] > 15
+
+
+def test_a_loop_that_never_densifies_can_be_gated_from_any_iteration(from_file):
+    with SkipGate(from_file(densification=NESTED), start_iter=5, policy=SkipAlways()) as gate:
+        train(gate.adapter.trainer, features=True)
+    assert gate.report()["backwards_skipped"] == 36
 
 
 def test_further_calls_and_arguments_are_listed():
@@ -282,6 +321,59 @@ def test_gate_begins_after_the_last_call_that_is_not_recognised(extra, start, fr
     assert gate.config.start_iter == start and gate.report()["backwards_skipped"] == 41 - start
 
 
+REPORT = """
+def report(model):
+    log.norm = model.values["xyz"].grad.data.norm()
+"""
+
+
+@pytest.mark.parametrize("settings", [{}, {"share": 0.5}])
+@pytest.mark.parametrize(
+    "extra", ["report(gaussians)", "if opt.logs and iteration % 2: log.last = gaussians.values['xyz'].grad.norm()"]
+)
+def test_a_loop_that_reads_gradients_until_its_end_is_refused(extra, settings, from_file):
+    """GES logs norms of gradients. A skipped iteration would end its run, such as the last one, before it saves."""
+    module = from_file(extra=extra, helper=REPORT)
+    with (
+        pytest.raises(AdapterMismatchError, match=r"its loop reads gradients \(grad\) until its end"),
+        SkipGate(module, **settings),
+    ):
+        train(module, logs=True)
+    assert not log.backwards
+
+
+@pytest.mark.parametrize("settings", [{}, {"refine_share": 0.5}])
+def test_a_loop_that_puts_the_end_of_densification_off_is_refused(settings, from_file):
+    """Binocular3DGS densifies until the end if its opacities decay."""
+    module = from_file(extra="if opt.logs and iteration > 10: opt.densify_until_iter = opt.iterations")
+    with (
+        pytest.raises(AdapterMismatchError, match="its loop itself sets densify_until_iter"),
+        SkipGate(module, **settings),
+    ):
+        train(module, logs=True)
+    assert not log.backwards
+    with SkipGate(module, **settings):
+        train(module, logs=False)
+
+
+@pytest.mark.parametrize(
+    ("extra", "start"),
+    [
+        ("if opt.logs: report(gaussians)", 20),
+        ("if gaussians.values['xyz'].grad is not None: report(gaussians)", 20),
+        ("if iteration < opt.prune_until_iter: log.last = gaussians.values['xyz'].grad", 30),
+    ],
+)
+def test_a_loop_that_reads_no_gradient_of_a_skipped_iteration_is_gated(extra, start, from_file):
+    with SkipGate(from_file(extra=extra, helper=REPORT), policy=SkipAlways()) as gate:
+        if start > 20:
+            with pytest.warns(RuntimeWarning, match="the loop calls for the grad of a tensor until iteration 29"):
+                train(gate.adapter.trainer, logs=False)
+        else:
+            train(gate.adapter.trainer, logs=False)
+    assert gate.config.start_iter == start and gate.report()["backwards_skipped"] == 41 - start
+
+
 def test_later_prunes_of_a_fork_put_the_start_off_too(from_file):
     extra = "if iteration <= opt.prune_until_iter: gaussians.prune_points(torch.zeros(30, dtype=torch.bool))"
     sentence = r"the loop calls prune_points\(\) until iteration 30"
@@ -355,7 +447,7 @@ def test_a_loop_that_does_the_same_in_other_words_is_gated(way, tmp_path, monkey
 @pytest.mark.parametrize(("name", "extra"), [("inria", "pass"), ("2dgs", "lambda_dist = opt.lambda_dist")])
 def test_the_viewer_that_2dgs_shares_with_other_forks_does_not_make_a_script_its_own(name, extra, tmp_path):
     shows = "render_net_image(None, dataset.render_items, None, None)"
-    text = TRAIN.format(before="pass", argument="", until="densify_until_iter", extra=extra, after=shows)
+    text = TRAIN.format(before="pass", argument="", extra=extra, after=shows)
     script = tmp_path / "train.py"
     script.write_text(f"from scene import GaussianModel\nfrom utils.image_utils import render_net_image\n{text}")
     assert find_script_adapter(script).name == name

@@ -171,6 +171,11 @@ def test_an_installed_command_fails_as_itself(installed, capfd):
         ([], "no script to run"),
         (["-m"], "no script to run"),
         (["-m", "absent_module.train"], "no module absent_module"),
+        (["python", "train.py"], "Leave out python: write after '--' what follows it"),
+        (["/usr/bin/python3.11", "-u", "train.py"], "Leave out /usr/bin/python3.11: write"),
+        (["bash", "run.sh"], "bash is not Python: write skipgs-plug run ADAPTER -- in place of python"),
+        (["scripts/run.sh"], "scripts/run.sh is not Python"),
+        (["torchrun", "--nproc_per_node", "2", "train.py"], "torchrun ... -m skipgs_plug run ADAPTER -- train.py"),
     ],
 )
 def test_nothing_to_run_is_said(command, message):
@@ -218,7 +223,14 @@ def test_missing_module_is_named(checkout, capfd):
     ("module", "listing", "text", "advice"),
     [
         ("absent_module", "requirements.txt", "numpy\nAbsent-Module>=2\n", "lists; run: pip install absent_module"),
-        ("absent_module", "../environment.yml", "  - absent_module=1.0\n", "environment.yml lists; run: pip install"),
+        ("absent_module", "../environment.yml", "  - pip:\n    - absent_module\n", "environment.yml lists; run: pip"),
+        (
+            "absent_module",
+            "environment.yml",
+            "  - absent_module=1.0\n  - pip:\n    - numpy\n",
+            "lists for conda: install",
+        ),
+        ("plyfile", "environment.yml", "  - plyfile=0.8.1\n", "environment.yml lists; run: pip install plyfile"),
         ("absent", "requirements.txt", "absent-module\n", "If absent is part of the checkout"),
         ("absent", "environment.yml", "name: absent\n  - numpy\n", "If absent is part of the checkout"),
         ("absent", "requirements.txt", "git+https://host/absent.git\n", "takes from git+https://host/absent.git:"),

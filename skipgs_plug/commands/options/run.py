@@ -11,6 +11,7 @@ import tyro
 
 from skipgs_plug.commands.options.gate import GateOptions
 from skipgs_plug.commands.options.parse import Words, parse_as
+from skipgs_plug.trainer.errors import InputError
 
 
 def split(argv: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -44,4 +45,7 @@ class Args:
 
 def parse(argv: list[str]) -> Args:
     ours, command = split(argv)
+    script = next((word for word in ours if word.endswith(".py")), None)
+    if script is not None and "--" not in argv:
+        raise InputError(f"Write '--' before the script: skipgs-plug run {ours[0]} ... -- {script} ...")
     return dataclasses.replace(parse_as(Args, ours, "run"), command=tuple(command))

@@ -14,8 +14,9 @@ from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_kn
 from skipgs_plug.core.pace.loop_range import LoopRange
 from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.source.lines import line_of
-from skipgs_plug.core.source.milestones import TrainingLoop, read_loop
+from skipgs_plug.core.source.milestones import TrainingLoop
 from skipgs_plug.core.source.progress_bars import Bars
+from skipgs_plug.core.source.reading import read_loop
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
 

@@ -17,8 +17,8 @@ from skipgs_plug.core.pace.sampling import Sampling
 
 log = logging.getLogger(__name__)
 
-# Largest number of iterations that run after a structural change that comes when refinement has ended. It is as long
-# as the gate's pause (`pause.MIN_PAUSE_ITERS`).
+# Largest number of iterations that run after a structural change that comes when refinement has ended, if one visit of
+# each view takes no more. It is as long as the gate's pause (`pause.MIN_PAUSE_ITERS`).
 RECOVERY = 500
 # Reasons for which iterations run.
 OF_SHARE, OF_LOOP, OF_CHANGES = "share", "conditions", "changes"
@@ -60,6 +60,7 @@ class Refining(Phase):
         self.ran_for = {OF_SHARE: 0, OF_LOOP: 0, OF_CHANGES: 0}
         self._recovery = self._recovered = 0  # number of iterations to run after a change, and number that ran
         self._changed: int | None = None  # iteration of the last change
+        self._most = RECOVERY  # largest number of iterations that run after it
         self._expected: int | None = None  # iteration in which another change is expected; None if no change is
         # Number of iterations that had run at the last change before refinement ended, and number that should follow.
         self._before_change = self._after_change = 0
@@ -145,7 +146,7 @@ class Refining(Phase):
         if self._expected is not None and number > self._expected:
             assert self._last is not None and self.stopping is not None
             if self.stopping.ended:
-                self._recover(min(RECOVERY, self._last - self._expected))
+                self._recover(min(self._most, self._last - self._expected))
             self._expected = None
         self._set_pace(number)
         recovers = self._recovered < self._recovery
@@ -193,8 +194,8 @@ class Refining(Phase):
 
         The distance to the following change is expected to be that to the previous one. Until then the share of the
         iterations runs, so that a trainer that prunes again and again still leaves out most iterations. After the last
-        change, or if no change comes as expected, all iterations run, up to `RECOVERY`. With the share alone, five
-        prunes cost Speedy-Splat 1.1 dB (benchmarks/notes/EVIDENCE.md).
+        change, or if no change comes as expected, all iterations run, up to `RECOVERY` or one visit of each view. With
+        the share alone, five prunes cost Speedy-Splat 1.1 dB (benchmarks/notes/EVIDENCE.md).
 
         Args:
             step: Iteration of the change.
@@ -204,7 +205,8 @@ class Refining(Phase):
         if self.stopping is None or step == before:
             return
         assert self._last is not None and self.share is not None
-        pause, most, self._expected = self._config.pause_iters, max(n_views, RECOVERY), None
+        self._most = most = max(n_views, RECOVERY)
+        pause, self._expected = self._config.pause_iters, None
         if pause is not None:
             iterations = pause
         elif before is None or self._last - step <= step - before:
@@ -326,6 +328,7 @@ class Refining(Phase):
             "recovery": [self._recovery, self._recovered],
             "changed": self._changed,
             "expected": self._expected,
+            "most": self._most,
             "late_change": [self._before_change, self._after_change],
             "ran_for": dict(self.ran_for),
             "stopping": None if self.stopping is None else self.stopping.state_dict(),
@@ -340,6 +343,7 @@ class Refining(Phase):
         self.watched = frozenset(state["watched"])
         self._recovery, self._recovered = state["recovery"]
         self._changed, self._expected = state.get("changed"), state.get("expected")
+        self._most = state.get("most", RECOVERY)
         self._before_change, self._after_change = state.get("late_change", (0, 0))
         earlier = {OF_SHARE: self.sampling.run}  # earlier states have no counts by reason
         self.ran_for.update({reason: int(count) for reason, count in state.get("ran_for", earlier).items()})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import inspect
 from collections.abc import Callable
 from types import FunctionType
@@ -26,6 +27,8 @@ def access(
             found = inspect.getattr_static(class_of(holder), name, None)
             called, given = node, [holder, *values]
             function = (found.fset if values else found.fget) if isinstance(found, property) else None
+            if isinstance(found, functools.cached_property) and not values:
+                function = found.func
         case ast.Subscript(holder, key):
             method = "__setitem__" if values else "__getitem__"
             called, given = ast.copy_location(ast.Attribute(holder, method, ast.Load()), node), [holder, key, *values]

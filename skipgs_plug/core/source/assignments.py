@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
-from skipgs_plug.core.source.inlining import PLACES
+from skipgs_plug.core.source.names import PLACES
 from skipgs_plug.core.source.run_options import comprehended, text_of
 
 # Methods that change lists, sets and queues, so that an object can differ from iteration to iteration.
-CHANGES = frozenset({"add", "append", "appendleft", "clear", "discard", "extend", "insert", "pop", "popleft", "remove"})
+SHRINKS = frozenset({"clear", "discard", "pop", "popleft", "remove"})
+CHANGES = SHRINKS | {"add", "append", "appendleft", "extend", "insert"}
 # Methods that change dictionaries. Other objects have methods of the same names for other purposes.
 CHANGES_OPTIONS = frozenset({"popitem", "setdefault", "update"})
 
@@ -21,6 +22,7 @@ class Assignments(NamedTuple):
     Attributes:
         assigned: Names, attributes and entries that they assign, once for each assignment.
         changed: The same, and objects whose methods in `CHANGES` they call.
+        shrunk: Objects whose methods in `SHRINKS` they call.
         options: Lists and dictionaries whose entries they assign, and objects whose methods in `CHANGES_OPTIONS` they
             call.
     """
@@ -28,6 +30,16 @@ class Assignments(NamedTuple):
     assigned: list[str]
     changed: set[str]
     options: set[str]
+    shrunk: set[str]
+
+    def possible(self, names: Mapping[str, Any]) -> Assignments:
+        """Return these without calls of methods of what is None, as in `if writer is not None: writer.add(...)`.
+
+        Args:
+            names: Names and values before the loop.
+        """
+        none = {name for name, value in names.items() if value is None}.difference(self.assigned)
+        return self._replace(changed=self.changed - none, options=self.options - none)
 
 
 def assignments_in(body: Iterable[ast.stmt]) -> Assignments:
@@ -40,4 +52,5 @@ def assignments_in(body: Iterable[ast.stmt]) -> Assignments:
     changed = {ast.unparse(method.value) for method in called if method.attr in CHANGES}
     options = {ast.unparse(method.value) for method in called if method.attr in CHANGES_OPTIONS}
     options |= {ast.unparse(node.value) for node in stored if isinstance(node, ast.Subscript)}
-    return Assignments(assigned, changed.union(assigned), options)
+    shrunk = {ast.unparse(method.value) for method in called if method.attr in SHRINKS}
+    return Assignments(assigned, changed.union(assigned), options, shrunk)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from skipgs_plug.core.source.inlining import InlinedFunction
@@ -34,30 +34,34 @@ def conditions_in(
     functions: Mapping[int, InlinedFunction],
     guards: Guards = (),
     function: InlinedFunction | None = None,
+    unread: Container[int] = (),
 ) -> Iterator[Condition]:
-    """Yield all conditions in statements, and in the functions that they call.
+    """Yield all conditions in statements, and in the functions that they call; and all calls that are not read.
 
     Args:
         body: The statements.
         functions: Inlined functions by the id of the call, or of the attribute or entry that makes it.
         guards: Conditions under which the statements run.
         function: The function that the statements are of; None for the loop.
+        unread: Calls that stand for conditions, because their functions are not read, by id.
     """
     for statement in body:
-        if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+        if isinstance(statement, ast.ClassDef):
             continue
         for call, reached in _calls_of(statement, guards):
+            if id(call) in unread:
+                yield Condition(call, reached, function)
             if (inside := functions.get(id(call))) is not None:
-                yield from conditions_in(inside.body, functions, reached, inside)
+                yield from conditions_in(inside.body, functions, reached, inside, unread)
         if isinstance(statement, (ast.If, ast.While)):
             yield Condition(statement.test, guards, function)
-            yield from conditions_in(statement.body, functions, (*guards, statement.test), function)
-            yield from conditions_in(statement.orelse, functions, (*guards, _not(statement.test)), function)
+            yield from conditions_in(statement.body, functions, (*guards, statement.test), function, unread)
+            yield from conditions_in(statement.orelse, functions, (*guards, _not(statement.test)), function, unread)
         else:
             if isinstance(statement, ast.Match):
                 yield from (Condition(equal, guards, function) for equal in _cases(statement))
             for block in _blocks(statement):
-                yield from conditions_in(block, functions, guards, function)
+                yield from conditions_in(block, functions, guards, function, unread)
             for part in ast.iter_child_nodes(statement):
                 if isinstance(statement, ast.Expr) and isinstance(part, ast.BoolOp):
                     yield Condition(_deciding(part), guards, function)
@@ -80,17 +84,25 @@ def leaves(node: ast.expr) -> Iterator[ast.expr]:
 
 
 def is_point(leaf: ast.expr) -> bool:
-    """Whether a part of a condition picks single numbers: by equality, membership, a remainder or a called function."""
+    """Whether a part of a condition picks single numbers: by equality, membership, a remainder or a called function.
+
+    So does the comparison of two numbers' stages, as in `step // 100 > (step - 1) // 100`.
+    """
     if isinstance(leaf, ast.Compare):
         compared = zip(leaf.ops, leaf.comparators, strict=True)
-        return any(isinstance(operator, _PICKS) and not _is_stretch(right) for operator, right in compared) or any(
-            isinstance(part, ast.Mod) for part in ast.walk(leaf)
-        )
+        if any(isinstance(operator, _PICKS) and not _is_stretch(right) for operator, right in compared):
+            return True
+        stages = all(_has(one, ast.FloorDiv) for one in (leaf.left, *leaf.comparators))
+        return stages or _has(leaf, ast.Mod)
     if isinstance(leaf, ast.IfExp):
         parts = [part for value in (leaf.test, leaf.body, leaf.orelse) for part in leaves(value)]
         return any(is_point(part) for part in parts if not isinstance(part, ast.Constant))
     # The training backward of a user's own loop receives the number too, but is not a milestone.
     return not (isinstance(leaf, ast.Call) and isinstance(leaf.func, ast.Attribute) and leaf.func.attr == "backward")
+
+
+def _has(node: ast.expr, operator: type[ast.operator]) -> bool:
+    return any(isinstance(part, operator) for part in ast.walk(node))
 
 
 def _is_stretch(values: ast.expr) -> bool:
@@ -189,6 +201,12 @@ def _matched(pattern: ast.pattern, subject: ast.expr) -> Iterator[tuple[ast.patt
     match pattern, subject:
         case ast.MatchSequence(), ast.Tuple(shown) if len(shown) == len(inner):
             parts = shown
+        case ast.MatchSequence(), _:
+            parts = [ast.Subscript(subject, ast.Constant(index), ast.Load()) for index in range(len(inner))]
+        case ast.MatchMapping(keys), _:
+            parts = [ast.Subscript(subject, key, ast.Load()) for key in keys]
+        case ast.MatchClass(_, places, names), _ if not places:
+            parts = [ast.Attribute(subject, name, ast.Load()) for name in names]
     for one, part in zip(inner, parts, strict=True):
         yield from _matched(one, part)
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skipgs_plug.core.source.conditions import Guards, is_point, leaves
-from skipgs_plug.core.source.inlining import PLACES
+from skipgs_plug.core.source.names import PLACES
 from skipgs_plug.core.source.run_options import RunOptions, comprehended, text_of
 
 Truths = npt.NDArray[np.bool_]  # one truth value for each number of a range

@@ -11,6 +11,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from types import CodeType, FunctionType, MethodType
 from typing import Any
 
+import torch
+
 from skipgs_plug.core.source.run_options import is_plain, text_of
 
 # Largest number of objects that are read one by one. Lists of callbacks are shorter, and lists of cameras longer.
@@ -19,6 +21,7 @@ MOST_CALLBACKS = 16
 
 def callbacks(held: Any) -> Sequence[Any]:
     """Return the entries of a short list of functions or objects; nothing for any other value."""
+    held = [*held] if isinstance(held, torch.nn.ModuleList) else held
     return held if isinstance(held, (list, tuple)) and len(held) <= MOST_CALLBACKS and not is_plain(held) else ()
 
 
@@ -37,7 +40,7 @@ def value_of(place: ast.expr, names: Mapping[str, Any], unknown: Collection[str]
         case ast.Name(name):
             return names.get(name)
         case ast.Attribute(holder, name) | ast.Call(ast.Name("getattr"), [holder, ast.Constant(str(name)), *_]):
-            found = inspect.getattr_static(value_of(holder, names, unknown), name, None)
+            found = _member(value_of(holder, names, unknown), name)
             return None if hasattr(type(found), "__get__") else found
         case ast.Subscript(holder, ast.Constant(key)) | ast.Call(ast.Attribute(holder, "get"), [ast.Constant(key), *_]):
             held = value_of(holder, names, unknown)
@@ -53,7 +56,7 @@ def called_function(
 ) -> Any:
     """Return the function that an expression names; None if it is unknown. Properties are not evaluated.
 
-    For an object that can be called, this is its method `__call__`.
+    For an object that can be called, this is its method `__call__`, and for a module of PyTorch its `forward`.
 
     Args:
         function: The expression before the brackets of the call.
@@ -62,7 +65,8 @@ def called_function(
         code: Code of the function that makes the call, for `super()`; None outside of methods.
     """
     found = _named(function, names, value, code)
-    own = inspect.getattr_static(type(found), "__call__", None)
+    method = "forward" if isinstance(found, torch.nn.Module) else "__call__"
+    own = inspect.getattr_static(type(found), method, None)
     return MethodType(own, found) if isinstance(own, FunctionType) else found
 
 
@@ -90,6 +94,12 @@ def without_partial(call: ast.Call, function: Any, named: Callable[[str, Any], a
     return ast.Call(call.func, [*first, *call.args], [*call.keywords, *further]), function.func
 
 
+def _member(owner: Any, name: str) -> Any:
+    """Return an attribute, or a module inside a module of PyTorch, without evaluating properties; None without it."""
+    inside = vars(owner).get("_modules", {}) if isinstance(owner, torch.nn.Module) else {}
+    return inside[name] if name in inside else inspect.getattr_static(owner, name, None)
+
+
 def _named(
     function: ast.expr, names: Mapping[str, Any], value: Callable[[ast.expr], Any], code: CodeType | None
 ) -> Any:
@@ -100,7 +110,7 @@ def _named(
             return _inherited(name, names.get("self"), code)
         case ast.Attribute(place, name) | ast.Call(ast.Name("getattr"), [place, ast.Constant(str(name)), *_]):
             owner = value(place)
-            found = inspect.getattr_static(owner, name, None)
+            found = _member(owner, name)
             if isinstance(found, FunctionType) and not inspect.isclass(owner) and not inspect.ismodule(owner):
                 in_class = inspect.getattr_static(type(owner), name, None) is found
                 return MethodType(found, owner) if in_class else found
@@ -124,7 +134,7 @@ def _inherited(name: str, owner: Any, code: CodeType | None) -> Any:
 def undecorated(function: Any) -> FunctionType | None:
     """Return the function under its decorators, even without `functools.wraps`; None if it is not a Python function."""
     function = function.__func__ if isinstance(function, MethodType) else function
-    if not isinstance(function, FunctionType):
+    if not isinstance(function, (FunctionType, functools._lru_cache_wrapper)):
         return None
     function = inspect.unwrap(function)
     if not isinstance(function, FunctionType):
@@ -163,7 +173,7 @@ def read_syntax(function: FunctionType) -> ast.FunctionDef | None:
     if function.__name__ == "<lambda>":
         return _lambda_syntax(function)
     try:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function.__code__)))  # not that of a function inside it
     except (OSError, TypeError, ValueError, SyntaxError):
         return None
     name = function.__code__.co_name

@@ -3,41 +3,30 @@
 from __future__ import annotations
 
 import ast
+import builtins
 import dis
 import inspect
-import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
+from collections.abc import Collection, Iterator, Mapping
+from types import CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
 from skipgs_plug.core.source.accesses import access
-from skipgs_plug.core.source.bindings import arguments, assigned_values, handed_over, held_in, initialiser, spread
-from skipgs_plug.core.source.conversions import is_conversion
+from skipgs_plug.core.source.bindings import arguments, assigned_values, handed_over, initialiser, spread
+from skipgs_plug.core.source.dispatch import chooses_decision, is_hidden
 from skipgs_plug.core.source.functions import (
-    callbacks,
-    called_function,
     closure,
     read_syntax,
     undecorated,
-    value_of,
     without_partial,
 )
-from skipgs_plug.core.source.project import Project
-from skipgs_plug.core.source.rewriting import Managed, Plain, Renamed, Repeated, Stored
+from skipgs_plug.core.source.known_values import KnownValues
+from skipgs_plug.core.source.names import PLACES, bound_in, counted_by, holders_of, reached_in
+from skipgs_plug.core.source.reach import carries, reached_by, results
+from skipgs_plug.core.source.rewriting import Managed, OneName, Plain, Renamed, Repeated, Stored
 from skipgs_plug.core.source.run_options import assigned_globals, comprehended, text_of
 
 # Largest depth of nested calls that are read: a loop calls its trainer, which calls a logger, which opens a file.
-MAX_DEPTH = 3
-PLACES = (ast.Name, ast.Attribute, ast.Subscript)  # syntax that holds a value, and that an assignment may have
-# Syntax that changes nothing and may be evaluated several times.
-_READS = (
-    *(*PLACES, ast.BinOp, ast.BoolOp, ast.Compare, ast.Constant, ast.List, ast.Tuple, ast.UnaryOp),
-    *(ast.FormattedValue, ast.JoinedStr, ast.keyword),
-    *(ast.boolop, ast.cmpop, ast.expr_context, ast.operator, ast.unaryop),
-)
-_DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
-# Further syntax that gives a name to a value; names that are assigned are `ast.Name`.
-_BINDS_NAME = (*_DEFINITIONS, ast.ExceptHandler, ast.MatchAs, ast.MatchStar)
+MAX_DEPTH = 5
 _ABSENT = object()
 
 
@@ -56,7 +45,7 @@ class InlinedFunction(NamedTuple):
     held: dict[str, ast.expr]
 
 
-class InlinedFunctions:
+class InlinedFunctions(KnownValues):
     """The functions that a loop calls with its number, or that read its number, and the functions that they call.
 
     Only functions of the user's own project are read, and methods of objects that exist before the loop or are made in
@@ -67,7 +56,8 @@ class InlinedFunctions:
         code: Code of the function that holds the loop.
         names: Names and values before the loop. Names of the functions are added.
         target: Name of the loop's number.
-        counters: Names and attributes with which the loop counts by itself. Functions that receive them are read too.
+        counters: Names, attributes and lengths with which the loop counts by itself. Functions that receive them are
+            read too.
         unknown: Names and attributes that the loop assigns.
         pure: Names of functions that are evaluated and not read.
 
@@ -76,6 +66,8 @@ class InlinedFunctions:
         unknown: The argument, and variables of the functions whose values are not known before the loop.
         counted: Variables of the functions that begin with the number and are assigned again.
         shared: Added names that other functions may change.
+        reached: Places that may hold the number, or a value that depends on it; see `reach`.
+        unread: Calls with the number, by id in the syntax tree, of functions that are not known, or cannot be read.
     """
 
     def __init__(
@@ -88,19 +80,23 @@ class InlinedFunctions:
         unknown: Collection[str],
         pure: Collection[str],
     ) -> None:
+        super().__init__(code, names, unknown, pure)
         self.by_call: dict[int, InlinedFunction] = {}
-        self.unknown, self.counted, self.shared = set(unknown), set[str](), set[str]()
-        self._names, self._target, self._pure = names, target, pure
-        self._project = Project(code, names)
-        stores = "STORE_GLOBAL" if code.co_flags & inspect.CO_NEWLOCALS else "STORE_NAME"
-        self._globals = {one.argval for one in dis.get_instructions(code) if one.opname == stores}
-        self._open = [code]  # code of the loop and of the functions that are being read, outermost first
+        self.counted, self.shared = set[str](), set[str]()
+        self.reached, self.unread = {target, *counters}, set[int]()
+        self._looped = set[str]()  # names that loops over known values give to these
+        self._returning: set[int] = set()  # calls whose functions return what they receive or compute from it, by id
+        self._target = target
+        self._globals = _stored_globals(code)  # those of the loop's module that the loop or its functions assign
         self._assigned: dict[int, ast.expr] = {}  # values that are assigned, by the id of the target in the syntax tree
         self._nodes: list[ast.AST] = []  # keeps the nodes of `by_call`, so that no new node gets the id of one
-        self._made: dict[str, type] = {}  # classes of new objects, by the names that hold them
         Repeated(self._held).visit_all(body)
-        Managed(self._new).visit_all(body)
-        self._follow(body, {target, *counters})
+        Managed(self._entered).visit_all(body)
+        numbers = {target, *map(counted_by, counters)}
+        kept = reached_by([node for statement in body for node in reached_in(statement)], numbers, ())
+        self._note_shared(holders_of(kept))
+        OneName(self._shared_name).visit_all(body)
+        self._follow(body, numbers)
 
     def __iter__(self) -> Iterator[ast.stmt]:
         """Iterate over the statements of all functions."""
@@ -115,7 +111,7 @@ class InlinedFunctions:
             body: The statements.
             numbers: Names and attributes that hold the number, or a value that is computed from it.
         """
-        nodes = [node for statement in body for node in _reached(statement)]
+        nodes = [node for statement in body for node in reached_in(statement)]
         for node in nodes:
             for target, value in assigned_values(node):
                 if isinstance(target, PLACES):
@@ -123,41 +119,49 @@ class InlinedFunctions:
                     held = self.held_in(text_of(target), value)
                     numbers |= self._numbers_in(held, numbers)
                     self._note_new(held)
-        holders = _holders(numbers)
+                    self.reached |= {text for text, one in held.items() if self._carries(one)}
+            match node:
+                case ast.For(ast.Name(name), values) if self._value(values) is not None:
+                    self._looped.add(name)
+        self.reached = reached_by(nodes, self.reached, self._returning)
+        holders = holders_of(numbers)
+        self._note_shared(holders)
         for node in nodes:
             call, function = self._called(node, numbers, holders)
             plain = undecorated(function)
+            if function is None and self._is_unread(node, numbers, holders):
+                self._note_unread(node)
             if call is not None and plain is not None and plain.__code__ not in self._open and self._is_own(plain):
                 before = set(self.unknown)
                 read = self._read(call, function, plain, numbers)
+                if is_hidden(function, plain, read is not None, self._project) and self._gets(call):
+                    self._note_unread(node)
                 if read is not None:
                     self.by_call[id(node)] = read
                     self._nodes.append(node)
                     self._note_new(read.held)
                     self._open.append(plain.__code__)
+                    self.reached |= {text for text, one in read.held.items() if self._carries(one)}
                     kept = self._follow(read.body, numbers | self._numbers_in(read.held, numbers))
                     self._open.pop()
+                    if any(map(self._carries, results(read.body))):
+                        self._returning.add(id(node))
+                        self.reached = reached_by(nodes, self.reached, self._returning)
                     own = self.unknown - before
-                    new = {text for text in kept - numbers if own.isdisjoint({text, *_holders([text])})}
-                    numbers, holders = numbers | new, holders | _holders(new)
+                    new = {text for text in kept - numbers if own.isdisjoint({text, *holders_of([text])})}
+                    numbers, holders = numbers | new, holders | holders_of(new)
         return numbers
-
-    def held_in(self, name: str, value: ast.expr) -> dict[str, ast.expr]:
-        """Return the values that a name holds, as source text; see `bindings.held_in`."""
-        return held_in(name, value, lambda call: self._function(call.func))
 
     def _numbers_in(self, held: Mapping[str, ast.expr], numbers: Collection[str]) -> set[str]:
         """Return the texts whose values are computed from the number."""
         return {text for text, value in held.items() if self._is_of(value, numbers)}
 
-    def _function(self, named: ast.expr) -> Any:
-        return called_function(named, self._names, self._value, self._open[-1])
-
     def _called(self, node: ast.AST, numbers: Collection[str], holders: Collection[str]) -> tuple[ast.Call | None, Any]:
         """Return the call and the function if a node calls a function with the number, or reads such a property."""
         if isinstance(node, ast.Call) and self._is_read(node):
             found = self._function(node.func)
-            if self._receives(node, numbers, holders) or self._shares_number(undecorated(found), numbers):
+            shares = self._shares_number(undecorated(found), numbers) or self._refers_to_shared(found)
+            if shares or self._receives(node, numbers, holders):
                 call, found = initialiser(node, found) if inspect.isclass(found) else (node, found)
                 if found is None and isinstance(call.func, ast.Attribute):
                     call, found = self._method_of_new(call, call.func)
@@ -167,42 +171,14 @@ class InlinedFunctions:
         made, method = access(node, self._assigned.get(id(node)), self._class)
         return (made, method) if made is not None and self._receives(made, numbers, holders) else (None, None)
 
-    def _note_new(self, held: Mapping[str, ast.expr]) -> None:
-        """Note the names that hold new objects."""
-        self._made |= {text: cls for text, value in held.items() if (cls := self._new(value)) is not None}
-
-    def _new(self, value: ast.expr) -> type | None:
-        """Return the class of a new object; None for any other value."""
-        if (cls := self._made.get(text_of(value))) is not None:
-            return cls
-        made = self._function(value.func) if isinstance(value, ast.Call) else None
-        return made if inspect.isclass(made) else None
-
-    def _class(self, value: ast.expr) -> type:
-        """Return the class of an object; that of None if it is unknown."""
-        return self._new(value) or type(self._value(value))
-
     def _method_of_new(self, call: ast.Call, method: ast.Attribute) -> tuple[ast.Call, Any]:
         """Return a call `Saver(step).save()` with the object as first argument, and its method; None if unknown."""
         found = inspect.getattr_static(self._new(method.value), method.attr, None)
+        if isinstance(found, staticmethod):
+            return call, found.__func__
         if not isinstance(found, FunctionType):
             return call, None
         return ast.copy_location(ast.Call(call.func, [method.value, *call.args], call.keywords), call), found
-
-    def _is_own(self, function: Any) -> bool:
-        """Whether this is a function of the project."""
-        plain = undecorated(function)
-        return plain is not None and plain in self._project
-
-    def _is_function(self, argument: ast.expr) -> bool:
-        """Whether an argument is a function of the project. An object that can be called, as a model, is none."""
-        function = self._function(argument)
-        return self._is_own(function) and function.__name__ != "__call__"
-
-    def _held(self, loop: ast.For | ast.comprehension) -> list[ast.expr]:
-        """Return names for the functions or objects that a loop runs over, such as callbacks; empty if unknown."""
-        held, place = callbacks(self._value(loop.iter)), ast.unparse(loop.iter)
-        return [self._named(f"{place}[{index}]", one) for index, one in enumerate(held)]
 
     def _is_read(self, call: ast.Call) -> bool:
         """Whether a call has a function that is known before the loop, and is not evaluated instead."""
@@ -230,34 +206,43 @@ class InlinedFunctions:
         if any(self._numbers_in(self.held_in("", value), numbers) for value in given):
             return True
         given = [one.value if isinstance(one, ast.Starred) else one for one in given]
-        return any(isinstance(one, (ast.Name, ast.Attribute)) and text_of(one) in holders for one in given)
+        return any(
+            (isinstance(one, (ast.Name, ast.Attribute)) and text_of(one) in holders) or self._carries(one)
+            for one in given
+        )
 
-    def is_foreign(self, part: ast.AST) -> bool:
-        """Whether a part of an expression calls a library's function, which is no method."""
-        function = self._function(part.func) if isinstance(part, ast.Call) else None
-        return isinstance(function, (FunctionType, BuiltinFunctionType)) and not self._is_own(function)
+    def _is_unread(self, node: ast.AST, numbers: Collection[str], holders: Collection[str]) -> bool:
+        """Whether this calls a function with the number that is not known before the loop, and may decide by it."""
+        if not (isinstance(node, ast.Call) and self._receives(node, numbers, holders)):
+            return False
+        if not self._gets(node):
+            return False
+        match node.func:
+            case ast.Name(name):
+                is_new = name in self.unknown or not hasattr(builtins, name)
+                return is_new and not {name} & {*self._pure, *self._names, *self._looped, *self._made}
+            case ast.Call(made) if inspect.isclass(self._function(made)):
+                return False
+        return chooses_decision(node.func, self._value, self._project, self._open)
+
+    def _note_unread(self, node: ast.AST) -> None:
+        self.unread.add(id(node))
+        self._nodes.append(node)
+
+    def _gets(self, call: ast.Call) -> bool:
+        """Whether an argument may be the number, or hold it, or be computed from it."""
+        return any(map(self._carries, [*call.args, *(one.value for one in call.keywords)]))
+
+    def _carries(self, value: ast.expr) -> bool:
+        """Whether a value may be the number, or hold it, or be computed from it in a way that is not followed."""
+        held = self.held_in("", value).values()
+        return any(carries(one, self.reached, self._returning) for one in (value, *held))
 
     def _is_of(self, value: ast.expr, numbers: Collection[str]) -> bool:
         """Whether a value is computed from the number alone, perhaps by functions of libraries."""
         places = (part for part in ast.walk(value) if isinstance(part, PLACES))
         plain = all(self._only_reads(part) or self.is_foreign(part) for part in ast.walk(value))
         return plain and any(text_of(one) in numbers for one in places)
-
-    def _is_plain(self, value: ast.expr) -> bool:
-        """Whether an expression only reads names, attributes and entries, so that it can stand in several places."""
-        return all(map(self._only_reads, ast.walk(value)))
-
-    def _only_reads(self, part: ast.AST) -> bool:
-        """Whether a part of an expression, apart from the parts inside it, changes nothing."""
-        match part:
-            case ast.Call(ast.Name(name), _, keywords) if name in self._pure:
-                return not keywords
-            case ast.Call():
-                return is_conversion(part, self._function)
-        return isinstance(part, _READS)
-
-    def _value(self, place: ast.expr) -> Any:
-        return value_of(place, self._names, self.unknown)
 
     def _read(
         self, call: ast.Call, function: Any, plain: FunctionType, numbers: Collection[str]
@@ -266,13 +251,16 @@ class InlinedFunctions:
         syntax = read_syntax(plain) if len(self._open) <= MAX_DEPTH else None
         if syntax is None:
             return None
+        if plain.__module__ == self._names.get("__name__"):
+            self._globals |= _stored_globals(plain.__code__)
         Plain(plain.__code__).visit_all(syntax.body)
         held: dict[str, ast.expr] = {}
         renamed = Renamed(self._meanings(call, function, plain, syntax, numbers, held))
         body = [renamed.visit(statement) for statement in syntax.body]
+        OneName(self._shared_name).visit_all(body)
         Stored(self._value).visit_all(body)
         Repeated(self._held).visit_all(body)
-        Managed(self._new).visit_all(body)
+        Managed(self._entered).visit_all(body)
         return InlinedFunction(body, plain.__code__, held)
 
     def _meanings(
@@ -291,7 +279,7 @@ class InlinedFunctions:
         times = sum(one.code.co_name == syntax.name for one in self.by_call.values())
         prefix = f"{syntax.name}{times + 1}" if times else syntax.name  # each call has local variables of its own
         given, defaults = self._given(call, function, plain, prefix)
-        bound = _bound(syntax)
+        bound = bound_in(syntax)
         own = bound.union(inspect.signature(plain).parameters)
         inner = {node.id for node in comprehended(ast.walk(syntax))}
         found: dict[str, ast.expr] = {}
@@ -307,6 +295,8 @@ class InlinedFunctions:
             else:
                 found[name] = ast.Name(f"{prefix}.{name}", ast.Load())
                 self.unknown.add(f"{prefix}.{name}")
+                if name in given and self._carries(given[name]):
+                    self.reached.add(f"{prefix}.{name}")
                 if name in given and self._is_of(given[name], numbers):
                     self.counted.add(f"{prefix}.{name}")
                 elif name in given and name not in bound:
@@ -352,37 +342,8 @@ class InlinedFunctions:
         absent = (one for name, one in signature.parameters.items() if name not in given)
         return given, {one.name: one.default for one in absent if one.default is not one.empty}
 
-    def _named(self, name: str, value: Any) -> ast.expr:
-        self._names[name] = value
-        return ast.Name(name, ast.Load())
 
-
-def _holders(places: Iterable[str]) -> set[str]:
-    """Return the names and places whose attributes or entries these are, as source text."""
-    return {text[: end.start()] for text in places for end in re.finditer(r"[.[]", text)}
-
-
-def _bound(syntax: ast.FunctionDef) -> set[str]:
-    """Return the names that a function gives to values of its own."""
-    found: set[str | None] = set()
-    shared: set[str] = set()
-    inner = set(map(id, comprehended(ast.walk(syntax))))
-    for node in ast.walk(syntax):
-        if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load) and id(node) not in inner:
-            found.add(node.id)
-        elif isinstance(node, _BINDS_NAME) and node is not syntax:
-            found.add(node.name)
-        elif isinstance(node, (ast.Import, ast.ImportFrom)):
-            found |= {one.asname or one.name.partition(".")[0] for one in node.names}
-        elif isinstance(node, (ast.Global, ast.Nonlocal)):
-            shared |= set(node.names)
-    return {name for name in found if name is not None} - shared
-
-
-def _reached(node: ast.AST) -> Iterator[ast.AST]:
-    """Iterate over a statement, without the functions and classes that it defines."""
-    if isinstance(node, _DEFINITIONS):
-        return
-    yield node
-    for child in ast.iter_child_nodes(node):
-        yield from _reached(child)
+def _stored_globals(code: CodeType) -> set[str]:
+    """Return the global names that a function, or the code of a module, assigns."""
+    stores = "STORE_GLOBAL" if code.co_flags & inspect.CO_NEWLOCALS else "STORE_NAME"
+    return {one.argval for one in dis.get_instructions(code) if one.opname == stores}

@@ -97,3 +97,8 @@ def running_loop(functions: Container[str]) -> str:
 def head_of(loop: ast.For | ast.While) -> str:
     """Return the first line of a loop, without its colon."""
     return ast.unparse(loop).partition(":\n")[0]
+
+
+def line_in_file(node: ast.expr, code: CodeType) -> int:
+    """Return the line of the file in which a part of this code begins."""
+    return node.lineno + (code.co_firstlineno - 1 if code.co_flags & inspect.CO_NEWLOCALS else 0)

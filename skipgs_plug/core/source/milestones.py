@@ -8,8 +8,6 @@ the number, and evaluates them ahead of time. It does not change the source.
 from __future__ import annotations
 
 import ast
-import inspect
-import textwrap
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from numbers import Integral
@@ -30,19 +28,19 @@ from skipgs_plug.core.source.conditions import (
     position,
     unconditional,
 )
-from skipgs_plug.core.source.counters import counters
+from skipgs_plug.core.source.counters import counters, counts_in
 from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator, places_in
 from skipgs_plug.core.source.functions import value_of
 from skipgs_plug.core.source.inlining import InlinedFunction, InlinedFunctions
-from skipgs_plug.core.source.lines import GATED_LOOP, head_of
+from skipgs_plug.core.source.lines import line_in_file
+from skipgs_plug.core.source.own_counts import decisions_by_count
 from skipgs_plug.core.source.progress_bars import Moves, moves, outermost_bar_ifs
 from skipgs_plug.core.source.project import Project
+from skipgs_plug.core.source.reach import carries, compared, inner_values, is_kept_in, remainders
 from skipgs_plug.core.source.rewriting import Plain, Stored
-from skipgs_plug.core.source.run_options import PURE, RunOptions, root_of
+from skipgs_plug.core.source.run_options import PURE, RunOptions, is_plain, root_of
 from skipgs_plug.core.source.substitution import Substitution
 
-# Functions that take all numbers from a range at once, before any iteration has run.
-GATHERING = frozenset({"list", "set", "sorted", "tuple"})
 BY_ALWAYS = "name the iterations that must run (--always, always=)"
 
 
@@ -72,8 +70,8 @@ class TrainingLoop:
         self._target = target = statement.target.id
         Plain(code).visit_all(statement.body)
         Stored(lambda place: value_of(place, self._names, ())).visit_all(statement.body)
-        own = assignments_in(statement.body)
-        self._counters = {*counters(statement.body, self._names, own.assigned, Project(code, self._names))}
+        own = assignments_in(statement.body).possible(self._names)
+        self._counters, self._set_back = counters(statement.body, self._names, own.assigned, Project(code, self._names))
         functions = InlinedFunctions(
             statement.body,
             code,
@@ -83,18 +81,23 @@ class TrainingLoop:
             set(own.assigned).difference(known),
             pure | PURE,
         )
-        inlined = assignments_in(functions)
+        inlined = assignments_in(functions).possible(self._names)
         by_loop = own.changed.difference(known)
         changing = by_loop.union(functions.unknown, inlined.changed).difference(known)
         no_options = changing.union({target}, own.options, inlined.options)
         options = RunOptions(code, around, self._names, no_options, functions.shared, pure | PURE)
+        counted = decisions_by_count(self._body, self._names, Project(code, self._names))
+        self._decisions_by_count = [Condition(test, (), InlinedFunction([], one, {})) for test, one in counted]
         self._evaluator = Evaluator(target, functions.counted, self._names, changing, options)
         self._evaluator_of_loop = Evaluator(target, (), self._names, by_loop, options)
+        self._inner = set(inner_values(statement.body))
         self._bar_ifs = outermost_bar_ifs(statement.body, names, around)
         times = Counter([*own.assigned, *inlined.assigned])
         Substitution(functions, self._evaluator, times).apply(self._body)
-        self._all = list(conditions_in(self._body, functions.by_call))
-        self._by_call = functions.by_call
+        found = list(conditions_in(self._body, functions.by_call, unread=functions.unread))
+        self._all = [one for one in found if id(one.test) not in functions.unread]
+        self._unread_calls = [one for one in found if id(one.test) in functions.unread]
+        self._by_call, self._reached = functions.by_call, functions.reached
         self._warned_of: set[str] = set()  # conditions that warnings have named
 
     def milestones(self, numbers: range, others_named: bool = False) -> dict[str, set[int]]:
@@ -124,15 +127,6 @@ class TrainingLoop:
             "counts the iterations that run, so it holds less often if others are left out. "
             f"Decide by {self._target} if that matters.",
         )
-        if not others_named:
-            self._warn_of(
-                self._moving_limits(),
-                f"moves its own limit, so it can hold later and less often if iterations are left out; {BY_ALWAYS}.",
-            )
-            self._warn_of(
-                self._kept_for_others(),
-                f"keeps the iteration's number for other code, whose conditions on it are not read; {BY_ALWAYS}.",
-            )
         found: dict[str, set[int]] = {}
         uncertain: list[str] = []
         for condition in self._conditions():
@@ -143,6 +137,25 @@ class TrainingLoop:
                 found.setdefault(f"{self._where(condition)}: {text}", set()).update(hits)
             if not certain:
                 uncertain.append(f"line {self._location(condition)}")
+        if not others_named:
+            self._warn_of(
+                self._moving_limits(),
+                f"moves its own limit, so it can hold later and less often if iterations are left out; {BY_ALWAYS}.",
+            )
+            self._warn_of(
+                self._lost(),
+                "can depend on the iteration's number, or on how many iterations have run, in a way that is not read, "
+                f"so iterations that it needs could be left out; {BY_ALWAYS}.",
+            )
+            self._warn_of(
+                self._unread(),
+                "hands the iteration's number to a function that is not known before the loop or lies too deep, so its "
+                f"conditions are not read; {BY_ALWAYS}.",
+            )
+            self._warn_of(
+                self._kept_for_others(),
+                f"keeps the iteration's number for other code, whose conditions on it are not read; {BY_ALWAYS}.",
+            )
         for lookup in self._lookups():
             hits = _rarer(self._evaluator, lookup, numbers)
             if hits:
@@ -158,10 +171,8 @@ class TrainingLoop:
                 value = eval(compile(ast.Expression(node), "<list>", "eval"), dict(self._names))
             except Exception:
                 continue
-            if _is_list(value):
-                hits = {int(entry) for entry in value if entry in numbers}
-                if hits:
-                    found[f"line {_line(node, self._code)}: {ast.unparse(node)}"] = hits
+            if _is_list(value) and (hits := {int(entry) for entry in value if entry in numbers}):
+                found[f"line {line_in_file(node, self._code)}: {ast.unparse(node)}"] = hits
         return found
 
     def bar_moves(self, numbers: range) -> list[Moves]:
@@ -190,7 +201,7 @@ class TrainingLoop:
             return None, False
         hits = _rarer(self._evaluator_of_loop, condition, numbers)
         if hits is None and not others_named:
-            text, line = ast.unparse(condition.test), _line(condition.test, self._code)
+            text, line = ast.unparse(condition.test), line_in_file(condition.test, self._code)
             raise SkipGSError(
                 f"Line {line} of {self._code.co_filename} has a condition on the iteration's number that cannot be "
                 f"evaluated ahead ({text}), so an iteration that it needs could be left out; use the gate without a "
@@ -214,14 +225,18 @@ class TrainingLoop:
                 yield condition
 
     def _counted_by_itself(self) -> Iterator[Condition]:
-        """Yield all conditions on a counter of the loop's own, which does not count left-out iterations."""
+        """Yield all conditions on a counter of the loop's own, or of a function, which misses left-out iterations."""
+        lines: set[str] = set()
         for condition in self._all:
-            if any(self._evaluator.is_off(guard) for guard in condition.guards):
+            sets_back = condition.function is None and position(condition.test) in self._set_back
+            if sets_back or any(self._evaluator.is_off(guard) for guard in condition.guards):
                 continue
             for leaf in leaves(condition.test):
                 picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and is_point(leaf)
-                if picks and places_in(leaf) & self._counters and not self._evaluator.mentions(leaf):
+                if picks and counts_in(leaf) & self._counters and not self._evaluator.mentions(leaf):
+                    lines.add(self._where(condition))
                     yield condition._replace(test=leaf)
+        yield from (one for one in self._decisions_by_count if self._where(one) not in lines)
 
     def _moving_limits(self) -> Iterator[Condition]:
         """Yield all comparisons as in `if step >= next_save: next_save += 100`."""
@@ -245,6 +260,32 @@ class TrainingLoop:
                     known = value_of(held, self._names, ()) is not None and id(node) not in self._by_call
                     yield from [Condition(node, (), function)] if known and self._evaluator.mentions(value) else []
 
+    def _lost(self) -> Iterator[Condition]:
+        """Yield all conditions on values that may depend on the number, in a way that was not followed."""
+        for condition in self._all:
+            if self._bar_if_of(condition) is None and not any(map(self._evaluator.is_off, condition.guards)):
+                for leaf in leaves(condition.test):
+                    if not self._evaluator.mentions(leaf) and not counts_in(leaf) & self._counters:
+                        lost = self._may_decide(leaf, condition.function)
+                        yield from [condition._replace(test=leaf)] if lost else []
+
+    def _may_decide(self, leaf: ast.expr, function: InlinedFunction | None) -> bool:
+        """Whether a condition is one on a remainder or a single value of what may depend on the number.
+
+        In the loop itself, that is every remainder of a value that it changes.
+        """
+        for number in remainders(leaf):
+            new = function is None and not self._evaluator.is_known(number) and not places_in(number) & self._inner
+            if new or carries(number, self._reached):
+                return True
+        return any(is_kept_in(value, self._reached) for value in compared(leaf))
+
+    def _unread(self) -> Iterator[Condition]:
+        """Yield all calls with the number of functions that are not known before the loop, or cannot be read."""
+        for call in self._unread_calls:
+            if not any(map(self._evaluator.is_off, call.guards)):
+                yield call
+
     def _lists(self) -> Iterator[ast.expr]:
         """Yield names that are passed to a function together with the number, and may be lists of iterations."""
         for call in (node for statement in self._body for node in ast.walk(statement)):
@@ -261,6 +302,12 @@ class TrainingLoop:
                     if self._evaluator.mentions(key) and isinstance(self._evaluator.value(table), dict):
                         test = ast.copy_location(ast.Compare(key, [ast.In()], [table]), node)
                         yield Condition(test, (), function)
+                case ast.Assign(value=ast.Call(ast.Attribute(table, "pop"), [key, *_])):
+                    held = value_of(table, self._names, ())  # before the loop takes anything out
+                    if self._evaluator.mentions(key) and isinstance(held, dict) and is_plain([*held]):
+                        keys = ast.Tuple([ast.Constant(one) for one in held], ast.Load())
+                        test = ast.copy_location(ast.Compare(key, [ast.In()], [keys]), table)
+                        yield Condition(test, (), function)
 
     def _nodes(self) -> Iterator[tuple[InlinedFunction | None, ast.AST]]:
         """Yield all nodes of the loop, with None, and of each function that it calls, with the function."""
@@ -275,7 +322,7 @@ class TrainingLoop:
     def _where(self, condition: Condition) -> str:
         """Return the line of a condition, and its file if that is not the file of the loop."""
         code = self._code_of(condition)
-        line, file = _line(condition.test, code), code.co_filename
+        line, file = line_in_file(condition.test, code), code.co_filename
         return f"line {line}" if file == self._code.co_filename else f"line {line} of {Path(file).name}"
 
     def _code_of(self, condition: Condition) -> CodeType:
@@ -284,7 +331,7 @@ class TrainingLoop:
     def _location(self, condition: Condition) -> str:
         """Return the number of the line, the file and the text of a condition, as warnings show them."""
         code = self._code_of(condition)
-        return f"{_line(condition.test, code)} of {code.co_filename} ({ast.unparse(condition.test)})"
+        return f"{line_in_file(condition.test, code)} of {code.co_filename} ({ast.unparse(condition.test)})"
 
     def _warn_of(self, conditions: Iterable[Condition], sentence: str) -> None:
         """Warn of each condition that no warning has named. The sentence follows "Line ..."."""
@@ -310,87 +357,6 @@ def _rarer(evaluator: Evaluator, condition: Condition, numbers: range) -> set[in
     except DependsOnLoop:
         return None
     return found
-
-
-def _line(node: ast.expr, code: CodeType) -> int:
-    """Return the line of the file in which a part of this code begins."""
-    return node.lineno + (code.co_firstlineno - 1 if code.co_flags & inspect.CO_NEWLOCALS else 0)
-
-
-def read_loop(
-    code: CodeType,
-    line: int,
-    names: Mapping[str, Any],
-    pure: Iterable[str] = (),
-    known: Mapping[str, Any] | None = None,
-) -> TrainingLoop:
-    """Return the loop that asks for its numbers.
-
-    Args:
-        code: Code of the function that holds the loop.
-        line: Present line of the function when the loop asks for a number, which is in the head of its `for`.
-        names: Names and values that the function had before the loop.
-        pure: Names of functions that only read numbers, and may occur in conditions.
-        known: Values of names that the loop assigns, if they are known before the loop.
-
-    Raises:
-        SkipGSError: The source cannot be read, or has no loop.
-    """
-    known = known or {}
-    function = code.co_flags & inspect.CO_NEWLOCALS
-    try:
-        # For the code of a module, getsource returns only the part before its first function.
-        source = inspect.getsource(code) if function else "".join(inspect.findsource(code)[0])
-        tree = ast.parse(textwrap.dedent(source))
-    except (OSError, TypeError, SyntaxError) as error:
-        raise SkipGSError(
-            f"The source of {code.co_name}() in {code.co_filename} cannot be read ({error}), so the gate cannot know "
-            "which iterations must run; gate without share and refine_share, or name them (--always, always=)."
-        ) from error
-    line_in_source = line - (code.co_firstlineno - 1 if function else 0)
-    # The head of a loop inside or around it lies on other lines.
-    heads = (node for node in ast.walk(tree) if isinstance(node, ast.For))
-    loop = next((one for one in heads if one.lineno <= line_in_source <= (one.iter.end_lineno or one.lineno)), None)
-    gathered = loop is not None and _gathers(loop.iter)
-    if loop is not None and isinstance(loop.target, ast.Name) and not gathered:
-        _refuse_to_yield(loop, code)
-        return TrainingLoop(loop, tree, code, {**names, **known}, known, frozenset(pure))
-    fault = "takes all numbers before the first iteration" if gathered else "is not in a loop over one number"
-    found = f"Line {line} of {code.co_filename} {fault}"
-    if loop is not None:
-        found = f"{found} ({head_of(loop)})"
-    elif not line:
-        found = f"{code.co_name}() of {code.co_filename} has ended, and the loop over its iterations is elsewhere"
-    raise SkipGSError(
-        f"{found}; write the loop as: {GATED_LOOP}.",
-        in_script=f"{found}; write the loop as one over range(...) alone, or name the iterations that must run "
-        "(--always).",
-    )
-
-
-def _gathers(numbers: ast.expr) -> bool:
-    """Whether the head of a loop takes all numbers before the first iteration, as `list(gate.iterations(...))` does."""
-    while isinstance(numbers, ast.Call) and isinstance(numbers.func, ast.Name) and numbers.args:
-        if numbers.func.id in GATHERING:
-            return True
-        numbers = numbers.args[0]
-    return False
-
-
-def _refuse_to_yield(loop: ast.For, code: CodeType) -> None:
-    """Raise SkipGSError if a loop yields its number: conditions of the code that receives it are not in the loop."""
-    assert isinstance(loop.target, ast.Name)
-    for node in (part for statement in loop.body for part in ast.walk(statement)):
-        if isinstance(node, ast.Yield) and any(
-            isinstance(part, ast.Name) and part.id == loop.target.id for part in ast.walk(node)
-        ):
-            found = f"Line {_line(node, code)} of {code.co_filename} yields the iteration's number to other code"
-            unread = "whose conditions on it cannot be read"
-            raise SkipGSError(
-                f"{found}, {unread}; loop over gate.iterations(range(...)) there, or name the iterations that must run "
-                "(always=).",
-                in_script=f"{found}, {unread}; name the iterations that must run (--always).",
-            )
 
 
 def _is_list(value: Any) -> bool:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import inspect
+import sys
 import sysconfig
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
@@ -30,6 +32,15 @@ class Project:
         module = getattr(names.get("__spec__"), "name", None) or str(names.get("__name__", ""))
         path = Path(code.co_filename).resolve()
         self._folder = import_folder(path, module) or path.parent
+
+    def methods(self, name: str) -> Iterator[FunctionType]:
+        """Iterate over the methods of this name of all classes in the project's modules that have been imported."""
+        for module in [*sys.modules.values()]:
+            file = getattr(module, "__file__", None)
+            if isinstance(file, str) and _is_below(file, self._folder):
+                classes = (value for value in [*vars(module).values()] if inspect.isclass(value))
+                found = (vars(cls).get(name) for cls in classes)
+                yield from (one for one in found if isinstance(one, FunctionType))
 
     def __contains__(self, function: FunctionType) -> bool:
         return _is_below(function.__code__.co_filename, self._folder)

@@ -27,7 +27,7 @@ class _Rewrite(ast.NodeTransformer):
 
 
 class Renamed(_Rewrite):
-    """Puts expressions in place of names."""
+    """Puts expressions in place of names. Texts that are put together of constants then are one constant."""
 
     def __init__(self, meanings: Mapping[str, ast.expr]) -> None:
         self._meanings = meanings
@@ -46,6 +46,39 @@ class Renamed(_Rewrite):
             case ast.Subscript(ast.Tuple(values) | ast.List(values), ast.Constant(int(index))) if index < len(values):
                 return ast.copy_location(values[index], node)
         return node
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.expr:
+        self.generic_visit(node)
+        parts = [one.value if isinstance(one, ast.FormattedValue) else one for one in node.values]
+        if any(isinstance(one, ast.FormattedValue) and one.format_spec is not None for one in node.values):
+            return node
+        return _text(node, parts)
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
+        self.generic_visit(node)
+        return _text(node, [node.left, node.right]) if isinstance(node.op, ast.Add) else node
+
+
+class OneName(_Rewrite):
+    """Puts one name of an object in place of the others, as `run` for `self.saver.run`.
+
+    Args:
+        name: Returns the name for a name, attribute or entry; None if it stays.
+    """
+
+    def __init__(self, name: Callable[[ast.expr], str | None]) -> None:
+        self._name = name
+
+    def visit_Attribute(self, node: ast.Name | ast.Attribute) -> ast.expr:
+        name = self._name(node) if isinstance(node.ctx, ast.Load) else None
+        if name is None:
+            return self.generic_visit(node)  # type: ignore[return-value]
+        made = ast.parse(name, mode="eval").body
+        for part in ast.walk(made):
+            ast.copy_location(part, node)
+        return made
+
+    visit_Name = visit_Attribute
 
 
 class Plain(_Rewrite):
@@ -85,23 +118,23 @@ class Plain(_Rewrite):
 
 
 class Managed(_Rewrite):
-    """Adds the calls that `with Saver(step):` makes of the new object's methods, around the block.
+    """Adds the calls that `with Saver(step):` makes of the object's methods, around the block.
 
     The name after `as` is assigned in the block.
 
     Args:
-        new: Returns the class of a new object; None for any other value.
+        entered: Returns the class of the object that a `with` statement enters; None if it is unknown.
     """
 
-    def __init__(self, new: Callable[[ast.expr], type | None]) -> None:
-        self._new = new
+    def __init__(self, entered: Callable[[ast.expr], type | None]) -> None:
+        self._entered = entered
 
     def visit_With(self, node: ast.With) -> ast.AST:
         self.generic_visit(node)
         begin: list[ast.stmt] = []
         end: list[ast.stmt] = []
         for item in node.items:
-            cls, made = self._new(item.context_expr), item.context_expr
+            cls, made = self._entered(item.context_expr), item.context_expr
             if cls is None:
                 continue
             enter = _call_of(made, "__enter__", 0)
@@ -170,6 +203,9 @@ class Stored(_Rewrite):
             case ast.Call(ast.Attribute(held, "update"), [], entries) if isinstance(self._value(held), dict):
                 named = ((entry.arg, entry.value) for entry in entries if entry.arg is not None)
                 stores = [(ast.Subscript(held, ast.Constant(name), ast.Store()), value) for name, value in named]
+            case ast.Call(ast.Attribute(held, "update"), [ast.Dict(keys, values)], []):
+                pairs = [pair for pair in zip(keys, values, strict=True) if isinstance(pair[0], ast.Constant)]
+                stores = [(ast.Subscript(held, key, ast.Store()), value) for key, value in pairs if key is not None]
             case ast.Call(ast.Attribute(held, "append"), [value], []) if isinstance(self._value(held), list):
                 last = ast.UnaryOp(ast.USub(), ast.Constant(1))
                 stores = [(ast.Subscript(held, last, ast.Store()), value)]
@@ -177,6 +213,12 @@ class Stored(_Rewrite):
                 stores = [(ast.Attribute(held, name, ast.Store()), value)]
         added = [ast.Assign([target], copy.deepcopy(value)) for target, value in stores]
         return [node, *(ast.fix_missing_locations(ast.copy_location(one, node)) for one in added)]
+
+
+def _text(node: ast.expr, parts: list[ast.expr]) -> ast.expr:
+    """Return the text that these parts have together; the node itself if they are not all texts."""
+    texts = [one.value for one in parts if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+    return ast.copy_location(ast.Constant("".join(texts)), node) if len(texts) == len(parts) else node
 
 
 def _call_of(owner: ast.expr, method: str, arguments: int) -> ast.Expr:

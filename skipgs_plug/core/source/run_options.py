@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import ast
+import functools
 import inspect
 import linecache
 import re
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from types import CodeType
+from types import CodeType, FunctionType
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from skipgs_plug.core.source.conversions import is_conversion
 # Built-in functions that conditions may call. They change nothing.
 PURE = frozenset({"abs", "all", "any", "bool", "divmod", "float", "frozenset", "getattr", "int", "isinstance", "len"})
 PURE |= {"list", "max", "min", "range", "round", "set", "sorted", "sum", "tuple"}
+SET_UP = ("__init__", "__post_init__")  # methods that set up a new object
 _UNKNOWN = object()  # stands for a value that is not known; None is a value
 # Containers whose length can be an option.
 _CONTAINERS = (deque, dict, frozenset, list, range, set, tuple, torch.utils.data.DataLoader, torch.utils.data.Dataset)
@@ -28,7 +30,8 @@ class RunOptions:
 
     Only plain values count (numbers, text, flags, None and collections of them), in variables of the function itself,
     in constants of its module, in dictionaries, or in objects without methods, such as a namespace of options. Methods
-    of other objects, such as a model, may change them.
+    of other objects, such as a model, may change them; but a part of such an object that is None, and that no method
+    assigns, stays None.
 
     Args:
         code: Code of the function that holds the loop.
@@ -54,7 +57,7 @@ class RunOptions:
         self._own = variables if code.co_flags & inspect.CO_NEWLOCALS else {*code.co_names}
         of_module = assigned_globals(code.co_filename) - variables
         self._shared = of_module.union(code.co_freevars, shared, *declared)
-        self._names, self._changing, self._pure = names, changing, pure
+        self._names, self._changing, self._pure, self._file = names, changing, pure, code.co_filename
 
     def __contains__(self, node: object) -> bool:
         """Whether an expression consists of options, constants and functions that only read."""
@@ -92,7 +95,7 @@ class RunOptions:
         if isinstance(value, (list, set)) and not self._is_own(node):
             return False  # any function can change it
         if value is not _UNKNOWN or not isinstance(node, ast.Call):
-            return is_plain(value)
+            return is_plain(value) or self._is_absent(node)
         match node:
             case ast.Call(ast.Name("len"), [held]) if lengths and isinstance(self._look_up(held), _CONTAINERS):
                 return True
@@ -104,6 +107,27 @@ class RunOptions:
         """Whether a value is that of a variable of the function itself, or is held by one."""
         root = root_of(node)
         return isinstance(root, ast.Name) and root.id in self._own
+
+    def _is_absent(self, node: ast.expr) -> bool:
+        """Whether this is a part of an object that is None, as `self.logger`, and that no function assigns later."""
+        if not isinstance(node, ast.Attribute) or text_of(node) in self._changing:
+            return False
+        holder = self._object(node.value)
+        if getattr(holder, "__dict__", {}).get(node.attr, _UNKNOWN) is not None:
+            return False
+        sources = [linecache.getlines(file) for file in {self._file, *_files_of(type(holder))}]
+        return all(lines and node.attr not in _assigned_late("".join(lines)) for lines in sources)
+
+    def _object(self, node: ast.expr) -> Any:
+        """Return the value of a name, or of an object's attribute, that the loop does not assign; None if unknown."""
+        if text_of(node) in self._changing:
+            return None
+        match node:
+            case ast.Name(name):
+                return None if name in self._shared else self._names.get(name)
+            case ast.Attribute(holder, name):
+                return getattr(self._object(holder), "__dict__", {}).get(name)
+        return None
 
     def _look_up(self, node: ast.expr) -> Any:
         """Return the value of an option, or of an object that holds options; `_UNKNOWN` if it is neither."""
@@ -146,6 +170,25 @@ def assigned_globals(file: str) -> set[str]:
     """Return the global names of a source file that its functions may assign."""
     declared = re.findall(r"\bglobal\s+(\w+(?:\s*,\s*\w+)*)", "".join(linecache.getlines(file)))
     return {name.strip() for names in declared for name in names.split(",")}
+
+
+def _files_of(cls: type) -> set[str]:
+    """Return the source files of the methods of a class, inherited ones included."""
+    methods = [vars(one) for one in cls.__mro__]
+    files = {one.__code__.co_filename for own in methods for one in own.values() if isinstance(one, FunctionType)}
+    return files - {"<string>"}  # methods that `dataclass` writes
+
+
+@functools.lru_cache(maxsize=64)
+def _assigned_late(source: str) -> frozenset[str]:
+    """Return the attributes that functions in a source assign, except those that set up a new object."""
+    try:
+        nodes = [*ast.walk(ast.parse(source))]
+    except SyntaxError:
+        return frozenset()
+    functions = [node for node in nodes if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))]
+    later = (part for one in functions if one.name not in SET_UP for part in ast.walk(one))
+    return frozenset(part.attr for part in later if isinstance(part, ast.Attribute) and isinstance(part.ctx, ast.Store))
 
 
 def comprehended(nodes: Iterable[ast.AST]) -> Iterator[ast.Name]:

@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 
 from skipgs_plug.core.source.bindings import assigned_values
 from skipgs_plug.core.source.evaluator import Evaluator
-from skipgs_plug.core.source.inlining import PLACES, InlinedFunctions
+from skipgs_plug.core.source.inlining import InlinedFunctions
+from skipgs_plug.core.source.names import PLACES
 from skipgs_plug.core.source.run_options import text_of
 
 

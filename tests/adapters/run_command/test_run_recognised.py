@@ -155,8 +155,21 @@ def test_modules_of_other_names_are_refused_before_an_iteration_has_trained(
     )
     code = cli.main(["run", "auto", "--cpu", *gate, "--", checkout, str(tmp_path)])
     assert code == (0 if gate == ["--no-gate"] else cli.BAD_INPUT) and (tmp_path / "model.pth").exists() == (code == 0)
-    why = "it trains without a module scene.gaussian_model or gaussian_renderer"
+    why = "it trains without a module gaussian_renderer or module scene.gaussian_model"
     assert (why in capfd.readouterr().err) == (code != 0)
+
+
+@pytest.mark.parametrize("gate", [[], ["--share", "0.5"], ["--no-gate"]])
+def test_a_model_of_another_class_is_refused_before_an_iteration_has_trained(gate, checkout, tmp_path, capfd):
+    """As in GES, which imports GaussianModel and trains its LaplacianModel."""
+    model = Path(checkout).parent / "scene" / "gaussian_model.py"
+    model.write_text(f"{model.read_text()}\nOwn = GaussianModel\nclass GaussianModel(Own):\n    pass\n")
+    script = Path(checkout)
+    text = script.read_text().replace("import GaussianModel", "import GaussianModel, Own")
+    script.write_text(text.replace("= GaussianModel()", "= Own()"))
+    code = cli.main(["run", "auto", "--cpu", *gate, "--", checkout, str(tmp_path)])
+    assert code == (0 if gate == ["--no-gate"] else cli.BAD_INPUT) and (tmp_path / "model.pth").exists() == (code == 0)
+    assert ("it trains without a GaussianModel" in capfd.readouterr().err) == (code != 0)
 
 
 def test_no_gate_is_never_refused(checkout, tmp_path, capfd, monkeypatch):

@@ -130,6 +130,19 @@ def test_script_that_never_trains_keeps_its_code(checkout, tmp_path, capfd):
     assert not (tmp_path / "skipgs.json").exists()
 
 
+@pytest.mark.parametrize("option", ["--share", "--refine-share=0.3", "--cpu"])
+def test_an_option_behind_the_dashes_is_named_if_the_script_refuses_it(option, checkout, tmp_path, capfd):
+    script = Path(checkout)
+    script.write_text(script.read_text().replace("random.seed(0)", "len(sys.argv) > 2 and sys.exit(2)"))
+    assert cli.main(["run", "auto", "--cpu", "--", checkout, str(tmp_path), option]) == 2
+    assert f"If {option} was meant for skipgs-plug, write it before '--'." in capfd.readouterr().err
+
+
+def test_a_script_without_the_dashes_is_said(checkout, tmp_path, capfd):
+    assert cli.main(["run", "auto", "--share", "auto", checkout, str(tmp_path)]) == cli.BAD_INPUT
+    assert f"Write '--' before the script: skipgs-plug run auto ... -- {checkout} ..." in capfd.readouterr().err
+
+
 def test_torch_keeps_to_one_thread_on_the_cpu(checkout, tmp_path, capfd):
     before = torch.get_num_threads()
     try:

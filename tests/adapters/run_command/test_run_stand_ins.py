@@ -1,5 +1,6 @@
 """`skipgs-plug run --cpu`: errors of the stand-ins for CUDA modules, and errors of the script's own."""
 
+import importlib.util
 from pathlib import Path
 
 import pytest
@@ -63,6 +64,28 @@ def test_a_feature_that_the_stand_ins_lack_is_one_sentence(error_of, old, new, f
     assert "it needs CUDA; run it without --cpu." in error and "Traceback" not in error
 
 
+@pytest.mark.skipif(importlib.util.find_spec("torchvision") is not None, reason="torchvision is installed")
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from torchvision.transforms import GaussianBlur",
+        "from torchvision.models import resnet18",
+        "import torchvision; torchvision.utils.make_grid",
+        "import torchvision.datasets",
+        "from lpips.pretrained_networks import alexnet",
+    ],
+)
+def test_a_part_of_torchvision_that_is_not_served_is_one_sentence(error_of, line):
+    error = error_of(lambda text: f"{line}\n{text}")
+    assert "it needs torchvision; install the version" in error and "Traceback" not in error and "CUDA" not in error
+
+
+def test_a_script_that_compiles_an_extension_is_one_sentence(error_of):
+    """As after `torch.utils.cpp_extension.load`, which RAIN-GS calls, where there is no CUDA compiler."""
+    error = error_of(lambda text: f"raise OSError('CUDA_HOME environment variable is not set.')\n{text}")
+    assert "The script compiles a CUDA extension of its own" in error and "Traceback" not in error
+
+
 def test_an_option_that_a_stand_in_refuses_is_one_sentence(error_of):
     error = error_of(lambda text: text.replace("scales=", "cov3D_precomp=torch.ones(12, 6), scales="))
     assert "skipgs-plug: The CPU stand-in needs scales and rotations" in error and "Traceback" not in error
@@ -78,6 +101,12 @@ def test_a_tensor_of_another_shape_is_one_sentence(error_of):
 def test_an_error_of_the_scripts_own_keeps_its_traceback(error_of, line):
     error = error_of(lambda text: f"{line}\n{text}")
     assert "Traceback" in error and "stand-ins of --cpu" not in error
+
+
+def test_a_traceback_shows_the_scripts_functions_and_not_what_the_gate_wraps_around_them(error_of):
+    error = error_of(lambda text: text.replace("return {", "raise KeyError('inv_covar'); return {"))
+    assert "in training" in error and "in render" in error and "KeyError: 'inv_covar'" in error
+    assert "skipgs_plug/" not in error
 
 
 def test_no_advice_to_give_an_option_that_is_given(error_of):

@@ -53,6 +53,8 @@ def test_a_long_schedule_and_many_views_bound_it():
 def test_where_no_other_comes_as_expected_the_model_recovers_then():
     _, ran = train(2000, [500, 600, 700])
     assert [step for step in ran if step > 700] == [*range(701, 721), *range(801, 1301), 2000]
+    _, ran = train(4000, [1000, 2000, 2700], views=600)  # one visit of each view, before and after it
+    assert [step for step in ran if step > 2700] == [*range(2701, 3301), *range(3401, 4001)]
 
 
 def test_a_prune_in_the_second_half_of_the_steps_is_recovered_from_at_the_end():
@@ -61,6 +63,8 @@ def test_a_prune_in_the_second_half_of_the_steps_is_recovered_from_at_the_end():
     assert gate.stats()["ran_for"] == {"share": 401, "conditions": 0, "changes": 450}
     _, ran = train(2000, [350, 1400])  # the iterations after the second prune are enough for both
     assert ran == [*range(401), *range(1400, 1901), 2000]
+    _, ran = train(8000, [1590], views=600)  # 10 were left, and 600 are wanted
+    assert ran == [*range(1601), *range(7411, 8001)]
     _, ran = train(2000, [150])
     assert ran == [*range(401), 2000]
     _, ran = train(2000, [350], pause_iters=30)  # 50 steps are enough

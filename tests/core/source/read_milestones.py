@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from skipgs_plug.core.source.lines import line_of
-from skipgs_plug.core.source.milestones import read_loop
+from skipgs_plug.core.source.reading import read_loop
 
 NUMBERS = range(50, 100)
 

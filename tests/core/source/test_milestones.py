@@ -344,6 +344,30 @@ def test_what_the_loop_counts_by_itself_is_warned_of():
             found(loop)
 
 
+def test_a_count_that_the_loop_sets_back_is_warned_of_where_it_decides_about_something_else():
+    """PUP 3D-GS raises SH bands by a count of its own, which begins anew at each prune."""
+
+    def loop(stop):
+        first, since, other, last = 1, 1, 0, 30
+        for step in stop(first=first, last=last):
+            if since % 10 == 0:
+                print("SH")
+            if since == last:
+                print("begin anew")
+                since = first
+            else:
+                since += 1
+            other += 1
+            if step == 70:
+                other = 0
+            if other == 20:
+                print("save")
+
+    with pytest.warns(RuntimeWarning, match="counts the iterations that run") as said:
+        assert found(loop) == {"step == 70": [70]}
+    assert [str(one.message).partition("(")[2].partition(")")[0] for one in said] == ["since % 10 == 0", "other == 20"]
+
+
 def test_a_number_that_is_kept_in_an_entry_of_a_table_is_the_number():
     def loop(stop):
         state = {"step": 0, "loss": 0.0}

@@ -245,3 +245,95 @@ def test_length_does_not_show_that_a_condition_never_holds():
                 print("save")
 
     assert [*found(loop).values()] == [[60, 90]]
+
+
+class Holdout:
+    def is_due(self, step):
+        return step % random.randint(1, 9) == 0
+
+
+class Trainer:
+    """As gsplat-trainer's, which stops early if a handler says so; most runs have no handler."""
+
+    def __init__(self):
+        self.holdout = self.made = self.every = None
+        self.parts = SimpleNamespace(early=Holdout())
+        self.parts.early.limit = None
+
+    def make(self):
+        self.made = Holdout()
+
+    def train(self, stop):
+        n = 1
+        for step in stop(self=self, n=n):
+            n += random.randint(1, 3)
+            if self.holdout is not None and not self.holdout.is_due(step):
+                print("stop")
+            if self.every and step % n == 0:
+                print("save")
+            if self.parts.early.limit is not None:
+                print("late" if step % n == 0 else "early")
+            if step == 70:
+                print("evaluate")
+
+    def train_with_what_is_made_later(self, stop):
+        for step in stop(self=self):
+            self.make_at(step)
+            if self.made is not None and not self.made.is_due(step):
+                print("stop")
+
+    def make_at(self, step):
+        if step == 60:
+            getattr(self, "make")()  # noqa: B009  # a call that is not read
+
+    def train_with_what_is_set(self, stop):
+        self.handler = Holdout()
+        for step in stop(self=self):
+            if self.handler is not None and not self.handler.is_due(step):
+                print("stop")
+
+
+def method(name):
+    """A method of a trainer as a function of its own."""
+    trainer = Trainer()
+
+    def loop(stop):
+        getattr(trainer, name)(stop)
+
+    return loop
+
+
+def test_a_part_of_a_trainer_that_is_none_guards_nothing():
+    assert found(method("train")) == {"step == 70": [70]}
+
+
+@pytest.mark.parametrize("name", ["train_with_what_is_made_later", "train_with_what_is_set"])
+def test_a_part_of_a_trainer_that_a_method_makes_later_is_not_none(name):
+    with pytest.raises(SkipGSError, match="cannot be evaluated ahead"):
+        found(method(name))
+
+
+def test_no_method_changes_what_is_none():
+    def loop(stop):
+        writer, bar, n = None, None, 1
+        for step in stop(writer=writer, bar=bar, n=n):
+            n += random.randint(1, 3)
+            if writer is not None and step % n == 0:
+                writer.add(step)
+            if bar and step % n == 0:
+                bar.update(1)
+            if step == 70:
+                print("save")
+
+    def makes_one(stop):
+        writer, n = None, 1
+        for step in stop(writer=writer, n=n):
+            n += random.randint(1, 3)
+            if step == 55:
+                writer = set()
+            if writer is not None and step % n == 0:
+                writer.add(step)
+
+    assert found(loop) == {"step == 70": [70]}
+    with pytest.raises(SkipGSError, match="cannot be evaluated ahead"):
+        found(makes_one)

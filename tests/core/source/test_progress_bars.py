@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from skipgs_plug import SkipGate
 from skipgs_plug.core.source.lines import line_of
-from skipgs_plug.core.source.milestones import read_loop
+from skipgs_plug.core.source.reading import read_loop
 
 NUMBERS = range(1, 101)
 
