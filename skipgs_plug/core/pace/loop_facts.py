@@ -140,9 +140,14 @@ class LoopFacts:
             "last": self.last,
             "keeps_rates": self._accumulates,
             "steps_each": self._steps_each,
+            "views": self._views,
+            "epoch": self._epoch,
+            "slow_positions": self._slow_positions,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict()`."""
         self.start, self.last, self._accumulates = state["start"], state["last"], state["keeps_rates"]
         self._steps_each = state.get("steps_each", False)
+        self._views, self._epoch = state.get("views"), state.get("epoch")
+        self._slow_positions = state.get("slow_positions", False)
