@@ -129,7 +129,10 @@ class Growing(Phase):
         following = plan.last + 1 - numbers.stop
         if following > 0:
             asked = self._config.refining
-            share = refining_share(following, plan.epoch or 0, len(numbers)) if asked == "auto" else float(asked or 1.0)
+            if asked == "auto":
+                share = refining_share(following, plan.epoch or 0, len(numbers), plan.slow_positions)
+            else:
+                share = 1.0 if asked is None else float(asked)
             self._steps_after = round(share * following)
         # Prunes and selections after the last event need no further iterations.
         self._length = min(numbers.stop, self.events.end or numbers.stop) - self._first

@@ -99,7 +99,7 @@ class Refining(Phase):
         self._must = frozenset().union(*self.always.values())
         total = plan.last + 1 - self._first
         if self._auto and self.share is None:
-            self.share = refining_share(total, plan.epoch_for("refine_share"), grown)
+            self.share = refining_share(total, plan.epoch_for("refine_share"), grown, plan.slow_positions)
         assert self.share is not None
         if self._judges:
             self._why_none_watched = self._unwatchable(plan, self.share * total)
