@@ -156,7 +156,7 @@ class InriaFamily(AbstractAdapter):
 
     def gradients_read_until(self, opt: Any, loop: Mapping[str, Any]) -> int:
         """Return the first iteration whose gradients only the optimizers read. Arguments as for `start_iter`."""
-        return int(getattr(opt, UNTIL)) if self._densifies else FIRST
+        return InriaFamily.start_iter(self, opt, loop)  # not that of a fork which begins later
 
     def steps_each(self, opt: Any, loop: Mapping[str, Any]) -> bool:
         """Whether optimizers would accumulate, but step in each iteration that runs; see `TrainerInfo.steps_each`."""

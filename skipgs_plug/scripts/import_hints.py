@@ -20,6 +20,7 @@ PACKAGES = {
     "tqdm": "tqdm",
     "yaml": "pyyaml",
 }
+ENVIRONMENTS = (".yml", ".yaml")  # endings of files that list packages for conda
 REQUIREMENTS = ("*requirements*.txt", "environment*.yml", "environment*.yaml", "pyproject.toml", "setup.*")
 # Number of folders that are searched for requirements, from the script's folder upwards. gsplat keeps its scripts one
 # folder below its checkout.
@@ -54,13 +55,15 @@ def install_hint(module: str, script: Path, stand_ins: Container[str] = ()) -> s
         return f"{top} is a CUDA extension of the trainer: build it as the trainer's README says{cpu}."
     package = PACKAGES.get(top, top)
     for listing in requirements(script):
-        entry = entry_of(listing.read_text(errors="replace"), package)
+        listed = listing.read_text(errors="replace")
+        entry = entry_of(listed, package)
         if entry is not None and "/" in entry:
             return (
                 f"{script.name} needs the module {top}, which {listing.name} takes from {entry}: install it from "
                 "there, as the trainer's README says."
             )
-        if entry is not None and top not in PACKAGES and is_for_conda(listing, package):
+        for_conda = listing.suffix in ENVIRONMENTS and is_for_conda(listed, package)
+        if entry is not None and top not in PACKAGES and for_conda:
             return (
                 f"{script.name} needs the package {package}, which {listing.name} lists for conda: install it from "
                 "there, or with pip under the name that its own page gives."
@@ -82,10 +85,9 @@ def requirements(script: Path) -> Iterator[Path]:
             yield from sorted(path for path in folder.glob(pattern) if path.is_file())
 
 
-def is_for_conda(listing: Path, package: str) -> bool:
+def is_for_conda(environment: str, package: str) -> bool:
     """Return whether an environment lists a package for conda, not for pip, whose index may not know that name."""
-    of_pip = listing.read_text(errors="replace").partition("pip:")[2]
-    return listing.suffix in (".yml", ".yaml") and entry_of(of_pip, package) is None
+    return entry_of(environment.partition("pip:")[2], package) is None
 
 
 def entry_of(listing: str, package: str) -> str | None:

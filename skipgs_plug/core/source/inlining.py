@@ -213,9 +213,7 @@ class InlinedFunctions(KnownValues):
 
     def _is_unread(self, node: ast.AST, numbers: Collection[str], holders: Collection[str]) -> bool:
         """Whether this calls a function with the number that is not known before the loop, and may decide by it."""
-        if not (isinstance(node, ast.Call) and self._receives(node, numbers, holders)):
-            return False
-        if not self._gets(node):
+        if not (isinstance(node, ast.Call) and self._receives(node, numbers, holders) and self._gets(node)):
             return False
         match node.func:
             case ast.Name(name):

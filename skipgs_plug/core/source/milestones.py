@@ -70,8 +70,8 @@ class TrainingLoop:
         self._target = target = statement.target.id
         Plain(code).visit_all(statement.body)
         Stored(lambda place: value_of(place, self._names, ())).visit_all(statement.body)
-        own = assignments_in(statement.body).possible(self._names)
-        self._counters, self._set_back = counters(statement.body, self._names, own.assigned, Project(code, self._names))
+        own, project = assignments_in(statement.body).possible(self._names), Project(code, self._names)
+        self._counters, self._set_back = counters(statement.body, self._names, own.assigned, project)
         functions = InlinedFunctions(
             statement.body,
             code,
@@ -86,7 +86,7 @@ class TrainingLoop:
         changing = by_loop.union(functions.unknown, inlined.changed).difference(known)
         no_options = changing.union({target}, own.options, inlined.options)
         options = RunOptions(code, around, self._names, no_options, functions.shared, pure | PURE)
-        counted = decisions_by_count(self._body, self._names, Project(code, self._names))
+        counted = decisions_by_count(self._body, self._names, project)
         self._decisions_by_count = [Condition(test, (), InlinedFunction([], one, {})) for test, one in counted]
         self._evaluator = Evaluator(target, functions.counted, self._names, changing, options)
         self._evaluator_of_loop = Evaluator(target, (), self._names, by_loop, options)
