@@ -112,6 +112,8 @@ class AbstractAdapter(ABC):
     def attach_on_call(self, hooks: Hooks, owner: Any, method: str) -> None:
         """Attach to the object that a method is called on, before it runs. A second call releases the gate.
 
+        Classes that derive from the owner may override the method. A script that trains without calling it is refused.
+
         Args:
             hooks: Reports to the gate, and replaces names in the trainer.
             owner: The class of the object.
@@ -120,20 +122,29 @@ class AbstractAdapter(ABC):
         Raises:
             AdapterMismatchError: The class has no such method.
         """
+        call = f"call of {owner.__name__}.{method}()"
 
         def begins(original: Callable[..., Any], trainer: Any, *args: Any, **kwargs: Any) -> Any:
+            hooks.awaited.discard(call)
             if self.trainer is not None:
                 hooks.release(
                     "The gate is released: a second training run begins in this process. Training goes on without it, "
                     "in all its iterations."
                 )
-                return original(trainer, *args, **kwargs)
+                return original(*args, **kwargs)
             self.trainer = trainer
             with hooks.guarded():
                 self.attach(hooks)
-            return original(trainer, *args, **kwargs)
+            return original(*args, **kwargs)
 
-        hooks.wrap(owner, method, begins)
+        def created(original: Callable[..., Any], trainer: Any, *args: Any, **kwargs: Any) -> Any:
+            original(trainer, *args, **kwargs)
+            hooks.wrap(trainer, method, lambda run, *args, **kwargs: begins(run, trainer, *args, **kwargs))
+
+        if not callable(getattr(owner, method, None)):
+            raise self.mismatch(f"a class {owner.__name__} with a method {method}()")
+        hooks.awaited.add(call)
+        hooks.wrap(owner, "__init__", created)
 
     def mismatch(self, expected: str) -> AdapterMismatchError:
         """Return the error for a trainer that differs from the one that the adapter knows.

@@ -47,6 +47,7 @@ _USES = {
     ("data", ast.Store): ASSIGNED,
     ("densify_until_iter", ast.Store): SETS_END,
     ("grad", ast.Load): READS_GRADIENT,
+    ("absgrad", ast.Load): READS_GRADIENT,
 }
 # Largest depth of nested calls that are read. A trainer's loop reaches its strategy in three; deeper calls reach
 # libraries.

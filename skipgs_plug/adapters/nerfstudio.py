@@ -96,14 +96,17 @@ class Nerfstudio(AbstractAdapter):
         hooks.check_drift(lambda: trainer.optimizers.optimizers)
         self._relocations = leave_out_noise(hooks, strategy, strategy)
         self.output_folder = getattr(trainer, "base_dir", None)
-        start, last = getattr(strategy, "refine_stop_iter", None), trainer.config.max_num_iterations - 1
+        last = trainer.config.max_num_iterations - 1
+        # Before 1.1.5, and in many methods of others, the model densifies by itself, by the gradients that it reads.
+        read_until = survey.end_of_gradients(last) if strategy is None else gradients_read_until(strategy)
+        start = read_until if strategy is None else strategy.refine_stop_iter
         hooks.ready(
             TrainerInfo(
                 None if start is None else survey.start_after_changes(start, last),
                 view_names=names,
                 max_steps=last,
                 world_size=trainer.world_size,
-                gradients_read_until=gradients_read_until(strategy),
+                gradients_read_until=read_until,
                 densification=None if survey.unknown else strategy_events(strategy),
             )
         )

@@ -174,15 +174,24 @@ def refuse_loop_without_end(ends: Mapping[str, int | None], last: int, who: str)
         AdapterMismatchError: It does. GES logs norms of gradients, also in the last iteration, before it saves.
             Binocular3DGS puts the end off when its opacities begin to decay.
     """
+    refuse_gradients_until_end(ends, last, who)
+    if SETS_END in ends:
+        raise AdapterMismatchError(
+            f"{who}: its loop itself sets densify_until_iter, so it is not known when densification ends. {BY_HAND}"
+        )
+
+
+def refuse_gradients_until_end(ends: Mapping[str, int | None], last: int, who: str) -> None:
+    """Raise an error if a trainer reads gradients in its last iteration; arguments as for `refuse_loop_without_end`.
+
+    Raises:
+        AdapterMismatchError: It does.
+    """
     until = ends.get(READS_GRADIENT, 0)
     if until is None or until > last:
         raise AdapterMismatchError(
             f"{who}: its loop reads gradients (grad) until its end, for example to log them, and a skipped iteration "
             f"has none. Switch that off if the script has an option for it, such as one for the log. {BY_HAND}"
-        )
-    if SETS_END in ends:
-        raise AdapterMismatchError(
-            f"{who}: its loop itself sets densify_until_iter, so it is not known when densification ends. {BY_HAND}"
         )
 
 
@@ -244,6 +253,18 @@ class Survey:
         """The calls that the adapter does not know, except getters."""
         called = self._reader.ends.keys() & self._methods - self._known
         return sorted(changing(called))
+
+    def end_of_gradients(self, last: int) -> int | None:
+        """Return the first iteration from which on the trainer reads no gradients; None if it never reads any.
+
+        Args:
+            last: Last iteration of the run.
+
+        Raises:
+            AdapterMismatchError: It reads them until the end of the run.
+        """
+        refuse_gradients_until_end(self._reader.ends, last, f"Adapter {self._adapter.name!r} cannot gate this trainer")
+        return self._reader.ends.get(READS_GRADIENT)
 
     def start_after_changes(self, start: int, last: float = math.inf, unit: int = 1) -> int:
         """Return the later of `start` and the end of the last change of the model, known or unknown.

@@ -115,7 +115,7 @@ class Engine:
                 settings["start_iter"] = max(info.start_iter or 0, info.settled_iter)
         self.config = config = dataclasses.replace(self.config, **settings)
         if config.start_iter is None:
-            sentence = "This trainer does not densify, so the gate cannot know when to begin; give"
+            sentence = "It is not known when this trainer's densification ends, or that it densifies at all; give"
             raise SkipGSError(f"{sentence} start_iter=.", in_script=f"{sentence} --start-iter.")
         self.start = config.start_iter
         read_until = info.gradients_read_until

@@ -94,3 +94,76 @@ def test_script_is_reached_through_the_trainer_class(monkeypatch):
     gate.verify()
     assert gate.report()["iterations"] == 60 and gate.report()["backwards_skipped"] > 0
     assert torch.Tensor.backward.__module__ == "torch._tensor"
+
+
+class OldModel(nerfstudio.Model):
+    """Densifies by itself, as splatfacto before 1.1.5 and methods of others do."""
+
+    until = 20
+
+    def __init__(self):
+        super().__init__(None)
+
+    def after_train(self, step):
+        self.step = step
+        if self.step >= self.until:
+            return
+        self.norms = self.info["means2d"].grad.norm()
+
+    def refinement_after(self, step):
+        if step < self.until and step % 5 == 0:
+            self.split_gaussians()
+
+    def split_gaussians(self):
+        """Stand for a change of the model."""
+
+
+def of_model(model, *callbacks):
+    trainer = nerfstudio.Trainer().setup()
+    trainer.pipeline.model, trainer.callbacks, trainer.schedulers = model, [*callbacks], []
+    trainer.optimizers.optimizers = {name: torch.optim.Adam([value]) for name, value in model.values.items()}
+    return trainer
+
+
+def of_old_model(model):
+    return of_model(model, model.after_train, model.refinement_after)
+
+
+@pytest.mark.filterwarnings("ignore:The trainer does more than .*split_gaussians")
+def test_a_model_that_densifies_by_itself_is_gated_when_it_reads_no_gradients_any_more():
+    new_log()
+    trainer = of_old_model(OldModel())
+    with SkipGate(trainer, policy=SkipAlways()) as gate:
+        trainer.train()
+    assert log.backwards == list(range(20)) and gate.report()["settings"]["start_iter"] == 20
+    with pytest.raises(SkipGSError, match="start_iter=15 is too early"):
+        SkipGate(of_old_model(OldModel()), start_iter=15)
+
+
+def test_a_model_that_reads_gradients_until_the_end_is_refused():
+    model = OldModel()
+    model.until = 60
+    with pytest.raises(AdapterMismatchError, match=r"reads gradients .* until its end"):
+        SkipGate(of_old_model(model), start_iter=40)
+
+
+def test_a_model_without_densification_needs_a_start():
+    with pytest.raises(SkipGSError, match="It is not known when this trainer's densification ends"):
+        SkipGate(of_model(nerfstudio.Model(None)))
+
+
+def test_a_trainer_that_overrides_the_loop_is_gated_and_one_of_another_class_is_refused(monkeypatch):
+    module = types.ModuleType("nerfstudio.engine.trainer")
+    module.Trainer = type("Trainer", (nerfstudio.Trainer,), {})
+    monkeypatch.setitem(sys.modules, "nerfstudio.engine.trainer", module)
+    own = type("Own", (module.Trainer,), {"train": nerfstudio.Trainer.train})  # calls no train() of its parent
+    new_log()
+    with SkipGate(adapter="nerfstudio", **RULE) as gate:
+        own().setup().train()
+    gate.verify()
+    assert gate.report()["backwards_skipped"] > 0
+    with (
+        pytest.raises(AdapterMismatchError, match=r"it trains without a call of Trainer.train\(\)"),
+        SkipGate(adapter="nerfstudio", **RULE),
+    ):
+        nerfstudio.Trainer().setup().train()

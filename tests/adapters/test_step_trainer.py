@@ -37,7 +37,10 @@ def test_trainer_without_densification_asks_for_a_start():
     del trainer.base_trainer.base_trainer.densifier.prune_until_iter
     del trainer.base_trainer.base_trainer.densifier.base_densifier
     del trainer.base_trainer.opacity_reset_until_iter
-    with pytest.raises(SkipGSError, match="does not densify, so the gate cannot know when to begin; give start_iter="):
+    with pytest.raises(
+        SkipGSError,
+        match="not known when this trainer's densification ends, or that it densifies at all; give start_iter=",
+    ):
         SkipGate(trainer)
     SkipGate(trainer, start_iter=5).detach()
 

@@ -128,15 +128,19 @@ class TrainingLoop:
             f"Decide by {self._target} if that matters.",
         )
         found: dict[str, set[int]] = {}
-        uncertain: list[str] = []
-        for condition in self._conditions():
-            if self._bar_if_of(condition) is not None:
-                continue
-            text, (hits, certain) = ast.unparse(condition.test), self._needed(condition, numbers, others_named)
+
+        def add(condition: Condition, hits: set[int] | None) -> bool:
             if hits is not None:
-                found.setdefault(f"{self._where(condition)}: {text}", set()).update(hits)
-            if not certain:
-                uncertain.append(f"line {self._location(condition)}")
+                found.setdefault(f"{self._where(condition)}: {ast.unparse(condition.test)}", set()).update(hits)
+            return hits is not None
+
+        own = [one for one in self._conditions() if self._bar_if_of(one) is None]
+        doubtful = [one for one in own if not add(one, _rarer(self._evaluator, one, numbers))]
+        run_anyway = set().union(*found.values())
+        doubtful = [one for one in doubtful if not self._reached_in(one, numbers) <= run_anyway]
+        for condition in doubtful:
+            add(condition, self._named_by_loop(condition, numbers, others_named))
+        uncertain = [f"line {self._location(one)}" for one in doubtful]
         if not others_named:
             self._warn_of(
                 self._moving_limits(),
@@ -186,19 +190,19 @@ class TrainingLoop:
                     found += [Moves(bar, by, frozenset(hits)) for bar, by in moves(bar_if.body, self._names)]
         return found
 
-    def _needed(self, condition: Condition, numbers: range, others_named: bool) -> tuple[set[int] | None, bool]:
-        """Return the iterations that a condition names, and whether called functions leave no doubt about them.
+    def _reached_in(self, condition: Condition, numbers: range) -> set[int]:
+        """Return the iterations in which the loop may evaluate a condition, as far as the conditions around it tell."""
+        (reached, _), _ = self._evaluator.branches(numbers, ast.Constant(True), condition.guards)
+        return reached
 
-        The iterations are None if they are not known.
+    def _named_by_loop(self, condition: Condition, numbers: range, others_named: bool) -> set[int] | None:
+        """Return the iterations that a condition names if functions do not change its values; None if not known.
 
         Raises:
             SkipGSError: The loop itself changes a value in its condition, and the user has not named its iterations.
         """
-        hits = _rarer(self._evaluator, condition, numbers)
-        if hits is not None:
-            return hits, True
         if condition.function is not None:
-            return None, False
+            return None
         hits = _rarer(self._evaluator_of_loop, condition, numbers)
         if hits is None and not others_named:
             text, line = ast.unparse(condition.test), line_in_file(condition.test, self._code)
@@ -207,7 +211,7 @@ class TrainingLoop:
                 f"evaluated ahead ({text}), so an iteration that it needs could be left out; use the gate without a "
                 f"share, or {BY_ALWAYS}."
             )
-        return hits, False
+        return hits
 
     def _only_numbers(self, condition: Condition, numbers: range) -> set[int] | None:
         """Return the numbers for which a condition holds; None if it also depends on other values."""

@@ -78,6 +78,8 @@ class RunOptions:
                 return True
             case ast.Attribute(holder, "get") if isinstance(self._look_up(holder), dict):
                 return True
+            case ast.Attribute(_, "items" | "keys" | "values") if not call.args and not call.keywords:
+                return True
         return is_conversion(call, self._function)
 
     def _function(self, named: ast.expr) -> Any:

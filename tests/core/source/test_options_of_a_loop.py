@@ -337,3 +337,26 @@ def test_no_method_changes_what_is_none():
     assert found(loop) == {"step == 70": [70]}
     with pytest.raises(SkipGSError, match="cannot be evaluated ahead"):
         found(makes_one)
+
+
+def test_a_condition_inside_one_whose_iterations_all_run_need_not_be_evaluated():
+    def loop(stop):
+        best = 0
+        for step in stop(best=best):
+            if step % 40 == 0:
+                print("save")
+                if step != best:
+                    print("delete the older one")
+                best = step
+
+    assert found(loop) == {"step % 40 == 0": [80]}
+
+
+def test_keys_and_values_of_a_table_are_read_ahead():
+    def loop(stop):
+        optimizers = SimpleNamespace(parameters={"means": [object()], "scales": [object()]})
+        every = {"means": 30, "scales": 40}
+        for step in stop(optimizers=optimizers, every=every):
+            print([every[name] for name, _ in optimizers.parameters.items() if step % every[name] == 0])
+
+    assert list(found(loop).values()) == [[60, 80, 90]]
