@@ -73,7 +73,7 @@ class FVDB(AbstractAdapter):
 
     @classmethod
     def recognises_script(cls, code: LoopCode) -> bool:
-        return any(name.partition(".")[0] == PACKAGE for name in code.names)
+        return code.leaves_training_to(PACKAGE)
 
     def attach_script(self, hooks: Hooks) -> None:
         gate_backwards_only(hooks, self)

@@ -182,8 +182,8 @@ class InriaFamily(AbstractAdapter):
         code = LoopCode.of_script(Path(sys.argv[0]))
         if not code.used:
             raise AdapterMismatchError(
-                f"Adapter {self.name!r} expects a function {LOOP}(), which {code.source} does not have; "
-                f"it was checked with {self.checked}."
+                f"Adapter {self.name!r} expects a function {LOOP}(), which {code.source} does not have; name the "
+                f"script that has it, or give SkipGate its module (docs/gate.md). It was checked with {self.checked}."
             )
         self._refuse_fork(code)
         refuse_loop_elsewhere(code, self.difference(code))

@@ -55,7 +55,7 @@ class LiteGS(AbstractAdapter):
 
     @classmethod
     def recognises_script(cls, code: LoopCode) -> bool:
-        return "litegs" in code.names
+        return code.leaves_training_to("litegs")
 
     def attach_script(self, hooks: Hooks) -> None:
         hooks.gate_tensor_backward(LOOP)

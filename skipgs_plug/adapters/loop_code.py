@@ -54,6 +54,15 @@ class LoopCode(NamedTuple):
     syntax: ast.FunctionDef | None = None
 
     @property
+    def calls_backward(self) -> bool:
+        """Whether the script itself calls `backward`, so that it has a loop of its own."""
+        return bool(self.backward) or "backward" in self.names - self.functions
+
+    def leaves_training_to(self, package: str) -> bool:
+        """Whether the script uses this package, and has no training loop itself."""
+        return not self.calls_backward and any(name.partition(".")[0] == package for name in self.names)
+
+    @property
     def number(self) -> str:
         """Name of the variable that holds the iteration's number: the one that `update_learning_rate` receives."""
         for node in () if self.syntax is None else ast.walk(self.syntax):

@@ -55,7 +55,7 @@ class Nerfstudio(AbstractAdapter):
 
     @classmethod
     def recognises_script(cls, code: LoopCode) -> bool:
-        return any(name.startswith("nerfstudio.") for name in code.names)
+        return code.leaves_training_to("nerfstudio")
 
     def attach_script(self, hooks: Hooks) -> None:
         refuse_other_processes(hooks)

@@ -142,7 +142,7 @@ def find_script_adapter(script: Path) -> type[AbstractAdapter]:
         found, advice = "a function training(), but no GaussianModel", "gate its loop"
     elif code.backward:
         found = f"no function training(), but calls backward in {_listed(code.backward)}"
-    elif "backward" in code.names - code.functions:
+    elif code.calls_backward:
         found = "no function training(), but calls backward itself"
     else:
         functions = [name for name in code.functions if not name.startswith("_")]

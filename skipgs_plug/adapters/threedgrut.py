@@ -76,7 +76,7 @@ class ThreeDGRUT(AbstractAdapter):
 
     @classmethod
     def recognises_script(cls, code: LoopCode) -> bool:
-        return any(name.startswith("threedgrut.") for name in code.names)
+        return code.leaves_training_to("threedgrut")
 
     def attach_script(self, hooks: Hooks) -> None:
         gate_backwards_only(hooks, self)

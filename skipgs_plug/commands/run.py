@@ -58,7 +58,10 @@ def run(args: Args) -> int:
         say(f"If {misplaced} was meant for skipgs-plug, write it before '--'.")
     seen = args.no_gate if gate is None else gate.trained or gate.released
     if code == 0 and not processes and not seen:
-        say(f"{script_name(command)} ended without a training iteration; nothing was gated.")
+        say(
+            f"{script_name(command)} ended without a training iteration that adapter {args.adapter!r} knows; nothing "
+            "was gated."
+        )
     return code
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, ClassVar, Protocol
@@ -10,6 +11,7 @@ import torch
 
 from skipgs_plug.core.clock import Times
 from skipgs_plug.core.drift_check import DriftCheck
+from skipgs_plug.core.elsewhere import Elsewhere
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.gaussian_count import GaussianCount
@@ -72,24 +74,21 @@ class Hooks(LoopHooks):
         """
         self._expectation = f"Adapter {adapter.name!r} was checked with {adapter.checked}."
         super().__init__(engine, adapter.optimizers, Patches(self._expectation, self._failed))
-        self._adapter = adapter
-        self._given = given
-        self._release = engine.release
+        self._adapter, self._given = adapter, given
+        self._release, self._iteration = engine.release, engine.iteration
         self._release.undoes(self.restore)
-        # Refusals come with the first iteration, when nothing is lost yet.
-        self._release.refuses = lambda: max(self._iterations, self._backwards) <= 1
+        self._release.refuses = lambda: max(self._iterations, self._backwards) <= 1  # nothing is lost yet
         self._release.in_script, self._release.attached = in_script, True
         self._guarded = self._release.guarded(lambda: self._iteration.step)
         self._ready = False
         self.script_globals: dict[str, Any] = {}
-        self._iteration = engine.iteration
         self._drift: DriftCheck | None = None
         self._count: GaussianCount | None = None
-        self._iterations = 0
-        self._backwards = 0
+        self._iterations = self._backwards = 0
         self._odd_iterations = 0  # iterations with a number of backward passes other than one, so far
         self._callers: set[str] = set()  # functions whose backward passes are gated
         self.awaited: set[str] = set()
+        self._elsewhere = Elsewhere(self.awaited, adapter.name, lambda: engine.config.enabled and not self.trained)
 
     # Facts, at attach or when training begins.
 
@@ -103,6 +102,8 @@ class Hooks(LoopHooks):
             SkipGSError: The settings do not fit the trainer; see `Engine.configure`.
         """
         with self.guarded():
+            if (folder := self._adapter.output_folder) is not None:
+                self._adapter.output_folder = os.path.abspath(folder)  # a script may change its working folder
             self._engine.configure(info, self._given)
             if self._engine.config.compensates:
                 self.on_detach("torch.optim.Optimizer.step (hooks)", self._engine.remove)
@@ -204,7 +205,7 @@ class Hooks(LoopHooks):
         self._backwards += 1
         if self._iterations == 0:
             if self._engine.config.enabled and self.awaited and self._backwards == 1:
-                raise self._mismatch(f"it trains without a {' or '.join(sorted(self.awaited))}")
+                raise self._mismatch(f"it trains without a {self._elsewhere.expected}")
             if self._engine.config.enabled and self._backwards >= CHECKED_ITERATIONS:
                 raise self._mismatch(f"{self._backwards} training backwards ran in no iteration")
             return False
@@ -291,7 +292,7 @@ class Hooks(LoopHooks):
                 while a module is still awaited is refused.
         """
         if not self._callers:
-            intercept_tensor_backward(self._patches, self._callers, self.backward)
+            intercept_tensor_backward(self._patches, self._callers, self.backward, self._elsewhere.note)
             guard_scalers(self._patches, self._iteration)
         self._callers.update(callers)
 

@@ -149,7 +149,10 @@ def _is_bound(function: Any, owner: Any) -> bool:
 
 
 def intercept_tensor_backward(
-    patches: Patches, callers: Container[str], gated: Callable[[torch.Tensor, Callable[[], Any]], Any]
+    patches: Patches,
+    callers: Container[str],
+    gated: Callable[[torch.Tensor, Callable[[], Any]], Any],
+    other: Callable[[str], None] = lambda caller: None,
 ) -> None:
     """Pass scalar backward calls of functions with these names to `gated`.
 
@@ -161,6 +164,7 @@ def intercept_tensor_backward(
         patches: List of replacements, to which this one is added.
         callers: Names of the functions that call the training backward.
         gated: Receives the loss and a function that runs the real backward.
+        other: Receives the name of another function that calls backward on a scalar, before the call.
     """
 
     def around(original: Callable[..., Any], loss: torch.Tensor, *args: Any, **kwargs: Any) -> Any:
@@ -168,7 +172,11 @@ def intercept_tensor_backward(
         frame: types.FrameType | None = sys._getframe(2)
         while frame is not None and frame.f_code.co_name == "backward":
             frame = frame.f_back
-        if frame is None or frame.f_code.co_name not in callers or loss.numel() != 1:
+        if frame is None or loss.numel() != 1:
+            return original(loss, *args, **kwargs)
+        if (caller := frame.f_code.co_name) not in callers:
+            if caller != "__torch_function__":  # of a mode such as that of --cpu, inside the call of a function
+                other(caller)
             return original(loss, *args, **kwargs)
         return gated(loss, lambda: original(loss, *args, **kwargs))
 

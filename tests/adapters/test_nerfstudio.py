@@ -9,7 +9,8 @@ from cases import RULE, SkipAlways
 from lookalikes import nerfstudio
 from lookalikes.splats import log, new_log
 
-from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError
+from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError, UnknownTrainerError
+from skipgs_plug.adapters.registry import find_script_adapter
 from skipgs_plug.core import decision
 
 
@@ -167,3 +168,35 @@ def test_a_trainer_that_overrides_the_loop_is_gated_and_one_of_another_class_is_
         SkipGate(adapter="nerfstudio", **RULE),
     ):
         nerfstudio.Trainer().setup().train()
+
+
+OWN_LOOP = """
+import torch
+from nerfstudio.cameras.cameras import Cameras
+
+def fit():
+    for step in range(60):
+        torch.ones(1, requires_grad=True).sum().backward()
+"""
+
+
+def test_a_script_that_only_reads_scenes_with_nerfstudio_is_not_recognised(tmp_path):
+    script = tmp_path / "train.py"
+    script.write_text(OWN_LOOP)
+    with pytest.raises(UnknownTrainerError, match="calls backward in fit"):
+        find_script_adapter(script)
+    script.write_text("from nerfstudio.scripts.train import entrypoint\nentrypoint()\n")
+    assert find_script_adapter(script).name == "nerfstudio"
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_training_by_another_function_is_warned_of_once(enabled, recwarn):
+    def fit():
+        torch.ones(1, requires_grad=True).sum().backward()
+
+    with SkipGate(adapter="nerfstudio", enabled=enabled, start_iter=5):
+        for _ in range(30):
+            fit()
+    said = [str(one.message) for one in recwarn]
+    assert len(said) == enabled
+    assert all("fit() called backward, and no module nerfstudio.engine.trainer was seen" in one for one in said)

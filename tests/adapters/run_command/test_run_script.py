@@ -124,9 +124,20 @@ def test_a_forked_child_that_ends_leaves_no_report(checkout, tmp_path):
     assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 39
 
 
+def test_the_report_lies_beside_the_model_though_the_script_changes_its_working_folder(checkout, tmp_path, monkeypatch):
+    (tmp_path / "outputs" / "model").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    text = Path(checkout).read_text().replace("import random, sys", "import os, random, sys; os.chdir('outputs')")
+    Path(checkout).write_text(text.replace('print("Training complete.")', 'os.chdir("..")'))  # as Hydra does
+    assert cli.main(["run", "auto", "--cpu", "--", checkout, "model"]) == 0
+    assert (tmp_path / "outputs" / "model" / "model.pth").exists()
+    assert (tmp_path / "outputs" / "model" / "skipgs.json").exists()
+
+
 def test_script_that_never_trains_keeps_its_code(checkout, tmp_path, capfd):
     assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path), "--idle"]) == 0
-    assert "train.py ended without a training iteration; nothing was gated." in capfd.readouterr().err
+    said = "train.py ended without a training iteration that adapter 'inria' knows; nothing was gated."
+    assert said in capfd.readouterr().err
     assert not (tmp_path / "skipgs.json").exists()
 
 
