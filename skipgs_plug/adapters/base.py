@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -139,12 +139,16 @@ class AbstractAdapter(ABC):
 
         def created(original: Callable[..., Any], trainer: Any, *args: Any, **kwargs: Any) -> Any:
             original(trainer, *args, **kwargs)
-            hooks.wrap(trainer, method, lambda run, *args, **kwargs: begins(run, trainer, *args, **kwargs))
+            if method not in vars(trainer):
+                hooks.wrap(trainer, method, lambda run, *args, **kwargs: begins(run, trainer, *args, **kwargs))
 
         if not callable(getattr(owner, method, None)):
             raise self.mismatch(f"a class {owner.__name__} with a method {method}()")
         hooks.awaited.add(call)
-        hooks.wrap(owner, "__init__", created)
+        kinds: set[type] = {owner, *derived(owner)}
+        for kind in kinds:
+            if kind is owner or "__init__" in vars(kind):  # such a one need not call that of its parent
+                hooks.wrap(kind, "__init__", created)
 
     def mismatch(self, expected: str) -> AdapterMismatchError:
         """Return the error for a trainer that differs from the one that the adapter knows.
@@ -169,6 +173,13 @@ class AbstractAdapter(ABC):
     def timing(self) -> Times | None:
         """Return the seconds of training, if the trainer measures them itself."""
         return None
+
+
+def derived(owner: type) -> Iterator[type]:
+    """Return all classes that derive from a class, and exist already."""
+    for kind in owner.__subclasses__():
+        yield kind
+        yield from derived(kind)
 
 
 def gate_backwards_only(hooks: Hooks, adapter: AbstractAdapter) -> None:

@@ -122,6 +122,20 @@ def test_script_is_reached_through_its_launcher(gsplat_module):
     )
 
 
+def test_a_runner_of_a_derived_class_with_all_of_its_own_is_reached(gsplat_module):
+    """As BAD-Gaussians' script for gsplat has: it imports the Runner, and calls none of its methods."""
+    parent = type("Runner", (Runner,), {})
+    own = type("Deblur", (parent,), {"__init__": Runner.__init__, "train": Runner.train})
+    new_log()
+    with SkipGate(adapter="gsplat", **RULE) as gate:
+        names = {"Runner": parent, "Deblur": own, "DefaultStrategy": DefaultStrategy}
+        exec("def main(local_rank, world_rank, world_size, cfg):\n    Deblur(DefaultStrategy()).train()\n", names)
+        gsplat_module.cli(names["main"], None)
+    gate.verify()
+    assert gate.report()["iterations"] == 60 and gate.report()["backwards_skipped"] > 0
+    assert not any(hasattr(kind.__init__, "__skipgs_plug__") for kind in (parent, own))
+
+
 def test_a_script_that_trains_without_the_launcher_is_refused_with_its_first_backward(monkeypatch):
     """As gsplat's own scripts before 1.2 and simple_trainer_2dgs.py do, if a user names the adapter for them."""
     monkeypatch.delitem(sys.modules, "gsplat.distributed", raising=False)
