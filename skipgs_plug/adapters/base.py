@@ -145,8 +145,7 @@ class AbstractAdapter(ABC):
         if not callable(getattr(owner, method, None)):
             raise self.mismatch(f"a class {owner.__name__} with a method {method}()")
         hooks.awaited.add(call)
-        kinds: set[type] = {owner, *derived(owner)}
-        for kind in kinds:
+        for kind in {owner, *derived(owner)}:
             if kind is owner or "__init__" in vars(kind):  # such a one need not call that of its parent
                 hooks.wrap(kind, "__init__", created)
 
@@ -177,7 +176,8 @@ class AbstractAdapter(ABC):
 
 def derived(owner: type) -> Iterator[type]:
     """Return all classes that derive from a class, and exist already."""
-    for kind in owner.__subclasses__():
+    children: list[type] = owner.__subclasses__()
+    for kind in children:
         yield kind
         yield from derived(kind)
 
