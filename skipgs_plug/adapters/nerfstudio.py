@@ -1,4 +1,4 @@
-"""nerfstudio's `Trainer` with splatfacto or splatfacto-mcmc."""
+"""nerfstudio's `Trainer` with splatfacto, splatfacto-mcmc, or a method of others that derives from them."""
 
 from __future__ import annotations
 
@@ -34,13 +34,16 @@ class Nerfstudio(AbstractAdapter):
     name = "nerfstudio"
     checked = "nerfstudio-project/nerfstudio 1.1.5 50e0e3c7 (ns-train, run on the CPU)"
     project = "[nerfstudio, splatfacto and splatfacto-mcmc](https://github.com/nerfstudio-project/nerfstudio)"
-    gated = "Like gsplat; decided on `main_loss`, since other terms appear in every tenth iteration only."
+    gated = (
+        "Like gsplat, by `main_loss`: other terms come every tenth iteration. Models that densify themselves "
+        "(before 1.1.5): after their last gradient."
+    )
     with_share = (
         "Like gsplat. All iterations until `stop_screen_size_at`, evaluations, and the first and last iteration of "
         "accumulated gradients always run."
     )
     left_alone = (
-        "The command: `skipgs-plug run nerfstudio -- ns-train splatfacto ...` (or `-m nerfstudio.scripts.train`). "
+        "`skipgs-plug run nerfstudio -- ns-train splatfacto ...` (or `-m nerfstudio.scripts.train`). "
         "`skipgs.json` lies beside its `config.yml`."
     )
     stand_ins = "nerfstudio"
