@@ -41,6 +41,7 @@ class Pilot:
         stop: Iteration of the pilot's schedule at which densification ends.
         half_size: Whether `share="auto"` would grow the scene on photographs of half the size. The pilot does not.
         peak_memory: Peak memory in bytes, of the process on the CPU and of PyTorch on a GPU; None if unknown.
+        fading: Whether the points that the scene begins with fade, as random ones do.
     """
 
     samples: tuple[Sample, ...]
@@ -50,6 +51,7 @@ class Pilot:
     stop: int
     half_size: bool
     peak_memory: int | None
+    fading: bool
 
 
 def run_pilot(
@@ -85,8 +87,10 @@ def run_pilot(
         meter.reset()
     with SkipGate(trainer, share="auto", half_size=False) as gate:
         trainer.train(progress=progress)
-        visible = gate.report()["gaussians_shown"]
+        report = gate.report()
     peak = None if meter is None else meter.peak()
     photographs = (in_unit_range(scene.train[i].image) for i in some_of(len(scene.train)))  # one at a time in memory
     halves = keep_detail(half_size_psnr(photographs))
-    return Pilot(tuple(samples), first, len(scene.train), visible, trainer.refine_stop_iter, halves, peak)
+    fading = bool(report["growing"] and report["growing"]["fading"])
+    visible, views = report["gaussians_shown"], len(scene.train)
+    return Pilot(tuple(samples), first, views, visible, trainer.refine_stop_iter, halves, peak, fading)

@@ -68,7 +68,7 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
     costs = [cost(number) for number in numbers]
     per_growing = mean(costs)
     per_refining = cost(grown)
-    growing = growing_share(stop, pilot.views, longer=pilot.visible is not None) * stop
+    growing = growing_share(stop, pilot.views, longer=pilot.visible is not None, fading=pilot.fading) * stop
     left = max_steps - stop
     refining = refining_share(left, pilot.views, grown=stop) * left if left else 0.0
     more = grown - max(sample.gaussians for sample in pilot.samples)

@@ -29,7 +29,7 @@ def pilot_of(
     for step in range(0, round(until * STOP), 4):
         count = FIRST + ADDED * growth_shape(step // 100 * 100 / STOP, BEGIN, rate)  # events every 100 iterations
         samples.append(Sample(step, round(count), seconds(count)))
-    return Pilot(tuple(samples), FIRST, 20, 0.3, STOP, half_size=False, peak_memory=peak)
+    return Pilot(tuple(samples), FIRST, 20, 0.3, STOP, half_size=False, peak_memory=peak, fading=False)
 
 
 @pytest.mark.parametrize("rate", [1.0, 2.2, 5.0])
@@ -54,6 +54,12 @@ def test_without_an_event_nothing_is_said_to_grow() -> None:
 def test_mcmc_grows_no_further_than_its_cap() -> None:
     config = TrainConfig(strategy="mcmc", cap_max=12_000)
     assert fit_growth(pilot_of(0.5), config)(1.0) == 12_000
+
+
+def test_a_scene_of_random_points_needs_more_iterations() -> None:
+    usual = pilot_of(1.0)
+    random = dataclasses.replace(usual, fading=True)
+    assert predict(random, TrainConfig(), 7000).iterations_auto > predict(usual, TrainConfig(), 7000).iterations_auto
 
 
 @pytest.mark.parametrize("power", [0.2, 0.5, 0.9])

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
-import torch
-
 from skipgs_plug.core import distributed
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.half_size import half_size_psnr, keep_detail
 from skipgs_plug.core.pace.densification_events import DensificationEvents
+from skipgs_plug.core.pace.half_size import HalfSize
 from skipgs_plug.core.pace.needs import (
+    GROWING_STEPS_FROM_RANDOM,
     LAST_FACTOR,
     LEAST_GROWING_SHARE,
     MOST_RAISED_SHARE,
@@ -53,6 +53,7 @@ class Growing(Phase):
     Attributes:
         sampling: Counts the iterations that ran and that were left out.
         events: Densification events; None before the phase begins.
+        half_size: Photographs of half the size.
         always: Iterations that must run, by reason.
     """
 
@@ -75,11 +76,11 @@ class Growing(Phase):
         self._share_now: float | None = None  # share of the present iterations; None for `share`
         self._rows_at_first = 0  # number of Gaussians at the first event
         self._measuring = True
+        self.half_size = HalfSize(config)
+        self._fading = False  # whether the points that the scene began with faded
         self._reset: int | None = None  # iteration of the last opacity reset; None without one, or if it is unknown
         self._whole_from: int | None = None  # iteration from which all run, because no refinement follows
         self._end = self._steps_after = 0  # end of the phase, and number of iterations that will run in the following
-        self._half_until: int | None = None  # iteration before which photographs have half their size
-        self._half_psnr: float | None = None  # PSNR of these photographs, in decibels; None if it did not decide
         self._saved_events: dict[str, Any] | None = None
 
     def numbers(self, number: int, end: int) -> range:
@@ -145,31 +146,11 @@ class Growing(Phase):
             self._whole_from = max(numbers.stop - last, self._first)
             self._must |= set(range(self._whole_from, numbers.stop))
         self._epoch = plan.epoch or self._epoch
-        if self._half_until is None:
-            self._half_until = min(numbers.stop, (plan.last + 1) // 2) if self._halves(plan) else 0
+        self.half_size.begin(plan)
         return True
 
-    def _halves(self, plan: PhasePlan) -> bool:
-        """Whether the scene grows on photographs of half the size. All processes must call it together.
-
-        Raises:
-            SkipGSError: The user asked for it, and it is not possible.
-        """
-        if plan.photographs is None:
-            if self._config.half_size:
-                raise SkipGSError(
-                    "half_size is not possible here: the adapter of this trainer does not show its views at half their "
-                    "size, or they are too small; leave it out."
-                )
-            return False
-        if not self._config.may_halve or self._config.half_size:
-            return self._config.may_halve
-        own = torch.tensor([half_size_psnr(plan.photographs())])
-        (self._half_psnr,) = distributed.mean(own)
-        return keep_detail(self._half_psnr)
-
     def at_half_size(self, number: int) -> bool:
-        return number < (self._half_until or 0)
+        return self.half_size.holds(number)
 
     @property
     def stretch(self) -> float:
@@ -256,7 +237,7 @@ class Growing(Phase):
         events.rows = distributed.largest(self._rates.rows)  # ranks leave out the same events
         self._rows_at_first = self._rows_at_first or events.rows
         if self._grows_strongly:  # new Gaussians are small by now, and half the size cost bonsai .0014 SSIM
-            self._half_until = min(self._half_until or 0, number)
+            self.half_size.end(number)
         if self._auto and self._visible is not None:
             wanted = min(1.0, LEAST_GROWING_SHARE * share_factor(events.growth) * self.stretch)
             self._share_now = max(self.share, wanted) if self._has_room(number) else self.share
@@ -296,10 +277,27 @@ class Growing(Phase):
         if settled:
             return
         self._visible = self._visible_now
+        if self._visible is not None:
+            # Where opacities are never reset, as in MCMC, a regulariser lets all of them fall.
+            self._fading = self._rates.fading.finish() and self.events.resets
+            if self._fading and not self._auto:
+                self._warn_of_fading()
         if self._auto:
             longer = self._config.compensates and self._visible is not None
             events = len(self.events) if self.events.all_run else 0
-            self.share = growing_share(self._length, self._epoch, longer, events)
+            self.share = growing_share(self._length, self._epoch, longer, events, self._fading)
+
+    def _warn_of_fading(self) -> None:
+        """Warn if the share that the user gave is too small for a scene of random points."""
+        assert self.share is not None
+        run = self.share * self._length
+        if self._has_longer_steps and run < GROWING_STEPS_FROM_RANDOM:
+            enough = min(1.0, math.ceil(100 * GROWING_STEPS_FROM_RANDOM / self._length) / 100)
+            caution(
+                f"The points that the scene began with fade, as random ones do. With a share of {self.share:g}, "
+                f"{run:,.0f} iterations run until densification ends, and such points can stay as haze: give "
+                f'grow_share={enough:g} or "auto".'
+            )
 
     def _factors(self, number: int) -> tuple[float, GrowingParts]:
         """Return the factor on learning rates in iteration `number`, and the parts of opacities and positions."""
@@ -328,8 +326,9 @@ class Growing(Phase):
 
         `share`, `iterations_run`, `iterations_skipped`, `events_run`, `events_skipped`, `rate_factor`,
         `opacity_rate_factor`, `times_grown` (Gaussians at the last event, as a multiple of those at the first; None if
-        unknown), `half_size_until` (iteration before which photographs had half their size; 0 for none),
-        `half_size_psnr` (decibels; None if it did not decide), `always_run`.
+        unknown), `fading` (whether the points that the scene began with faded), `half_size_until` (iteration before
+        which photographs had half their size; 0 for none), `half_size_psnr` (decibels; None if it did not decide),
+        `always_run`.
         """
         if self._first is None:
             return None
@@ -345,8 +344,9 @@ class Growing(Phase):
             "rate_factor": factor,
             "opacity_rate_factor": None if parts is None else parts.opacities,
             "times_grown": self._times_grown,
-            "half_size_until": self._half_until,
-            "half_size_psnr": self._half_psnr,
+            "fading": self._fading,
+            "half_size_until": self.half_size.until,
+            "half_size_psnr": self.half_size.psnr,
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
         }
 
@@ -367,8 +367,9 @@ class Growing(Phase):
             "share_now": self._share_now,
             "gaussians_at_first": self._rows_at_first,
             "measuring": self._measuring,
+            "fading": self._fading,
             "positions_rate": self._rates.positions_rate,
-            "half_size": [self._half_until, self._half_psnr],
+            "half_size": self.half_size.state_dict(),
             "sampling": self.sampling.state_dict(),
             "events": self._events_state,
         }
@@ -378,10 +379,12 @@ class Growing(Phase):
         until, after = state.get("must_shares", (1.0, 1.0))
         self._must_shares = until, after
         self._epoch = state["views"]
-        self._measuring = state["measuring"]
+        self._measuring, self._fading = state["measuring"], state.get("fading", False)
         self._share_now, self._rows_at_first = state.get("share_now"), state.get("gaussians_at_first", 0)
         self._visible, self._visible_now = state["gaussians_shown"]
+        if self._visible is not None:
+            self._rates.fading.stop()
         self._rates.positions_rate = state.get("positions_rate", 0.0)
-        self._half_until, self._half_psnr = state.get("half_size", (0, None))  # an older run has no such photographs
+        self.half_size.load_state_dict(state.get("half_size", [0, None]))  # an older run has no such photographs
         self.sampling.load_state_dict(state["sampling"])
         self._saved_events, self.events = state["events"], None

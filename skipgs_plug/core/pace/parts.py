@@ -207,11 +207,12 @@ class OptimizerInfo:
         name: The argument.
         positions: Parameters that may be positions [N, 3].
         known_positions: Positions [N, 3], if a name says so, which tell the number of Gaussians; else None.
+        opacities: The only parameter of a group of opacities; else None.
         scaled: The groups that are scaled; see `divide`.
         division: The argument of `divide` that `scaled` was found for.
     """
 
-    __slots__ = ("_only", "division", "groups", "known_positions", "name", "positions", "scaled")
+    __slots__ = ("_only", "division", "groups", "known_positions", "name", "opacities", "positions", "scaled")
 
     def __init__(self, optimizer: torch.optim.Optimizer, name: str | None) -> None:
         self.name = name
@@ -219,6 +220,7 @@ class OptimizerInfo:
         self.positions = [param for group in self.groups for param in group.positions]
         named = [param for group in self.groups if group.named_positions for param in group.positions]
         self.known_positions = named[0] if len(named) == 1 else None
+        self.opacities = next((info.first for info in self.groups if info.part is None), None)
         self.scaled: list[ScaledGroup] = []
         self.division: Division | None = None
         self._only = self.groups[0] if len(self.groups) == 1 and self.groups[0].first is not None else None

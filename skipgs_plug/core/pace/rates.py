@@ -15,6 +15,7 @@ from torch.utils.hooks import RemovableHandle
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.optimizers import Optimizers, with_names
+from skipgs_plug.core.pace.fading import Fading
 from skipgs_plug.core.pace.needs import longest_positions
 from skipgs_plug.core.pace.optimizer_steps import OptimizerSteps
 from skipgs_plug.core.pace.parts import UNCHANGED, Division, GrowingParts, OptimizerInfo, ScaledGroup
@@ -72,6 +73,7 @@ class ScaledRates:
     Attributes:
         only: The argument.
         visibility: Share of the Gaussians that a view shows, measured in the steps scaled so far.
+        fading: Whether opacities fall in the first steps.
         opacity_rate: See `Division`.
         positions_rate: Largest learning rate of positions while the scene grew; 0 if it is not known.
         bounds_positions: Whether their rate is bounded in refinement; see `longest_positions`.
@@ -81,6 +83,7 @@ class ScaledRates:
     def __init__(self, only: Optimizers | None = None) -> None:
         self.only = only
         self.visibility = Visibility()
+        self.fading = Fading()
         self.on_error: Callable[[Exception], None] | None = None
         self._factor: float | None = None
         self.opacity_rate = self.positions_rate = 0.0
@@ -194,6 +197,8 @@ class ScaledRates:
                 info = step.info = OptimizerInfo(optimizer, info.name)
             if info.positions:
                 self._count(info)
+            if info.opacities is not None and self._division.growing is not None:
+                self.fading.see(info.opacities)
             if info.division is not self._division:
                 info.divide(self._division)
             self._unstepped = 0

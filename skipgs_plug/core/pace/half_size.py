@@ -1,0 +1,67 @@
+"""Until when a scene grows on photographs of half the size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from skipgs_plug.core import distributed
+from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.half_size import half_size_psnr, keep_detail
+from skipgs_plug.core.pace.phase import PhasePlan
+
+
+class HalfSize:
+    """Decides until which iteration photographs have half the width and height.
+
+    Args:
+        config: Settings with `half_size`.
+
+    Attributes:
+        until: The iteration; 0 if they never have; None before `begin`.
+        psnr: PSNR of these photographs against their own size, in decibels; None if it did not decide.
+    """
+
+    def __init__(self, config: SkipConfig) -> None:
+        self._config = config
+        self.until: int | None = None
+        self.psnr: float | None = None
+
+    def begin(self, plan: PhasePlan) -> None:
+        """Decide, unless a saved state did. All processes must call it together.
+
+        Raises:
+            SkipGSError: The user asked for it, and it is not possible.
+        """
+        if self.until is None:
+            self.until = min(plan.numbers.stop, (plan.last + 1) // 2) if self._is_worth(plan) else 0
+
+    def _is_worth(self, plan: PhasePlan) -> bool:
+        if plan.photographs is None:
+            if self._config.half_size:
+                raise SkipGSError(
+                    "half_size is not possible here: the adapter of this trainer does not show its views at half their "
+                    "size, or they are too small; leave it out."
+                )
+            return False
+        if not self._config.may_halve or self._config.half_size:
+            return self._config.may_halve
+        own = torch.tensor([half_size_psnr(plan.photographs())])
+        (self.psnr,) = distributed.mean(own)
+        return keep_detail(self.psnr)
+
+    def holds(self, number: int) -> bool:
+        """Return whether iteration `number` trains on a photograph of half the size."""
+        return number < (self.until or 0)
+
+    def end(self, number: int) -> None:
+        """Give photographs their own size from iteration `number` on."""
+        self.until = min(self.until or 0, number)
+
+    def state_dict(self) -> list[Any]:
+        return [self.until, self.psnr]
+
+    def load_state_dict(self, state: list[Any]) -> None:
+        self.until, self.psnr = state
