@@ -282,6 +282,7 @@ def measure_ply(path: Path, scene: Path, factor: int) -> dict[str, Any]:
             view.width,
             view.height,
             sh_degree=round(colors.shape[1] ** 0.5) - 1,
+            backgrounds=torch.tensor([loaded.background]),
             eps2d=0.3 if smoothing is None else MIP_FILTER,
             rasterize_mode="classic" if smoothing is None else "antialiased",
         )

@@ -309,7 +309,8 @@ class Growing(Phase):
         share = max(self._share_now or self.share, self._must_shares[ends])
         grown = self._times_grown
         factor = growing_factor(self._length, share, self._visible, events.all_run, grown, events.resets)
-        return factor, GrowingParts(opacity_factor(share), positions_part(factor, events.resets), events.clears_moments)
+        positions = 1.0 if self._fading else positions_part(factor, events.resets)
+        return factor, GrowingParts(opacity_factor(share), positions, events.clears_moments, scales_stay=self._fading)
 
     @property
     def _times_grown(self) -> float | None:

@@ -11,12 +11,13 @@ from torch import Tensor
 
 from skipgs_plug.core.pace.visibility import POSITIONS
 
+SCALES = ("scaling", "scales")
 # Multiples of the common factor that groups of parameters take, by kind. In refinement opacities take none.
 HIGHER_BANDS, GEOMETRY, OTHERS, CONSTANT_BAND = 4.0, 2.0, 1.0, 0.5
 PART_BY_NAME = {
     **dict.fromkeys(("f_rest", "shN", "features_rest"), HIGHER_BANDS),
     **dict.fromkeys(("f_dc", "sh0", "features_dc"), CONSTANT_BAND),
-    **dict.fromkeys((*POSITIONS, "scaling", "scales"), GEOMETRY),
+    **dict.fromkeys((*POSITIONS, *SCALES), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
 # Largest factor on the rate of opacities that must recover from their last reset. They flicker with more.
@@ -77,6 +78,7 @@ class GroupInfo:
         first: The parameter of a group that has only one; else None.
         positions: Parameters that may be positions [N, 3].
         named_positions: Whether the name says that they are positions.
+        named_scales: Whether the name says that they are scales.
         betas: The trainer's betas when `shorter` was called last.
         short: The betas that `shorter` returned then.
     """
@@ -89,6 +91,7 @@ class GroupInfo:
         "first",
         "group",
         "named_positions",
+        "named_scales",
         "part",
         "positions",
         "short",
@@ -106,6 +109,7 @@ class GroupInfo:
         # model, even if their shapes are unusual, as those of anchors are.
         self._shaped = all(shape in GAUSSIAN_SHAPES or (len(shape) == 2 and shape[1] == 3) for shape in shapes)
         self.named_positions = known in POSITIONS
+        self.named_scales = known in SCALES
         may_be = self._params if known is None or known in POSITIONS else []
         self.positions = [param for param in may_be if param.ndim == 2 and param.shape[1] == 3]
         self.betas: Any = None
@@ -164,12 +168,18 @@ class GrowingParts(NamedTuple):
         positions: Multiple of the common factor that positions take.
         opacities_remember: Whether opacities keep the trainer's beta2.
         only_higher_bands: Whether no steps are longer but those of the colours' higher bands.
+        scales_stay: Whether scales keep their rate.
     """
 
     opacities: float
     positions: float
     opacities_remember: bool = False
     only_higher_bands: bool = False
+    scales_stay: bool = False
+
+    def keeps(self, info: GroupInfo) -> bool:
+        """Whether a group other than opacities keeps its rate."""
+        return (self.only_higher_bands and info.part != HIGHER_BANDS) or (self.scales_stay and info.named_scales)
 
 
 UNCHANGED = GrowingParts(1.0, 1.0)  # with a factor of 1, the trainer's own steps
@@ -254,7 +264,7 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
             remembers = growing is not None and growing.opacities_remember
             return ScaledGroup(info.group, times, 1.0, None if remembers else info)
         return None
-    if not raised or (growing is not None and growing.only_higher_bands and info.part != HIGHER_BANDS):
+    if not raised or (growing is not None and growing.keeps(info)):
         return None
     if not info.named_positions:
         return ScaledGroup(info.group, info.part, math.inf, info)

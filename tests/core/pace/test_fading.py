@@ -53,16 +53,21 @@ def test_a_scene_of_random_points_needs_more_iterations():
     assert growing_share(1500, 17, longer=True, fading=True) == 1.0
 
 
-def train(gate, direction, until=LAST):
-    """Train a model whose opacities rise or fall, and return the number of iterations before refinement."""
-    means = torch.nn.Parameter(torch.randn(ROWS, 3))
+def train(gate, direction, until=LAST, note=None):
+    """Train a model whose opacities rise or fall, and return the number of iterations before refinement.
+
+    `note` is called before each step.
+    """
+    means, scales = torch.nn.Parameter(torch.randn(ROWS, 3)), torch.nn.Parameter(torch.randn(ROWS, 3))
     opacities = torch.nn.Parameter(torch.rand(ROWS, 1))
-    groups = [{"params": [means], "name": "xyz"}, {"params": [opacities], "name": "opacity"}]
-    optimizer = torch.optim.Adam(groups, lr=0.01)
+    named = {"xyz": means, "opacity": opacities, "scaling": scales}
+    optimizer = torch.optim.Adam([{"params": [param], "name": name} for name, param in named.items()], lr=0.01)
+    if note is not None:
+        optimizer.register_step_pre_hook(note)
     ran = 0
     for step in gate.iterations(range(LAST), views=VIEWS, events=range(100, START, 100)):
         ran += step < START
-        loss = means.square().sum() - direction * opacities.sum()
+        loss = means.square().sum() + scales.square().sum() - direction * opacities.sum()
         if gate.backward(loss, view=VIEWS[step % 4], step=step):
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
@@ -100,3 +105,17 @@ def test_a_share_that_is_too_small_for_random_points_is_warned_of(share, compens
                 train(gate, -1, until=100)
         else:
             train(gate, -1, until=100)
+
+
+def test_scales_keep_their_rate_and_positions_take_the_common_factor():
+    rates = []
+
+    def note(optimizer, args, kwargs):
+        rates.append([group["lr"] / 0.01 for group in optimizer.param_groups])
+
+    with SkipGate(start_iter=START, share="auto") as gate:
+        train(gate, -1, until=500, note=note)
+    factor = gate.report()["growing"]["rate_factor"]
+    assert factor > 1.0
+    opacities = (START / GROWING_STEPS_FROM_RANDOM) ** 0.5
+    assert rates[-1] == pytest.approx([factor, opacities, 1.0])

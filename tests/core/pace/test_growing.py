@@ -107,7 +107,7 @@ class Opaque(Loop):
         self.optimizer.register_step_pre_hook(self.note)
 
     def note(self, optimizer, args, kwargs):
-        self.opacities.grad = torch.ones_like(self.opacities)
+        self.opacities.grad = -torch.ones_like(self.opacities)  # they rise, as those of points on surfaces do
         groups = zip(optimizer.param_groups, (0.1, 0.05), strict=True)
         self.rates[self.ran[-1]] = tuple(group["lr"] / rate for group, rate in groups)
 
