@@ -309,8 +309,10 @@ class Growing(Phase):
         share = max(self._share_now or self.share, self._must_shares[ends])
         grown = self._times_grown
         factor = growing_factor(self._length, share, self._visible, events.all_run, grown, events.resets)
-        positions = 1.0 if self._fading else positions_part(factor, events.resets)
-        return factor, GrowingParts(opacity_factor(share), positions, events.clears_moments, scales_stay=self._fading)
+        # A reset takes random points away. Without one, long steps would make them large, and they would stay.
+        stay = self._fading and self._reset is None
+        positions = 1.0 if stay else positions_part(factor, events.resets)
+        return factor, GrowingParts(opacity_factor(share), positions, events.clears_moments, scales_stay=stay)
 
     @property
     def _times_grown(self) -> float | None:
