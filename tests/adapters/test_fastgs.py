@@ -10,7 +10,7 @@ from skipgs_plug.adapters import fastgs as adapter
 from skipgs_plug.adapters.fastgs import FastGS
 from skipgs_plug.adapters.improved_gs import ImprovedGS
 from skipgs_plug.core import decision
-from skipgs_plug.core.pace import growing
+from skipgs_plug.core.pace import fading, growing
 from skipgs_plug.core.pace.rates import path_factor
 from skipgs_plug.core.trainer_info import Densification
 
@@ -142,6 +142,7 @@ def test_opacities_of_fastgs_keep_their_beta2_while_the_scene_grows(monkeypatch)
 
     monkeypatch.setattr(fastgs.GaussianModel, "adam", Adam)
     monkeypatch.setattr(growing, "MEASURED", 2)
+    monkeypatch.setattr(fading, "MOST", 1.0)  # two steps do not tell whether points fade
     run(CASES["fastgs"], share=0.5)
     assert betas["opacity", True] == {0.999} and betas["opacity", False] == {0.98}
     assert 0.98 in betas["xyz", True]

@@ -25,7 +25,7 @@ def test_filter_of_mip_splatting_is_taken_into_the_unit_of_the_scene(tmp_path: P
     PlyData([PlyElement.describe(vertices, "vertex")]).write(tmp_path / "model.ply")
     image = torch.full((2, 2, 3), 128, dtype=torch.uint8)
     view = SimpleNamespace(viewmat=torch.eye(4), K=torch.eye(3), width=2, height=2, image=image)
-    scene = SimpleNamespace(frame=Frame((1.0, 2.0, 3.0), 4.0), test=[view])
+    scene = SimpleNamespace(frame=Frame((1.0, 2.0, 3.0), 4.0), test=[view], background=(0.0, 0.0, 0.0))
     drawn = {}
 
     def rasterization(means, quats, scales, opacities, colors, *args, **kwargs):
