@@ -105,7 +105,7 @@ FACTS = (
     "steps_each: 'bool' = False, "
     "densification: 'Densification | None' = None, "
     "photographs: 'Callable[[], Iterable[Tensor]] | None' = None, "
-    "slow_positions: 'bool' = False, defaults: 'Mapping[str, Any]' = <factory>) -> None"
+    "slow_positions: 'bool' = False, positions_rate: 'float' = 0.0, defaults: 'Mapping[str, Any]' = <factory>) -> None"
 )
 POLICY = {
     "decide": "(self, view: 'Hashable', loss: 'float', step: 'int') -> 'Decision'",

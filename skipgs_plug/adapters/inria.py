@@ -37,6 +37,8 @@ from skipgs_plug.adapters.unknown_forks import (
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import AdapterMismatchError
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.optimizers import held_by
+from skipgs_plug.core.pace.parts import rate_of_positions
 from skipgs_plug.core.source.functions import undecorated
 from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 from skipgs_plug.core.views import view_key
@@ -255,15 +257,12 @@ class InriaFamily(AbstractAdapter):
             # Variables of the loop are read once, before they hold the graph of an iteration.
             if self._model() is not model:
                 self._refuse_fork(LoopCode.of_module(caller.f_globals))
-                self._read_run(hooks, names_around(caller))
                 self._model = weakref.ref(model)
-                hooks.check_drift(self._optimizers_of_model)
+                self._read_run(hooks, names_around(caller))
+                hooks.check_drift(lambda: held_by(self._model()))
             else:
                 self._step = hooks.number(self._step + 1)
             hooks.iteration(self._step)
-
-    def _optimizers_of_model(self) -> list[torch.optim.Optimizer]:
-        return [one for one in vars(self._model()).values() if isinstance(one, torch.optim.Optimizer)]
 
     def _attach_to_loop(self, hooks: Hooks, script: dict[str, Any], code: LoopCode) -> None:
         """Attach to the loop's backward and to its range."""
@@ -318,9 +317,8 @@ class InriaFamily(AbstractAdapter):
         missing = [name for name in (OPTIONS, number) if name not in loop]
         if scene is None or missing:
             raise self.mismatch(f"{', '.join(missing or self.scenes)} among the variables of {LOOP}()")
-        opt, self._step = loop[OPTIONS], int(loop[number])
+        opt, self._step, cameras = loop[OPTIONS], int(loop[number]), scene.getTrainCameras()
         self.output_folder = getattr(scene, "model_path", None)
-        cameras = scene.getTrainCameras()
         if len({camera.image_name for camera in cameras}) < len(cameras):
             caution(
                 "Several training images have the same name; the gate tells views apart by their position, "
@@ -341,6 +339,7 @@ class InriaFamily(AbstractAdapter):
                 accumulates=self.accumulates(opt, loop),
                 steps_each=self.steps_each(opt, loop),
                 slow_positions=True,  # they reach their last rate in `position_lr_max_steps`, by default 30,000
+                positions_rate=rate_of_positions(held_by(self._model())),
                 photographs=None if self._cameras is None else self._cameras.photographs,
             )
         )

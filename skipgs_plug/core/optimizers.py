@@ -1,4 +1,4 @@
-"""Helpers for the optimizer steps of a gated loop."""
+"""Helpers for the optimizers of a gated loop."""
 
 from __future__ import annotations
 
@@ -18,6 +18,11 @@ def has_pending_gradient(optimizer: torch.optim.Optimizer) -> bool:
             if parameter.grad is not None:
                 return True
     return False
+
+
+def held_by(owner: Any) -> list[torch.optim.Optimizer]:
+    """Return the optimizers that are attributes of an object."""
+    return [one for one in vars(owner).values() if isinstance(one, torch.optim.Optimizer)]
 
 
 def listed(optimizer: Any) -> list[torch.optim.Optimizer]:

@@ -70,6 +70,7 @@ class TrainerInfo:
         photographs: Returns some training photographs [3, H, W] with values in [0, 1], if the adapter shows views at
             half their size while `Hooks.at_half_size`; None if it cannot.
         slow_positions: Whether the trainer may lower the learning rate of positions too slowly for its schedule.
+        positions_rate: First learning rate of positions then; 0 if it is not known.
         defaults: Settings that suit this trainer. They are used where the user gave no value.
     """
 
@@ -86,4 +87,5 @@ class TrainerInfo:
     densification: Densification | None = None
     photographs: Callable[[], Iterable[Tensor]] | None = None
     slow_positions: bool = False
+    positions_rate: float = 0.0
     defaults: Mapping[str, Any] = dataclasses.field(default_factory=dict)

@@ -126,7 +126,6 @@ class Growing(Phase):
         if self._first is None:
             self._first = numbers.start
         self._reset, self._end = max(resets, default=None), numbers.stop
-        self._rates.bounds_positions = plan.slow_positions
         following = plan.last + 1 - numbers.stop
         if following > 0:
             asked = self._config.refining
@@ -371,7 +370,6 @@ class Growing(Phase):
             "gaussians_at_first": self._rows_at_first,
             "measuring": self._measuring,
             "fading": self._fading,
-            "positions_rate": self._rates.positions_rate,
             "half_size": self.half_size.state_dict(),
             "sampling": self.sampling.state_dict(),
             "events": self._events_state,
@@ -387,7 +385,6 @@ class Growing(Phase):
         self._visible, self._visible_now = state["gaussians_shown"]
         if self._visible is not None:
             self._rates.fading.stop()
-        self._rates.positions_rate = state.get("positions_rate", 0.0)
         self.half_size.load_state_dict(state.get("half_size", [0, None]))  # an older run has no such photographs
         self.sampling.load_state_dict(state["sampling"])
         self._saved_events, self.events = state["events"], None

@@ -51,7 +51,7 @@ class LoopFacts:
         self._known: Known = nothing_known
         self._accumulates = self._steps_each = False
         self._photographs: Callable[[], Iterable[Tensor]] | None = None
-        self._slow_positions = False
+        self._slow_positions, self._positions_rate = False, 0.0
         self._views: list[str] | None = None
         self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
 
@@ -61,6 +61,7 @@ class LoopFacts:
         self._accumulates, self._steps_each, self._epoch = info.accumulates, info.steps_each, info.epoch
         self.densification = info.densification or self.densification
         self._photographs, self._slow_positions = info.photographs, info.slow_positions
+        self._positions_rate = self._positions_rate or info.positions_rate  # a resumed run begins with another one
 
     def describe(self, always: Always, pure: Iterable[str], densification: Densification | None, known: Known) -> None:
         """Receive facts from the trainer's adapter; see `Pace.describe`."""
@@ -130,6 +131,7 @@ class LoopFacts:
             self._accumulates,
             self._photographs,
             self._slow_positions,
+            self._positions_rate,
             self._steps_each,
         )
 
@@ -143,6 +145,7 @@ class LoopFacts:
             "views": self._views,
             "epoch": self._epoch,
             "slow_positions": self._slow_positions,
+            "positions_rate": self._positions_rate,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -151,3 +154,4 @@ class LoopFacts:
         self._steps_each = state.get("steps_each", False)
         self._views, self._epoch = state.get("views"), state.get("epoch")
         self._slow_positions = state.get("slow_positions", False)
+        self._positions_rate = state.get("positions_rate", 0.0)

@@ -78,13 +78,14 @@ MOST_LAST = 1000
 LAST_FACTOR = 2.0
 
 # Refining (after densification ends).
-# Largest rate of positions where a view shows a third of the Gaussians, as a multiple of the largest rate while the
-# scene grew. Most trainers have lowered it to a tenth by then, so that steps are 2 to 2.7 times as long as the first
-# ones. Inria's script lowers it by 30,000 iterations, however many it runs: with 7,000, positions took 10 times their
-# first rate, and bonsai at 399 pixels ended 0.5 dB and .020 SSIM lower. Where a view shows nearly all, as on fern,
-# steps of 11 and 22 times that rate end 0.2 dB higher than steps of 3 times. So the bound goes with the square of that
-# share.
+# Largest rate of positions, as a multiple of their first one, if each view comes up `AVERAGING_VISITS` times at most.
+# Most trainers have lowered the rate to a tenth by then, so that steps are 2 to 2.7 times as long as the first ones.
+# Inria's script lowers it by 30,000 iterations, however many it runs. With 7,000, positions took 10 to 15 times their
+# first rate, which cost Lego 2.4 dB, and bonsai at 399 pixels 0.5 dB. On fern each view comes up 32 to 44 times, and 11
+# times the first rate ends 0.25 dB higher than twice. So the bound goes with the visits, over which the noise of single
+# views averages out.
 LONGEST_POSITIONS = 2.0
+AVERAGING_VISITS = 10.0
 # Length of the path of opacities (sum of their rates) after their last reset. They begin at 0.01, however long their
 # steps are. Inria's script on bonsai at 798x531 pixels, 7,000 iterations, reset them at iteration 3,000: with a path of
 # 27 it ended with a mean opacity of 0.12 instead of 0.43, and 1.5 dB below its own run. A path of 60 lost nothing.
@@ -125,13 +126,13 @@ def last_part(iterations: int, since_reset: int | None) -> int:
     return max(math.ceil(LAST_PART * iterations), min(since_reset or 0, MOST_LAST))
 
 
-def longest_positions(visible: float | None) -> float:
-    """Return the largest rate of positions in refinement, as a multiple of the largest one while the scene grew.
+def longest_positions(visits: float | None) -> float:
+    """Return the largest rate of positions in refinement, as a multiple of their first one.
 
     Args:
-        visible: Share of the Gaussians that a view shows; None before it is measured.
+        visits: Number of iterations of refinement that run, per training view; None if the views are unknown.
     """
-    return LONGEST_POSITIONS * (1.0 if visible is None else (3.0 * visible) ** 2)
+    return LONGEST_POSITIONS * max(1.0, (visits or 0.0) / AVERAGING_VISITS)
 
 
 def opacity_rate(steps: float) -> float:

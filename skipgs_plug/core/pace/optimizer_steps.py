@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -59,11 +60,13 @@ class OptimizerSteps:
         """
         self._under_way.append(self)
         before = self.before
-        for group, part, most, longer in scaled:
+        for group, part, most, longer, highest in scaled:
             rate, betas = group.get("lr"), group.get("betas")
             before.append((group, rate, betas))
             if rate is not None:
-                group["lr"] = rate * (part * (factor if factor < most else most))
+                longer_rate = rate * (part * (factor if factor < most else most))
+                # A rate that is a tensor on a device has no bound, so nothing waits for it.
+                group["lr"] = longer_rate if highest == math.inf or longer_rate < highest else highest
             if betas is not None and longer is not None:
                 group["betas"] = longer.short if betas is longer.betas else longer.shorter(betas)
         if self.own is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from typing import Any
 
 import torch
@@ -39,10 +40,12 @@ class OwnSteps:
             before: The same groups, each with the trainer's rate and betas.
             factor: Factor on learning rates.
         """
-        for (group, part, most, longer), (_, rate, betas) in zip(scaled, before, strict=True):
+        for (group, part, most, longer, highest), (_, rate, betas) in zip(scaled, before, strict=True):
             if longer is None:
                 continue
             times = part * min(factor, most)
+            if highest != math.inf and rate:
+                times = min(times, highest / rate)
             if self._memory_stays and betas is not None:
                 times = max(min(times, 1.0), times * shorter_memory(betas))
                 if rate is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import torch
@@ -63,6 +64,12 @@ def group_part(group: dict[str, Any], name: str | None = None) -> float | None:
     if all(len(shape) == 2 and shape[0] > 1 and shape[1] == 3 for shape in shapes):
         return HIGHER_BANDS
     return OTHERS
+
+
+def rate_of_positions(optimizers: Iterable[torch.optim.Optimizer]) -> float:
+    """Return the learning rate of the groups whose names say that they are positions; 0 without one."""
+    groups = (group for optimizer in optimizers for group in optimizer.param_groups)
+    return max((float(group["lr"]) for group in groups if known_name(group.get("name")) in POSITIONS), default=0.0)
 
 
 class GroupInfo:
@@ -152,12 +159,14 @@ class ScaledGroup(NamedTuple):
         times: Multiple of the factor that the group takes.
         most: Bound on the factor, before it is multiplied.
         longer: Facts about the group if its steps are larger and have a smaller beta2; else None.
+        highest: Bound on the learning rate that results.
     """
 
     group: dict[str, Any]
     times: float
     most: float
     longer: GroupInfo | None
+    highest: float = math.inf
 
 
 class GrowingParts(NamedTuple):
@@ -235,11 +244,6 @@ class OptimizerInfo:
         self.division: Division | None = None
         self._only = self.groups[0] if len(self.groups) == 1 and self.groups[0].first is not None else None
 
-    @property
-    def positions_rate(self) -> float:
-        """Learning rate of the parameters whose name says that they are positions."""
-        return max((group.rate for group in self.groups if group.named_positions), default=0.0)
-
     def fits(self, optimizer: torch.optim.Optimizer) -> bool:
         """Whether these facts still hold."""
         groups, only = optimizer.param_groups, self._only
@@ -270,9 +274,7 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
         return ScaledGroup(info.group, info.part, math.inf, info)
     if growing is not None:
         return ScaledGroup(info.group, growing.positions, math.inf, info)
-    step = info.part * info.rate
-    most = positions_rate / step if step > 0.0 else math.inf
-    return ScaledGroup(info.group, info.part, most, info)
+    return ScaledGroup(info.group, info.part, math.inf, info, positions_rate)
 
 
 def _recovering(rate: float, least: float) -> float:

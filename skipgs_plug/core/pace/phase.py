@@ -29,6 +29,7 @@ class PhasePlan(NamedTuple):
         accumulates: Optimizers step on gradients that are accumulated over several iterations; see `TrainerInfo`.
         photographs: Returns some training photographs, if views can be shown at half their size; see `TrainerInfo`.
         slow_positions: Whether the learning rate of positions may fall too slowly; see `TrainerInfo`.
+        positions_rate: First learning rate of positions then; 0 if it is not known.
         steps_each: Optimizers would do so, but step in refinement as in densification; see `TrainerInfo`.
     """
 
@@ -43,6 +44,7 @@ class PhasePlan(NamedTuple):
     accumulates: bool
     photographs: Callable[[], Iterable[Tensor]] | None = None
     slow_positions: bool = False
+    positions_rate: float = 0.0
     steps_each: bool = False
 
     def epoch_for(self, setting: str) -> int:

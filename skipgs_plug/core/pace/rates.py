@@ -16,7 +16,6 @@ from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.optimizers import Optimizers, with_names
 from skipgs_plug.core.pace.fading import Fading
-from skipgs_plug.core.pace.needs import longest_positions
 from skipgs_plug.core.pace.optimizer_steps import OptimizerSteps
 from skipgs_plug.core.pace.parts import UNCHANGED, Division, GrowingParts, OptimizerInfo, ScaledGroup
 from skipgs_plug.core.pace.visibility import VISIBLE, Visibility
@@ -75,8 +74,7 @@ class ScaledRates:
         visibility: Share of the Gaussians that a view shows, measured in the steps scaled so far.
         fading: Whether opacities fall in the first steps.
         opacity_rate: See `Division`.
-        positions_rate: Largest learning rate of positions while the scene grew; 0 if it is not known.
-        bounds_positions: Whether their rate is bounded in refinement; see `longest_positions`.
+        positions_rate: See `Division`.
         on_error: Receives errors of hooks, and raises them or releases the gate. None raises them.
     """
 
@@ -86,8 +84,7 @@ class ScaledRates:
         self.fading = Fading()
         self.on_error: Callable[[Exception], None] | None = None
         self._factor: float | None = None
-        self.opacity_rate = self.positions_rate = 0.0
-        self.bounds_positions = False
+        self.opacity_rate, self.positions_rate = 0.0, math.inf
         self._division = Division(0, None, True)
         self._rows = self._rows_now = 0  # number of Gaussians in the previous and in this iteration; 0 if unknown
         self._thread = get_ident()
@@ -218,17 +215,13 @@ class ScaledRates:
             self.visibility.see(info.positions)
         if info.known_positions is not None:
             self._rows = self._rows_now = info.known_positions.shape[0]
-            if self._division.growing is not None:
-                self.positions_rate = max(self.positions_rate, info.positions_rate)
         else:  # in groups without names, positions of cameras have the shape of positions of Gaussians, but fewer rows
             self._rows_now = max(self._rows_now, *(param.shape[0] for param in info.positions))
         self._divide(max(self._rows_now, self._rows), self._division.growing, self._division.raised)
 
     def _divide(self, rows: int, growing: GrowingParts | None, raised: bool) -> None:
         """Set the division; an equal one stays the same object, so that optimizers compare it fast."""
-        bounds = growing is None and self.bounds_positions and self.positions_rate > 0.0
-        bound = longest_positions(self.visibility.visible) * self.positions_rate if bounds else math.inf
-        division = (rows, growing, raised, self.opacity_rate, bound)
+        division = (rows, growing, raised, self.opacity_rate, self.positions_rate)
         if division != self._division:
             self._division = Division(*division)
 

@@ -10,7 +10,7 @@ from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import GateStateError
 from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, ONE_CYCLE, EarlyStopping, watched_views, why_none_watched
-from skipgs_plug.core.pace.needs import MOST_RAISED_SHARE, refining_share
+from skipgs_plug.core.pace.needs import MOST_RAISED_SHARE, longest_positions, refining_share
 from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates, path_factor
 from skipgs_plug.core.pace.sampling import Sampling
@@ -69,6 +69,8 @@ class Refining(Phase):
         self._shrinks = False  # whether the steps, as many as in the trainer's own run, shrink with its schedule
         self._before = Phase()
         self._grown_by_few = False
+        self._first_positions_rate = 0.0  # see `TrainerInfo`
+        self._epoch: int | None = None
         self._begun = self._entered = self._removed = False
 
     @property
@@ -94,6 +96,7 @@ class Refining(Phase):
             self._first = plan.numbers.start
         grown = plan.before.shortened(self._first)
         self._begun, self._last, self._before, self._grown_by_few = True, plan.last, plan.before, grown > 0
+        self._first_positions_rate, self._epoch = plan.positions_rate, plan.epoch
         reasons = {**plan.conditions, NAMED_FOR_TRAINER: plan.named}
         self.always = {reason: hits for reason, hits in reasons.items() if hits}
         self._must = frozenset().union(*self.always.values())
@@ -143,6 +146,7 @@ class Refining(Phase):
         if not self._entered:
             self._enter()
             self._rates.opacity_rate = self._before.opacity_rate
+            self._rates.positions_rate = self._positions_rate
         if self._expected is not None and number > self._expected:
             assert self._last is not None and self.stopping is not None
             if self.stopping.ended:
@@ -237,6 +241,15 @@ class Refining(Phase):
     def _recover(self, iterations: int) -> None:
         """Let this number of iterations run from now on."""
         self._recovery, self._recovered = iterations, 0
+
+    @property
+    def _positions_rate(self) -> float:
+        """Largest learning rate that positions may take."""
+        if not self._first_positions_rate:
+            return math.inf
+        assert self.share is not None and self._first is not None and self._last is not None
+        run = self.share * (self._last + 1 - self._first)
+        return longest_positions(run / self._epoch if self._epoch else None) * self._first_positions_rate
 
     @property
     def _auto(self) -> bool:

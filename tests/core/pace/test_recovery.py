@@ -8,7 +8,9 @@ import torch
 
 from skipgs_plug import SkipGate
 from skipgs_plug.adapters.gsplat_strategy import strategy_events
+from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.pace.needs import (
+    AVERAGING_VISITS,
     LONGEST_POSITIONS,
     MOST_LAST,
     OPACITY_PATH,
@@ -16,8 +18,10 @@ from skipgs_plug.core.pace.needs import (
     longest_positions,
     opacity_rate,
 )
-from skipgs_plug.core.pace.parts import MOST_OPACITY_FACTOR, UNCHANGED
+from skipgs_plug.core.pace.parts import MOST_OPACITY_FACTOR, rate_of_positions
+from skipgs_plug.core.pace.phase import Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates
+from skipgs_plug.core.pace.refining import Refining
 
 VIEWS = [f"{i}.png" for i in range(4)]
 RATE = 0.1
@@ -50,22 +54,48 @@ def test_opacities_take_the_rate_that_they_need_in_refinement(least, times, rate
     assert moved("opacity", 0.5, rates) == pytest.approx(0.5 * times)
 
 
-def test_a_rate_of_positions_that_falls_too_slowly_is_bounded_by_the_first_one(rates):
-    rates.bounds_positions = True
-    assert moved("xyz", 10.0, rates) == pytest.approx(20.0)  # their first rate is not known
-    moved("xyz", 1.0, rates, growing=UNCHANGED)
-    rates.visibility.restart()
-    assert moved("xyz", 10.0, rates, shown=2) == pytest.approx(longest_positions(2 / 5))
+def test_a_rate_of_positions_that_falls_too_slowly_is_bounded(rates):
+    assert moved("xyz", 10.0, rates) == pytest.approx(20.0)
+    rates.positions_rate = 3.0 * RATE
+    assert moved("xyz", 10.0, rates) == pytest.approx(3.0)
     # A trainer that has lowered the rate to a tenth gets the steps that it would get without the bound.
     assert moved("xyz", 10.0, rates, rate=RATE / 10) == pytest.approx(20.0)
     assert moved("xyz", 1.0, rates) == pytest.approx(2.0)
-    rates.bounds_positions = False
-    assert moved("xyz", 10.0, rates) == pytest.approx(20.0)
 
 
-def test_where_a_view_shows_more_positions_take_longer_steps():
-    assert longest_positions(None) == longest_positions(1 / 3) == LONGEST_POSITIONS
-    assert longest_positions(2 / 3) == pytest.approx(4 * LONGEST_POSITIONS)
+def test_the_bound_holds_for_each_step_while_the_trainer_lowers_its_rate(rates):
+    value = torch.nn.Parameter(torch.zeros(5, 3))
+    optimizer = torch.optim.SGD([{"params": [value], "name": "xyz"}], lr=RATE)
+    rates.positions_rate = 3.0 * RATE
+    for own in (RATE, RATE / 2, RATE / 10):
+        optimizer.param_groups[0]["lr"] = own
+        value.data.zero_()
+        value.grad = torch.ones_like(value)
+        rates.scale(10.0)
+        optimizer.step()
+        assert -value[0, 0].item() == pytest.approx(min(3.0 * RATE, 20.0 * own))
+        assert optimizer.param_groups[0]["lr"] == own
+
+
+def test_with_more_visits_of_each_view_positions_take_longer_steps():
+    assert longest_positions(None) == longest_positions(3.0) == longest_positions(AVERAGING_VISITS) == LONGEST_POSITIONS
+    assert longest_positions(4 * AVERAGING_VISITS) == 4 * LONGEST_POSITIONS
+
+
+@pytest.mark.parametrize("first", [RATE, 0.0])
+def test_visits_in_refinement_set_the_bound(first, rates):
+    refining = Refining(SkipConfig(share=0.3), rates)
+    plan = PhasePlan(range(100, 400), {}, set(), 399, Phase(), VIEWS, len(VIEWS), None, False, positions_rate=first)
+    refining.begin(plan)
+    refining.runs(100)
+    assert rates.positions_rate == (longest_positions(0.3 * 300 / len(VIEWS)) * RATE if first else math.inf)
+
+
+def test_the_first_rate_of_positions_is_that_of_the_named_group():
+    model = torch.nn.Linear(2, 3)
+    adam = torch.optim.Adam([{"params": [model.weight], "name": "xyz", "lr": 0.2}], lr=0.1)
+    other = torch.optim.Adam([{"params": [model.bias], "name": "opacity", "lr": 0.5}], lr=0.1)
+    assert rate_of_positions([other, adam]) == 0.2 and rate_of_positions([other]) == 0.0
 
 
 def test_the_end_of_a_run_without_refinement():
