@@ -36,9 +36,9 @@ class HalfSize:
             SkipGSError: The user asked for it, and it is not possible.
         """
         if self.until is None:
-            self.until = min(plan.numbers.stop, (plan.last + 1) // 2) if self._is_worth(plan) else 0
+            self.until = min(plan.numbers.stop, (plan.last + 1) // 2) if self._pays(plan) else 0
 
-    def _is_worth(self, plan: PhasePlan) -> bool:
+    def _pays(self, plan: PhasePlan) -> bool:
         if plan.photographs is None:
             if self._config.half_size:
                 raise SkipGSError(
