@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -60,13 +59,12 @@ class OptimizerSteps:
         """
         self._under_way.append(self)
         before = self.before
-        for group, part, most, longer, highest in scaled:
+        for one in scaled:
+            group, longer = one.group, one.longer
             rate, betas = group.get("lr"), group.get("betas")
             before.append((group, rate, betas))
             if rate is not None:
-                longer_rate = rate * (part * (factor if factor < most else most))
-                # A rate that is a tensor on a device has no bound, so nothing waits for it.
-                group["lr"] = longer_rate if highest == math.inf or longer_rate < highest else highest
+                group["lr"] = rate * one.times_rate(factor, rate)
             if betas is not None and longer is not None:
                 group["betas"] = longer.short if betas is longer.betas else longer.shorter(betas)
         if self.own is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from typing import Any
 
 import torch
@@ -40,17 +39,15 @@ class OwnSteps:
             before: The same groups, each with the trainer's rate and betas.
             factor: Factor on learning rates.
         """
-        for (group, part, most, longer, highest), (_, rate, betas) in zip(scaled, before, strict=True):
-            if longer is None:
+        for one, (group, rate, betas) in zip(scaled, before, strict=True):
+            if one.longer is None:
                 continue
-            times = part * min(factor, most)
-            if highest != math.inf and rate:
-                times = min(times, highest / rate)
+            times = one.times_rate(factor, rate)
             if self._memory_stays and betas is not None:
                 times = max(min(times, 1.0), times * shorter_memory(betas))
                 if rate is not None:
                     group["lr"] = rate * times
-            if not self._judged and times != 1.0 and longer.has_gradient():
+            if not self._judged and times != 1.0 and one.longer.has_gradient():
                 self._longer.append(group)
         if self._longer:
             with_betas = next((betas for _, _, betas in before if betas is not None), None)

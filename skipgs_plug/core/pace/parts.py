@@ -168,6 +168,16 @@ class ScaledGroup(NamedTuple):
     longer: GroupInfo | None
     highest: float = math.inf
 
+    def times_rate(self, factor: float, rate: Any) -> float:
+        """Return the multiple of its learning rate that the group takes.
+
+        Args:
+            factor: Factor on learning rates.
+            rate: The group's learning rate; None for a group without one. A tensor is read only if there is a bound.
+        """
+        times = self.times * (factor if factor < self.most else self.most)
+        return times if self.highest == math.inf or not rate else min(times, self.highest / rate)
+
 
 class GrowingParts(NamedTuple):
     """How two kinds of parameters share in longer steps while the scene grows.
