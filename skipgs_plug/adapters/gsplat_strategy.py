@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ast
+import functools
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from types import FunctionType
 from typing import Any
 
 from skipgs_plug.adapters.unknown_forks import Survey
 from skipgs_plug.core.hooks import Adapter, Hooks
+from skipgs_plug.core.source.functions import syntax_of, undecorated
 from skipgs_plug.core.trainer_info import Densification
 
 OPERATIONS = "gsplat.strategy.ops"  # module of the functions by which strategies change the model
@@ -82,7 +86,34 @@ def iterations_that_run(strategy: Any, numbers: range) -> Iterable[int]:
 def _resets(strategy: Any, numbers: range) -> Iterable[int]:
     """Return the iterations of a range that reset opacities."""
     every, stop = getattr(strategy, "reset_every", 0), getattr(strategy, "refine_stop_iter", 0)
-    return (n for n in numbers if every and 0 < n < stop and n % every == 0)
+    holds = _reset_condition(undecorated(getattr(strategy, "step_post_backward", None)))
+    if holds is None:
+        return (n for n in numbers if every and 0 < n < stop and n % every == 0)
+    return (n for n in numbers if 0 < n < stop and holds(strategy, n))
+
+
+@functools.cache
+def _reset_condition(method: FunctionType | None) -> Callable[[Any, int], bool] | None:
+    """Return the condition under which a strategy's method resets opacities; None if it cannot be read.
+
+    The settings do not tell it: gsplat 1.5.3 tests `step % self.reset_every == 0 & step > 0`, which Python reads as
+    `step % self.reset_every == (0 & step) > 0`. So it never resets opacities.
+    """
+    syntax = None if method is None else syntax_of(method)
+    tests = (
+        [] if syntax is None else [test for test in ast.walk(syntax) if isinstance(test, ast.If) and _resets_in(test)]
+    )
+    parts = [part for test in tests for part in ast.walk(test.test)]
+    names = {part.id for part in parts if isinstance(part, ast.Name)}
+    if not tests or not names <= {"self", "step"} or any(isinstance(part, ast.Call) for part in parts):
+        return None
+    return eval(f"lambda self, step: {' and '.join(f'({ast.unparse(test.test)})' for test in tests)}")
+
+
+def _resets_in(test: ast.If) -> bool:
+    """Whether a branch resets opacities."""
+    calls = (part for line in test.body for part in ast.walk(line) if isinstance(part, ast.Call))
+    return any(isinstance(call.func, ast.Name) and call.func.id == "reset_opa" for call in calls)
 
 
 def leave_out_noise(hooks: Hooks, strategy: Any, owner: Any) -> range:

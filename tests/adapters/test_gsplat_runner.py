@@ -11,6 +11,7 @@ from lookalikes.gsplat_runner import DefaultStrategy, HeadRunner, MCMCStrategy, 
 from lookalikes.splats import NAMES, log, new_log
 
 from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError
+from skipgs_plug.adapters.gsplat_strategy import iterations_that_run, strategy_events
 from skipgs_plug.adapters.registry import find_script_adapter
 from skipgs_plug.core.errors import UnknownTrainerError
 
@@ -245,3 +246,42 @@ def test_gsplats_other_scripts_are_not_taken_for_it(tmp_path):
         find_script_adapter(script)
     script.write_text("from gsplat.distributed import cli\nclass Runner:\n    pass\n")
     assert find_script_adapter(script).name == "gsplat"
+
+
+def reset_opa():
+    """Stand-in of gsplat's function."""
+
+
+class NeverResets(DefaultStrategy):  # the condition of gsplat 1.5.3
+    def step_post_backward(self, params, optimizers, state, step, info, packed=False):
+        if step % self.reset_every == 0 & step > 0:
+            reset_opa()
+
+
+class ResetsLater(DefaultStrategy):
+    def step_post_backward(self, params, optimizers, state, step, info, packed=False):
+        if step < self.refine_stop_iter:
+            if step % self.reset_every == 0 and step > 8:
+                reset_opa()
+        else:
+            self.done = True
+
+
+class ResetsByFunction(DefaultStrategy):  # its condition calls a function, which is not called to read it
+    def step_post_backward(self, params, optimizers, state, step, info, packed=False):
+        if self.due(step):
+            reset_opa()
+
+
+@pytest.mark.parametrize(
+    ("strategy", "resets"),
+    [
+        (DefaultStrategy, [8, 16]),
+        (NeverResets, []),
+        (ResetsLater, [16]),
+        (ResetsByFunction, [8, 16]),
+    ],
+)
+def test_opacity_resets_are_those_of_the_strategys_own_condition(strategy, resets):
+    assert list(iterations_that_run(strategy(), range(60))) == resets
+    assert list(strategy_events(strategy()).reset_numbers(range(60))) == resets
