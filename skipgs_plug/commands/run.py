@@ -17,6 +17,7 @@ from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
 from skipgs_plug.commands.options.gate import GateOptions
 from skipgs_plug.commands.options.run import Args
 from skipgs_plug.compat import FAMILIES, serve
+from skipgs_plug.compat.child_processes import also_in_children
 from skipgs_plug.core.errors import AdapterMismatchError, BrokenTrainingError
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster import ADAM_REPLACED, instead_of_torchs_adam
@@ -26,8 +27,9 @@ from skipgs_plug.scripts import spawned
 from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
 from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED
 from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu, exclusive_cores
-from skipgs_plug.scripts.exits import before_os_exit
+from skipgs_plug.scripts.exits import before_process_ends
 from skipgs_plug.scripts.launch import Attach, run_script, source_of
+from skipgs_plug.scripts.processes import Beginning, told_if_it_starts_itself, told_if_it_trains
 
 ARGPARSE_ERROR = 2  # exit code of a script whose arguments argparse does not know
 
@@ -52,12 +54,15 @@ def run(args: Args) -> int:
         stand_ins = FAMILIES.get(get_adapter(args.adapter).stand_ins_for(command), {})
         execute = functools.partial(run_script, command, on_cpu=args.cpu, stand_ins=stand_ins)
         rank = int(os.environ.get("RANK") or 0)  # torchrun sets it
-        code, gate = run_gated(args, command, execute, rank)
+        spawned_untold = functools.partial(told_if_it_trains, script_name(command))
+        begins = Beginning()
+        with contextlib.nullcontext() if args.no_gate else also_in_children(spawned_untold):
+            code, gate = run_gated(args, command, execute, begins, rank)
     verify(code, gate)
     if code == ARGPARSE_ERROR and not (gate is not None and gate.trained) and (misplaced := own_options(command)):
         say(f"If {misplaced} was meant for skipgs-plug, write it before '--'.")
     seen = args.no_gate if gate is None else gate.trained or gate.released
-    if code == 0 and not processes and not seen:
+    if code == 0 and not processes and not seen and not begins.anywhere:
         say(
             f"{script_name(command)} ended without a training iteration that adapter {args.adapter!r} knows; nothing "
             "was gated."
@@ -94,7 +99,8 @@ def find_adapter(args: Args, command: list[str]) -> str | None:
 
 def run_spawned(args: Args, command: list[str], rank: int, call: bytes) -> None:
     """Do the work of a process that the script spawns: attach a gate like `run`, then make the script's call."""
-    code, gate = run_gated(args, command, lambda attach: spawned.run_call(command, attach, rank, call, args.cpu), rank)
+    execute = functools.partial(spawned.run_call, command, rank=rank, call=call, on_cpu=args.cpu)
+    code, gate = run_gated(args, command, execute, Beginning(), rank)
     if code:
         sys.exit(code)
     verify(code, gate)
@@ -112,9 +118,11 @@ def verify(code: int, gate: SkipGate | None) -> None:
 
 
 def run_gated(
-    args: Args, command: list[str], execute: Callable[[Attach], int], rank: int = 0
+    args: Args, command: list[str], execute: Callable[[Attach], int], begins: Beginning, rank: int = 0
 ) -> tuple[int, SkipGate | None]:
     """Attach a gate to the script that `execute(attach)` runs, and write skipgs.json if `rank` is 0.
+
+    `begins` is told when training begins. A process that the script forks has the gate too, and reports if it trained.
 
     A run that the gate refuses has trained nothing, so it leaves a report of an earlier run as it is.
     """
@@ -128,9 +136,12 @@ def run_gated(
     gates: list[SkipGate] = []
     refused, process = False, os.getpid()
 
+    def first_iteration(number: int) -> dict[str, Any] | None:
+        begins.note()
+        return checkpoints.state_for(number)
+
     def attach() -> dict[str, Any]:
-        if not args.no_gate:
-            adapter.saved_state = checkpoints.state_for
+        adapter.saved_state = first_iteration
         try:
             gates.append(SkipGate(adapter=adapter, **settings))
         except SkipGSError as error:
@@ -144,12 +155,27 @@ def run_gated(
     def finish() -> None:
         for gate in gates:
             gate.detach()
-            if rank == 0 and not refused and os.getpid() == process:  # not in a child that the script forked
+            if rank == 0 and not refused and begins.here:
                 report(gate, adapter)
+
+    def untrained() -> bool:
+        return any(gate.config.enabled and not gate.trained and not gate.released for gate in gates)
+
+    def replaced(program: str) -> None:
+        if os.getpid() != process:
+            return
+        if untrained():
+            raise SkipGSError(
+                f"{script_name(command)} puts {program} in the place of its process before it trains, and no gate "
+                "reaches that program; if it restarts itself to change a setting, such as a variable of the "
+                "environment, make that setting before skipgs-plug run."
+            )
+        finish()
 
     with cpu_instead_of_cuda(args, command) if args.cpu else contextlib.nullcontext():
         try:
-            with checkpoints.watch(), before_os_exit(finish):
+            starts_itself = told_if_it_starts_itself(source_of(command), untrained)
+            with checkpoints.watch(), before_process_ends(finish, replaced), starts_itself:
                 code = execute(attach)
         except SkipGSError as error:
             refused = not isinstance(error, BrokenTrainingError)

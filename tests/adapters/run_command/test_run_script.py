@@ -176,3 +176,60 @@ def test_an_error_while_the_gate_attaches_lets_the_script_train(checkout, tmp_pa
         assert cli.main(["run", "inria", "--cpu", *options, "--", checkout, str(tmp_path)]) == 0
     error = capfd.readouterr().err
     assert (tmp_path / "model.pth").exists() and "Traceback" not in error and "nothing was gated" not in error
+
+
+def rewritten(checkout, main):
+    """Replace the last lines of the look-alike, which call `training`."""
+    file = Path(checkout)
+    text = file.read_text()
+    head = text[: text.index('if __name__ == "__main__":')]
+    file.write_text(f"{head}options = SimpleNamespace(iterations=60, densify_until_iter=20)\n{main}\n")
+
+
+def run_alone(checkout, tmp_path, *options):
+    """Run the look-alike in a new process, which may end at once."""
+    command = [sys.executable, "-m", "skipgs_plug", "run", "inria", "--cpu", *options, "--", checkout, str(tmp_path)]
+    root = Path(__file__).parents[3]
+    return subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(root)})
+
+
+STARTED = """
+if __name__ == "__main__":
+    import multiprocessing
+    process = multiprocessing.get_context("{}").Process(target=training, args=(options, sys.argv[1]))
+    process.start()
+    process.join()
+"""
+
+
+def test_a_process_that_the_script_forks_is_gated_and_reports(checkout, tmp_path):
+    rewritten(checkout, STARTED.format("fork"))
+    ended = run_alone(checkout, tmp_path)
+    assert ended.returncode == 0 and "nothing was gated" not in ended.stderr, ended.stderr
+    assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 60
+    assert ended.stderr.count("SkipGS: ") == 1
+
+
+def test_a_process_that_the_script_spawns_says_that_it_is_not_gated(checkout, tmp_path):
+    rewritten(checkout, STARTED.format("spawn"))
+    ended = run_alone(checkout, tmp_path)
+    assert ended.returncode == 0 and (tmp_path / "model.pth").exists(), ended.stderr
+    assert "training() called backward in a process that train.py has spawned, which no gate reaches." in ended.stderr
+    assert not (tmp_path / "skipgs.json").exists()
+    assert "which no gate reaches" not in run_alone(checkout, tmp_path, "--no-gate").stderr
+
+
+def test_a_script_that_restarts_itself_before_it_trains_is_refused(checkout, tmp_path):
+    rewritten(checkout, "import os\nos.execv(sys.executable, [sys.executable, '-c', 'print(5)'])")
+    ended = run_alone(checkout, tmp_path)
+    assert ended.returncode == 2 and ended.stdout == ""
+    assert "in the place of its process before it trains, and no gate reaches that program" in ended.stderr
+    assert run_alone(checkout, tmp_path, "--no-gate").stdout == "5\n"
+
+
+def test_a_script_that_ends_by_another_program_leaves_a_report(checkout, tmp_path):
+    end = "import os\nos.execv(sys.executable, [sys.executable, '-c', 'exit(4)'])"
+    rewritten(checkout, f"training(options, sys.argv[1])\n{end}")
+    ended = run_alone(checkout, tmp_path)
+    assert ended.returncode == 4 and ended.stderr.count("SkipGS: ") == 1, ended.stderr
+    assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 60
