@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -40,6 +41,7 @@ class AbstractAdapter(ABC):
         saved_state: Returns the gate's state of the checkpoint from which the trainer continues, if any. It is called
             once, with the first iteration. Set it before the gate is created.
         output_folder: The trainer's output folder, if known.
+        script: File that holds the training loop, if it is not `sys.argv[0]`. Set it before the gate is created.
         replaced: Names that the launcher has replaced around the trainer, for `SkipGate.patched`. Set it before the
             gate is created.
     """
@@ -53,6 +55,7 @@ class AbstractAdapter(ABC):
     stand_ins: ClassVar[str] = ""
     saved_state: Callable[[int], dict[str, Any] | None] | None = None
     output_folder: str | None = None
+    script: Path | None = None
     replaced: Sequence[str] = ()
 
     def __init__(self, trainer: Any = None) -> None:
@@ -99,7 +102,7 @@ class AbstractAdapter(ABC):
     def attach_script(self, hooks: Hooks) -> None:
         """Attach to a training script that is about to run in this process.
 
-        Its file is `sys.argv[0]`, its folder is first on `sys.path`, and none of its modules is imported yet.
+        Its file is `script` or `sys.argv[0]`. Its folder is first on `sys.path`, and none of its modules is imported.
 
         Args:
             hooks: Reports to the gate, and replaces names in the trainer.

@@ -181,7 +181,7 @@ class InriaFamily(AbstractAdapter):
         self._attach_to_loop(hooks, names, code)
 
     def attach_script(self, hooks: Hooks) -> None:
-        code = LoopCode.of_script(Path(sys.argv[0]))
+        code = LoopCode.of_script(self.script or Path(sys.argv[0]))
         if not code.used:
             raise AdapterMismatchError(
                 f"Adapter {self.name!r} expects a function {LOOP}(), which {code.source} does not have; name the "
@@ -318,7 +318,8 @@ class InriaFamily(AbstractAdapter):
         if scene is None or missing:
             raise self.mismatch(f"{', '.join(missing or self.scenes)} among the variables of {LOOP}()")
         opt, self._step, cameras = loop[OPTIONS], int(loop[number]), scene.getTrainCameras()
-        self.output_folder = getattr(scene, "model_path", None)
+        if self.output_folder is None:  # a second run is not gated, and the report tells of the first
+            self.output_folder = getattr(scene, "model_path", None)
         if len({camera.image_name for camera in cameras}) < len(cameras):
             caution(
                 "Several training images have the same name; the gate tells views apart by their position, "

@@ -141,7 +141,7 @@ def run_gated(
         return checkpoints.state_for(number)
 
     def attach() -> dict[str, Any]:
-        adapter.saved_state = first_iteration
+        adapter.saved_state, adapter.script = first_iteration, source_of(command)
         try:
             gates.append(SkipGate(adapter=adapter, **settings))
         except SkipGSError as error:

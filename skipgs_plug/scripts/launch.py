@@ -118,14 +118,15 @@ def _resolve(command: Sequence[str]) -> _Program:
     if (instead := wrapper_hint(name)) is not None:
         raise SkipGSError(instead)
     script = Path(name).resolve()
-    if script.is_file():
+    commands = Path(sys.executable).parent  # folder of the commands that installed packages provide
+    if script.is_file() and not (script.parent == commands.resolve() and _provided(script.name)):
         _refuse_shadowed_modules(script.parent)
         run = functools.partial(_run_path, str(script))
         return _Program([str(script), *arguments], script.parent, script, run)
-    for installed in importlib.metadata.entry_points(group="console_scripts", name=name):
-        folder = Path(sys.executable).parent
-        source = _source_of(installed.module) or folder / name
-        return _Program([str(folder / name), *arguments], folder, source, functools.partial(_call, installed))
+    if (installed := _provided(script.name if script.is_file() else name)) is not None:
+        command = commands / installed.name
+        source = _source_of(installed.module) or command
+        return _Program([str(command), *arguments], commands, source, functools.partial(_call, installed))
     if script.is_dir():
         raise SkipGSError(f"{script} is a folder: name the training script in it after '--'.")
     raise SkipGSError(f"There is no script {script}: name the training script after '--'.")
@@ -140,8 +141,15 @@ def _run_path(script: str, names: dict[str, Any]) -> None:
     runpy.run_path(script, init_globals=names, run_name="__main__")
 
 
+def _provided(name: str) -> importlib.metadata.EntryPoint | None:
+    """Return the command of this name that an installed package provides."""
+    return next(iter(importlib.metadata.entry_points(group="console_scripts", name=name)), None)
+
+
 def _call(installed: importlib.metadata.EntryPoint, names: dict[str, Any]) -> None:
-    sys.exit(installed.load()())
+    function = installed.load()
+    vars(sys.modules[installed.module]).update(names)
+    sys.exit(function())
 
 
 def _source_of(module: str) -> Path | None:

@@ -233,3 +233,35 @@ def test_a_script_that_ends_by_another_program_leaves_a_report(checkout, tmp_pat
     ended = run_alone(checkout, tmp_path)
     assert ended.returncode == 4 and ended.stderr.count("SkipGS: ") == 1, ended.stderr
     assert json.loads((tmp_path / "skipgs.json").read_text())["iterations"] == 60
+
+
+def test_the_report_of_two_runs_in_one_process_lies_with_the_first(checkout, tmp_path):
+    rewritten(checkout, "for run in 'ab':\n    training(options, f'{sys.argv[1]}/{run}')")
+    for run in "ab":
+        (tmp_path / run).mkdir()
+    with pytest.warns(RuntimeWarning, match="as in a second training run"):
+        assert cli.main(["run", "inria", "--cpu", "--", checkout, str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "a" / "skipgs.json").read_text())["iterations"] == 60
+    assert (tmp_path / "b" / "model.pth").exists() and not (tmp_path / "b" / "skipgs.json").exists()
+
+
+@pytest.mark.parametrize("by_path", [False, True])
+def test_a_command_that_a_package_provides_is_gated(checkout, tmp_path, monkeypatch, by_path):
+    """Its loop is in the module of its function, which iterations are left out of."""
+    rewritten(checkout, "def entry():\n    training(options, sys.argv[1])")
+    facts = tmp_path / "train_lookalike-1.0.dist-info"
+    facts.mkdir()
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: train-lookalike\nVersion: 1.0\n")
+    (facts / "entry_points.txt").write_text("[console_scripts]\ntrain-lookalike = train:entry\n")
+    command = tmp_path / "bin" / "train-lookalike"
+    command.parent.mkdir()
+    command.write_text("import sys\nfrom train import entry\nsys.exit(entry())\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.syspath_prepend(Path(checkout).parent)
+    monkeypatch.setattr(sys, "executable", str(command.parent / "python"))
+    monkeypatch.delitem(sys.modules, "train", raising=False)
+    name = str(command) if by_path else command.name
+    assert cli.main(["run", "auto", "--cpu", "--refine-share", "0.5", "--", name, str(tmp_path)]) == 0
+    report = json.loads((tmp_path / "skipgs.json").read_text())
+    assert report["iterations_skipped"] > 0 and report["iterations"] < 60
+    monkeypatch.delitem(sys.modules, "train", raising=False)
